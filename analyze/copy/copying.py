@@ -234,7 +234,7 @@ def _copy_episode(
             copied += episode.copy_file(file, place)
     seal = folder / SEAL_FILE
     if without:
-        seal_episode(folder, episode.name, run, copied_from=_captured(episode))
+        seal_episode(folder, episode.name, run, episode.version, copied_from=_captured(episode))
     else:
         seal.parent.mkdir()
         seal.write_bytes(without_other_fields(episode.source.whole(SEAL_FILE)))

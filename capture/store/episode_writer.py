@@ -206,7 +206,7 @@ class EpisodeWriter:
             self._write_side_arrays()
             self.group.update_attributes(to_json(self._attributes(success, num_steps)))
             run = read_run(self.store)[1]
-            seal_episode(self.folder, self.name, run)
+            seal_episode(self.folder, self.name, run, self.run.store_version)
             self._read_back(run)
             return self._publish()
 
@@ -282,5 +282,5 @@ class EpisodeWriter:
 
     def _read_back(self, run: str) -> None:
         """Read everything back from disk, with the checks of `vla-analyze verify`."""
-        for problem in content_problems(self.run, StoredEpisode(self.folder, self.name, run)):
+        for problem in content_problems(self.run, StoredEpisode(self.folder, self.name, run, self.run.store_version)):
             raise CorruptEpisode(f"Episode {self.name}, read back from {self.folder}, is damaged: {problem}.")

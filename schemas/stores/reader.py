@@ -37,7 +37,7 @@ from vla_attention.schemas.stores.packed_index import (
 )
 from vla_attention.schemas.stores.remote_source import RemoteFailure, at_commit, kept_bytes, source_of
 from vla_attention.schemas.stores.root import group_attributes, list_episodes, read_run
-from vla_attention.schemas.stores.seal import identity_problem, read_seal
+from vla_attention.schemas.stores.seal import digests_problem, identity_problem, read_seal
 from vla_attention.schemas.stores.sealed_files import SealedFiles
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
@@ -74,6 +74,7 @@ class StoredEpisode:
         folder: where it is; in a packed store its zip.
         name: the name of its group, which its seal must have.
         run: digest of the configuration of the run that it must belong to, see `run_digest`.
+        version: that of the store, as the run's configuration states it.
         place: where its files are read; those in the folder unless it is given.
         indexed: digest of its seal in the index of a packed store.
     """
@@ -81,6 +82,7 @@ class StoredEpisode:
     folder: StorePlace
     name: str
     run: str
+    version: int
     place: ByteSource | None = None
     indexed: str = ""
 
@@ -130,7 +132,7 @@ class StoredEpisode:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: it has lost its seal ({lost}).") from None
         except ValueError as error:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: its seal is damaged ({error}).") from None
-        problem = identity_problem(seal, self.name, self.run)
+        problem = identity_problem(seal, self.name, self.run) or digests_problem(seal, self.version)
         if problem is None and self.indexed not in ("", seal.digest):
             problem = f"its zip holds another seal than the {INDEX_FILE} of the store lists: one of them was changed"
         if problem is not None:
@@ -418,12 +420,12 @@ def open_store(path: str | StorePlace) -> Store:
     if isinstance(path, StoreUrl) and (kept := kept_bytes()) is not None:
         refuse_in_store(kept.folder, "keep what is fetched in")
     root, run = read_run(path)
-    source = source_of(path)
+    source, version = source_of(path), root.store_version
     index = read_index(source, path, run)
     if index is not None:
         _name_unlisted(path, index)
         in_order = sorted(index.episodes.items(), key=lambda item: parse_episode_name(item[0]))
-        return Store(path, root, run, tuple(_packed(path, source, run, *item) for item in in_order))
+        return Store(path, root, run, tuple(_packed(path, source, run, version, *item) for item in in_order))
     folders, strays = list_episodes(path)
     if strays:
         warnings.warn(
@@ -433,7 +435,7 @@ def open_store(path: str | StorePlace) -> Store:
             stacklevel=2,
         )
     folders.sort(key=lambda folder: parse_episode_name(folder.name))
-    return Store(path, root, run, tuple(StoredEpisode(folder, folder.name, run) for folder in folders))
+    return Store(path, root, run, tuple(StoredEpisode(folder, folder.name, run, version) for folder in folders))
 
 
 def _name_unlisted(path: StorePlace, index: PackedIndex) -> None:
@@ -451,9 +453,11 @@ def _name_unlisted(path: StorePlace, index: PackedIndex) -> None:
         )
 
 
-def _packed(path: StorePlace, source: ByteSource, run: str, name: str, entry: PackedEpisode) -> StoredEpisode:
+def _packed(
+    path: StorePlace, source: ByteSource, run: str, version: int, name: str, entry: PackedEpisode
+) -> StoredEpisode:
     members = ZipMembers(source.bound_to(entry.seal), entry.file, entry.bytes, entry.tail, entry.frame)
-    return StoredEpisode(path / entry.file, name, run, members, entry.seal)
+    return StoredEpisode(path / entry.file, name, run, version, members, entry.seal)
 
 
 def _once_if_same(values: NDArray[np.uint8]) -> NDArray[np.uint8]:

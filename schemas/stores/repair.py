@@ -146,7 +146,7 @@ def _move(store: Store, episode: StoredEpisode, claims: Claims, verify: bool) ->
         if not local_path(episode.folder).is_dir():
             return None
         # A new `StoredEpisode`: the old one keeps what it has read.
-        damaged = look_at(store, StoredEpisode(episode.folder, episode.name, store.run), verify)
+        damaged = look_at(store, replace(episode), verify)
         if damaged is None or holder is not None:
             return None if damaged is None else Finding(damaged, holder=holder)
         return Finding(damaged, moved_to=_move_aside(local_path(store.path), local_path(episode.folder), damaged))

@@ -5,7 +5,7 @@ zarr-python reads it through an event loop, and passing the chunks between threa
 analysis of words reads thousands of chunks. `ShardedLayers` handles the one layout that `capture/store/codecs.py`
 writes. An array of any other layout is read with zarr-python.
 
-Nothing that a file says about sizes is believed: the index, and the checksum at each chunk's end, are compared with the
+Nothing that a file says is believed: the index, each chunk, and the checksum at its end are compared with the
 episode's seal, positions with the file's size, and the header of each compressed chunk with the size of the decoded
 one. A frame of Blosc that says it holds fewer bytes than the chunk would otherwise leave the rest of the buffer as it
 was: bytes of the process, which would pass for attention.
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from vla_attention.schemas.cached_property import cached_property
 from vla_attention.schemas.limit_checks import TooLarge, check_decoded
 from vla_attention.schemas.stores.byte_source import ByteSource, Memory
-from vla_attention.schemas.stores.digest import bytes_digest, crc32c
+from vla_attention.schemas.stores.digest import CHUNK_DIGEST_BYTES, bytes_digest, chunk_digest, crc32c
 from vla_attention.schemas.stores.remote_source import RemoteFailure
 from vla_attention.schemas.stores.store_format import CorruptEpisode, FileRecord
 
@@ -108,6 +108,7 @@ class SealedShard:
         index_bytes: the index as it is stored, with its checksum.
         index: offset and length of each chunk, shape (chunk, 2); (0, 0): not written.
         checksums: the last `CHECKSUM_BYTES` of each chunk, from the seal.
+        digests: `CHUNK_DIGEST_BYTES` of each chunk, from the seal; empty in version 1.
     """
 
     source: ByteSource
@@ -115,6 +116,7 @@ class SealedShard:
     index_bytes: bytes
     index: NDArray[np.uint64]
     checksums: bytes
+    digests: bytes = b""
 
     @classmethod
     def open(cls, source: ByteSource, file: str, record: FileRecord) -> SealedShard:
@@ -133,7 +135,7 @@ class SealedShard:
         else:
             raise CorruptEpisode(f"its {file} does not agree with its seal: its index was changed")
         try:
-            return cls(source, file, stored, read_index(stored, record.size), checksums)
+            return cls(source, file, stored, read_index(stored, record.size), checksums, bytes.fromhex(record.digests))
         except CorruptEpisode as error:
             raise CorruptEpisode(f"its {file} cannot be read: {error}") from None
 
@@ -152,7 +154,8 @@ class SealedShard:
         half a megabyte takes longer than to read it from the system's cache.
 
         Raises:
-            CorruptEpisode: the chunk is missing, its checksum is not the one in the seal, or not that of its bytes.
+            CorruptEpisode: the chunk is missing, or it is not the one that was sealed: its checksum is another one than
+                in the seal or than that of its bytes, or its digest is another one than in the seal.
         """
         offset, length = (int(value) for value in self.index[number])
         if length <= CHECKSUM_BYTES:
@@ -169,8 +172,12 @@ class SealedShard:
                 raise CorruptEpisode(f"its {self.file} cannot be read: {error.strerror or error}") from None
             if found != length or checksum.tobytes() != self.checksum(number):
                 problem = f"chunk {number} of its {self.file} does not agree with its seal"
+            elif self.digests and chunk_digest(stored.data) == self._digest(number):
+                return encoded  # sha256 says all that crc32c would
             elif crc32c(encoded) != int.from_bytes(self.checksum(number), "little"):
                 problem = f"the checksum of chunk {number} of its {self.file} does not fit"
+            elif self.digests:
+                problem = f"chunk {number} of its {self.file} does not agree with its seal, although its checksum fits"
             else:
                 return encoded
         raise CorruptEpisode(problem)
@@ -178,6 +185,9 @@ class SealedShard:
     def checksum(self, number: int) -> bytes:
         """The checksum of one chunk, from the seal."""
         return self.checksums[CHECKSUM_BYTES * number : CHECKSUM_BYTES * (number + 1)]
+
+    def _digest(self, number: int) -> bytes:
+        return self.digests[CHUNK_DIGEST_BYTES * number : CHUNK_DIGEST_BYTES * (number + 1)]
 
 
 def check_blosc_frame(frame: bytes | memoryview, decoded_bytes: int, typesize: int) -> None:

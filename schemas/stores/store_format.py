@@ -77,6 +77,7 @@ SEAL_GROUP = "seal"
 #: Numbers of up to twelve digits.
 _EPISODE_NAME = re.compile(r"task([0-9]{3,12})_episode([0-9]{3,12})")
 _CHECKSUMS = re.compile(r"([0-9a-fA-F]{8})*")
+_DIGESTS = re.compile(r"([0-9a-fA-F]{16})*")
 
 
 class StoreError(UserError, ValueError):
@@ -363,22 +364,30 @@ class ArrayRecord:
 class FileRecord:
     """Size in bytes and sha256 of a file of an episode.
 
-    A shard, from which parts are read, has two fields more. `index` is the sha256 of the index at its end (with the
+    A shard, from which parts are read, has three fields more. `index` is the sha256 of the index at its end (with the
     index's checksum). `chunks` has the crc32c of every chunk, the 4 bytes at the chunk's end, in the index's order: 8
-    hexadecimal digits each, without a separator; `00000000` for a chunk that was not written.
+    hexadecimal digits each, without a separator; `00000000` for a chunk that was not written. `digests` has, in the
+    same order, the first 8 bytes of the sha256 of every chunk as it is stored, with its crc32c: 16 hexadecimal digits
+    each; zeros for a chunk that was not written. Version 1 has no digests.
     """
 
     size: int
     sha256: str
     index: str = ""
     chunks: str = ""
+    digests: str = ""
 
     def __post_init__(self) -> None:
-        """Check the size and the form of the checksums."""
+        """Check the size, the form of checksums and digests, and that there is one of each for every chunk."""
         if self.size < 0:
             raise BadArgument(f"a file of {self.size} bytes")
         if self.chunks and not _CHECKSUMS.fullmatch(self.chunks):
             raise BadArgument("the checksums of the chunks of a file are not 8 hexadecimal digits each")
+        if self.digests and not _DIGESTS.fullmatch(self.digests):
+            raise BadArgument("the digests of the chunks of a file are not 16 hexadecimal digits each")
+        checksums, digests = len(self.chunks) // 8, len(self.digests) // 16
+        if digests not in (0, checksums):
+            raise BadArgument(f"a file has {digests} digests of chunks and {checksums} checksums; expected one of each")
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import struct
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -204,7 +204,7 @@ def _read(name: str, file: str, content: bytes) -> None:
         document = {"zarr_format": 3, "node_type": "group", "attributes": seal}
         (folder / SEAL_FILE).write_text(json.dumps(document))
     store = open_store(_store(name))
-    found = StoredEpisode(store.episodes[0].folder, episode.name, store.run)
+    found = replace(store.episodes[0], name=episode.name)
     list(content_problems(store.attributes, found))
     found.tokens(store.attributes, "joint")
     for array in found.attributes.arrays:

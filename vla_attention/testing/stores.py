@@ -147,7 +147,8 @@ def commit(writer: EpisodeWriter, spec: StoreSpec, task: int, episode: int) -> P
 
 def reseal(folder: Path) -> None:
     """Seal a committed episode anew, after a test has changed its files: it then passes for what was captured."""
-    seal_episode(folder, folder.name, read_run(folder.parents[1])[1])
+    root, run = read_run(folder.parents[1])
+    seal_episode(folder, folder.name, run, root.store_version)
 
 
 def reseal_root(store: Path) -> None:

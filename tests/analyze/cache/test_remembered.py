@@ -28,7 +28,7 @@ from vla_attention.analyze.measures.steps import measure_episodes
 from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.schemas.groupings.resolve import EmptyGroup
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
-from vla_attention.schemas.stores.store_format import CorruptEpisode
+from vla_attention.schemas.stores.store_format import STORE_VERSION, CorruptEpisode
 from vla_attention.testing.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=9, contributions=True, prompts="same")
@@ -303,7 +303,7 @@ def test_the_state_of_a_zip_is_that_of_the_file(tmp_path, monkeypatch):
     monkeypatch.setattr(fingerprints, "SETTLED_SECONDS", 0.0)
     path = tmp_path / "task000_episode000.zip"
     path.write_bytes(b"some bytes")
-    episode = StoredEpisode(path, path.stem, "")
+    episode = StoredEpisode(path, path.stem, "", STORE_VERSION)
     state = fingerprints.file_state(episode)
     assert state == fingerprints.file_state(episode) is not None
     before = path.stat()

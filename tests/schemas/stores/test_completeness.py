@@ -9,6 +9,7 @@ import pytest
 
 from vla_attention.schemas.stores.completeness import check_presence
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
+from vla_attention.schemas.stores.store_format import STORE_VERSION
 from vla_attention.testing.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0,), episodes=2, replans=2, layers=(0,), heads=(0,), contributions=True)
@@ -27,7 +28,7 @@ def episode(original, tmp_path) -> Path:
 
 
 def problems(episode: Path) -> list[str]:
-    return check_presence(StoredEpisode(episode, episode.name, open_store(episode.parents[1]).run))
+    return check_presence(StoredEpisode(episode, episode.name, open_store(episode.parents[1]).run, STORE_VERSION))
 
 
 def test_a_whole_episode_is_present(episode):

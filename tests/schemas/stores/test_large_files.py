@@ -15,6 +15,7 @@ from vla_attention.schemas.stores import reader, sealed_files
 from vla_attention.schemas.stores.byte_source import Folder
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.seal import read_seal, seal_episode
+from vla_attention.schemas.stores.store_format import STORE_VERSION
 from vla_attention.schemas.stores.verify import verify_store
 from vla_attention.schemas.stores.zip_members import ZipMembers
 from vla_attention.testing.stores import StoreSpec
@@ -93,4 +94,4 @@ def test_a_damage_in_any_part_is_found(made, tmp_path, asked, capsys, at):
 def test_a_seal_made_in_parts_is_the_same(made):
     folder = made / "episodes/task000_episode000"
     before = read_seal(folder)
-    assert seal_episode(folder, before.episode, before.run) == before
+    assert seal_episode(folder, before.episode, before.run, STORE_VERSION) == before
