@@ -196,7 +196,7 @@ def _parts(question: Question, progress: Callable[[int], object] | None) -> Any:
     start = 0
     for item in question.selected:
         stop = start + item.episode.attributes.num_replans
-        for part in layer_rows(item.episode, question.selection, question.site, per_head=True):
+        for part in layer_rows(item.store.attributes, item.episode, question.selection, question.site, per_head=True):
             yield (slice(start, stop), part.layer, part.denoise), part.rows
         start = stop
         if progress is not None:

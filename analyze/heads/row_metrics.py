@@ -135,7 +135,7 @@ def measure_rows(
     inside = valid[:, used]
     columns = [*(resolved.names.index(name) for name in shown), weights.shape[2] - 1]
     within = np.ascontiguousarray(weights[:, used][:, :, columns] * inside[:, :, None])
-    for part in layer_rows(item.episode, selection, site, per_head=True):
+    for part in layer_rows(item.store.attributes, item.episode, selection, site, per_head=True):
         rows = part.rows if len(used) == part.rows.shape[2] else part.rows[:, :, used]
         out.entropy[:, part.layer, part.denoise] = entropies(rows, within)
         out.top[:, part.layer, part.denoise] = top_mass(rows, inside, options.top)

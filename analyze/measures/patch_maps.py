@@ -29,7 +29,7 @@ def mean_rows(item: SelectedEpisode, selection: Selection, site: str) -> NDArray
     A block that was named by two layer numbers counts once.
     """
     total, count = 0.0, 0
-    for part in layer_rows(item.episode, selection, site, per_head=True):
+    for part in layer_rows(item.store.attributes, item.episode, selection, site, per_head=True):
         if selection.is_first_of_block(part.layer):
             total, count = total + part.rows.mean(axis=1, dtype=np.float64), count + 1
     return np.asarray(total) / count

@@ -213,7 +213,7 @@ def episode_key_shares(item: SelectedEpisode, selection: Selection, site: str, r
     """Read an episode's rows once."""
     valid, uniform = item.valid, UniformShares.of(item, selection)
     shares = KeyShares.empty(item, selection, uniform)
-    for part in layer_rows(item.episode, selection, site, per_head=True):
+    for part in layer_rows(item.store.attributes, item.episode, selection, site, per_head=True):
         limit = rule.factor * uniform.at(part.layer, part.denoise)
         shares.add(part.layer, part.rows, valid, limit, selection)
     return shares

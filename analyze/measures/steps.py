@@ -127,7 +127,7 @@ def measure_episode(
         mass = masses(_reduce(atoms, selection, axis=-2), of_segments)
     else:
         mass = np.empty((*row_sum.shape, weights.shape[2]))
-        for part in layer_rows(item.episode, selection, site):
+        for part in layer_rows(item.store.attributes, item.episode, selection, site):
             mass[:, part.layer, part.denoise] = masses(part.rows, weights)
     return measured_from(item, resolved, selection, mass, row_sum, weights)
 

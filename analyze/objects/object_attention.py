@@ -242,7 +242,7 @@ def _measure_episode(
     waiting: dict[str, list[NDArray[np.float32]]] = {view.camera: [] for view in views}
     places: list[tuple[int, int]] = []
     done = 0
-    for part in layer_rows(item.episode, selection, site):
+    for part in layer_rows(item.store.attributes, item.episode, selection, site):
         rows = part.rows
         if item.without:
             rows = rows.copy()

@@ -1,15 +1,21 @@
-"""Rows of one episode, one layer and denoise step at a time: no analysis holds all rows of an episode."""
+"""Rows of one episode, one layer and denoise step at a time: no analysis holds all rows of an episode.
+
+Every row that is read is held against its stored sum. Of a store of version 1 this finds what a crc32c alone cannot:
+bits that were chosen so that it stays.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.analyze.stores.selection import Selection
+from vla_attention.schemas.stores.content_rules import add_up, row_problems
 from vla_attention.schemas.stores.reader import StoredEpisode
+from vla_attention.schemas.stores.store_format import CorruptEpisode, Recording, RootAttributes
 
 
 @dataclass(frozen=True)
@@ -29,19 +35,24 @@ class LayerRows:
 
 
 def layer_rows(
-    episode: StoredEpisode, selection: Selection, site: str, per_head: bool | None = None
+    root: RootAttributes, episode: StoredEpisode, selection: Selection, site: str, per_head: bool | None = None
 ) -> Iterator[LayerRows]:
     """Read the selected layers and denoise steps of an episode one after the other.
 
     All are read into the same memory: each is gone when the next one is asked for.
 
     Args:
+        root: of the episode's store.
         episode: where the rows are.
         selection: which layers, denoise steps and heads.
         site: the softmax family.
         per_head: keep heads apart; as in the selection unless it is given.
+
+    Raises:
+        CorruptEpisode: a chunk is not the one that was sealed, or rows do not add up to their stored sums.
     """
-    name = f"{site}/rows"
+    name, recording = f"{site}/rows", root.recording_of(site)
+    sums = episode.read(f"{site}/row_sum")
     # A slice where it can be one: picking heads by their numbers copies every row.
     replans, *_, stored, queries, keys = episode.shape_of(name)
     heads = slice(None) if selection.heads == tuple(range(stored)) else list(selection.heads)
@@ -51,13 +62,27 @@ def layer_rows(
     of_heads = None if apart else np.empty((replans, keys), np.float32)
     cells = [(i, j) for i in range(len(selection.layers)) for j in range(len(selection.denoise))]
     places = [(selection.layers[i], selection.denoise[j]) for i, j in cells]
-    for (i, j), whole in zip(cells, episode.read_layers(name, places), strict=True):
+    for (i, j), (layer, step), whole in zip(cells, places, episode.read_layers(name, places), strict=True):
+        if not add_up(whole, sums[:, layer, step], recording.mantissa_bits):
+            here = replace(recording, layers=(recording.layers[layer],), denoise_steps=(recording.denoise_steps[step],))
+            _refuse(episode, name, whole, sums[:, layer, step], here)
         rows = whole[:, heads]
         rows = rows[:, :, 0] if of_queries is None else _mean_into(of_queries, rows, 2)
         if of_heads is not None:
             rows = _mean_into(of_heads, rows, 1)[:, None]
-        episode.refuse_missing(name, rows)
         yield LayerRows(i, j, rows)
+
+
+def _refuse(
+    episode: StoredEpisode, name: str, rows: NDArray[np.float32], sums: NDArray[np.float32], recording: Recording
+) -> None:
+    """Raise `CorruptEpisode` if rows (replan, head, query, key) of one layer and denoise step break the rules.
+
+    sums: (replan, head, query). recording: of the site, with this layer and denoise step alone.
+    """
+    episode.refuse_missing(name, rows)
+    for problem in row_problems(name, rows[:, None, None], sums[:, None, None], recording, recording.mantissa_bits):
+        raise CorruptEpisode(f"Episode {episode.name} is damaged: {problem}.")
 
 
 def _mean_into(memory: NDArray[np.float32], values: NDArray[np.float32], axis: int) -> NDArray[np.float32]:

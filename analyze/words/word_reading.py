@@ -117,7 +117,7 @@ def _word_masses(item: SelectedEpisode, selection: Selection, site: str) -> dict
     items = _episode_items(item)
     heads = len(selection.heads) if selection.per_head else 1
     mass = np.zeros((item.tokens.num_replans, len(selection.layers), heads, items.weights.shape[2]))
-    for part in layer_rows(item.episode, selection, site):
+    for part in layer_rows(item.store.attributes, item.episode, selection, site):
         mass[:, part.layer] += masses(part.rows, items.weights) / len(selection.denoise)
     return {"mass": mass}
 

@@ -29,6 +29,23 @@ _COVERAGE_TOLERANCE = 1e-3
 _GRAM_TOLERANCE = 1e-4
 
 
+def row_sum_bound(mantissa_bits: int) -> float:
+    """Largest difference between the sum of a row of that precision and its stored sum, as a share of it."""
+    return _SUMMATION_TOLERANCE + mass_error_bound(mantissa_bits)
+
+
+def add_up(rows: NDArray[np.float32], row_sum: NDArray[np.float32], mantissa_bits: int) -> bool:
+    """Whether rows (..., key) have the sums `row_sum` (...), within `row_sum_bound`: one product in float32.
+
+    Where it says no, `row_problems` decides: sums in float32 err by some 1e-6.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # of numbers that no row has
+        found = rows.reshape(-1, rows.shape[-1]) @ np.ones(rows.shape[-1], np.float32)
+    expected = row_sum.reshape(-1)
+    most = np.float32(row_sum_bound(mantissa_bits) - _SUMMATION_TOLERANCE / 2)
+    return bool((np.abs(found - expected) <= most * expected).all())  # a NaN is in no bound
+
+
 def row_problems(
     name: str,
     values: NDArray[np.float32],
@@ -54,7 +71,7 @@ def row_problems(
     if (lowest < 0).any():
         yield f"{name} holds negative numbers {_where(lowest < 0, recording, first_replan)}"
     expected = row_sum.astype(np.float64)
-    bound = _SUMMATION_TOLERANCE + mass_error_bound(mantissa_bits)
+    bound = row_sum_bound(mantissa_bits)
     error = np.abs(sums - expected) / np.maximum(np.abs(expected), 1e-30)
     differs = np.isfinite(error) & (error > bound)
     if differs.any():

@@ -31,7 +31,7 @@ def test_rows_are_numpys_means_of_the_stored_ones_to_the_last_bit(tmp_path, quer
     selection = select(store.attributes, layers=[2, 0], heads=heads, per_head=per_head)
     raw = raw_rows(path)
     seen = []
-    for part in layer_rows(store.episodes[0], selection, "joint"):
+    for part in layer_rows(store.attributes, store.episodes[0], selection, "joint"):
         expected = raw[:, selection.layers[part.layer], selection.denoise[part.denoise]][:, list(selection.heads)]
         expected = expected.mean(axis=2) if queries == "all" else expected[:, :, 0]
         if not per_head:
@@ -44,7 +44,7 @@ def test_rows_are_numpys_means_of_the_stored_ones_to_the_last_bit(tmp_path, quer
 def test_a_caller_can_keep_heads_apart_whatever_the_selection_says(tmp_path):
     path = write_store(tmp_path / "a.zarr", tasks=(0,), episodes=1, heads=(0, 1, 3))
     store = open_store(path)
-    first = next(layer_rows(store.episodes[0], select(store.attributes), "joint", per_head=True))
+    first = next(layer_rows(store.attributes, store.episodes[0], select(store.attributes), "joint", per_head=True))
     np.testing.assert_array_equal(first.rows, raw_rows(path)[:, 0, 0, :, 0])
 
 
@@ -59,9 +59,9 @@ def test_one_missing_value_in_one_head_is_an_error(tmp_path, per_head, queries):
     store = open_store(path)
     selection = select(store.attributes, per_head=per_head)
     with pytest.raises(CorruptEpisode, match="joint/rows of episode task000_episode000 has missing values"):
-        list(layer_rows(store.episodes[0], selection, "joint"))
+        list(layer_rows(store.attributes, store.episodes[0], selection, "joint"))
     others = select(store.attributes, layers=[0], per_head=per_head)
-    assert len(list(layer_rows(store.episodes[0], others, "joint"))) == 2
+    assert len(list(layer_rows(store.attributes, store.episodes[0], others, "joint"))) == 2
 
 
 @pytest.mark.skipif(not Path("/proc/self/io").exists(), reason="the system does not count the bytes that are read")

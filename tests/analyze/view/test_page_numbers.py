@@ -129,7 +129,7 @@ def test_rows_patches_words_and_their_readers(answers, name, query):
         va.open(FOLDER / f"{name}.zarr").stores, settings_from_keywords(grouping="default", per_head=True, **asked)
     )
     item = question.selected[0]
-    read = layer_rows(item.episode, question.selection, answer["site"])
+    read = layer_rows(item.store.attributes, item.episode, question.selection, answer["site"])
     parts = [(part.layer, part.rows[replan].astype(np.float64)) for part in read]
     by_head = np.zeros((len(question.selection.layers), *parts[0][1].shape))  # (layer, head, key)
     for layer, rows in parts:
