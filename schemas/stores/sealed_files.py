@@ -61,13 +61,17 @@ class SealedFiles:
     def copy(self, file: str, path: Path) -> int:
         """Write a file to `path` part by part, and return its bytes; raises `CorruptEpisode` as `whole` does.
 
-        What has been written when that is raised is of no use.
+        The chunks of a shard are compared, too, as they were written. What has been written when the error is raised is
+        of no use.
         """
+        record = self._record(file)
         with path.open("wb") as copied:
             for offset, part in self._parts(file):
                 copied.seek(offset)
                 copied.write(part)
-        return self._record(file).size
+        if record.chunks:
+            SealedShard.open(Folder(path.parents[file.count("/")]), file, record).check()
+        return record.size
 
     def _parts(self, file: str) -> Iterator[tuple[int, bytes]]:
         """Offset and bytes of each part of a file; they are those of the seal when all of them have been taken.

@@ -55,8 +55,12 @@ class SealedArrayStore(Store):
         if shard is None:
             self._check_frame(content[:-CHECKSUM_BYTES] if self._codecs[-1] == "crc32c" else content, file)
         else:
-            for offset, length in shard.index.tolist():
+            stored = np.frombuffer(content, np.uint8)
+            for number, (offset, length) in enumerate(shard.index.tolist()):
                 if length:
+                    problem = shard.problem(number, stored[offset : offset + length])
+                    if problem is not None:
+                        raise CorruptEpisode(problem)
                     self._check_frame(content[offset : offset + length - CHECKSUM_BYTES], file)
         return _cut(content, byte_range)
 

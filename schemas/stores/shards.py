@@ -161,8 +161,7 @@ class SealedShard:
         if length <= CHECKSUM_BYTES:
             raise CorruptEpisode(f"its {self.file} lacks chunk {number}: it is missing")
         stored = np.empty(length, np.uint8) if memory is None else memory[:length]
-        encoded, checksum = stored[:-CHECKSUM_BYTES], stored[-CHECKSUM_BYTES:]
-        problem = ""
+        problem: str | None = None
         for fresh in (False, True) if self.source.remembers else (False,):
             try:
                 found = self.source.read_into(stored, self.file, offset, fresh=fresh)
@@ -170,17 +169,29 @@ class SealedShard:
                 raise
             except OSError as error:
                 raise CorruptEpisode(f"its {self.file} cannot be read: {error.strerror or error}") from None
-            if found != length or checksum.tobytes() != self.checksum(number):
-                problem = f"chunk {number} of its {self.file} does not agree with its seal"
-            elif self.digests and chunk_digest(stored.data) == self._digest(number):
-                return encoded  # sha256 says all that crc32c would
-            elif crc32c(encoded) != int.from_bytes(self.checksum(number), "little"):
-                problem = f"the checksum of chunk {number} of its {self.file} does not fit"
-            elif self.digests:
-                problem = f"chunk {number} of its {self.file} does not agree with its seal, although its checksum fits"
-            else:
-                return encoded
-        raise CorruptEpisode(problem)
+            problem = self.problem(number, stored[:found])
+            if problem is None:
+                return stored[:-CHECKSUM_BYTES]
+        raise CorruptEpisode(str(problem))
+
+    def problem(self, number: int, stored: Memory) -> str | None:
+        """How bytes differ from the sealed chunk of that number, with its checksum, or None."""
+        encoded, checksum = stored[:-CHECKSUM_BYTES], stored[-CHECKSUM_BYTES:]
+        if len(stored) != self.index[number, 1] or checksum.tobytes() != self.checksum(number):
+            return f"chunk {number} of its {self.file} does not agree with its seal"
+        if self.digests and chunk_digest(stored.data) == self._digest(number):
+            return None  # sha256 says all that crc32c would
+        if crc32c(encoded) != int.from_bytes(self.checksum(number), "little"):
+            return f"the checksum of chunk {number} of its {self.file} does not fit"
+        if self.digests:
+            return f"chunk {number} of its {self.file} does not agree with its seal, although its checksum fits"
+        return None
+
+    def check(self) -> None:
+        """Read all chunks that were written; raises `CorruptEpisode` as `chunk` does."""
+        memory = np.empty(self.longest(), np.uint8)
+        for number in np.flatnonzero(self.index[:, 1]).tolist():
+            self.chunk(number, memory)
 
     def checksum(self, number: int) -> bytes:
         """The checksum of one chunk, from the seal."""

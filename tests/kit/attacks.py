@@ -14,9 +14,13 @@ from typing import Any
 import google_crc32c
 import numpy as np
 import zarr
+from numcodecs import blosc
 
 #: The first two episodes of a task; arrays of both have the same shapes.
 FIRST, SECOND = "task000_episode000", "task000_episode001"
+
+#: The polynomial of crc32c (RFC 3720), highest power first.
+_CRC32C = 0x11EDC6F41
 
 #: Changes the store at the first path; the other one is of another seed, with equal shapes.
 Attack = Callable[[Path, Path], object]
@@ -68,6 +72,40 @@ def permute_chunks(shard: Path, order: list[int]) -> None:
 def with_checksum(content: bytes) -> bytes:
     """The bytes with their crc32c at the end, as in chunks and indices."""
     return content + int(google_crc32c.value(content)).to_bytes(4, "little")
+
+
+def forge_chunk(content: bytes, number: int, chunks: int, keys: int) -> bytes:
+    """A shard of rows in which bits of one chunk are flipped so that its crc32c stays, and rows have other sums.
+
+    A multiple of the checksum's polynomial is added to the chunk. Most frames of Blosc decode all the same.
+    """
+    index = np.frombuffer(content[-16 * chunks - 4 : -4], dtype="<u8").reshape(-1, 2)
+    start, length = index[number].tolist()
+    frame = content[start : start + length - 4]
+    before = _sums_of(frame, keys)
+    assert before is not None
+    for bit in range(8 * length // 2, 8 * len(frame) - 33):
+        other = bytearray(frame)
+        for power in range(33):
+            if _CRC32C >> 32 - power & 1:  # the highest power comes first, and in each byte the lowest bit
+                other[(bit + power) // 8] ^= 1 << (bit + power) % 8
+        after = _sums_of(bytes(other), keys)
+        if after is not None and (np.abs(after / before - 1) > 0.02).any():
+            forged = bytes(other) + content[start + length - 4 : start + length]
+            assert forged == with_checksum(bytes(other))
+            return content[:start] + forged + content[start + length :]
+    raise AssertionError("no such bits were found")
+
+
+def _sums_of(frame: bytes, keys: int) -> np.ndarray | None:
+    """The sums of the rows in a frame that pass for rows: finite numbers, not negative, with sums of at most 1.5."""
+    try:
+        rows = np.frombuffer(blosc.decompress(frame), np.float32).reshape(-1, keys)
+    except (RuntimeError, ValueError):
+        return None
+    rows = rows[~np.isnan(rows).all(axis=1)]  # a block that is not full is filled with NaN
+    sums = rows.sum(axis=1, dtype=np.float64)
+    return sums if (rows >= 0).all() and (sums <= 1.5).all() else None
 
 
 def encode_again(episode: Path, array: str) -> None:
@@ -141,6 +179,9 @@ def attacks(arrays: list[str]) -> dict[str, Attack]:
             shard(path), *pair, 12
         )
         found[f"chunks of rows: {what} exchanged"] = lambda path, other, order=order: permute_chunks(shard(path), order)
+    found["chunks of rows: other bits of the same crc32c"] = lambda path, other: shard(path).write_bytes(
+        forge_chunk(shard(path).read_bytes(), 3, 12, 39)
+    )
     found["attributes exchanged"] = lambda path, other: exchange(*(episode / "zarr.json" for episode in two(path)))
     found["seals exchanged"] = lambda path, other: exchange(*(episode / "seal" for episode in two(path)))
     found["seals and attributes exchanged"] = lambda path, other: [

@@ -103,6 +103,7 @@ FAST = (
     "objects/base_0_rgb encoded again",
     "index of rows: layers exchanged",
     "chunks of rows: denoise steps exchanged",
+    "chunks of rows: other bits of the same crc32c",
     "an episode copied under another name",
 )
 
