@@ -1,17 +1,24 @@
-"""Rows as the analysis gets them: against the raw arrays, without missing values, no more bytes than are needed."""
+"""Rows as the analysis gets them: against the raw arrays and row sums, whole, no more bytes than are needed."""
 
 import re
+import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import polars as pl
 import pytest
 import zarr
 
+from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.steps import measure_episodes
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import select
+from vla_attention.schemas.precision import round_mantissa
+from vla_attention.schemas.stores.content_rules import add_up, row_sum_bound
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 from vla_attention.testing.stores import StoreSpec, reseal, write_store
@@ -62,6 +69,88 @@ def test_one_missing_value_in_one_head_is_an_error(tmp_path, per_head, queries):
         list(layer_rows(store.attributes, store.episodes[0], selection, "joint"))
     others = select(store.attributes, layers=[0], per_head=per_head)
     assert len(list(layer_rows(store.attributes, store.episodes[0], others, "joint"))) == 2
+
+
+def with_other_rows(path: Path, change: Callable[[np.ndarray], object], **fields: Any) -> Path:
+    """A store in which somebody changed the rows of the first episode, and sealed it again."""
+    write_store(path, tasks=(0,), episodes=2, replans=11, heads=(0, 1, 3), layers=(0, 2), **fields)
+    folder = path / "episodes/task000_episode000"
+    rows = zarr.open_array(folder / "joint/rows", mode="r+")
+    values = rows[:]
+    change(values)
+    rows[...] = values
+    reseal(folder)
+    return path
+
+
+def one_row(values: np.ndarray) -> None:
+    values[7, 1, 0, 2] *= 1.01
+
+
+@pytest.mark.parametrize("per_head", [True, False])
+@pytest.mark.parametrize("queries", ["mean", "all"])
+def test_a_row_of_another_sum_is_refused_by_its_place(tmp_path, queries, per_head):
+    store = open_store(with_other_rows(tmp_path / "a.zarr", one_row, queries=queries))
+    selection = select(store.attributes, heads=[1, 3], per_head=per_head)
+    with pytest.raises(CorruptEpisode) as caught:
+        list(layer_rows(store.attributes, store.episodes[0], selection, "joint"))
+    assert re.fullmatch(
+        r"Episode task000_episode000 is damaged: joint/rows does not add up to the row sums: they differ by up to "
+        r"0\.01 of them, allowed is 0\.0005, at replan 7, denoise step 0, layer 2, head 3"
+        r"(, query 0, and at 3 of 99 places in all)?\.",
+        str(caught.value),
+    )
+    for layers, denoise in (([0], None), ([2], ["last"])):
+        others = select(store.attributes, layers=layers, denoise=denoise, per_head=per_head)
+        assert list(layer_rows(store.attributes, store.episodes[0], others, "joint"))
+
+
+def test_commands_end_so_or_leave_the_episode_out(tmp_path, capsys):
+    path = with_other_rows(tmp_path / "a.zarr", one_row)
+    corner = ["--group", "corner=patch:base_0_rgb[0:1,0:1]"]
+    asked: list[list[str]] = [[str(path), *corner], *([name, str(path)] for name in ("heads", "words", "objects"))]
+    for words in asked:
+        out = str(tmp_path / f"out{len(words[0])}")
+        words += ["--no-plots", "--no-cache", "--output", out]
+        assert main(words) == 2, words
+        said = capsys.readouterr().err
+        assert "Episode task000_episode000 is damaged: joint/rows does not add up to the row sums" in said
+        assert said.count("\n") == 1
+    assert main([*asked[0], "--skip-corrupt"]) == 0
+    assert "task000_episode000" in capsys.readouterr().out
+    assert pl.read_parquet(tmp_path / f"out{len(str(path))}/episodes.parquet")["episode_index"].unique().to_list() == [
+        1
+    ]
+
+
+@pytest.mark.parametrize("value", [np.inf, 1e38, -0.5])
+def test_numbers_that_no_row_has_are_refused_without_a_warning(tmp_path, value):
+    def change(values: np.ndarray) -> None:
+        values[3, 0, 1, 0, 0, 4:] = value
+
+    store = open_store(with_other_rows(tmp_path / "a.zarr", change))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(CorruptEpisode, match=r"replan 3, denoise step 9, layer 0, head 0"):
+            list(layer_rows(store.attributes, store.episodes[0], select(store.attributes), "joint"))
+
+
+@pytest.mark.parametrize("bits", [1, 4, 10, 23])
+@pytest.mark.parametrize("keys", [39, 978, 5000])
+def test_what_is_quickly_held_to_add_up_does(bits, keys):
+    generator = np.random.default_rng(bits)
+    rows = generator.random((200, keys)).astype(np.float32) ** 8
+    rows /= rows.sum(axis=1, keepdims=True)
+    sums = rows.sum(axis=1, dtype=np.float64).astype(np.float32)
+    rounded = round_mantissa(rows, bits)
+    assert add_up(rounded, sums, bits)
+    bound = row_sum_bound(bits)
+    for share, expected in ((0.98, True), (1.02, False)):
+        exact = rows * np.float32(1 + share * bound)
+        # Near the bound float32 may say no: `row_problems` then says what is right. A yes is right.
+        assert add_up(exact, sums, bits) <= expected
+        assert add_up(exact, sums, bits) == expected or bound < 1e-4
+    assert not add_up(np.where(np.arange(keys) == 3, np.float32(np.nan), rounded), sums, bits)
 
 
 @pytest.mark.skipif(not Path("/proc/self/io").exists(), reason="the system does not count the bytes that are read")
