@@ -50,6 +50,7 @@ class Task:
 
     instruction: the sentence that the policy gets.
     num_initial_states: number of stored initial states; an episode selects one by its index.
+    task_family: the sentence template that it shares with other tasks (`task_families.py`); empty: none known.
     """
 
     suite: str
@@ -57,6 +58,7 @@ class Task:
     name: str
     instruction: str
     num_initial_states: int
+    task_family: str = ""
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from typing import Any
 
 from vla_attention.capture.environments.base import Suite, Task
 from vla_attention.capture.environments.robosuite_installation import import_robosuite, readable_device_choice
+from vla_attention.capture.environments.task_families import sentence_template
 from vla_attention.capture.foreign_files.regular_files import check_folder
 from vla_attention.schemas.errors import MissingDependency, UserError
 from vla_attention.schemas.installing import INSTALL_LIBERO
@@ -86,9 +87,10 @@ def list_libero_tasks(suite: Suite) -> tuple[Task, ...]:
             f"The installed LIBERO has {len(names)} tasks in {suite.name} instead of {suite.num_tasks}; "
             "run 'make setup'."
         )
+    given = [(name, instruction_of(name)) for name in names]
     return tuple(
-        Task(suite.name, task_id, name, instruction_of(name), suite.initial_states_per_task)
-        for task_id, name in enumerate(names)
+        Task(suite.name, task_id, name, words, suite.initial_states_per_task, sentence_template(words))
+        for task_id, (name, words) in enumerate(given)
     )
 
 

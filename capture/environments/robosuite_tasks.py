@@ -13,6 +13,7 @@ from typing import Any
 
 from vla_attention.capture.environments.base import ROBOT, Suite, Task
 from vla_attention.capture.environments.simulator import SimulatedEnvironment
+from vla_attention.capture.environments.task_families import sentence_template
 from vla_attention.schemas.groupings.vocabulary import ObjectKind, SceneObject
 
 
@@ -78,7 +79,14 @@ BUILTIN_TASKS: tuple[BuiltinTask, ...] = (
 def list_robosuite_tasks(suite: Suite) -> tuple[Task, ...]:
     """Return the built-in tasks in their fixed order."""
     return tuple(
-        Task(suite.name, task_id, task.environment, task.instruction, suite.initial_states_per_task)
+        Task(
+            suite.name,
+            task_id,
+            task.environment,
+            task.instruction,
+            suite.initial_states_per_task,
+            sentence_template(task.instruction),
+        )
         for task_id, task in enumerate(BUILTIN_TASKS)
     )
 

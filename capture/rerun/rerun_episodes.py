@@ -78,6 +78,7 @@ def rerun_episode(
         initial_state_digest=attributes.initial_state_digest,
         objects=attributes.objects,
         provenance=dict(machine),
+        task_family=attributes.task_family,
     )
     denoise_times = repeater.policy.denoise_times()[list(recording.denoise_steps)]
     progress.begin(calls.episode.name)

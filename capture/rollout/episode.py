@@ -100,6 +100,7 @@ def episode_start(run: EpisodeRun, task: Task, episode_index: int, begun: Begun)
         initial_state_digest=begun.initial_state_digest,
         objects=begun.objects,
         provenance=run.machine,
+        task_family=task.task_family,
     )
 
 

@@ -86,6 +86,7 @@ class EpisodeStart:
     initial_state_digest: str
     objects: tuple[SceneObject, ...]
     provenance: dict[str, str]
+    task_family: str = ""
 
 
 class ReplanRefused(StoreError):

@@ -17,6 +17,7 @@ from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing, unknown_name
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.layout import Prompt
+from vla_attention.schemas.safe_text import check_text
 
 
 @dataclass(frozen=True)
@@ -29,9 +30,10 @@ class EpisodeFacts:
     seed: int | None = None
     task_name: str | None = None
     objects: tuple[SceneObject, ...] = ()
+    task_family: str = ""
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
+        """Check the numbers and the texts."""
         for name in ("task_id", "episode_index"):
             number = whole_number(f"{name} of an episode", getattr(self, name))
             if number < 0:
@@ -39,6 +41,9 @@ class EpisodeFacts:
             object.__setattr__(self, name, number)
         if not isinstance(self.instruction, str):
             raise BadArgument(f"The instruction of an episode is {self.instruction!r}; expected a text.")
+        if not isinstance(self.task_family, str):
+            raise BadArgument(f"The task_family of an episode is {self.task_family!r}; expected a text, or none.")
+        check_text("task family", self.task_family)
 
 
 @dataclass(frozen=True)

@@ -407,6 +407,7 @@ class RecordedRun:
         seed: int | None = None,
         task_name: str | None = None,
         objects: Sequence[Any] = (),
+        task_family: str = "",
     ) -> Iterator[Episode]:
         """Record an episode; leaving the block stores it, an exception drops it.
 
@@ -416,13 +417,15 @@ class RecordedRun:
             seed: that of the policy's noise in all calls; None: not known.
             task_name: short name of the task; None: made of the id.
             objects: `SceneObject` of the scene, for masks and coverage.
+            task_family: what tasks of one sentence template share, for instance "put A on B": they are not counted as
+                independent; empty: not known.
 
         Raises:
             StoreExists: the episode is in the store already.
             NothingRecorded: no attention was seen in the block.
             WeightsChanged: the policy has other weights than when the run began.
         """
-        facts = EpisodeFacts(task_id, episode_index, instruction, seed, task_name, tuple(objects))
+        facts = EpisodeFacts(task_id, episode_index, instruction, seed, task_name, tuple(objects), task_family)
         with ExitStack() as stack:
             episode = self._begin(stack, facts)
             try:
@@ -498,6 +501,7 @@ class RecordedRun:
             initial_state_digest="",
             objects=facts.objects,
             provenance=dict(self.attributes.provenance),
+            task_family=facts.task_family,
         )
         steps = self.attributes.recording.denoise_steps
         times = self.layout.denoise_times or tuple(float(step) for step in range(self.layout.num_denoise_steps))

@@ -45,13 +45,20 @@ class CubeTask:
     def instruction(self) -> str:
         """The sentence that the policy gets."""
         places = {"leftmost": "the cube on the left", "rightmost": "the cube on the right"}
-        target = places.get(self.target, f"the {self.target} cube")
+        return self._sentence(places.get(self.target, f"the {self.target} cube"), str(self.destination))
+
+    @property
+    def family(self) -> str:
+        """The sentence template: the instruction without its colours and sides, whatever the number of cubes."""
+        return self._sentence("the COLOUR cube" if self.target in COLOURS else "the cube on the SIDE", "COLOUR")
+
+    def _sentence(self, target: str, destination: str) -> str:
         return {
             "touch": f"touch {target}",
             "lift": f"lift {target}",
             "push_left": f"push {target} to the left",
             "push_right": f"push {target} to the right",
-            "put_on": f"put {target} on the {self.destination} cube",
+            "put_on": f"put {target} on the {destination} cube",
         }[self.verb]
 
 
@@ -86,6 +93,8 @@ def list_cube_tasks(suite: Suite) -> tuple[Task, ...]:
             task.name,
             MARK_INSTRUCTION if suite.name == MARK_ONLY else task.instruction,
             suite.initial_states_per_task,
+            # What is to be done, also where the mark says it.
+            task.family,
         )
         for task_id, task in enumerate(CUBE_TASKS[: suite.num_tasks])
     )

@@ -164,7 +164,7 @@ def test_contributions_are_those_of_the_values_and_the_projection(tmp_path, poli
 
 def test_masks_pieces_and_the_callers_facts_are_stored(tmp_path, policy):
     with start(tmp_path, policy, suite="my_robot", checkpoint="mine", untrained=True) as run:
-        fill(run, policy, task_name="bowl")
+        fill(run, policy, task_name="bowl", task_family="pick A")
     store = stored(tmp_path)
     episode = store.episodes[0]
     labels = [Role(code).label for code in episode.read("joint/key_role")[0]]
@@ -177,7 +177,7 @@ def test_masks_pieces_and_the_callers_facts_are_stored(tmp_path, policy):
     assert episode.read("env_step").tolist() == [0, 5]
     assert episode.attributes.success is True
     assert episode.attributes.num_steps == 6
-    assert episode.attributes.task_name == "bowl"
+    assert (episode.attributes.task_name, episode.attributes.task_family) == ("bowl", "pick A")
     np.testing.assert_array_equal(episode.read("actions")[1], policy.act(**given(seed=1))[0].double().numpy())
     np.testing.assert_allclose(episode.read("state")[1], given(seed=1)["states"][0].numpy())
     picture = (given(seed=1)["pictures"][0].permute(1, 2, 0) * 255).round().byte().numpy()
@@ -361,6 +361,16 @@ def test_wrong_arguments_are_sentences(tmp_path, policy, changes, error, sentenc
         start(tmp_path, policy, **changes)
     assert sentence in str(caught.value)
     assert not (tmp_path / "a.zarr").exists()
+
+
+def test_a_family_is_a_text_of_one_line(tmp_path, policy):
+    with start(tmp_path, policy) as run:
+        for family in (3, "two\nlines"):
+            with (
+                pytest.raises(BadArgument, match="task.family"),
+                run.episode(task_id=0, episode_index=0, instruction="", task_family=family),
+            ):
+                pass
 
 
 def test_another_version_may_be_allowed(tmp_path, policy):

@@ -1,0 +1,84 @@
+"""Families of tasks by sentence template: every task of every suite has one, and the templates are sentences."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from vla_attention.capture.environments.suites import SUITES, find_suite, list_tasks
+from vla_attention.capture.environments.task_families import TEMPLATES, sentence_template
+
+GUIDE = Path(__file__).parents[3] / "docs" / "statistics.md"
+SIZES = {
+    "libero_spatial": [10],
+    "libero_object": [10],
+    "libero_goal": [1, 5, 1, 1, 1, 1],
+    "libero_10": [3, 1, 2, 1, 1, 1, 1],
+    "libero_90": [4, 1, 5, 3, 4, 1, 23, 2, 2, 2, 1, 1, 2, 1, 1, 27, 2, 1, 3, 3, 1],
+    "robosuite": [1, 1, 4, 2],
+    "cubes": [3, 6, 3, 3, 2],
+    "cubes_harder": [3, 6, 3, 3, 2, 6],
+    "cubes_marked": [3, 3, 3, 3],
+    "cubes_mark_only": [3, 3, 3, 3],
+}
+
+
+def families(name: str) -> Counter[str]:
+    return Counter(task.task_family for task in list_tasks(find_suite(name)))
+
+
+@pytest.mark.parametrize("suite", [suite.name for suite in SUITES])
+def test_every_task_is_in_a_family(suite):
+    found = families(suite)
+    assert "" not in found
+    assert list(found.values()) == SIZES[suite]
+
+
+def test_tasks_of_a_family_differ_in_what_they_name_only():
+    """A template's words are in all of its instructions, in this order; `on top of` and `put it` count as the same."""
+    for suite in SUITES:
+        for task in list_tasks(suite):
+            if suite.kind == "cubes":
+                continue
+            words = task.instruction.replace("on top of", "on").replace("put it", "place it")
+            words = words.replace("put the bowl inside", "put the bowl in it")
+            kept = [word for word in task.task_family.split() if not re.fullmatch("[A-D]", word)]
+            place = -1
+            for word in kept:
+                place = words.split().index(word, place + 1)
+
+
+def test_cubes_are_named_by_colour_or_by_side():
+    found = {}
+    for task in list_tasks(find_suite("cubes")):
+        found.setdefault(task.task_family, []).append(task.instruction)
+    assert found["lift the cube on the SIDE"] == ["lift the cube on the left", "lift the cube on the right"]
+    # The scenes of four cubes have no template of their own.
+    assert found["lift the COLOUR cube"] == 2 * [f"lift the {colour} cube" for colour in ("red", "green", "blue")]
+    assert len(found) == 5
+    assert families("cubes_harder")["put the COLOUR cube on the COLOUR cube"] == 6
+
+
+@pytest.mark.parametrize(
+    ("instruction", "family"),
+    [
+        ("put the wine bottle on top of the cabinet", "put A on B"),
+        ("open the top drawer and put the bowl inside", "open A and put B in it"),
+        ("put the black bowl in the bottom drawer of the cabinet and close it", "put A in B and close it"),
+        ("put both moka pots on the stove", "put both A on B"),
+        ("turn on the stove", "turn on A"),
+        ("pick up the ketchup and put it in the basket", "pick up A and place it in B"),
+        ("fold the towel", ""),
+    ],
+)
+def test_the_first_template_that_fits_is_the_family(instruction, family):
+    assert sentence_template(instruction) == family
+
+
+def test_no_template_hides_another():
+    """Each is the family of its own sentence, so that none stands behind one that takes its tasks."""
+    for template in TEMPLATES:
+        assert sentence_template(re.sub(r"\b([A-D])\b", r"the \1-thing", template)) == template
