@@ -2,6 +2,7 @@
 
     python benchmarks/interval_coverage.py                # 2000 simulated stores of every size, some minutes
     python benchmarks/interval_coverage.py --on-disk 20   # and 20 stores that are written to disk and read back
+    python benchmarks/interval_coverage.py --only families
 
 The mean log ratios of tasks are drawn from a population with standard deviation `between`. Episodes differ from their
 task by `within` (both in natural logarithms: 0.3 is 30 %), and replans drift around their episode. Coverage:
@@ -12,6 +13,10 @@ task by `within` (both in natural logarithms: 0.3 is 30 %), and replans drift ar
 
 The intervals are those of `aggregate.task_tables`: of the geometric mean, which texts and pictures show, and for
 comparison of the arithmetic mean of the episodes' mean ratios.
+
+Families: tasks of one family share a part of their deviation, as many per cent as the intraclass correlation says.
+Deviations of families and tasks are normal, or skewed (exponential, skewness 2). Coverage of the population's ratio by
+the interval of "tasks like these", whose units are the families, and by that of "independent tasks".
 
 Power: how often a paired comparison of two runs, as `vla-analyze compare` makes it, excludes 0, beside a t test over
 the task means of the differences.
@@ -34,12 +39,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from vla_attention.analyze.statistics.intervals import (
     POSITIVE,
     EpisodeStatistic,
-    Estimand,
     estimates,
     geometric_mean_over_episodes,
     mean_over_episodes,
 )
 from vla_attention.analyze.statistics.student import student_quantile
+from vla_attention.analyze.statistics.units import Estimand, Units
 
 POPULATION = np.log(5.0)
 NUM_REPLANS = 8
@@ -88,6 +93,22 @@ CASES = (
     Case((5,) * 2, 0.3, 0.25),
     Case((5,) * 3, 0.3, 0.25),
 )
+#: Numbers of tasks of the families, with names: a suite's where it is one.
+FAMILIES = (
+    ("5 of 4", (4,) * 5),
+    ("cubes: 6+3+3+3+2", (6, 3, 3, 3, 2)),
+    ("10+4+1+1+1", (10, 4, 1, 1, 1)),
+    ("6 of 3", (3,) * 6),
+    ("libero_goal: 5 + 5 of 1", (5, 1, 1, 1, 1, 1)),
+    ("libero_10: 3+2 + 5 of 1", (3, 2, 1, 1, 1, 1, 1)),
+    ("10 of 3", (3,) * 10),
+    ("12+6+4+2+2 + 5 of 1", (12, 6, 4, 2, 2, 1, 1, 1, 1, 1)),
+    ("libero_90: 21", (27, 23, 5, 4, 4, 3, 3, 3, 2, 2, 2, 2, 2, 1, 1, 1, 1, 1, 1, 1, 1)),
+)
+#: Intraclass correlations of tasks in families; the last one is about that of the suite `cubes`.
+CORRELATIONS = (0.0, 0.5, 0.95)
+#: Standard deviation of tasks, and of episodes in a task; episodes per task.
+OF_TASKS, OF_EPISODES, EPISODES = 0.3, 0.1, 2
 #: Tasks x episodes of the paired comparisons; the true difference is `EFFECT` and differs between tasks by `SPREAD`.
 PAIRED = ((10, 5), (10, 10), (5, 5), (4, 4), (10, 50))
 EFFECT, SPREAD, NOISE = 0.25, 0.25, 0.35
@@ -102,9 +123,9 @@ def log_ratios(case: Case, generator: np.random.Generator) -> tuple[NDArray[np.f
     return tasks, episodes[:, None] + walk - walk.mean(axis=1, keepdims=True)
 
 
-def bounds(statistic: EpisodeStatistic, tasks: NDArray[np.int64], estimand: Estimand) -> tuple[float, float]:
+def bounds(statistic: EpisodeStatistic, units: Units) -> tuple[float, float]:
     """The ends of one interval."""
-    interval = estimates([statistic], tasks, estimand)[0].interval()
+    interval = estimates([statistic], units)[0].interval()
     assert interval is not None
     return interval.low, interval.high
 
@@ -119,7 +140,7 @@ def simulate(case: Case, num_stores: int, seed: int) -> dict[str, float]:
     def note(
         name: str, statistic: EpisodeStatistic, truth: float, estimand: Estimand, tasks: NDArray[np.int64]
     ) -> None:
-        low, high = bounds(statistic, tasks, estimand)
+        low, high = bounds(statistic, Units.of(tasks, estimand))
         found.setdefault(name, []).append(float(low <= truth <= high))
         found.setdefault(f"width {name}", []).append(float(np.log(high / low)))
 
@@ -142,6 +163,55 @@ def simulate(case: Case, num_stores: int, seed: int) -> dict[str, float]:
     return {name: float(np.mean(values)) for name, values in found.items()}
 
 
+def deviations(shape: tuple[int, ...], skewed: bool, generator: np.random.Generator) -> NDArray[np.float64]:
+    """Independent values with mean 0 and standard deviation 1: normal, or exponential (skewness 2)."""
+    return generator.exponential(size=shape) - 1.0 if skewed else generator.normal(size=shape)
+
+
+def with_families(
+    sizes: tuple[int, ...], correlation: float, skewed: bool, num_stores: int, seed: int
+) -> dict[str, tuple[float, float]]:
+    """Share of the intervals that hold the population's ratio and log(high / low) in the median, by what units are."""
+    generator = np.random.default_rng([seed, len(sizes), sum(sizes), int(100 * correlation), skewed])
+    families = np.repeat(np.arange(len(sizes)), sizes)
+    tasks = np.repeat(np.arange(len(families)), EPISODES)
+    units = {
+        name: Units.of(tasks, estimand, families[tasks].astype(str))
+        for name, estimand in (("families", Estimand.TASKS_LIKE_THESE), ("tasks", Estimand.INDEPENDENT_TASKS))
+    }
+    held: dict[str, list[bool]] = {name: [] for name in units}
+    widths: dict[str, list[float]] = {name: [] for name in units}
+    for _ in range(num_stores):
+        own = np.sqrt(1 - correlation) * deviations(families.shape, skewed, generator)
+        shared = np.sqrt(correlation) * deviations((len(sizes),), skewed, generator)[families]
+        logs = POPULATION + OF_TASKS * (own + shared)[tasks] + generator.normal(0, OF_EPISODES, len(tasks))
+        for name, of in units.items():
+            low, high = bounds(geometric_mean_over_episodes(logs), of)
+            held[name].append(low <= np.exp(POPULATION) <= high)
+            widths[name].append(float(np.log(high / low)))
+    return {name: (float(np.mean(held[name])), float(np.median(widths[name]))) for name in units}
+
+
+def print_families(num_stores: int, seed: int) -> None:
+    """The table of families."""
+    print("\nFamilies: coverage in % of the population's ratio, by families of tasks and as if no two were related;")
+    print(
+        f"tasks differ by {OF_TASKS}, episodes by {OF_EPISODES}, {EPISODES} episodes of each task. width: the median.\n"
+    )
+    print("                                     deviations  intraclass   coverage         width")
+    print("families                             are         correlation  families tasks   families tasks")
+    for name, sizes in FAMILIES:
+        for skewed in (False, True):
+            for correlation in CORRELATIONS:
+                found = with_families(sizes, correlation, skewed, num_stores, seed)
+                (by_family, wide), (by_task, narrow) = found["families"], found["tasks"]
+                print(
+                    f"{name:36} {'skewed' if skewed else 'normal':11} {correlation:11.2f}  {100 * by_family:8.1f} "
+                    f"{100 * by_task:5.1f}   {wide:8.2f} {narrow:5.2f}",
+                    flush=True,
+                )
+
+
 def power(num_tasks: int, num_episodes: int, num_stores: int, seed: int, effect: float) -> tuple[float, float]:
     """How often 0 is excluded: by the interval of a paired comparison, and by a t test over task means."""
     generator = np.random.default_rng([seed, num_tasks, num_episodes])
@@ -149,7 +219,7 @@ def power(num_tasks: int, num_episodes: int, num_stores: int, seed: int, effect:
     ours = theirs = 0
     for _ in range(num_stores):
         differences = effect + generator.normal(0, SPREAD, num_tasks)[tasks] + generator.normal(0, NOISE, len(tasks))
-        low, high = bounds(mean_over_episodes(differences), tasks, Estimand.TASKS_LIKE_THESE)
+        low, high = bounds(mean_over_episodes(differences), Units.of(tasks))
         ours += not low <= 0 <= high
         means = differences.reshape(num_tasks, num_episodes).mean(axis=1)
         t = means.mean() / (means.std(ddof=1) / np.sqrt(num_tasks))
@@ -219,8 +289,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Coverage and power of the intervals of nominal 95 %.")
     parser.add_argument("--stores", type=int, default=2000, help="simulated stores of every size (default: 2000)")
     parser.add_argument("--on-disk", type=int, default=0, metavar="N", help="also N stores of 10 x 5 through files")
+    parser.add_argument("--only", choices=("tasks", "families"), help="one of the two tables (default: everything)")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
+    if arguments.only == "families":
+        print_families(arguments.stores, arguments.seed)
+        return
     error = 100 * np.sqrt(0.95 * 0.05 / max(1, arguments.stores))
     print(f"Coverage in % of intervals of nominal 95 %, {arguments.stores} stores of each size, error {error:.1f}.")
     print(
@@ -230,6 +304,8 @@ def main() -> None:
     print("tasks x episodes           tasks episodes  geo    mean     geo    mean     geo    mean    like   these")
     for case in CASES if arguments.stores else ():
         print(line(case, simulate(case, arguments.stores, arguments.seed)), flush=True)
+    if arguments.stores and not arguments.only:
+        print_families(arguments.stores, arguments.seed)
     if arguments.stores:
         print(f"\nPaired comparisons that exclude 0, in % (difference {EFFECT}, between tasks {SPREAD}, noise {NOISE})")
         print("tasks x episodes   interval  t test over task means   without a difference")

@@ -23,6 +23,7 @@ from vla_attention.analyze.statistics.intervals import (
     mean_over_episodes,
     ratio_of_means_over_episodes,
 )
+from vla_attention.analyze.statistics.units import Units
 
 SIZE, REPLANS = 16, 20
 ROW, COLUMN = np.divmod(np.arange(SIZE**2), SIZE)
@@ -64,7 +65,7 @@ def intervals_of_store(
         balanced += [control.balanced[0, 0, 0] for control in controls(sources)]
     of_task = np.repeat(np.arange(tasks), episodes)
     statistics = [mean_over_episodes(enrichment, POSITIVE), ratio_of_means_over_episodes(enrichment, balanced)]
-    plain, over = (one.interval() for one in estimates(statistics, of_task))
+    plain, over = (one.interval() for one in estimates(statistics, Units.of(of_task)))
     return plain, over
 
 

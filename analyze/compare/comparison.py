@@ -26,11 +26,11 @@ from vla_attention.analyze.compare.runs import Run, RunArgument, check_comparabl
 from vla_attention.analyze.measures.aggregate import baseline_logs, episode_tables, overall_layer, replans_of
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables, float_values
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.measures.task_families import relation_remarks, sampling_of, units_of
 from vla_attention.analyze.statistics.effect_sizes import contrast, standardised_mean
-from vla_attention.analyze.statistics.episode_intervals import task_number
+from vla_attention.analyze.statistics.episode_intervals import ABOUT_COLUMNS, Sampling, about_row
 from vla_attention.analyze.statistics.intervals import (
     SHARE,
-    Estimand,
     Estimate,
     ends,
     estimates,
@@ -39,6 +39,7 @@ from vla_attention.analyze.statistics.intervals import (
     named_interval,
 )
 from vla_attention.analyze.statistics.many_looks import adjusted_p_values
+from vla_attention.analyze.statistics.units import Units
 from vla_attention.schemas.groupings.grouping import Grouping
 
 LOG2_RATIO, SUCCESS = "log2_ratio", "success"
@@ -56,20 +57,22 @@ class Comparison:
         runs: the runs; the others are compared with the first one.
         grouping: groups of the comparison.
         quantities: what is compared, in order.
-        estimates: one row per (run, suite, layer, quantity): `num_tasks`, `num_episodes`, `value`, `low`, `high`.
-            Quantities are `ratio` (geometric mean), `ratio_lift`, every fraction and `success`. On rows of the ratio
-            also `uniform_ratio`, `episodes_without_ratio` (no finite positive ratio in any replan) and `num_nonfinite`
-            (replans without a finite ratio).
+        estimates: one row per (run, suite, layer, quantity): `num_tasks`, `num_families`, `intervals` (what they are
+            about), `num_episodes`, `value`, `low`, `high`. Quantities are `ratio` (geometric mean), `ratio_lift`, every
+            fraction and `success`. On rows of the ratio also `uniform_ratio`, `episodes_without_ratio` (no finite
+            positive ratio in any replan) and `num_nonfinite` (replans without a finite ratio).
         differences: one row per (run, scope, layer, quantity) for every run but the first: scope "task", "suite" (only
-            when there are several) or "all"; `paired`; `num_pairs`, `num_first`, `num_other`, `num_tasks`;
-            `mean_first`, `mean_other`, `difference`, `low`, `high`, `p` (of no difference). From five pairs on
-            `d_z` (mean / standard deviation of the paired differences, corrected for small samples), of independent
-            episodes `hedges_g`, each with `_low` and `_high`. `q` is p adjusted (Benjamini-Hochberg): of a task over
-            the tasks, of a suite or of all over the quantities; `layers_q` over the single layers.
+            when there are several) or "all"; `paired`; `num_pairs`, `num_first`, `num_other`, `num_tasks`,
+            `num_families`, `intervals`; `mean_first`, `mean_other`, `difference`, `low`, `high`, `p` (of no
+            difference). From five pairs on `d_z` (mean / standard deviation of the paired differences, corrected for
+            small samples), of independent episodes `hedges_g`, each with `_low` and `_high`. `q` is p adjusted
+            (Benjamini-Hochberg): of a task over the tasks, of a suite or of all over the quantities; `layers_q` over
+            the single layers.
         pairs: one row per (run, pair, layer, quantity): `episode_first`, `episode_other`, `first`, `other`,
             `difference`.
         unpaired: one row per episode that has no partner: `run`, `compared_with`, its suite, task and episode index.
         notes: one line per difference between the runs that was allowed, or that has no effect on the numbers.
+        units: what intervals over all tasks are about.
         ignores_seed: whether episodes of different seeds may be pairs.
     """
 
@@ -81,6 +84,7 @@ class Comparison:
     pairs: pl.DataFrame
     unpaired: pl.DataFrame
     notes: tuple[str, ...]
+    units: Units
     ignores_seed: bool = False
 
     @property
@@ -124,9 +128,10 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
     """
     notes = [*check_comparable(runs, allowed), *noted_differences(runs)]
     notes += [line for run in runs[1:] for line in intervention_notes(runs[0], run)]
-    notes += dict.fromkeys(line for run in runs for line in run.question.remarks)
+    notes += dict.fromkeys(line for run in runs for line in (*run.question.skipped, *run.question.notes))
     grouping = runs[0].question.grouping
-    estimand = runs[0].question.settings.intervals
+    selected = [item for run in runs for item in run.question.selected]
+    sampling = sampling_of(runs[0].question.settings.intervals, selected)
     replans = [replans_of(run.question) for run in runs]
     levels = [episode_tables(of_run, grouping) for of_run in replans]
     having = {name for level in levels for name in level.groups_with_mass()}
@@ -134,7 +139,7 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
     tables = [_episode_values(run, level, filled, "seed" in allowed) for run, level in zip(runs, levels, strict=True)]
     quantities = ((LOG2_RATIO,) if grouping.ratio else ()) + tuple(f"{name}_fraction" for name in filled) + (SUCCESS,)
     of_runs = pl.concat(
-        [_estimates(run.name, table, quantities, estimand) for run, table in zip(runs, tables, strict=True)]
+        [_estimates(run.name, table, quantities, sampling) for run, table in zip(runs, tables, strict=True)]
     )
     differences, pairs, unpaired = [], [], []
     for run, table, of_run in zip(runs[1:], tables[1:], replans[1:], strict=True):
@@ -150,9 +155,9 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
         unpaired += [_without_partner(tables[0], joined, "first", runs[0].name, run.name)]
         unpaired += [_without_partner(table, joined, "other", run.name, runs[0].name)]
         rows = (
-            _paired(joined, quantities, estimand)
+            _paired(joined, quantities, sampling)
             if joined.height
-            else _unpaired(tables[0], table, quantities, estimand)
+            else _unpaired(tables[0], table, quantities, sampling)
         )
         differences.append(rows.select(pl.lit(run.name).alias("run"), pl.all()))
     return Comparison(
@@ -163,7 +168,8 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
         differences=_with_adjusted(pl.concat(differences)),
         pairs=pl.concat(pairs),
         unpaired=pl.concat(unpaired),
-        notes=tuple(notes),
+        notes=(*notes, *relation_remarks(sampling, selected)),
+        units=units_of(sampling, selected).decided(),
         ignores_seed="seed" in allowed and len({run.stores[0].attributes.protocol.seed for run in runs}) > 1,
     )
 
@@ -262,27 +268,28 @@ def _without_partner(table: pl.DataFrame, joined: pl.DataFrame, side: str, run: 
     return alone.select(pl.lit(run).alias("run"), pl.lit(other).alias("compared_with"), pl.all())
 
 
-def _paired(joined: pl.DataFrame, quantities: Sequence[str], estimand: Estimand) -> pl.DataFrame:
+def _paired(joined: pl.DataFrame, quantities: Sequence[str], sampling: Sampling) -> pl.DataFrame:
     rows: list[dict[str, Any]] = []
     for scope, part in _scopes(joined):
-        tasks = _tasks(part)
+        given = sampling.units(part)
+        units = given.decided()
         values = [_numbers(part, f"{quantity}_difference") for quantity in quantities]
         statistics = [mean_over_episodes(value) for value in values]
-        found = estimates(statistics, tasks, estimand)
+        found = estimates(statistics, units)
         for quantity, value, statistic, one in zip(quantities, values, statistics, found, strict=True):
             used = statistic.used
-            counts = {"num_tasks": len(set(tasks[used]))}
+            counts = {"num_tasks": units.part(used).num_tasks, **about_row(given)}
             counts |= dict.fromkeys(("num_pairs", "num_first", "num_other"), int(used.sum()))
             sides = {
-                f"mean_{side}": _mean(np.where(used, _numbers(part, f"{quantity}_{side}"), np.nan), tasks)
+                f"mean_{side}": _mean(np.where(used, _numbers(part, f"{quantity}_{side}"), np.nan), units)
                 for side in ("first", "other")
             }
             of = {**scope, "quantity": quantity, "paired": True, **counts, **sides}
-            rows.append(of | _difference_row(one) | _effect(D_Z, standardised_mean(value[used], tasks[used], estimand)))
+            rows.append(of | _difference_row(one) | _effect(D_Z, standardised_mean(value[used], units.part(used))))
     return pl.DataFrame(rows, schema=_DIFFERENCE_SCHEMA)
 
 
-def _unpaired(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str], estimand: Estimand) -> pl.DataFrame:
+def _unpaired(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str], sampling: Sampling) -> pl.DataFrame:
     """Differences of means of independent episodes.
 
     A task that both runs have moves both means, and its difference has less noise than two different tasks.
@@ -296,17 +303,19 @@ def _unpaired(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str
     rows: list[dict[str, Any]] = []
     for scope, part in _scopes(both):
         is_other = part["_run"].to_numpy() == 1
-        tasks = _tasks(part)
+        units = sampling.units(part)
         if is_other.all() or not is_other.any():
             continue  # a task of one run only
         for quantity in quantities:
-            found = contrast(_numbers(part, quantity), is_other, tasks, estimand)
+            found = contrast(_numbers(part, quantity), is_other, units)
             rows.append(
                 {
                     **scope,
                     "quantity": quantity,
                     "paired": False,
-                    "num_tasks": len(set(tasks)),
+                    "num_tasks": units.num_tasks,
+                    "num_families": units.num_families,
+                    "intervals": found.estimand.value,
                     "num_pairs": 0,
                     "num_first": found.num_second,
                     "num_other": found.num_first,
@@ -337,7 +346,9 @@ _DIFFERENCE_SCHEMA = {
     "block": pl.Int64,
     "quantity": pl.String,
     "paired": pl.Boolean,
-    **dict.fromkeys(("num_tasks", "num_pairs", "num_first", "num_other"), pl.Int64),
+    "num_tasks": pl.Int64,
+    **ABOUT_COLUMNS,
+    **dict.fromkeys(("num_pairs", "num_first", "num_other"), pl.Int64),
     **dict.fromkeys(("mean_first", "mean_other", "difference", "low", "high", "p"), pl.Float64),
     **{f"{name}{end}": pl.Float64 for name in (D_Z, HEDGES_G) for end in ("", "_low", "_high")},
 }
@@ -378,10 +389,10 @@ def _scopes(table: pl.DataFrame) -> list[tuple[dict[str, Any], pl.DataFrame]]:
     return scopes
 
 
-def _estimates(run: str, table: pl.DataFrame, quantities: Sequence[str], estimand: Estimand) -> pl.DataFrame:
+def _estimates(run: str, table: pl.DataFrame, quantities: Sequence[str], sampling: Sampling) -> pl.DataFrame:
     rows = []
     for part in table.partition_by("suite", "layer", maintain_order=True):
-        tasks = _tasks(part)
+        units = sampling.units(part)
         statistics = {
             ("ratio" if quantity == LOG2_RATIO else quantity): geometric_mean_over_episodes(
                 _numbers(part, "log_ratio_mean")
@@ -393,15 +404,15 @@ def _estimates(run: str, table: pl.DataFrame, quantities: Sequence[str], estiman
         if LOG2_RATIO in quantities:
             statistics["ratio_lift"] = geometric_mean_over_episodes(np.log(_numbers(part, "ratio_lift")))
         names = {"run": run, "suite": part["suite"][0], "layer": part["layer"][0], "block": part["block"][0]}
-        counts = {"num_tasks": len(set(tasks)), "num_episodes": part.height}
-        found = estimates(list(statistics.values()), tasks, estimand)
+        counts = {"num_tasks": units.num_tasks, **about_row(units), "num_episodes": part.height}
+        found = estimates(list(statistics.values()), units.decided())
         for (name, statistic), one in zip(statistics.items(), found, strict=True):
             low, high = ends(one.interval())
             row = {**names, **counts, "quantity": name, "value": one.value, "low": low, "high": high}
             if name == "ratio":
                 logs = baseline_logs(_numbers(part, "uniform_ratio"), _numbers(part, "log_ratio_mean"))
                 baseline = geometric_mean_over_episodes(logs)
-                row["uniform_ratio"] = estimates([baseline], tasks, estimand)[0].value
+                row["uniform_ratio"] = estimates([baseline], units)[0].value
                 row["episodes_without_ratio"] = statistic.num_left_out
                 row["num_nonfinite"] = int(part["num_nonfinite"].sum())
             rows.append(row)
@@ -410,20 +421,18 @@ def _estimates(run: str, table: pl.DataFrame, quantities: Sequence[str], estiman
 
 _ESTIMATE_SCHEMA = {
     **dict.fromkeys(("run", "suite", "layer"), pl.String),
-    **dict.fromkeys(("block", "num_tasks", "num_episodes"), pl.Int64),
+    **dict.fromkeys(("block", "num_tasks"), pl.Int64),
+    **ABOUT_COLUMNS,
+    "num_episodes": pl.Int64,
     "quantity": pl.String,
     **dict.fromkeys(("value", "low", "high", "uniform_ratio"), pl.Float64),
     **dict.fromkeys(("episodes_without_ratio", "num_nonfinite"), pl.Int64),
 }
 
 
-def _tasks(part: pl.DataFrame) -> NDArray[np.int64]:
-    return part.select(task_number()).to_series().to_numpy()
-
-
 def _numbers(part: pl.DataFrame, column: str) -> NDArray[np.float64]:
     return float_values(part[column])
 
 
-def _mean(values: NDArray[np.float64], tasks: NDArray[np.int64]) -> float | None:
-    return estimates([mean_over_episodes(values)], tasks)[0].value
+def _mean(values: NDArray[np.float64], units: Units) -> float | None:
+    return estimates([mean_over_episodes(values)], units)[0].value

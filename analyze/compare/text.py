@@ -6,7 +6,7 @@ import polars as pl
 
 from vla_attention.analyze.compare.comparison import D_Z, HEDGES_G, LOG2_RATIO, SUCCESS, Comparison
 from vla_attention.analyze.measures.frames import LAYERS_AVG, layer_name
-from vla_attention.analyze.show.findings import findings
+from vla_attention.analyze.show.findings import few_families_note, findings
 from vla_attention.analyze.show.headings import (
     WIDTH,
     heading,
@@ -28,6 +28,7 @@ from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.effect_sizes import FEWEST_EPISODES, FEWEST_TASKS
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Units
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.stores.store_format import episode_name
 
@@ -56,12 +57,13 @@ def _header(comparison: Comparison, layer: str) -> str:
         stores = ", ".join(str(store.path) for store in run.stores)
         lines += wrap(f"{run.name}: {policy.name} ({policy.checkpoint}), {listing(run.suites)}; {stores}", rest="  ")
     which = layer_name(layer, LAYERS_AVG, "block")
-    about = comparison.runs[0].question.settings.intervals.words
     lines += wrap(
         f"Grouping '{comparison.grouping.name}', site {comparison.runs[0].question.site}, {which}; differences are run "
-        f"minus {comparison.names[0]}. {interval_note(DEFAULT_LEVEL, about)}",
+        f"minus {comparison.names[0]}. {interval_note(DEFAULT_LEVEL, comparison.units.words)}",
     )
-    lines += note_lines(comparison.notes)
+    of_suites = comparison.estimates.filter(pl.col("layer") == layer).unique(["run", "suite"], maintain_order=True)
+    few = few_families_note(of_suites, "suite", comparison.units)
+    lines += note_lines([*comparison.notes, *([few] if few else [])])
     return "\n".join(lines)
 
 
@@ -132,10 +134,16 @@ def _difference_section(comparison: Comparison, name: str, layer: str) -> str:
     )
     lines += wrap(
         f"{meaning}, all weighing the same, corrected for small samples; none below {FEWEST_EPISODES} pairs or "
-        f"episodes, or {FEWEST_TASKS} tasks where tasks are the units. q: p of no difference, adjusted for the number "
+        f"episodes, or {_fewest_units(comparison.units)} are the units. q: p of no difference, adjusted for the number "
         "of quantities (Benjamini-Hochberg)."
     )
     return "\n".join(lines)
+
+
+def _fewest_units(units: Units) -> str:
+    if units.families is None:
+        return f"{FEWEST_TASKS} tasks where tasks"
+    return f"{FEWEST_FAMILIES} families of tasks where these"
 
 
 def _pairing(comparison: Comparison, name: str, rows: pl.DataFrame) -> list[str]:

@@ -194,8 +194,8 @@ def _phase_table(episodes: list[_Episode], question: Question) -> pl.DataFrame:
             for phase, found in parts.items()
         ]
     table = pl.DataFrame(rows).with_columns(pl.col(MEASURES).fill_nan(None))
-    limits, estimand = dict.fromkeys(MEASURES, POSITIVE), question.settings.intervals
-    return means_of_all_and_of_tasks(table, ["phase"], limits, estimand)
+    limits = dict.fromkeys(MEASURES, POSITIVE)
+    return means_of_all_and_of_tasks(table, ["phase"], limits, question.sampling)
 
 
 def _dimension_table(episodes: list[_Episode], question: Question, spread: ActionSpread) -> pl.DataFrame:
@@ -218,7 +218,7 @@ def _dimension_table(episodes: list[_Episode], question: Question, spread: Actio
         ]
     limits = {**dict.fromkeys(MEASURES, POSITIVE), "bias": NO_LIMITS}
     return means_with_intervals(
-        pl.DataFrame(rows), ["dimension", "spread"], limits, question.settings.intervals, nulls={"bias": 0.0}
+        pl.DataFrame(rows), ["dimension", "spread"], limits, question.sampling, nulls={"bias": 0.0}
     )
 
 
@@ -250,7 +250,7 @@ def _correlation_table(episodes: list[_Episode], question: Question, level: Tabl
         pl.DataFrame(rows, schema=_CORRELATION_SCHEMA),
         ["quantity", "of", "measure"],
         {"correlation": _CORRELATION_LIMITS},
-        question.settings.intervals,
+        question.sampling,
         nulls={"correlation": 0.0},
     )
     q_values = adjusted_p_values(table["correlation_p"].to_list())

@@ -37,7 +37,7 @@ def plot_deviation(study: DeviationStudy, folder: Path) -> list[Path]:
     overall = study.overall
     n = of_tasks(int(overall["num_episodes"] or 0), int(overall["num_tasks"] or 0))
     note = (
-        f"n = {n}; whiskers: {interval_name(DEFAULT_LEVEL)}s, about {study.question.settings.intervals.words}. Dashed: "
+        f"n = {n}; whiskers: {interval_name(DEFAULT_LEVEL)}s, about {study.question.units.words}. Dashed: "
         "a policy that always answers with the data set's mean action. Very long whiskers are cut."
     )
     title(figure, f"Actions against the data set's; attention: {layer_name(study.layer, 'mean over layers')}", note)

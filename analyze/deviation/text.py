@@ -33,7 +33,7 @@ def deviation_text(study: DeviationStudy) -> str:
                 *wrap(answer(study)),
                 "",
                 *wrap(_MEANING),
-                *wrap(interval_note(DEFAULT_LEVEL, study.question.settings.intervals.words)),
+                *wrap(interval_note(DEFAULT_LEVEL, study.question.units.words)),
             ]
         ),
         _dimensions(study),

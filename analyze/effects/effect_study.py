@@ -41,8 +41,8 @@ from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens
 from vla_attention.analyze.ratios.analysis import Analysis, analyse
-from vla_attention.analyze.statistics.episode_intervals import means_of_all_and_of_tasks
-from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE, SHARE, Estimand
+from vla_attention.analyze.statistics.episode_intervals import Sampling, means_of_all_and_of_tasks
+from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE, SHARE
 from vla_attention.analyze.statistics.many_looks import adjusted_p_values
 from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.schemas.errors import BadArgument, listing
@@ -103,12 +103,12 @@ class EffectStudy:
     @cached_property
     def summary(self) -> pl.DataFrame:
         """Means over episodes with intervals, see `summary_of`."""
-        return summary_of(self.episodes, self.question.settings.intervals)
+        return summary_of(self.episodes, self.question.sampling)
 
     @cached_property
     def rollouts(self) -> pl.DataFrame:
         """Success and length of paired rollouts, see `rollouts.rollout_summary`."""
-        return rollout_summary(self.rollout_episodes, self.question.settings.intervals)
+        return rollout_summary(self.rollout_episodes, self.question.sampling)
 
     @property
     def measured(self) -> tuple[int, int]:
@@ -360,7 +360,7 @@ def with_floors(episodes: pl.DataFrame, conditions: Sequence[Condition]) -> pl.D
     )
 
 
-def summary_of(episodes: pl.DataFrame, estimand: Estimand = Estimand.TASKS_LIKE_THESE) -> pl.DataFrame:
+def summary_of(episodes: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
     """Means over episodes with intervals; every task weighs the same.
 
     Returns:
@@ -378,7 +378,7 @@ def summary_of(episodes: pl.DataFrame, estimand: Estimand = Estimand.TASKS_LIKE_
     quotients = {"over_noise": ("effect", "noise"), "over_random": ("effect", "random")}
     nulls = {"minus_noise": 0.0, "minus_random": 0.0}
     return _with_adjusted(
-        means_of_all_and_of_tasks(episodes, [*_NAMES, "phase"], values, estimand, quotients=quotients, nulls=nulls)
+        means_of_all_and_of_tasks(episodes, [*_NAMES, "phase"], values, sampling, quotients=quotients, nulls=nulls)
     )
 
 

@@ -43,7 +43,7 @@ def plot_attention_and_effect(study: EffectStudy, folder: Path) -> list[Path]:
     n = of_tasks(*study.measured)
     note = (
         f"Each point: a group of keys that was knocked out; n = {n}. Bars: {interval_name(DEFAULT_LEVEL)}s, about "
-        f"{study.question.settings.intervals.words}. Attention is the base's, in the same replans. "
+        f"{study.question.units.words}. Attention is the base's, in the same replans. "
         "Larger groups have more mass by their size alone. Names stand where there is room; very long bars are cut."
     )
     title(figure, "Attention to a group, and what the action does without it", note)

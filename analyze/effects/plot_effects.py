@@ -78,7 +78,7 @@ def plot_effects(study: EffectStudy, folder: Path) -> list[Path]:
 def _title(figure: Figure, study: EffectStudy, num_rows: int) -> None:
     note = (
         f"n = {of_tasks(*study.measured)}. Bars: {interval_name(DEFAULT_LEVEL)}s, about "
-        f"{study.question.settings.intervals.words}; none where there can be none, and very long ones are cut."
+        f"{study.question.units.words}; none where there can be none, and very long ones are cut."
     )
     headline = study.analysis.headline
     if headline is not None and headline.value is not None:

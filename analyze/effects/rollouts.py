@@ -9,8 +9,8 @@ import polars as pl
 
 from vla_attention.analyze.effects.conditions import Condition
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.statistics.episode_intervals import means_of_all_and_of_tasks
-from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE, SHARE, Estimand
+from vla_attention.analyze.statistics.episode_intervals import Sampling, means_of_all_and_of_tasks
+from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE, SHARE
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import StoredEpisode
@@ -83,7 +83,7 @@ def rollout_pairs(condition: Condition, question: Question) -> tuple[pl.DataFram
     return pl.DataFrame(rows, schema=ROLLOUT_COLUMNS), " ".join(notes)
 
 
-def rollout_summary(pairs: pl.DataFrame, estimand: Estimand) -> pl.DataFrame:
+def rollout_summary(pairs: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
     """Means over pairs with intervals, of every condition over all tasks and of every task.
 
     Returns:
@@ -91,7 +91,7 @@ def rollout_summary(pairs: pl.DataFrame, estimand: Estimand) -> pl.DataFrame:
         (pairs), num_tasks; success_base, success, success_difference, steps_base, steps, steps_difference, each with
         `_low`, `_high` and `_episodes`. The number of steps of a failure is that at which it was stopped.
     """
-    return means_of_all_and_of_tasks(pairs, ["condition"], _VALUES, estimand)
+    return means_of_all_and_of_tasks(pairs, ["condition"], _VALUES, sampling)
 
 
 def _by_start(episodes: Sequence[StoredEpisode]) -> dict[tuple[int, str, int], StoredEpisode]:

@@ -11,6 +11,7 @@ from vla_attention.analyze.effects.conditions import FLOORS, Condition, Kind
 from vla_attention.analyze.effects.effect_study import EffectStudy
 from vla_attention.analyze.effects.group_rows import GroupRow, group_rows
 from vla_attention.analyze.effects.paired_replans import ALL, PHASES, stores_executed
+from vla_attention.analyze.show.findings import few_families_note
 from vla_attention.analyze.show.headings import heading, interval_note, note_lines, wrap
 from vla_attention.analyze.show.numbers import format_number, format_percent, format_signed, of_tasks, row_interval
 from vla_attention.analyze.show.plot_text import shortened
@@ -64,7 +65,7 @@ def _groups(study: EffectStudy) -> str:
     body = [_group_cells(row, with_norm) for row in rows]
     lines = [heading("WITHOUT IT, AND WITH IT ALONE  effect on the action"), text_table(header, body, left=(0,))]
     lines += wrap(_EFFECT_NOTE.format(which=counted_actions(study)))
-    lines += wrap(interval_note(DEFAULT_LEVEL, study.question.settings.intervals.words) + " Effects do not add up.")
+    lines += wrap(interval_note(DEFAULT_LEVEL, study.question.units.words) + " Effects do not add up.")
     return "\n".join(lines)
 
 
@@ -237,7 +238,9 @@ def _left_out(study: EffectStudy) -> str:
 
 
 def _notes(study: EffectStudy) -> str:
-    return "\n".join(note_lines(study.notes))
+    whole = study.summary.filter(pl.col("scope") == "all", pl.col("phase") == ALL)
+    few = few_families_note(whole, "condition", study.question.units)
+    return "\n".join(note_lines([*study.notes, *([few] if few else [])]))
 
 
 def _attention_notes(study: EffectStudy) -> str:

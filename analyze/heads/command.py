@@ -92,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
         grouping = question.grouping
         files += plot_head_grid(study.heads, grouping, folder)
         files += plot_layer_profile(study.tasks, grouping, folder)
-        time = layer_time_table(study.replans, grouping, estimand=study.question.settings.intervals)
+        time = layer_time_table(study.replans, grouping, study.question.sampling)
         files += plot_layer_time(time, study.replans, grouping, folder)
         files += plot_denoise_profile(study.denoise, grouping, folder)
     print(fitted(text, folder, files))

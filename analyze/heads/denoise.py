@@ -18,13 +18,11 @@ from vla_attention.analyze.measures.aggregate import (
 from vla_attention.analyze.measures.frames import Tables, concat_tables
 from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked
 from vla_attention.analyze.measures.steps import MeasuredEpisode
-from vla_attention.analyze.statistics.intervals import Estimand
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.schemas.groupings.grouping import Grouping
 
 
-def denoise_tables(
-    measured: Sequence[MeasuredEpisode], grouping: Grouping, estimand: Estimand = Estimand.TASKS_LIKE_THESE
-) -> Tables:
+def denoise_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping, sampling: Sampling) -> Tables:
     """Every denoise step: the numbers over all tasks and layers of an analysis in which only this step is selected.
 
     Returns:
@@ -37,7 +35,7 @@ def denoise_tables(
         of_step = MadeWhenAsked(partial(_at_denoise, measured, position), range(len(measured)))
         episodes = episode_tables(replan_tables(of_step, grouping), grouping)
         layer = overall_layer(episodes.cells)
-        whole = overall_rows(task_tables(episodes.filter(pl.col("layer") == layer), grouping, estimand=estimand))
+        whole = overall_rows(task_tables(episodes.filter(pl.col("layer") == layer), grouping, sampling))
         times = [one.item.episode.read("denoise_time")[selection.denoise[position]] for one in measured]
         time = pl.lit(float(np.mean(times)), dtype=pl.Float64).alias("denoise_time")
         number = pl.lit(selection.denoise_steps[position], dtype=pl.Int64).alias("denoise_step")

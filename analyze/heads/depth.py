@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
 from vla_attention.analyze.measures.group_contributions import group_contribution_tables
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
-from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL, NO_LIMITS, Estimand
+from vla_attention.analyze.statistics.episode_intervals import Sampling, means_with_intervals
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL, NO_LIMITS
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 
 
@@ -37,21 +37,22 @@ def depth_centre(amounts: ArrayLike, blocks: ArrayLike) -> NDArray[np.float64]:
 
 def depth_table(
     episodes: Tables,
-    norms: pl.DataFrame | None = None,
-    estimand: Estimand = Estimand.TASKS_LIKE_THESE,
+    norms: pl.DataFrame | None,
+    sampling: Sampling,
     level: float = DEFAULT_LEVEL,
 ) -> pl.DataFrame:
     """One row per group that has any amount: the mean over episodes of its centre, with its interval.
 
     Columns: group; of: "mass", or "contribution" (the norm of what the group's keys add to the residual stream; norms
     may grow with depth, so compare this centre only with those of other groups); num_episodes, num_tasks,
-    centre_episodes (with a centre); centre, centre_low, centre_high; even: the centre of an amount that is the same at
-    every layer; first_block, last_block, num_layers: the layers that the centre is over.
+    `ABOUT_COLUMNS`; centre_episodes (with a centre); centre, centre_low, centre_high;
+    even: the centre of an amount that is the same at every layer; first_block, last_block, num_layers: the layers that
+    the centre is over.
 
     Args:
         episodes: `aggregate.episode_tables`. A block that was named by two layer numbers counts once.
         norms: suite, task_id, episode_index, block, group, norm (see `contribution_norms`), where there are any.
-        estimand: what intervals are about.
+        sampling: what intervals are about, and which tasks are related.
         level: of the intervals.
     """
     single = episodes.groups.filter(pl.col("layer") != LAYERS_AVG)
@@ -61,7 +62,7 @@ def depth_table(
     blocks = single["block"].unique().sort()
     # With a single layer both limits are equal, and no interval could be widened between them.
     limits = (float(blocks[0]), float(blocks[-1])) if len(blocks) > 1 else NO_LIMITS
-    table = means_with_intervals(pl.concat(parts), ("group", "of"), {"centre": limits}, estimand, level)
+    table = means_with_intervals(pl.concat(parts), ("group", "of"), {"centre": limits}, sampling, level)
     return table.filter(pl.col("centre").is_not_null()).with_columns(
         pl.lit(float(np.mean(blocks.to_numpy()))).alias("even"),
         pl.lit(blocks[0], dtype=pl.Int64).alias("first_block"),

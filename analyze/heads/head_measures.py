@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from vla_attention.analyze.measures.frames import EPISODE_ID, Tables, float_values, head_axis, layer_axis, long_table
 from vla_attention.analyze.measures.masses import finite_mean, group_measures, ratio, sides, uniform_ratio
 from vla_attention.analyze.measures.steps import MeasuredEpisode
-from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
-from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE, SHARE, Estimand
+from vla_attention.analyze.statistics.episode_intervals import ABOUT_COLUMNS, Sampling, means_with_intervals
+from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE, SHARE
 from vla_attention.schemas.groupings.grouping import Grouping
 
 _HEAD = ("layer", "block", "head")
@@ -73,24 +73,27 @@ def dispersion(values: NDArray[np.float64], axis: int = -1) -> tuple[NDArray[np.
         return std, np.where(mean != 0, std / mean, np.nan)
 
 
-def heads_tables(episodes: Tables, grouping: Grouping, estimand: Estimand = Estimand.TASKS_LIKE_THESE) -> Tables:
+def heads_tables(episodes: Tables, grouping: Grouping, sampling: Sampling) -> Tables:
     """Every (layer, head), from `episode_heads` of all episodes: means over episodes with intervals.
 
     X_low and X_high bound X, and X_episodes says how many episodes have a finite value.
 
     Returns:
-        cells: layer, block, head, num_episodes, num_tasks; with a ratio, bounded, `numerator_fraction`, `log2_ratio`
-            (two to its power is the geometric mean that `task_tables` has) and `log2_lift`; without bounds
-            `denominator_fraction`, `ratio_of_means` (mean numerator mass / mean denominator mass) and `num_nonfinite`,
-            the number of (episode, replan) left out of the logarithms.
-        groups: layer, block, head, group, num_episodes, num_tasks; bounded, `fraction` and `lift`.
+        cells: layer, block, head, num_episodes, num_tasks, `ABOUT_COLUMNS`; with a ratio, bounded,
+            `numerator_fraction`, `log2_ratio` (two to its power is the geometric mean that `task_tables` has) and
+            `log2_lift`; without bounds `denominator_fraction`, `ratio_of_means` (mean numerator mass / mean denominator
+            mass) and `num_nonfinite`, the number of (episode, replan) left out of the logarithms.
+        groups: layer, block, head, group, num_episodes, num_tasks, `ABOUT_COLUMNS`; bounded, `fraction` and `lift`.
     """
     ordered = Tables(
         episodes.cells.sort(*EPISODE_ID, maintain_order=True), episodes.groups.sort(*EPISODE_ID, maintain_order=True)
     )
-    groups = means_with_intervals(ordered.groups, (*_HEAD, "group"), {"fraction": SHARE, "lift": POSITIVE}, estimand)
+    groups = means_with_intervals(ordered.groups, (*_HEAD, "group"), {"fraction": SHARE, "lift": POSITIVE}, sampling)
     if grouping.ratio is None:
-        return Tables(groups.select(*_HEAD, "num_episodes", "num_tasks").unique(_HEAD, maintain_order=True), groups)
+        return Tables(
+            groups.select(*_HEAD, "num_episodes", "num_tasks", *ABOUT_COLUMNS).unique(_HEAD, maintain_order=True),
+            groups,
+        )
     bounded = {"log2_ratio": NO_LIMITS, "log2_lift": NO_LIMITS, "numerator_fraction": SHARE}
     above, below = pl.col("numerator_mass").mean(), pl.col("denominator_mass").mean()
     plain = ordered.cells.group_by(_HEAD).agg(
@@ -98,13 +101,11 @@ def heads_tables(episodes: Tables, grouping: Grouping, estimand: Estimand = Esti
         (above / below).fill_nan(None).alias("ratio_of_means"),
         pl.col("num_nonfinite").sum(),
     )
-    means = means_with_intervals(ordered.cells, _HEAD, bounded, estimand)
+    means = means_with_intervals(ordered.cells, _HEAD, bounded, sampling)
     return Tables(means.join(plain, on=_HEAD, how="left", maintain_order="left"), groups)
 
 
-def dispersion_table(
-    episodes: Tables, grouping: Grouping, estimand: Estimand = Estimand.TASKS_LIKE_THESE
-) -> pl.DataFrame:
+def dispersion_table(episodes: Tables, grouping: Grouping, sampling: Sampling) -> pl.DataFrame:
     """How much the heads of a layer differ, one row per layer, from `episode_heads` of all episodes.
 
     Means over episodes with intervals: `fraction_std` and `fraction_cv`, standard deviation and coefficient
@@ -129,7 +130,7 @@ def dispersion_table(
     table = pl.DataFrame(rows).sort(*EPISODE_ID, maintain_order=True)
     values = {"fraction_std": POSITIVE, "fraction_cv": POSITIVE}
     values |= {"log2_ratio_std": POSITIVE} if grouping.ratio is not None else {}
-    return means_with_intervals(table, ("layer", "block", "num_heads"), values, estimand)
+    return means_with_intervals(table, ("layer", "block", "num_heads"), values, sampling)
 
 
 def ranked_heads(heads: Tables, grouping: Grouping) -> pl.DataFrame:

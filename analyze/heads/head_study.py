@@ -104,7 +104,7 @@ def study_heads(question: Question, options: RowOptions | None = None) -> HeadSt
 
     Without `options` rows are only read when a group cuts a stored segment (a word, an object).
     """
-    grouping, estimand, selection = question.grouping, question.settings.intervals, question.selection
+    grouping, sampling, selection = question.grouping, question.sampling, question.selection
     resolved = resolve_each(grouping, question.selected, question.vocabulary)
     shown = groups_with_valid_keys(question.selected, resolved)
     measures = None
@@ -144,11 +144,11 @@ def study_heads(question: Question, options: RowOptions | None = None) -> HeadSt
         question=question,
         options=options,
         replans=replans,
-        tasks=task_tables(episodes, grouping, estimand=estimand),
-        heads=heads_tables(heads, grouping, estimand),
-        dispersion=dispersion_table(heads, grouping, estimand),
-        depth=depth_table(episodes, contribution_norms(question, resolved), estimand),
-        denoise=denoise_tables(over_heads, grouping, estimand),
+        tasks=task_tables(episodes, grouping, sampling),
+        heads=heads_tables(heads, grouping, sampling),
+        dispersion=dispersion_table(heads, grouping, sampling),
+        depth=depth_table(episodes, contribution_norms(question, resolved), sampling),
+        denoise=denoise_tables(over_heads, grouping, sampling),
         rows=rows,
         search=search,
     )

@@ -7,9 +7,9 @@ import polars as pl
 
 from vla_attention.analyze.measures.aggregate import layer_order
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.intervals import (
     DEFAULT_LEVEL,
-    Estimand,
     estimates,
     mean_over_episodes,
 )
@@ -24,8 +24,8 @@ _MOST_GROUPS = 3
 def layer_time_table(
     replans: Tables,
     grouping: Grouping,
+    sampling: Sampling,
     num_bins: int | None = None,
-    estimand: Estimand = Estimand.TASKS_LIKE_THESE,
     level: float = DEFAULT_LEVEL,
 ) -> pl.DataFrame:
     """Means over episodes with intervals for every layer and equal part of the episodes' time.
@@ -38,8 +38,8 @@ def layer_time_table(
     Args:
         replans: `aggregate.replan_tables`.
         grouping: the groups.
+        sampling: what intervals are about, and which tasks are related.
         num_bins: parts of the time; `MOST_BINS` unless no episode has as many replans.
-        estimand: what intervals are about.
         level: of the intervals.
     """
     tables = replans.filter(pl.col("layer") != LAYERS_AVG)
@@ -56,7 +56,7 @@ def layer_time_table(
     blocks = dict(single.select("layer", "block").unique().iter_rows())
     bins = num_bins or min(MOST_BINS, int(single["replan"].to_numpy().max()) + 1)
     place = {layer: i for i, layer in enumerate(layers)}
-    values, tasks = [], []
+    values, names = [], []
     for key, part in single.sort(*EPISODE_ID, "replan").group_by(EPISODE_ID, maintain_order=True):
         at = part["replan"].rank("dense").to_numpy().astype(np.int64) - 1
         column = part["layer"].replace_strict(place, return_dtype=pl.Int64).to_numpy()
@@ -66,10 +66,11 @@ def layer_time_table(
         starts, num_steps = steps_of_time(starts, int(part["num_steps"][0]))
         timed = on_episode_time(table.reshape(len(table), -1), starts, num_steps, bins)
         values.append(timed.reshape(bins, len(layers), len(quantities)))
-        tasks.append(f"{key[0]}\t{key[1]}")
+        names.append(key)
     stacked = np.stack(values).transpose(0, 3, 2, 1).reshape(len(values), -1)  # (episode, quantity x layer x bin)
     statistics = [mean_over_episodes(stacked[:, i]) for i in range(stacked.shape[1])]
-    found = estimates(statistics, np.array(tasks), estimand)
+    episodes = pl.DataFrame(names, schema={name: single.schema[name] for name in EPISODE_ID}, orient="row")
+    found = estimates(statistics, sampling.units(episodes).decided())
     intervals = [one.interval(level) for one in found]
     quantity, layer, part_of = (axis.ravel() for axis in np.indices((len(quantities), len(layers), bins)))
     return pl.DataFrame(

@@ -56,7 +56,7 @@ def _row_means(episodes: pl.DataFrame, by: Sequence[str], study: HeadStudy) -> p
     measured = [name for name in episodes.columns if name not in (*EPISODE_ID, *by)]
     # A group may hold fewer than one key, and then its entropy is below 0.
     limits = {name: NO_LIMITS if name == "entropy" else POSITIVE for name in measured}
-    return means_with_intervals(episodes, by, limits, study.question.settings.intervals)
+    return means_with_intervals(episodes, by, limits, study.question.sampling)
 
 
 def _header(study: HeadStudy) -> str:
@@ -68,7 +68,7 @@ def _header(study: HeadStudy) -> str:
         f"{listing(chosen.head_numbers, 40)}",
         f"Grouping '{question.grouping.name}'; {_measure_name(study.heads, question.grouping)}",
         *([chosen.note] if chosen.note else []),
-        interval_note(DEFAULT_LEVEL, question.settings.intervals.words),
+        interval_note(DEFAULT_LEVEL, question.units.words),
     ]
     return "\n".join([*lines, *wrap_all(about)])
 

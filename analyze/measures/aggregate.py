@@ -43,13 +43,12 @@ from vla_attention.analyze.measures.frames import (
 )
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.steps import MeasuredEpisode, in_order_of_episodes, measure_episodes
-from vla_attention.analyze.statistics.episode_intervals import task_number
+from vla_attention.analyze.statistics.episode_intervals import ABOUT_COLUMNS, Sampling, about_row
 from vla_attention.analyze.statistics.intervals import (
     DEFAULT_LEVEL,
     POSITIVE,
     SHARE,
     EpisodeStatistic,
-    Estimand,
     estimates,
     geometric_mean_over_episodes,
     mean_over_episodes,
@@ -58,12 +57,12 @@ from vla_attention.analyze.statistics.intervals import (
     ratio_of_means_over_episodes,
 )
 from vla_attention.analyze.statistics.summaries import summarize_rows
+from vla_attention.analyze.statistics.units import Units
 from vla_attention.schemas.groupings.grouping import Grouping
 
 #: The ratio that texts and pictures show first: with few episodes and strong spread, its interval alone covers the
 #: truth as often as its level says (docs/benchmarks.md).
 HEADLINE = "geometric_mean"
-_TASK = "_task_of_suite"
 
 
 def replans_of(question: Question) -> Tables:
@@ -103,21 +102,22 @@ def _episode_replans(measured: MeasuredEpisode, grouping: Grouping) -> Tables:
 def task_tables(
     episodes: Tables,
     grouping: Grouping,
+    sampling: Sampling,
     level: float = DEFAULT_LEVEL,
-    estimand: Estimand = Estimand.TASKS_LIKE_THESE,
 ) -> Tables:
     """Every (task, layer) and, over tasks, cells with `task_id` null: means over tasks of the tasks' means.
 
     `scope` is "task", "all" (every task of one suite) or "combined" (every suite; only when there are several).
-    `X_low` and `X_high` bound the interval of X (see `statistics.intervals`): over episodes inside a task, about
-    `estimand` over several tasks; null where there is none.
+    `X_low` and `X_high` bound the interval of X (see `statistics.intervals`): over episodes inside a task, else about
+    what the row's `intervals` says; null where there is none.
 
     Returns:
-        cells: scope, suite, task_id, instruction, layer, layer_number, block, num_tasks, num_episodes, num_replans,
-            success_rate; with a ratio ratio_std, ratio_median, ratio_min, ratio_max (over the episodes' mean ratios),
-            episodes_without_ratio (episodes without a single finite ratio), num_nonfinite, geometric_left_out,
-            nonfinite_layers (sums), numerator_mass, denominator_mass (means), uniform_ratio (geometric mean), and with
-            bounds geometric_mean and ratio_lift (geometric means), ratio_mean, ratio_of_means.
+        cells: scope, suite, task_id, instruction, layer, layer_number, block, num_tasks, num_families and intervals
+            (`episode_intervals.ABOUT_COLUMNS`), num_episodes, num_replans, success_rate; with a ratio ratio_std,
+            ratio_median, ratio_min, ratio_max (over the episodes' mean ratios), episodes_without_ratio (episodes
+            without a single finite ratio), num_nonfinite, geometric_left_out, nonfinite_layers (sums), numerator_mass,
+            denominator_mass (means), uniform_ratio (geometric mean), and with bounds geometric_mean and ratio_lift
+            (geometric means), ratio_mean, ratio_of_means.
         groups: scope, suite, task_id, instruction, layer, layer_number, block, group; mass, keys, density, lift
             (means); fraction, fraction_low, fraction_high.
     """
@@ -125,13 +125,14 @@ def task_tables(
     ordered = Tables(cells, sorted_by_episode(episodes.groups))
     # As arrays, once: there can be thousands of (task, layer) pairs. numpy has no null: NaN.
     columns = {name: float_values(cells[name]) for name in _columns_over_episodes(grouping)}
-    columns[_TASK] = cells.select(task_number()).to_series().to_numpy()
+    units = sampling.units(cells)
     values = {name: ordered.values(name) for name in ("mass", "keys", "density", "lift", "fraction")}
     rows, group_rows = [], []
     for scope, names, members in _scopes(cells):
         of_scope = {name: array[members] for name, array in columns.items()}
         of_groups = {name: array[members] for name, array in values.items()}
-        for row, bounds, layer in zip(*_task_rows(of_scope, of_groups, grouping, estimand, level), names, strict=True):
+        of_tasks = units.of_tasks(units.tasks[members[0]])  # the episodes of all layers are the same
+        for row, bounds, layer in zip(*_task_rows(of_scope, of_groups, grouping, of_tasks, level), names, strict=True):
             rows.append({**scope, **layer, **row})
             group_rows += [{**scope, **layer, **bound} for bound in bounds]
     return Tables(_task_frame(rows, _cell_schema(grouping)), _task_frame(group_rows, _GROUP_SCHEMA))
@@ -209,14 +210,13 @@ def _task_rows(
     columns: Mapping[str, NDArray[Any]],
     groups: Mapping[str, NDArray[np.float64]],
     grouping: Grouping,
-    estimand: Estimand,
+    units: Units,
     level: float,
-) -> tuple[list[dict[str, float | int | None]], list[list[dict[str, Any]]]]:
+) -> tuple[list[dict[str, Any]], list[list[dict[str, Any]]]]:
     """For each layer of a scope the cell's row, and a row per group.
 
-    columns: (layer, episode) each; groups: (layer, episode, group) each.
+    columns: (layer, episode) each; groups: (layer, episode, group) each; units: of the episodes, not decided.
     """
-    tasks = columns[_TASK][0]
     # Outcomes that are not known are NaN, and in no mean.
     plain: dict[str, EpisodeStatistic] = {"success_rate": mean_over_episodes(columns["success"])}
     bounded: dict[str, EpisodeStatistic] = {}
@@ -235,15 +235,14 @@ def _task_rows(
         for name in ("num_nonfinite", "geometric_left_out", "nonfinite_layers"):
             counts[name] = columns[name].sum(axis=1).astype(int).tolist()
     shares = mean_over_episodes(groups["fraction"].swapaxes(1, 2), SHARE)
-    found = iter(estimates([*plain.values(), *bounded.values(), shares], tasks, estimand))
-    layers = range(len(columns[_TASK]))
+    found = iter(estimates([*plain.values(), *bounded.values(), shares], units.decided()))
+    layers = range(len(columns["success"]))
     of_plain, of_bounded = ({name: [next(found) for _ in layers] for name in which} for which in (plain, bounded))
-    means = {name: means_over_tasks(groups[name], tasks).tolist() for name in ("mass", "keys", "density", "lift")}
+    means = {name: means_over_tasks(groups[name], units.tasks).tolist() for name in ("mass", "keys", "density", "lift")}
     spreads = summarize_rows(columns["ratio_mean"]) if grouping.ratio else []
-    num_tasks, num_episodes = len(np.unique(tasks)), len(tasks)
     rows, group_rows = [], []
     for i in layers:
-        row: dict[str, float | int | None] = {"num_tasks": num_tasks, "num_episodes": num_episodes}
+        row: dict[str, Any] = {"num_tasks": units.num_tasks, **about_row(units), "num_episodes": len(units.tasks)}
         row |= {name: count[i] for name, count in counts.items()}
         if grouping.ratio:
             row |= {f"ratio_{name}": getattr(spreads[i], name) for name in ("std", "median", "min", "max")}
@@ -288,8 +287,9 @@ _GROUP_SCHEMA: dict[str, type[pl.DataType]] = {
 
 def _cell_schema(grouping: Grouping) -> dict[str, type[pl.DataType]]:
     """Columns of the cells and their types, which cannot be taken from a column that is null throughout."""
-    counts = dict.fromkeys(("num_tasks", "num_episodes", "num_replans"), pl.Int64)
-    schema: dict[str, type[pl.DataType]] = {**_NAMES, **counts, "success_rate": pl.Float64}
+    counts = dict.fromkeys(("num_episodes", "num_replans"), pl.Int64)
+    schema: dict[str, type[pl.DataType]] = {**_NAMES, "num_tasks": pl.Int64, **ABOUT_COLUMNS, **counts}
+    schema["success_rate"] = pl.Float64
     if grouping.ratio:
         whole = ("episodes_without_ratio", "num_nonfinite", "geometric_left_out", "nonfinite_layers")
         plain = ("ratio_std", "ratio_median", "ratio_min", "ratio_max")

@@ -27,8 +27,8 @@ from vla_attention.analyze.measures.baselines import uniform_keys, uniform_masse
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, in_larger_parts
 from vla_attention.analyze.measures.masses import ratio
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
-from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL, NO_LIMITS, POSITIVE, Estimand
+from vla_attention.analyze.statistics.episode_intervals import Sampling, means_with_intervals
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL, NO_LIMITS, POSITIVE
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.segments import segment_members
 from vla_attention.schemas.stores.store_format import RootAttributes
@@ -136,7 +136,7 @@ def _with_ratio_over_blocks(
 
 
 def contribution_rows(
-    parts: Iterable[pl.DataFrame], above: str, below: str, estimand: Estimand, level: float = DEFAULT_LEVEL
+    parts: Iterable[pl.DataFrame], above: str, below: str, sampling: Sampling, level: float = DEFAULT_LEVEL
 ) -> pl.DataFrame:
     """Norms and their ratio of every layer and over all of them ("layers_avg"), over episodes, with intervals.
 
@@ -145,7 +145,7 @@ def contribution_rows(
             whole episodes.
         above: the column of the numerator's norm.
         below: the column of the denominator's norm.
-        estimand: what the intervals are about.
+        sampling: what the intervals are about, and which tasks are related.
         level: of the intervals.
 
     Returns:
@@ -183,7 +183,7 @@ def contribution_rows(
     episodes = pl.concat(of_parts)
     values = dict.fromkeys((above, below, "ratio_mean"), POSITIVE) | dict.fromkeys(logs, NO_LIMITS)
     quotients = {"ratio_of_means": (above, below)}
-    rows = means_with_intervals(episodes, ["layer"], values, estimand, level, quotients=quotients)
+    rows = means_with_intervals(episodes, ["layer"], values, sampling, level, quotients=quotients)
     bounded = ("ratio_mean", "ratio_of_means", "geometric_mean", "ratio_lift")
     return rows.with_columns(pl.col(rf"^({'|'.join(logs)})(_low|_high)?$").exp()).select(
         "layer",

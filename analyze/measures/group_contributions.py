@@ -37,7 +37,7 @@ from vla_attention.analyze.measures.frames import (
 from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_episode
-from vla_attention.analyze.statistics.intervals import Estimand
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.stores.parallel import each_episode, map_episodes
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.groupings.grouping import Grouping
@@ -141,9 +141,9 @@ def have_ratio(tables: Tables) -> bool:
     return "contribution_ratio" in tables.parts[0].cells.columns
 
 
-def ratios_by_layer(tables: Tables, estimand: Estimand) -> dict[str, dict[str, Any]]:
+def ratios_by_layer(tables: Tables, sampling: Sampling) -> dict[str, dict[str, Any]]:
     """By layer the rows of `contribution_ratios.contribution_rows`; empty without a ratio."""
     if not have_ratio(tables):
         return {}
-    rows = contribution_rows(cells_in_parts(tables), "numerator_norm", "denominator_norm", estimand)
+    rows = contribution_rows(cells_in_parts(tables), "numerator_norm", "denominator_norm", sampling)
     return {row["layer"]: row for row in rows.iter_rows(named=True)}

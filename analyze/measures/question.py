@@ -12,8 +12,11 @@ from vla_attention.analyze.measures.baselines import baseline_notes
 from vla_attention.analyze.measures.frames import layer_name
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
+from vla_attention.analyze.measures.task_families import relation_remarks, sampling_of, units_of
 from vla_attention.analyze.show.headings import run_header
 from vla_attention.analyze.show.progress import progress_bar
+from vla_attention.analyze.statistics.episode_intervals import Sampling
+from vla_attention.analyze.statistics.units import Units
 from vla_attention.analyze.stores.checking import faults_of_each
 from vla_attention.analyze.stores.read_ahead import read_ahead
 from vla_attention.analyze.stores.selection import (
@@ -46,6 +49,7 @@ class Question:
         selected: the episodes, each with its store and its tokens.
         grouping: the groups of keys.
         vocabulary: the names that selectors may use over the episodes.
+        sampling: what intervals over several tasks are about, and which tasks are related.
         skipped: one line for every episode that was left out because it is damaged or empty (`skip_corrupt`).
         notes: further lines for every result, for instance which denoise steps it is of or which keys were taken out.
     """
@@ -57,6 +61,7 @@ class Question:
     selected: tuple[SelectedEpisode, ...]
     grouping: Grouping
     vocabulary: Vocabulary
+    sampling: Sampling
     skipped: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -67,8 +72,18 @@ class Question:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """The lines that every result with numbers has: what was left out, what the baselines are of, and the notes."""
-        return (*self.skipped, *baseline_notes(self.stores), *self.notes)
+        """The lines of every result with numbers: what was left out, of what baselines are, related tasks, the notes."""
+        return (
+            *self.skipped,
+            *baseline_notes(self.stores),
+            *relation_remarks(self.sampling, self.selected),
+            *self.notes,
+        )
+
+    @property
+    def units(self) -> Units:
+        """The units of intervals over all selected episodes."""
+        return units_of(self.sampling, self.selected).decided()
 
     @property
     def num_tasks(self) -> int:
@@ -128,7 +143,19 @@ def ask(stores: Sequence[Store], settings: AnalysisSettings, known: KnownEpisode
             known[site, settings.tasks] = selected, vocabulary
     grouping = choose_grouping(settings, vocabulary)
     notes = _denoise_notes(root, selection, grouping)
-    return Question(tuple(stores), settings, selection, site, selected, grouping, vocabulary, tuple(skipped), notes)
+    sampling = sampling_of(settings.intervals, selected)
+    return Question(
+        stores=tuple(stores),
+        settings=settings,
+        selection=selection,
+        site=site,
+        selected=selected,
+        grouping=grouping,
+        vocabulary=vocabulary,
+        sampling=sampling,
+        skipped=tuple(skipped),
+        notes=notes,
+    )
 
 
 def select_again(question: Question, site: str) -> Selection:

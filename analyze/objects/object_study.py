@@ -18,8 +18,8 @@ from vla_attention.analyze.objects.control_masks import STILL_OVERLAP
 from vla_attention.analyze.objects.object_attention import ObjectTables, object_tables
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_views import ALL_CAMERAS, CLASSES, site_of_pictures
-from vla_attention.analyze.statistics.episode_intervals import means_with_intervals, task_number
-from vla_attention.analyze.statistics.intervals import POSITIVE, SHARE, Estimand, quotient_by_episode
+from vla_attention.analyze.statistics.episode_intervals import Sampling, means_with_intervals, task_number
+from vla_attention.analyze.statistics.intervals import POSITIVE, SHARE, quotient_by_episode
 from vla_attention.analyze.statistics.many_looks import Leader, adjusted_p_values, leader_of_table
 from vla_attention.schemas.stores.reader import Store
 
@@ -56,27 +56,27 @@ class ObjectStudy:
     @cached_property
     def summary(self) -> pl.DataFrame:
         """Shares, enrichment and control; see `objects_summary`."""
-        return objects_summary(self._of_layer(self.tables.objects), self.question.settings.intervals)
+        return objects_summary(self._of_layer(self.tables.objects), self.question.sampling)
 
     @cached_property
     def pointing_summary(self) -> pl.DataFrame | None:
         """Pointing game and distances; see `pointing_summary`."""
         if self.tables.pointing is None:
             return None
-        return pointing_summary(self._of_layer(self.tables.pointing), self.question.settings.intervals)
+        return pointing_summary(self._of_layer(self.tables.pointing), self.question.sampling)
 
     @cached_property
     def iou_summary(self) -> pl.DataFrame | None:
         """IoU by threshold; see `iou_summary`."""
         if self.tables.iou is None:
             return None
-        return iou_summary(self._of_layer(self.tables.iou), self.question.settings.intervals)
+        return iou_summary(self._of_layer(self.tables.iou), self.question.sampling)
 
     @property
     def followed(self) -> list[tuple[dict[str, Any], Leader]]:
         """Which object is followed more than the others; see `followed_objects`."""
         together = self.tables.objects.filter(pl.col("kind") == "object", pl.col("camera") == ALL_CAMERAS)
-        return followed_objects(together, self.question.settings.intervals)
+        return followed_objects(together, self.question.sampling)
 
     @property
     def finder(self) -> tuple[dict[str, Any], Leader] | None:
@@ -85,7 +85,7 @@ class ObjectStudy:
             return None
         threshold = self.settings.shown_threshold
         classes = self.tables.iou.filter(pl.col("kind") == "class", pl.col("threshold") == threshold)
-        return leading_finder(classes, threshold, self.question.settings.intervals)
+        return leading_finder(classes, threshold, self.question.sampling)
 
     def files(self) -> dict[str, pl.DataFrame | TableInParts]:
         """All tables by the names of their files."""
@@ -125,7 +125,7 @@ def study_objects(
     return ObjectStudy(question, chosen, example, object_tables(question, chosen, keep_steps))
 
 
-def objects_summary(objects: pl.DataFrame, estimand: Estimand = Estimand.TASKS_LIKE_THESE) -> pl.DataFrame:
+def objects_summary(objects: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
     """Means of every item over the episodes that have it, with intervals, of the layers' mean.
 
     From `object_tables`, `objects`. Classes in their order, then objects by enrichment; per camera, all cameras first.
@@ -136,7 +136,7 @@ def objects_summary(objects: pl.DataFrame, estimand: Estimand = Estimand.TASKS_L
     values = {"share": SHARE, "area_share": SHARE, "enrichment": POSITIVE}
     values |= {"control_enrichment": POSITIVE, "control_overlap": SHARE}
     quotients = {_OVER_CONTROL: ("enrichment", "control_balanced")}
-    summary = _means(objects, _ITEM, values, estimand, quotients, {_OVER_CONTROL: 1.0})
+    summary = _means(objects, _ITEM, values, sampling, quotients, {_OVER_CONTROL: 1.0})
     telling = pl.col("control_overlap") < STILL_OVERLAP
     bounded = [f"{_OVER_CONTROL}{end}" for end in ("", "_low", "_high", "_p")]
     summary = summary.with_columns(pl.when(telling).then(pl.col(name)).alias(name) for name in bounded)
@@ -150,25 +150,23 @@ def objects_summary(objects: pl.DataFrame, estimand: Estimand = Estimand.TASKS_L
     return _ordered(summary, "enrichment")
 
 
-def pointing_summary(pointing: pl.DataFrame, estimand: Estimand = Estimand.TASKS_LIKE_THESE) -> pl.DataFrame:
+def pointing_summary(pointing: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
     """Mean pointing game and distances of every item over the episodes in which it has a mask, with intervals.
 
     From `object_tables`, `pointing`; of "layers_avg" (means of the layers' values) or the only layer.
     """
     values = {"mask_patches": POSITIVE, "distance": POSITIVE, "distance_uniform": POSITIVE}
     values |= {"pointing": SHARE, "pointing_chance": SHARE}
-    return _ordered(_means(pointing.filter(pl.col("mask_replans") > 0), _ITEM, values, estimand), "pointing")
+    return _ordered(_means(pointing.filter(pl.col("mask_replans") > 0), _ITEM, values, sampling), "pointing")
 
 
-def iou_summary(iou: pl.DataFrame, estimand: Estimand = Estimand.TASKS_LIKE_THESE) -> pl.DataFrame:
+def iou_summary(iou: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
     """Mean IoU of every item at every threshold, highest first, as in `pointing_summary`; from the table `iou`."""
     values = {"iou": SHARE, "iou_chance": SHARE}
-    return _ordered(_means(iou.drop_nulls("iou"), (*_ITEM, "threshold"), values, estimand), "iou")
+    return _ordered(_means(iou.drop_nulls("iou"), (*_ITEM, "threshold"), values, sampling), "iou")
 
 
-def followed_objects(
-    objects: pl.DataFrame, estimand: Estimand = Estimand.TASKS_LIKE_THESE
-) -> list[tuple[dict[str, Any], Leader]]:
+def followed_objects(objects: pl.DataFrame, sampling: Sampling) -> list[tuple[dict[str, Any], Leader]]:
     """The object that exceeds its control by the largest factor over layers, and the (object, layer, head) that does.
 
     From `object_tables`, `objects`, all cameras together. Each with how surely it exceeds all the others
@@ -193,7 +191,7 @@ def followed_objects(
             pl.col("enrichment").mean(), pl.col("control_balanced").mean()
         )
         factors = [_linearised(of_item) for of_item in means.partition_by(item, maintain_order=True)]
-        leading = leader_of_table(pl.concat(factors), item, _OVER_CONTROL, estimand) if factors else None
+        leading = leader_of_table(pl.concat(factors), item, _OVER_CONTROL, sampling) if factors else None
         found += [] if leading is None else [leading]
     return found
 
@@ -205,14 +203,12 @@ def _linearised(of_item: pl.DataFrame) -> pl.DataFrame:
     return of_item.with_columns(pl.Series(_OVER_CONTROL, values))
 
 
-def leading_finder(
-    iou: pl.DataFrame, threshold: str, estimand: Estimand = Estimand.TASKS_LIKE_THESE
-) -> tuple[dict[str, Any], Leader] | None:
+def leading_finder(iou: pl.DataFrame, threshold: str, sampling: Sampling) -> tuple[dict[str, Any], Leader] | None:
     """The (camera, layer, head) whose maps have the highest IoU above chance with the objects of interest."""
     of_interest = (pl.col("kind") == "class") & (pl.col("item") == CLASSES[0])
     found = _single_layers(iou).filter(of_interest, pl.col("threshold") == threshold).drop_nulls("iou")
     above = found.with_columns((pl.col("iou") - pl.col("iou_chance")).alias("above"))
-    return leader_of_table(above, ("camera", "layer", "head"), "above", estimand) if above.height else None
+    return leader_of_table(above, ("camera", "layer", "head"), "above", sampling) if above.height else None
 
 
 def _single_layers(table: pl.DataFrame) -> pl.DataFrame:
@@ -224,7 +220,7 @@ def _means(
     table: pl.DataFrame,
     item: Sequence[str],
     values: dict[str, tuple[float, float]],
-    estimand: Estimand,
+    sampling: Sampling,
     quotients: dict[str, tuple[str, str]] | None = None,
     nulls: dict[str, float] | None = None,
 ) -> pl.DataFrame:
@@ -233,7 +229,7 @@ def _means(
     episodes = chosen.group_by(*EPISODE_ID, *item, maintain_order=True).agg(
         *(pl.col(name).mean() for name in table.columns if name in names)
     )
-    return means_with_intervals(episodes, item, values, estimand, quotients=quotients, nulls=nulls)
+    return means_with_intervals(episodes, item, values, sampling, quotients=quotients, nulls=nulls)
 
 
 def _ordered(summary: pl.DataFrame, by: str) -> pl.DataFrame:

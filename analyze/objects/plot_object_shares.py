@@ -18,15 +18,16 @@ from vla_attention.analyze.show.plot_axes import legend_below, ratio_axis, unifo
 from vla_attention.analyze.show.plot_colours import FIXED_COLORS, FURTHER_COLORS
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import shortened, title
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.intervals import (
     DEFAULT_LEVEL,
     POSITIVE,
     SHARE,
     EpisodeStatistic,
-    Estimand,
     estimates,
     mean_over_episodes,
 )
+from vla_attention.analyze.statistics.units import Units
 from vla_attention.schemas.safe_text import visible
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def plot_object_shares(study: ObjectStudy, folder: Path) -> list[Path]:
     )
     left, middle, right = figure.subplots(1, 3)
     shown = _draw_example(left, own)
-    classes = _draw_classes(middle, right, whole, _controls(study.summary), study.question.settings.intervals)
+    classes = _draw_classes(middle, right, whole, _controls(study.summary), study.question.sampling)
     return save_figure(figure, folder, STEM, pl.concat([shown, classes], how="diagonal"))
 
 
@@ -132,20 +133,21 @@ def _controls(summary: pl.DataFrame) -> dict[str, float]:
 
 
 def _draw_classes(
-    axes: Axes, enrichment_axes: Axes, whole: pl.DataFrame, controls: Mapping[str, float], estimand: Estimand
+    axes: Axes, enrichment_axes: Axes, whole: pl.DataFrame, controls: Mapping[str, float], sampling: Sampling
 ) -> pl.DataFrame:
     parts: list[pl.DataFrame] = []
     for name in CLASSES:
         part = whole.filter((pl.col("kind") == "class") & (pl.col("item") == name))
         if part.is_empty():
             continue
-        share, area, tasks = _by_phase(part)
-        shares = _with_intervals([mean_over_episodes(column, SHARE) for column in share.T], tasks, estimand)
+        share, area, episodes = _by_phase(part)
+        units = sampling.units(episodes).decided()
+        shares = _with_intervals([mean_over_episodes(column, SHARE) for column in share.T], units)
         with np.errstate(divide="ignore", invalid="ignore"):  # where the object is out of view
             of_episodes = [mean_over_episodes(column, POSITIVE) for column in (share / area).T]
-        enrichments = _with_intervals(of_episodes, tasks, estimand)
+        enrichments = _with_intervals(of_episodes, units)
         covered, color = area.mean(axis=0), CLASS_COLORS[name]
-        label = name if len(tasks) == whole.select(EPISODE_ID).unique().height else f"{name} (n = {len(tasks)})"
+        label = name if len(share) == whole.select(EPISODE_ID).unique().height else f"{name} (n = {len(share)})"
         axes.plot(_PHASES, 100 * covered, color=color, linestyle="--", linewidth=1.0)
         for target, factor, (value, low, high) in ((axes, 100, shares), (enrichment_axes, 1, enrichments)):
             target.plot(_PHASES, factor * value, color=color, label=label)
@@ -162,7 +164,7 @@ def _draw_classes(
                 pl.lit(name).alias("name"),
                 "time",
                 "area_share",
-                pl.lit(len(tasks), dtype=pl.Int64).alias("num_episodes"),
+                pl.lit(len(share), dtype=pl.Int64).alias("num_episodes"),
                 pl.lit(control, dtype=pl.Float64).alias("control_enrichment"),
                 pl.exclude("time", "area_share"),
             )
@@ -184,10 +186,10 @@ def _draw_classes(
 
 
 def _with_intervals(
-    statistics: list[EpisodeStatistic], tasks: list[str], estimand: Estimand
+    statistics: list[EpisodeStatistic], units: Units
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Value, low and high of each statistic; NaN where there is none."""
-    found = estimates(statistics, tasks, estimand)
+    found = estimates(statistics, units)
     values = [np.nan if one.value is None else one.value for one in found]
     intervals = [one.interval() for one in found]
     low = [interval.low if interval else np.nan for interval in intervals]
@@ -195,14 +197,14 @@ def _with_intervals(
     return np.array(values), np.array(low), np.array(high)
 
 
-def _by_phase(part: pl.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.float64], list[str]]:
-    """Share and area (episode, phase) by linear interpolation over each episode's replans, and the episodes' tasks."""
-    shares, areas, tasks = [], [], []
-    for key, episode in part.group_by(EPISODE_ID, maintain_order=True):
+def _by_phase(part: pl.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.float64], pl.DataFrame]:
+    """Share and area (episode, phase) by linear interpolation over each episode's replans, and the episodes."""
+    shares, areas = [], []
+    episodes = part.select(EPISODE_ID).unique(maintain_order=True)
+    for _, episode in part.group_by(EPISODE_ID, maintain_order=True):
         ordered = episode.sort("replan")
         last = ordered.height - 1
         phase = ordered["replan"].to_numpy() / last if last else np.zeros(1)
         shares.append(np.interp(_PHASES, phase, ordered["share"].cast(pl.Float64).to_numpy()))
         areas.append(np.interp(_PHASES, phase, ordered["area_share"].to_numpy()))
-        tasks.append(f"{key[0]}\t{key[1]}")
-    return np.array(shares), np.array(areas), tasks
+    return np.array(shares), np.array(areas), episodes

@@ -10,6 +10,7 @@ from vla_attention.analyze.objects.control_masks import STILL_OVERLAP
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_study import ObjectStudy
 from vla_attention.analyze.objects.object_views import ALL_CAMERAS, item_name
+from vla_attention.analyze.show.findings import few_families_note
 from vla_attention.analyze.show.headings import interval_note, wrap
 from vla_attention.analyze.show.numbers import format_interval, format_number, plural, row_interval
 from vla_attention.analyze.show.text_table import episode_counts, text_table
@@ -48,14 +49,15 @@ def _shares(study: ObjectStudy) -> list[str]:
         else:
             classes = part.filter(pl.col("kind") == "class")
             lines += ["", f"camera {camera}", _shares_table(classes, several, shares=False)]
-    about = study.question.settings.intervals.words
-    return [*lines, "", *wrap(f"{_SHARES_NOTE} {interval_note(DEFAULT_LEVEL, about)}")]
+    units = study.question.units
+    few = few_families_note(study.summary.filter(pl.col("camera") == study.summary["camera"][0]), "item", units)
+    return [*lines, "", *wrap(f"{_SHARES_NOTE} {interval_note(DEFAULT_LEVEL, units.words)} {few}".rstrip())]
 
 
 def followed_sentence(study: ObjectStudy) -> str:
     """Which object, and which layer of an object, surely exceeds its control more than all the others do."""
     leaders = study.followed
-    about = study.question.settings.intervals.words
+    about = study.question.units.words
     named = [
         f"'{row['item']}'{_place(row)} exceeds its control by a larger factor ({format_number(found.value)}) than each "
         f"of the other {found.num_items - 1} {'pairs of object and layer' if 'layer' in row else 'objects'}"

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from vla_attention.analyze.measures.aggregate import episode_tables, layer_order, task_tables
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables, float_values
 from vla_attention.analyze.published.results_reader import ResultsFile, ResultsKind, SummaryNumber
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.summaries import SampleSummary, summarize
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 
@@ -87,7 +88,7 @@ def results_tables(files: Sequence[ResultsFile], labels: Sequence[str]) -> Resul
     grouping = _grouping(files[0].kind, rows)
     replans = _replans(rows, grouping)
     episodes = episode_tables(replans, grouping)
-    return ResultsTables(grouping, replans, episodes, task_tables(episodes, grouping))
+    return ResultsTables(grouping, replans, episodes, task_tables(episodes, grouping, Sampling()))
 
 
 def _rows(file: ResultsFile, label: str) -> pl.DataFrame:

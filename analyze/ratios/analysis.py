@@ -136,7 +136,7 @@ class Analysis:
         """See `measures.contribution_ratios.contribution_rows`, of both sides; None when they were not recorded."""
         if self.contributions is None:
             return None
-        return contribution_rows(self.contributions, "visual_norm", "linguistic_norm", self.question.settings.intervals)
+        return contribution_rows(self.contributions, "visual_norm", "linguistic_norm", self.question.sampling)
 
     @property
     def headline(self) -> Headline | None:
@@ -145,7 +145,7 @@ class Analysis:
         Where a site has one of the modalities only (Cosmos), it is that of the norms of contributions.
         """
         several = self.overall["num_tasks"] > 1
-        about = self.question.settings.intervals.words if several else "episodes like these of the one task"
+        about = self.question.units.words if several else "episodes like these of the one task"
         untrained, layers = self.question.untrained, layer_name(self.overall["layer"], "average over layers")
         if self.grouping.ratio is not None:
             what = " / ".join(shortened(side, 40) for side in ratio_definition(self.grouping).split(" / "))
@@ -195,12 +195,12 @@ class Analysis:
         question = self.question
         parts = [summary_text(_described(self), self.grouping, self.episodes, self.tasks)]
         if all(store.attributes.recording.contributions for store in question.stores):
-            tables, estimand = self.group_contributions, question.settings.intervals
+            tables, sampling = self.group_contributions, question.sampling
             if self.contributions is not None and not same_sides(self.contributions, tables):
                 assert self.contribution_rows is not None
                 parts.append(contributions_section(self.contribution_rows))
             first = len(parts) == 1
-            parts.append(group_contributions_section(tables, self.grouping, question.site, estimand, first))
+            parts.append(group_contributions_section(tables, self.grouping, question.site, sampling, first))
         return "\n".join(parts)
 
 
@@ -219,7 +219,7 @@ def analyse(question: Question, without_sinks: SinkRule | None = None) -> Analys
     grouping = question.grouping
     measured = measure_episodes(question)
     episodes = episode_tables_of(measured, grouping)
-    tasks = task_tables(episodes, grouping, estimand=question.settings.intervals)
+    tasks = task_tables(episodes, grouping, question.sampling)
     return Analysis(question, measured, episodes, tasks, sinks)
 
 
@@ -233,7 +233,7 @@ def _described(analysis: Analysis) -> AnalysedRun:
         untrained=policy.untrained,
         denoise_steps=question.selection.denoise_steps,
         heads=describe_heads(question.selection, question.stores[0].attributes.size_of(question.site)[1]),
-        estimand=question.settings.intervals,
+        units=question.units,
         notes=analysis.notes,
         answer=analysis.answer,
     )

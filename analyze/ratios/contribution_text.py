@@ -12,7 +12,8 @@ from vla_attention.analyze.measures.group_contributions import have_ratio, norms
 from vla_attention.analyze.show.headings import WIDTH, heading, wrap
 from vla_attention.analyze.show.numbers import format_number, interval_name, row_interval
 from vla_attention.analyze.show.text_table import text_table
-from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL, Estimand
+from vla_attention.analyze.statistics.episode_intervals import Sampling
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
 
@@ -49,7 +50,7 @@ def contributions_section(contributions: pl.DataFrame) -> str:
 
 
 def group_contributions_section(
-    tables: Tables | None, grouping: Grouping, site: str, estimand: Estimand, first: bool = True
+    tables: Tables | None, grouping: Grouping, site: str, sampling: Sampling, first: bool = True
 ) -> str:
     """The summary's section: per layer the groups' mean norms and the ratio of norms with its interval.
 
@@ -75,7 +76,7 @@ def group_contributions_section(
     if first:
         note = f"{_HOW} {note}".strip()
     norms = norms_by_layer(tables)
-    ratios = ratios_by_layer(tables, estimand)
+    ratios = ratios_by_layer(tables, sampling)
     layers, of_norms, of_ratios = [], [], []
     for layer in (*tables.parts[0].cells["layer"].unique(maintain_order=True).cast(pl.String), LAYERS_AVG):
         layers.append(layer)

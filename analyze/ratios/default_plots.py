@@ -60,7 +60,7 @@ class PlottedTables:
             episodes=analysis.episodes.cells,
             tasks=analysis.tasks.kept(),
             note=note,
-            about=f"{note} Intervals over tasks: about {analysis.question.settings.intervals.words}.",
+            about=f"{note} Intervals over tasks: about {analysis.question.units.words}.",
             formats=picture_formats(),
         )
 

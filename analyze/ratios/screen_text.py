@@ -34,8 +34,8 @@ from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 
 #: Rows of groups, and blocks of layers beside each other, before "in summary.txt" stands for the rest.
 _MOST_GROUPS, _MOST_BLOCKS = 6, 2
-#: Notes leave room for so many tasks.
-_FEWEST_TASKS = 3
+#: Notes leave room for so many tasks, and many groups for as many as these.
+_FEWEST_TASKS, _FEWEST_GROUPS = 3, 2
 _REST = f"in {WHOLE_TEXT}"
 _PROGRAM = "vla-analyze"
 #: Groups whose fractions stand in rows where there is no ratio.
@@ -51,11 +51,14 @@ def screen_text(analysis: Analysis, folder: Path, files: Sequence[str]) -> str:
         files: the lines about further files, which stand last.
     """
     last = [*wrap(f"The whole, with every interval: {folder / WHOLE_TEXT}", rest="  "), *files]
-    answer, tables = wrap_all(analysis.answer), [*_layers(analysis), "", *_groups(analysis), ""]
-    room = SCREEN_LINES - len(answer) - len(tables) - len(last) - 2
+    answer, layers, groups = wrap_all(analysis.answer), _layers(analysis), _groups(analysis, _MOST_GROUPS)
+    room = SCREEN_LINES - len(answer) - len(layers) - len(groups) - len(last) - 4
     notes = _notes(analysis, room - _FEWEST_TASKS - 3)
-    above = [*answer, "", *notes, *([""] if notes else []), *tables]
     room -= len(notes) + bool(notes)
+    if room < _FEWEST_TASKS + 2:  # header, and that there are more
+        fewer = _groups(analysis, max(_FEWEST_GROUPS, _MOST_GROUPS - _FEWEST_TASKS - 2 + room))
+        groups, room = fewer, room + len(groups) - len(fewer)
+    above = [*answer, "", *notes, *([""] if notes else []), *layers, "", *groups, ""]
     pages = _pages(analysis)
     if room - len(pages) > _FEWEST_TASKS + 2:  # header, and that there are more
         room, last = room - len(pages), [*last, *pages]
@@ -128,8 +131,8 @@ def _beside_each_other(name: str, columns: Sequence[str], rows: Mapping[str, Seq
     return [*lines, f"{more} more {name}s {_REST}"] if more else lines
 
 
-def _groups(analysis: Analysis) -> list[str]:
-    """The groups that get attention, over all tasks and layers."""
+def _groups(analysis: Analysis, most: int) -> list[str]:
+    """The groups that get attention, at most so many, over all tasks and layers."""
     found = [(name, analysis.overall_groups[name]) for name in analysis.present_groups]
     found = [(name, row) for name, row in found if row["mass"]]
     rows = [
@@ -140,7 +143,7 @@ def _groups(analysis: Analysis) -> list[str]:
             format_percent_interval(row["fraction_low"], row["fraction_high"]),
             format_number(row["lift"]),
         )
-        for name, row in found[:_MOST_GROUPS]
+        for name, row in found[:most]
     ]
     table = _table(("GROUPS", "keys", "fraction", interval_name(DEFAULT_LEVEL), "lift"), rows)
     more = len(found) - len(rows)

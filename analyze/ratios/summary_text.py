@@ -11,7 +11,15 @@ import polars as pl
 from vla_attention.analyze.measures.aggregate import layer_order, overall_layer, overall_rows
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables, layer_name
 from vla_attention.analyze.ratios.verdict import LINGUISTIC_BELOW, VISUAL_ABOVE, meanings, reading, verdict
-from vla_attention.analyze.show.headings import WIDTH, heading, title, untrained_warning, wrap, wrap_all
+from vla_attention.analyze.show.findings import few_families_note
+from vla_attention.analyze.show.headings import (
+    WIDTH,
+    heading,
+    title,
+    untrained_warning,
+    wrap,
+    wrap_all,
+)
 from vla_attention.analyze.show.numbers import (
     format_number,
     format_percent,
@@ -22,7 +30,7 @@ from vla_attention.analyze.show.numbers import (
 )
 from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.show.text_table import text_table
-from vla_attention.analyze.statistics.intervals import Estimand
+from vla_attention.analyze.statistics.units import Units
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
 
@@ -41,9 +49,9 @@ class AnalysedRun:
         policy: name of the policy and its checkpoint, as it should be shown.
         untrained: whether the weights are random.
         denoise_steps: denoise steps that were averaged over.
+        units: what the intervals over all tasks are about.
         heads: how heads were averaged, as text.
         level: level of the intervals in `tasks_table`.
-        estimand: what the intervals over several tasks are about.
         notes: further lines, for instance about translated layer numbers.
         answer: the sentences that stand first.
     """
@@ -52,9 +60,9 @@ class AnalysedRun:
     policy: str
     untrained: bool
     denoise_steps: Sequence[int]
+    units: Units
     heads: str = "mean over all heads"
     level: float = 0.95
-    estimand: Estimand = Estimand.TASKS_LIKE_THESE
     notes: Sequence[str] = field(default_factory=tuple)
     answer: Sequence[str] = ()
 
@@ -149,7 +157,7 @@ def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: Tables) -> str:
 def _interval_note(run: AnalysedRun, overall: dict[str, object]) -> str:
     if overall["num_episodes"] == 1:
         return "No interval: a single episode says nothing about how much episodes differ."
-    about = run.estimand.words if overall["num_tasks"] != 1 else "episodes like these of the one task"
+    about = run.units.words if overall["num_tasks"] != 1 else "episodes like these of the one task"
     return f"interval: of the geometric mean, about {about}."
 
 
@@ -280,6 +288,8 @@ def _across_section(run: AnalysedRun, grouping: Grouping, tasks: Tables, scope: 
             f"{FEW_EPISODES} episodes its width varies much by chance: a narrow one is no sign of certainty."
         )
         table = "\n".join([table, *wrap(warning)])
+    if scope == "all":
+        table = "\n".join([table, *wrap(few_families_note(rows, "suite", run.units))])
     return "\n".join([heading(f"PER {name.upper()}{of}  {what}, {shown}"), table])
 
 

@@ -11,6 +11,7 @@ import polars as pl
 from vla_attention.analyze.measures.baselines import baseline_notes
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.sinks import SinkRule
+from vla_attention.analyze.measures.task_families import family_notes, unknown_families
 from vla_attention.analyze.ratios.analysis import Analysis, site_without_a_side
 from vla_attention.analyze.ratios.summary_text import FEW_EPISODES
 from vla_attention.analyze.report.section_parts import Section
@@ -73,9 +74,16 @@ def caveats(analysis: Analysis, masses: Mapping[str, float], sinks: pl.DataFrame
         *_rounding(question),
         *(Caveat("Left out", line, True) for line in question.skipped),
         *(Caveat("Baseline of version 1", line, True) for line in baseline_notes(question.stores)),
+        *_related_tasks(question),
         *(Caveat("Chosen part", line) for line in question.notes),
     ]
     return sorted(found, key=lambda caveat: not caveat.grave)
+
+
+def _related_tasks(question: Question) -> list[Caveat]:
+    warning = unknown_families(question.sampling, question.selected)
+    notes = family_notes(question.sampling, question.selected)
+    return [Caveat("Related tasks", line, True) for line in (*([warning] if warning else []), *notes)]
 
 
 def _weights(question: Question) -> list[Caveat]:

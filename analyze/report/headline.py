@@ -65,7 +65,7 @@ def headline_section(analysis: Analysis, notes: Sequence[Caveat]) -> Section:
         ]
         other.append(f"median of the episodes {format_number(row['ratio_median'])}")
         if row["num_tasks"] > 1:
-            other.append(f"intervals are about {analysis.question.settings.intervals.words}")
+            other.append(f"intervals are about {analysis.question.units.words}")
         parts.append(Paragraph(f"{', '.join(other)}.", quiet=True))
     return Section("headline", "Headline", parts)
 

@@ -102,7 +102,7 @@ def _section_makers(
         lambda: contribution_section(analysis),
         lambda: overlay_section(question, analysis.replans.cells, settings),
         lambda: run_section(analysis),
-        lambda: method_section(analysis.question.settings.intervals),
+        lambda: method_section(analysis.question.units),
     ]
 
 

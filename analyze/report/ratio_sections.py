@@ -118,10 +118,10 @@ def layer_section(analysis: Analysis, folder: Path) -> Section:
 
 def _layer_diagrams(analysis: Analysis, folder: Path) -> list[Diagram]:
     """Layer profile, and layers over time."""
-    grouping, estimand = analysis.grouping, analysis.question.settings.intervals
+    grouping = analysis.grouping
     what = "fractions" if grouping.ratio is None else "ratio"
     extremes = ""
-    time = layer_time_table(analysis.replans, grouping, estimand=estimand)
+    time = layer_time_table(analysis.replans, grouping, analysis.question.sampling)
     if grouping.ratio is not None:
         known = time.filter(pl.col("mean").is_not_null()).sort("mean")["layer"].to_list()
         extremes = f" The estimates run from layer {known[0]} to layer {known[-1]}." if known else ""

@@ -101,5 +101,5 @@ def _question_items(analysis: Analysis) -> list[Item]:
         Item("grouping", f"{grouping.name}{described}"),
         *(Item(f"group {name}", " | ".join(parts), code=True) for name, parts in grouping.groups.items()),
         Item("ratio", " / ".join(" + ".join(side) for side in sides) or "none"),
-        Item("intervals", f"{100 * DEFAULT_LEVEL:g}%, about {settings.intervals.words}"),
+        Item("intervals", f"{100 * DEFAULT_LEVEL:g}%, about {question.units.words}"),
     ]

@@ -1,11 +1,14 @@
-"""The sentence that says which of many may be named after looking at all of them."""
+"""Sentences on many rows: which may be named after looking at all of them, and whose intervals are about less."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import polars as pl
+
 from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
+from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Units
 from vla_attention.schemas.errors import listing
 
 
@@ -33,3 +36,21 @@ def findings(
         return f"Of {plural(len(tested), kind)}, none shows {what} {bound}."
     verb = "shows" if len(found) == 1 else "show"
     return f"Of {plural(len(tested), kind)}, {len(found)} {verb} {what} {bound}: {listing(found, 8)}."
+
+
+def few_families_note(table: pl.DataFrame, name: str, units: Units) -> str:
+    """Which rows have intervals about these tasks, where those of the others are about tasks like these; or nothing.
+
+    Args:
+        table: with `num_tasks`, `intervals` (`episode_intervals.ABOUT_COLUMNS`) and a column that names a row.
+        name: that column.
+        units: what intervals over all tasks are about.
+    """
+    if not units.estimand.of_other_tasks:
+        return ""
+    # Of a single task, it is said elsewhere.
+    few = table.filter(pl.col("intervals") != units.estimand.value, pl.col("num_tasks") > 1)
+    if few.is_empty():
+        return ""
+    names = listing(dict.fromkeys(few[name]))
+    return f"In tasks of fewer than {FEWEST_FAMILIES} families, and so about these tasks: {names}."

@@ -91,7 +91,7 @@ def interval_note(level: float, about: str, kind: str = "") -> str:
 
     Args:
         level: their level.
-        about: the estimand in words: "tasks like these", "these tasks".
+        about: what they are about (`Units.words`): "tasks like these, by 5 families", "these tasks".
         kind: a property, for instance that they are pointwise.
     """
     which = ", ".join(part for part in (f"{100 * level:g}%", kind) if part)

@@ -4,11 +4,11 @@ A contrast gives two differences. `difference` is that of the classes' means, ea
 means. Where some tasks are solved more often than others, it also contains the difference between tasks.
 `within_tasks` does not: it is the mean over the tasks with both classes of the difference inside the task.
 
-Their intervals are those of `intervals`: tasks are the units where both classes have several, else episodes. Effect
-sizes are over all episodes of a class, which weigh the same whatever their task; their standard errors come from
-leaving out one unit after the other (jackknife: Efron & Tibshirani 1993, chapter 11), with Student's t. Fewer than
-`FEWEST_EPISODES` in either class show too little of their own spread, and have no such interval. Pure numpy functions
-of one value per episode.
+Their intervals are those of `intervals`: families of tasks, or tasks where no family is known, are the units where both
+classes have several, else episodes. Effect sizes are over all episodes of a class, which weigh the same whatever their
+task; their standard errors come from leaving out one unit after the other (jackknife: Efron & Tibshirani 1993, chapter
+11), with Student's t. Fewer than `FEWEST_EPISODES` in either class show too little of their own spread, and have no
+such interval. Pure numpy functions of one value per episode.
 """
 
 from __future__ import annotations
@@ -20,23 +20,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vla_attention.analyze.statistics.family_errors import family_shares
 from vla_attention.analyze.statistics.intervals import (
     DEFAULT_LEVEL,
     NO_LIMITS,
     ROUNDING,
     UNKNOWN,
-    Estimand,
     Estimate,
     named_interval,
     strata_error,
     to_scale,
     welch_degrees,
 )
+from vla_attention.analyze.statistics.units import Estimand, Units
 
 #: Each class needs at least this many episodes for a comparison.
 FEWEST = 2
 #: Each class needs at least this many episodes for the interval of an effect size, and this many tasks where tasks are
-#: the units.
+#: the units; where their families are, `units.FEWEST_FAMILIES`.
 FEWEST_EPISODES, FEWEST_TASKS = 5, 3
 _BETWEEN_MINUS_ONE_AND_ONE = (-1.0, 1.0)
 #: Leave-one-out samples handled at once where all pairs of episodes are compared.
@@ -55,6 +56,7 @@ class Contrast:
         hedges_g: the difference between all episodes of either class, in standard deviations.
         cliffs_delta: P(first > second) - P(first < second).
         note: why something is missing.
+        estimand: what the intervals are about: these tasks, where a class has too few families of tasks.
     """
 
     num_first: int
@@ -67,6 +69,7 @@ class Contrast:
     hedges_g: Estimate = UNKNOWN
     cliffs_delta: Estimate = UNKNOWN
     note: str = ""
+    estimand: Estimand = Estimand.TASKS_LIKE_THESE
 
 
 def small_sample_factor(degrees: ArrayLike) -> NDArray[np.float64]:
@@ -102,12 +105,10 @@ def cliffs_delta(first: ArrayLike, second: ArrayLike) -> float | None:
     return float(np.sign(x[:, None] - y[None, :]).mean())
 
 
-def standardised_mean(
-    differences: ArrayLike, tasks: ArrayLike, estimand: Estimand = Estimand.TASKS_LIKE_THESE
-) -> Estimate:
+def standardised_mean(differences: ArrayLike, units: Units) -> Estimate:
     """Mean / standard deviation of paired differences (pair,), corrected for small samples: d_z (Cohen 1988) times J.
 
-    `tasks`: (pair,) labels. Undefined below `FEWEST_EPISODES` pairs or without any spread.
+    `units`: of the pairs. Undefined below `FEWEST_EPISODES` pairs or without any spread.
     """
     sample = np.asarray(differences, dtype=np.float64)
     if len(sample) < FEWEST_EPISODES or not np.ptp(sample) > 0:
@@ -119,30 +120,27 @@ def standardised_mean(
         with np.errstate(divide="ignore", invalid="ignore"):
             return factor * total / number / np.sqrt(squares / (number - 1))
 
-    task_of = np.unique(np.asarray(tasks), return_inverse=True)[1]
-    return _jackknife(value, task_of, [np.ones(len(sample), dtype=bool)], estimand)
+    return _jackknife(value, units, [np.ones(len(sample), dtype=bool)])
 
 
-def contrast(
-    values: ArrayLike, is_first: ArrayLike, tasks: ArrayLike, estimand: Estimand = Estimand.TASKS_LIKE_THESE
-) -> Contrast:
+def contrast(values: ArrayLike, is_first: ArrayLike, units: Units) -> Contrast:
     """Compare the episodes for which `is_first` is true with the others.
 
     Args:
         values: (episode,) one value per episode; values that are not finite are left out.
         is_first: (episode,) bool.
-        tasks: (episode,) labels of the episodes' tasks.
-        estimand: what the intervals are about.
+        units: the episodes' tasks and families, and what the intervals are about; these tasks, where a class has too
+            few families for other tasks.
     """
-    split = _Classes.of(values, is_first, tasks)
-    x, task_of, classes, cells = split.x, split.task_of, split.members, split.cells
+    split = _Classes.of(values, is_first, units)
+    x, classes, cells, units = split.x, split.members, split.cells, split.units
     sizes = [int(member.sum()) for member in classes]
     means = [cell.mean if size else None for cell, size in zip(cells, sizes, strict=True)]
     if min(sizes) < FEWEST:
         note = f"{sizes[0]} against {sizes[1]} episodes: at least {FEWEST} of either are needed"
-        return Contrast(sizes[0], sizes[1], means[0], means[1], note=note)
+        return Contrast(sizes[0], sizes[1], means[0], means[1], note=note, estimand=units.estimand)
     both = (cells[0].size > 0) & (cells[1].size > 0)
-    within = _difference(cells[0].part(both), cells[1].part(both), estimand, split.several) if both.any() else UNKNOWN
+    within = split.difference(both) if both.any() else UNKNOWN
 
     def standardised(weights: NDArray[np.float64]) -> NDArray[np.float64]:
         first, second = (_moments(weights, x, member) for member in classes)
@@ -156,22 +154,24 @@ def contrast(
         num_second=sizes[1],
         mean_first=means[0],
         mean_second=means[1],
-        difference=_difference(cells[0], cells[1], estimand, split.several),
+        difference=split.difference(),
         within_tasks=within,
         num_tasks_with_both=int(both.sum()),
-        hedges_g=_jackknife(standardised, task_of, classes, estimand),
-        cliffs_delta=_jackknife(dominance, task_of, classes, estimand, _BETWEEN_MINUS_ONE_AND_ONE),
+        hedges_g=_jackknife(standardised, units, classes),
+        cliffs_delta=_jackknife(dominance, units, classes, _BETWEEN_MINUS_ONE_AND_ONE),
         note="" if both.any() else "no task holds both outcomes: the difference may be one between tasks",
+        estimand=units.estimand,
     )
 
 
-def mean_difference(
-    values: ArrayLike, is_first: ArrayLike, tasks: ArrayLike, estimand: Estimand = Estimand.TASKS_LIKE_THESE
-) -> Estimate:
-    """`Contrast.difference` alone; unknown where a class has no finite value."""
-    split = _Classes.of(values, is_first, tasks)
+def mean_difference(values: ArrayLike, is_first: ArrayLike, units: Units) -> Estimate:
+    """`Contrast.difference` alone; unknown where a class has no finite value.
+
+    Unlike there, it stays about what `units` says: without enough families it has no error.
+    """
+    split = _Classes.of(values, is_first, units, decide=False)
     first, second = split.cells
-    return _difference(first, second, estimand, split.several) if first.num_tasks and second.num_tasks else UNKNOWN
+    return split.difference() if first.num_tasks and second.num_tasks else UNKNOWN
 
 
 @dataclass(frozen=True)
@@ -183,8 +183,8 @@ class _TaskCells:
     squares: NDArray[np.float64]
 
     @classmethod
-    def of(cls, x: NDArray[np.float64], member: NDArray[np.bool_], task_of: NDArray[np.intp]) -> _TaskCells:
-        count = int(task_of.max()) + 1
+    def of(cls, x: NDArray[np.float64], member: NDArray[np.bool_], units: Units) -> _TaskCells:
+        count, task_of = len(units.clusters), units.tasks
         size = np.bincount(task_of[member], minlength=count).astype(np.float64)
         total: NDArray[np.float64] = np.bincount(task_of[member], x[member], minlength=count).astype(np.float64)
         means = np.divide(total, size, out=np.zeros(count), where=size > 0)
@@ -192,8 +192,8 @@ class _TaskCells:
         return cls(size, means, np.bincount(task_of[member], deviations, minlength=count).astype(np.float64))
 
     def part(self, tasks: NDArray[np.bool_]) -> _TaskCells:
-        """The tasks that are chosen."""
-        return _TaskCells(self.size[tasks], self.means[tasks], self.squares[tasks])
+        """Without the tasks that are not chosen."""
+        return _TaskCells(*(np.where(tasks, values, 0.0) for values in (self.size, self.means, self.squares)))
 
     @property
     def num_tasks(self) -> int:
@@ -210,90 +210,96 @@ class _Classes:
 
     Attributes:
         x: values (episode,), 0 where not finite.
-        task_of: number of each episode's task (episode,).
+        units: the episodes' tasks and families, and what intervals are about.
         members: (episode,) bool of either class.
         cells: either class by task.
     """
 
     x: NDArray[np.float64]
-    task_of: NDArray[np.intp]
+    units: Units
     members: tuple[NDArray[np.bool_], NDArray[np.bool_]]
     cells: tuple[_TaskCells, _TaskCells]
 
     @classmethod
-    def of(cls, values: ArrayLike, is_first: ArrayLike, tasks: ArrayLike) -> _Classes:
+    def of(cls, values: ArrayLike, is_first: ArrayLike, units: Units, decide: bool = True) -> _Classes:
         sample, chosen = np.asarray(values, dtype=np.float64), np.asarray(is_first, dtype=bool)
         finite = np.isfinite(sample)
-        x, task_of = np.where(finite, sample, 0.0), np.unique(np.asarray(tasks), return_inverse=True)[1]
+        x = np.where(finite, sample, 0.0)
         first, second = finite & chosen, finite & ~chosen
-        return cls(x, task_of, (first, second), (_TaskCells.of(x, first, task_of), _TaskCells.of(x, second, task_of)))
+        cells = _TaskCells.of(x, first, units), _TaskCells.of(x, second, units)
+        return cls(x, units.decided(first, second) if decide else units, (first, second), cells)
 
-    @property
-    def several(self) -> bool:
-        """Whether the classes have several tasks together."""
-        return bool(((self.cells[0].size > 0) | (self.cells[1].size > 0)).sum() > 1)
+    def difference(self, tasks: NDArray[np.bool_] | None = None) -> Estimate:
+        """Difference of the means of two classes over all tasks, or over those that are chosen, (task,) bool.
 
+        The units are families of tasks, tasks, or the episodes of every (class, task). Where there are several tasks,
+        and other tasks are what the interval is about, one task shows nothing about them: no error.
+        """
+        sides = self.cells if tasks is None else (self.cells[0].part(tasks), self.cells[1].part(tasks))
+        value = sides[0].mean - sides[1].mean
+        several = bool(((self.cells[0].size > 0) | (self.cells[1].size > 0)).sum() > 1)
+        if several and self.units.estimand.of_other_tasks:
+            variance, degrees = self._between_clusters(sides)
+        else:
+            squares, sizes = (np.concatenate([getattr(side, name) for side in sides]) for name in ("squares", "size"))
+            divisors = np.repeat([float(side.num_tasks) for side in sides], [len(side.size) for side in sides])
+            found, freedom = strata_error(squares, sizes, divisors)
+            variance, degrees = float(found), math.floor(freedom) if np.isfinite(freedom) else 0
+        largest = max(float(np.abs(side.means).max()) for side in sides)
+        # The variance is not a number with too few clusters, and where a stratum has a single episode.
+        if not variance > (ROUNDING * largest) ** 2 or degrees < 1:
+            return Estimate(value)
+        return Estimate(value, math.sqrt(variance), degrees)
 
-def _difference(first: _TaskCells, second: _TaskCells, estimand: Estimand, several: bool) -> Estimate:
-    """Difference of the means of two classes, with tasks or the episodes of every (class, task) as units.
+    def _between_clusters(self, sides: tuple[_TaskCells, _TaskCells]) -> tuple[float, float]:
+        """Variance of the difference and its degrees of freedom, with families of tasks, or tasks, as the units.
 
-    Where there are `several` tasks and the tasks should be the units, one task shows nothing about others: no error.
-    """
-    value = first.mean - second.mean
-    sides = (first, second)
-    if estimand == Estimand.TASKS_LIKE_THESE and min(side.num_tasks for side in sides) > 1:
-        # A task in both classes moves both means: its deviations are subtracted before they are squared.
-        shares = [
-            np.where(side.size > 0, side.means - side.mean, 0.0) / math.sqrt(side.num_tasks * (side.num_tasks - 1))
-            for side in sides
-        ]
-        variance = float(((shares[0] - shares[1]) ** 2).sum())
-        degrees = float(min(side.num_tasks for side in sides) - 1)
-        if not ((first.size > 0) & (second.size > 0)).any():
-            of_side = np.array([(share**2).sum() for share in shares])
-            degrees = float(welch_degrees(of_side, np.array([side.num_tasks - 1.0 for side in sides])))
-    elif estimand == Estimand.TASKS_LIKE_THESE and several:
-        return Estimate(value)
-    else:
-        squares, sizes = (np.concatenate([getattr(side, name) for side in sides]) for name in ("squares", "size"))
-        divisors = np.repeat([float(side.num_tasks) for side in sides], [len(side.size) for side in sides])
-        found, freedom = strata_error(squares, sizes, divisors)
-        variance, degrees = float(found), float(freedom)  # not a number where a stratum has a single episode
-    largest = max(float(np.abs(side.means).max()) for side in sides)
-    if not variance > (ROUNDING * largest) ** 2 or degrees < 1:
-        return Estimate(value)
-    return Estimate(value, math.sqrt(variance), int(degrees))
+        This is the bias-reduced linearisation of the regression on both classes: its residuals are those of the means.
+        """
+        clusters, fewest = self.units.clusters, self.units.fewest_clusters
+        parts = [family_shares(side.means - side.mean, side.size > 0, clusters, fewest) for side in sides]
+        (first, first_degrees), (second, second_degrees) = parts
+        # A cluster in both classes moves both means: its deviations are subtracted before they are squared.
+        variance = float(((first - second) ** 2).sum())
+        shared = set(clusters[sides[0].size > 0]) & set(clusters[sides[1].size > 0])
+        if shared or not math.isfinite(variance):
+            return variance, float(np.minimum(first_degrees, second_degrees))
+        of_side = np.array([(share**2).sum() for share in (first, second)])
+        degrees = float(welch_degrees(of_side, np.array([first_degrees, second_degrees])))
+        return variance, degrees if self.units.families is not None else float(np.floor(degrees))
 
 
 def _jackknife(
     statistic: Callable[[NDArray[np.float64]], NDArray[np.float64]],
-    task_of: NDArray[np.intp],
+    units: Units,
     classes: tuple[NDArray[np.bool_], ...] | list[NDArray[np.bool_]],
-    estimand: Estimand,
     limits: tuple[float, float] = NO_LIMITS,
 ) -> Estimate:
     """A statistic of weighted episodes, with the standard error from leaving out one unit after the other.
 
     Args:
         statistic: from weights (sample, episode) to values (sample,).
-        task_of: (episode,).
+        units: of the episodes; families of tasks, or tasks, where intervals are about other tasks and every class has
+            several, else the episodes of every (class, task).
         classes: (episode,) bool each; the statistic uses the episodes in them.
-        estimand: tasks are the units where every class has several, else the episodes of every (class, task).
         limits: of the statistic.
     """
+    task_of, cluster_of = units.tasks, units.clusters[units.tasks]
     estimate = _or_none(float(statistic(np.ones((1, len(task_of))))[0]))
-    num_tasks = [len(np.unique(task_of[member])) for member in classes]
-    clusters = estimand == Estimand.TASKS_LIKE_THESE and min(num_tasks) > 1
-    few = min(int(member.sum()) for member in classes) < FEWEST_EPISODES or (clusters and min(num_tasks) < FEWEST_TASKS)
+    num_clusters = [len(np.unique(cluster_of[member])) for member in classes]
+    by_family = units.families is not None
+    clusters = units.estimand.of_other_tasks and (by_family or min(num_clusters) > 1)
+    fewest = units.fewest_clusters if by_family else FEWEST_TASKS
+    few = min(int(member.sum()) for member in classes) < FEWEST_EPISODES or (clusters and min(num_clusters) < fewest)
     low, high = limits
     if estimate is None or few or not low < estimate < high:
         return Estimate(estimate)
     used = np.any(classes, axis=0)
     variances, degrees = [], []
     if clusters:
-        units = np.unique(task_of[used])
-        variances.append(_left_out_variance(statistic(1.0 - (task_of[None, :] == units[:, None]))))
-        degrees.append(min(num_tasks) - 1.0)
+        names = np.unique(cluster_of[used])
+        variances.append(_left_out_variance(statistic(1.0 - (cluster_of[None, :] == names[:, None]))))
+        degrees.append(min(num_clusters) - 1.0)
     else:
         for member in classes:
             for task in np.unique(task_of[member]):
@@ -374,7 +380,7 @@ def contrast_row(
     """A contrast as a table row.
 
     Columns: `num_NAME` and `mean_NAME` of either class, `num_tasks_with_both`, and `X`, `X_low`, `X_high` of every X in
-    `CONTRAST_COLUMNS`, `note`.
+    `CONTRAST_COLUMNS`, `intervals` (what these are about), `note`.
     """
     row: dict[str, float | int | str | None] = {
         f"num_{first}": found.num_first,
@@ -386,4 +392,4 @@ def contrast_row(
     for name, read in CONTRAST_COLUMNS.items():
         estimate = read(found)
         row |= named_interval(name, estimate.value, estimate.interval(level))
-    return row | {"note": found.note or None}
+    return row | {"intervals": found.estimand.value, "note": found.note or None}

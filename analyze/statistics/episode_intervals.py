@@ -1,4 +1,4 @@
-"""Means with intervals of items that not every episode has, such as words and objects.
+"""Intervals of tables: which units their episodes have, and means of items that not every episode has, such as words.
 
 The input is a table with one row per (episode, item).
 """
@@ -6,20 +6,46 @@ The input is a table with one row per (episode, item).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import polars as pl
 
 from vla_attention.analyze.statistics.intervals import (
     DEFAULT_LEVEL,
-    Estimand,
     estimates,
     mean_over_episodes,
     named_interval,
     ratio_of_means_over_episodes,
 )
+from vla_attention.analyze.statistics.units import Estimand, Units
 
+#: Columns of a row: of how many families its tasks are (null: none known), and what its intervals are about.
+ABOUT_COLUMNS: dict[str, Any] = {"num_families": pl.Int64, "intervals": pl.String}
 _TASK = "_task_of_suite"
+#: Suite and number of a task.
+TaskName = tuple[str, int]
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """What intervals over several tasks are about, and which tasks are related.
+
+    Attributes:
+        estimand: what was asked for.
+        families: those of the tasks that have a known one; tasks of one family may be of different suites.
+    """
+
+    estimand: Estimand = Estimand.TASKS_LIKE_THESE
+    families: Mapping[TaskName, str] = field(default_factory=dict)
+
+    def units(self, table: pl.DataFrame) -> Units:
+        """The units of the rows of a table with `suite` and `task_id`, not decided (`Units.decided`)."""
+        numbered = table.select("suite", "task_id", task_number().alias(_TASK))
+        names = numbered.unique(_TASK).sort(_TASK).select("suite", "task_id").rows()
+        units = Units.of(np.arange(len(names)), self.estimand, [self.families.get(name, "") for name in names])
+        return units.of_tasks(numbered[_TASK].to_numpy() - 1)
 
 
 def task_number() -> pl.Expr:
@@ -27,11 +53,17 @@ def task_number() -> pl.Expr:
     return pl.struct("suite", "task_id").rank("dense").cast(pl.Int64)
 
 
+def about_row(units: Units) -> dict[str, Any]:
+    """The values of `ABOUT_COLUMNS` of a row over units, which are not decided yet."""
+    estimand = units.decided().estimand if units.num_tasks > 1 else Estimand.THESE_TASKS
+    return {"num_families": units.num_families, "intervals": estimand.value}
+
+
 def means_with_intervals(
     table: pl.DataFrame,
     by: Sequence[str],
     values: Mapping[str, tuple[float, float]],
-    estimand: Estimand = Estimand.TASKS_LIKE_THESE,
+    sampling: Sampling,
     level: float = DEFAULT_LEVEL,
     quotients: Mapping[str, tuple[str, str]] | None = None,
     nulls: Mapping[str, float] | None = None,
@@ -45,21 +77,23 @@ def means_with_intervals(
         table: one row per (episode, item), with `suite` and `task_id`.
         by: the columns that identify an item.
         values: columns to average, with their natural limits (`intervals.NO_LIMITS`, `POSITIVE`, `SHARE`).
-        estimand: what the intervals are about.
+        sampling: what the intervals are about, and which tasks are related.
         level: level of the intervals.
         quotients: further columns, each the mean of one column / the mean of another over the episodes that have both.
         nulls: for some of the values or quotients, what they would be if nothing were there.
 
     Returns:
-        One row per item in order of first appearance: `by`, `num_episodes`, `num_tasks`, and per value or quotient `V`,
-        `V_low`, `V_high` (null where there is none) and `V_episodes`, the number of episodes with a finite value; for
-        those in `nulls` also `V_p`, the p-value of that null, not adjusted for the number of items.
+        One row per item in order of first appearance: `by`, `num_episodes`, `num_tasks`, `ABOUT_COLUMNS`, and per value
+        or quotient `V`, `V_low`, `V_high` (null where there is none) and `V_episodes`, the number of episodes with a
+        finite value; for those in `nulls` also `V_p`, the p-value of that null, not adjusted for the number of items.
     """
     nulls = nulls or {}
-    task = task_number().alias(_TASK)
     rows = []
-    for key, part in table.with_columns(task).group_by(by, maintain_order=True):
-        tasks = part[_TASK].to_numpy()
+    whole = sampling.units(table)
+    numbered = table.with_columns(pl.Series(_TASK, whole.tasks))
+    for key, part in numbered.group_by(by, maintain_order=True):
+        given = whole.of_tasks(part[_TASK].to_numpy())
+        units = given.decided()
         statistics = {
             name: mean_over_episodes(part[name].cast(pl.Float64).to_numpy(), limits) for name, limits in values.items()
         }
@@ -67,15 +101,16 @@ def means_with_intervals(
             pair = (part[column].cast(pl.Float64).to_numpy() for column in (above, below))
             statistics[name] = ratio_of_means_over_episodes(*pair)
         row: dict[str, Any] = dict(zip(by, key, strict=True))
-        row |= {"num_episodes": part.height, "num_tasks": part[_TASK].n_unique()}
-        found = dict(zip(statistics, estimates(list(statistics.values()), tasks, estimand), strict=True))
+        row |= {"num_episodes": part.height, "num_tasks": given.num_tasks}
+        row |= about_row(given)
+        found = dict(zip(statistics, estimates(list(statistics.values()), units), strict=True))
         for name, one in found.items():
             row |= named_interval(name, one.value, one.interval(level))
         row |= {f"{name}_p": found[name].p_value(null) for name, null in nulls.items()}
         row |= {f"{name}_episodes": int(statistic.used.sum()) for name, statistic in statistics.items()}
         rows.append(row)
     schema: dict[str, Any] = {name: table.schema[name] for name in by}
-    schema |= {"num_episodes": pl.Int64, "num_tasks": pl.Int64}
+    schema |= {"num_episodes": pl.Int64, "num_tasks": pl.Int64, **ABOUT_COLUMNS}
     for name in (*values, *(quotients or {})):
         schema |= dict.fromkeys((name, f"{name}_low", f"{name}_high"), pl.Float64) | {f"{name}_episodes": pl.Int64}
     schema |= dict.fromkeys((f"{name}_p" for name in nulls), pl.Float64)
@@ -86,7 +121,7 @@ def means_of_all_and_of_tasks(
     table: pl.DataFrame,
     by: Sequence[str],
     values: Mapping[str, tuple[float, float]],
-    estimand: Estimand = Estimand.TASKS_LIKE_THESE,
+    sampling: Sampling,
     *,
     quotients: Mapping[str, tuple[str, str]] | None = None,
     nulls: Mapping[str, float] | None = None,
@@ -100,12 +135,12 @@ def means_of_all_and_of_tasks(
         `means_with_intervals`.
     """
     of_task = ["suite", "task_id", "instruction"]
-    whole = means_with_intervals(table, by, values, estimand, quotients=quotients, nulls=nulls).select(
+    whole = means_with_intervals(table, by, values, sampling, quotients=quotients, nulls=nulls).select(
         pl.lit("all").alias("scope"),
         *(pl.lit(None, dtype=table.schema[name]).alias(name) for name in of_task),
         pl.all(),
     )
-    tasks = means_with_intervals(table, [*of_task, *by], values, estimand, quotients=quotients, nulls=nulls).select(
+    tasks = means_with_intervals(table, [*of_task, *by], values, sampling, quotients=quotients, nulls=nulls).select(
         pl.lit("task").alias("scope"), pl.all()
     )
     return pl.concat([whole, tasks.select(whole.columns)])

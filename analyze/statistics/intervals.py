@@ -4,13 +4,16 @@ Replans of one episode follow each other within a second and are strongly correl
 every function here takes one value (or one pair of values) per episode. Episodes of one task share their instruction
 and their scene, so a mean is the mean over tasks of the tasks' means: every task weighs the same.
 
-An interval is about one of two things (`Estimand`):
+An interval is about one of these (`Estimand`):
 
-    tasks like these   the mean over a population of tasks of which the store's tasks are a sample. The units are the
-                       tasks, each with its mean: t = (mean - truth) / (s / sqrt(T)) has T - 1 degrees of freedom.
-                       Episodes vary inside the tasks' means already. To count them once more, as a bootstrap of
-                       tasks and then of episodes does, makes the interval too wide (Field & Welsh 2007, "Bootstrapping
-                       clustered data", Journal of the Royal Statistical Society B 69).
+    tasks like these   the mean over a population of tasks of which the store's tasks are a sample. Tasks of one family
+                       are related, so the units are the families, and from four of them on there is an interval: the
+                       error is cluster-robust (`family_errors`). Episodes vary inside the tasks' means already. To
+                       count them once more, as a bootstrap of tasks and then of episodes does, makes the interval too
+                       wide (Field & Welsh 2007, "Bootstrapping clustered data", Journal of the Royal Statistical
+                       Society B 69).
+    independent tasks  the same, as if no two tasks were related, and what is done where no family is known. The units
+                       are the tasks: t = (mean - truth) / (s / sqrt(T)) has T - 1 degrees of freedom.
     these tasks        the mean over exactly these tasks, with endless episodes of each. Tasks are strata: the variance
                        is the sum over tasks of s_t^2 / n_t, divided by T^2, with the degrees of freedom of Welch 1947
                        (Biometrika 34; the approximation with n_t + 1 and - 2, which is unbiased for equal variances),
@@ -27,12 +30,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from vla_attention.analyze.statistics.family_errors import family_error
 from vla_attention.analyze.statistics.student import student_quantile, two_sided_p
+from vla_attention.analyze.statistics.units import Estimand as Estimand
+from vla_attention.analyze.statistics.units import Units
 
 DEFAULT_LEVEL = 0.95
 #: Natural limits of a quantity, for `mean_over_episodes`. An interval never leaves them.
@@ -44,18 +49,6 @@ SHARE = (0.0, 1.0)
 _FEW, _SMALL_STRATUM = 5, 0.85
 #: A spread below this share of the values is rounding. Values without spread have no interval.
 ROUNDING = 1e-12
-
-
-class Estimand(StrEnum):
-    """What an interval over several tasks is about; see the module."""
-
-    TASKS_LIKE_THESE = "tasks-like-these"
-    THESE_TASKS = "these-tasks"
-
-    @property
-    def words(self) -> str:
-        """The name in running text."""
-        return self.value.replace("-", " ")
 
 
 @dataclass(frozen=True)
@@ -100,13 +93,13 @@ class Estimate:
         value: the statistic; +inf for a positive mean over zero, None when it is undefined.
         error: standard error of `on_scale(value)`, None where there is none: fewer than two units, no spread between
             them, or a value on a limit.
-        degrees: degrees of freedom of the error, rounded down.
+        degrees: degrees of freedom of the error; by families they need not be whole, else they are rounded down.
         limits, exponentiate: as in `EpisodeStatistic`.
     """
 
     value: float | None
     error: float | None = None
-    degrees: int = 0
+    degrees: float = 0
     limits: tuple[float, float] = NO_LIMITS
     exponentiate: bool = False
 
@@ -178,21 +171,19 @@ def geometric_mean_over_episodes(log_means: ArrayLike) -> EpisodeStatistic:
     return EpisodeStatistic(mean.numerator, mean.denominator, mean.used, exponentiate=True)
 
 
-def estimates(
-    statistics: Sequence[EpisodeStatistic], tasks: ArrayLike, estimand: Estimand = Estimand.TASKS_LIKE_THESE
-) -> list[Estimate]:
+def estimates(statistics: Sequence[EpisodeStatistic], units: Units) -> list[Estimate]:
     """Values and standard errors of several statistics over the same episodes.
 
     Args:
         statistics: over the same episodes; one of many of a kind gives as many estimates, in C order.
-        tasks: (episode,) labels of the episodes' tasks.
-        estimand: what the intervals are about. Each task counts with the episodes that the statistic uses; for
-            `THESE_TASKS` every task needs two of them.
+        units: the episodes' tasks and families, and what the intervals are about. Each task counts with the episodes
+            that the statistic uses. About tasks like these, the tasks must be of `FEWEST_FAMILIES` families; about
+            `THESE_TASKS` every task needs two episodes.
     """
     if not statistics:
         return []
-    task_of = np.unique(np.asarray(tasks), return_inverse=True)[1]
-    member = (task_of[:, None] == np.arange(task_of.max() + 1)).astype(np.float64)  # (episode, task)
+    task_of = units.tasks
+    member = (task_of[:, None] == np.arange(len(units.clusters))).astype(np.float64)  # (episode, task)
     used, above, below = (
         np.concatenate([part.reshape(-1, len(task_of)) for part in parts]).astype(np.float64)  # (statistic, episode)
         for parts in zip(*((one.used, one.numerator, one.denominator) for one in statistics), strict=True)
@@ -207,12 +198,15 @@ def estimates(
         # One episode's, and one task's, share in the deviation of the quotient from its truth, to first order.
         by_episode = (above - quotient[:, None] * below) / mean_below[:, None]
         by_task = (task_above - quotient[:, None] * task_below) / mean_below[:, None]
-        between = (by_task**2 * (size > 0)).sum(axis=1) / (num_tasks - 1) / num_tasks
         squares = ((by_episode - by_task[:, task_of]) ** 2 * used) @ member
         scale = np.where(mean_below == 0, 0.0, np.abs(above).max(axis=1, initial=0.0) / mean_below)
-    in_strata, welch = strata_error(squares, size, num_tasks[:, None])
-    clusters = (num_tasks > 1) & (estimand == Estimand.TASKS_LIKE_THESE)
-    variance, degrees = np.where(clusters, between, in_strata), np.where(clusters, num_tasks - 1, welch)
+    variance, degrees = strata_error(squares, size, num_tasks[:, None])
+    degrees = np.floor(degrees)
+    if units.estimand.of_other_tasks:
+        between, of_clusters = family_error(by_task, size > 0, units.clusters, units.fewest_clusters)
+        # A single task of none: an interval over its episodes.
+        clusters = (num_tasks > 1) | (units.families is not None)
+        variance, degrees = np.where(clusters, between, variance), np.where(clusters, of_clusters, degrees)
     kinds = [statistic for statistic in statistics for _ in range(statistic.used.size // len(task_of))]
     each = zip(*(part.tolist() for part in (quotient, variance, degrees, scale)), kinds, strict=True)
     return [_estimate(*one) for one in each]
@@ -226,7 +220,8 @@ def quotient_by_episode(numerator: ArrayLike, denominator: ArrayLike, tasks: Arr
     """
     above, below = np.asarray(numerator, dtype=np.float64), np.asarray(denominator, dtype=np.float64)
     quotient, mean_below = (
-        one.value for one in estimates([ratio_of_means_over_episodes(above, below), mean_over_episodes(below)], tasks)
+        one.value
+        for one in estimates([ratio_of_means_over_episodes(above, below), mean_over_episodes(below)], Units.of(tasks))
     )
     if quotient is None or not mean_below:
         return np.full(len(above), np.nan)
@@ -282,7 +277,7 @@ def _estimate(quotient: float, variance: float, degrees: float, size: float, sta
     if value is None or not spread or not degrees >= 1:
         return Estimate(value)
     _, slope = to_scale(quotient, statistic.limits)
-    return Estimate(value, slope * math.sqrt(variance), int(degrees), statistic.limits, statistic.exponentiate)
+    return Estimate(value, slope * math.sqrt(variance), degrees, statistic.limits, statistic.exponentiate)
 
 
 def to_scale(value: float, limits: tuple[float, float]) -> tuple[float, float]:

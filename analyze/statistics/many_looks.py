@@ -18,8 +18,9 @@ import polars as pl
 from numpy.typing import ArrayLike, NDArray
 
 from vla_attention.analyze.statistics.effect_sizes import FEWEST_TASKS, mean_difference
-from vla_attention.analyze.statistics.episode_intervals import task_number
-from vla_attention.analyze.statistics.intervals import Estimand, Estimate, estimates, mean_over_episodes
+from vla_attention.analyze.statistics.episode_intervals import Sampling
+from vla_attention.analyze.statistics.intervals import Estimate, estimates, mean_over_episodes
+from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Units
 
 #: What identifies an episode in a table.
 EPISODE_COLUMNS = ("suite", "task_id", "episode_index")
@@ -53,58 +54,60 @@ class Leader:
         value: its mean over tasks.
         p_value: the largest p of its differences to the other items; None where one has none.
         num_items: how many items have a mean.
+        apart: the items that it was compared with between episodes, because too few have both: these differences are
+            between tasks too, with their other scenes and instructions.
     """
 
     item: int
     value: float
     p_value: float | None
     num_items: int
+    apart: tuple[int, ...] = ()
 
     def is_named(self, num_names: int = 1) -> bool:
         """Whether it may be called the first, in a text that could name `num_names` leaders (Bonferroni)."""
         return self.p_value is not None and self.p_value <= NAMED_AT / num_names
 
 
-def leader(values: ArrayLike, tasks: ArrayLike, estimand: Estimand = Estimand.TASKS_LIKE_THESE) -> Leader | None:
+def leader(values: ArrayLike, units: Units) -> Leader | None:
     """The item with the highest mean over tasks, and how surely it is above every other item.
 
-    Two items are compared within the episodes that have both; where there are none, between episodes. About tasks like
-    these, items of fewer than `fewest_tasks` take no part: an item of one task shows nothing about others.
+    Two items are compared within the episodes that have both; where these are too few, between episodes. About tasks
+    like these, items of fewer than `fewest_clusters` take no part: an item of one task shows nothing about others.
 
     Args:
         values: (episode, item); not finite where an episode lacks the item.
-        tasks: (episode,) labels.
-        estimand: what the differences are about.
+        units: the episodes' tasks and families, and what the differences are about.
 
     Returns:
         None without two items that have a mean.
     """
-    table, task_of = np.asarray(values, dtype=np.float64), np.asarray(tasks)
-    means = [one.value for one in estimates([mean_over_episodes(column) for column in table.T], task_of, estimand)]
-    fewest = fewest_tasks(task_of, estimand)
-    tasks_of_items = [len(np.unique(task_of[np.isfinite(column)])) for column in table.T]
-    known = [i for i, mean in enumerate(means) if mean is not None and tasks_of_items[i] >= fewest]
+    table = np.asarray(values, dtype=np.float64)
+    means = [one.value for one in estimates([mean_over_episodes(column) for column in table.T], units)]
+    fewest, cluster_of = fewest_clusters(units), units.clusters[units.tasks]
+    clusters_of_items = [len(np.unique(cluster_of[np.isfinite(column)])) for column in table.T]
+    known = [i for i, mean in enumerate(means) if mean is not None and clusters_of_items[i] >= fewest]
     if len(known) < 2:
         return None
     highest = np.array([means[i] if i in known else np.nan for i in range(len(means))], dtype=np.float64)
     first = int(np.nanargmax(highest))
     others = [i for i in known if i != first]
     gaps = table[:, [first]] - table[:, others]
-    paired = estimates([mean_over_episodes(gap) for gap in gaps.T], task_of, estimand)
-    p_values = []
+    paired = estimates([mean_over_episodes(gap) for gap in gaps.T], units)
+    p_values, apart = [], []
     for column, gap, other in zip(gaps.T, paired, others, strict=True):
-        shared = len(np.unique(task_of[np.isfinite(column)]))
-        within = (
-            gap if shared >= min(fewest, 2) else _between_episodes(table[:, first], table[:, other], task_of, estimand)
-        )
-        p_values.append(_one_above(within))
+        shared = len(np.unique(cluster_of[np.isfinite(column)]))
+        if shared < min(fewest, units.fewest_clusters):
+            gap = _between_episodes(table[:, first], table[:, other], units)
+            apart.append(other)
+        p_values.append(_one_above(gap))
     missing = any(p is None for p in p_values)
     p_value = None if missing else max(p for p in p_values if p is not None)
-    return Leader(first, float(highest[first]), p_value, len(known))
+    return Leader(first, float(highest[first]), p_value, len(known), tuple(apart))
 
 
 def leader_of_table(
-    table: pl.DataFrame, item: Sequence[str], value: str, estimand: Estimand = Estimand.TASKS_LIKE_THESE
+    table: pl.DataFrame, item: Sequence[str], value: str, sampling: Sampling
 ) -> tuple[dict[str, Any], Leader] | None:
     """`leader` of a table with one row per (episode, item): the leading item's columns `item`, and the leader."""
     names = table.select(item).unique(maintain_order=True)
@@ -117,14 +120,18 @@ def leader_of_table(
     wide[numbered["_episode"].to_numpy(), numbered["_item"].to_numpy()] = (
         numbered[value].cast(pl.Float64).fill_null(np.nan).to_numpy()
     )
-    tasks = episodes.select(task_number()).to_series().to_numpy()
-    found = leader(wide, tasks, estimand)
+    found = leader(wide, sampling.units(episodes).decided())
     return None if found is None else (names.row(found.item, named=True), found)
 
 
-def fewest_tasks(tasks: ArrayLike, estimand: Estimand) -> int:
-    """In how many tasks an item must occur to take part in `leader`: in all of up to three, if tasks are the units."""
-    return min(FEWEST_TASKS, len(np.unique(np.asarray(tasks)))) if estimand == Estimand.TASKS_LIKE_THESE else 1
+def fewest_clusters(units: Units) -> int:
+    """In how many families an item must occur to take part in `leader`, or in how many tasks where these are the units.
+
+    In all of up to three tasks. About these tasks, in one.
+    """
+    if not units.estimand.of_other_tasks:
+        return 1
+    return FEWEST_FAMILIES if units.families is not None else min(FEWEST_TASKS, units.num_tasks)
 
 
 def _one_above(difference: Estimate) -> float | None:
@@ -132,8 +139,6 @@ def _one_above(difference: Estimate) -> float | None:
     return 1.0 if difference.value is not None and difference.value <= 0 else difference.p_value(0.0)
 
 
-def _between_episodes(
-    first: NDArray[np.float64], other: NDArray[np.float64], tasks: NDArray[np.generic], estimand: Estimand
-) -> Estimate:
+def _between_episodes(first: NDArray[np.float64], other: NDArray[np.float64], units: Units) -> Estimate:
     is_first = np.repeat([True, False], len(first))
-    return mean_difference(np.concatenate([first, other]), is_first, np.concatenate([tasks, tasks]), estimand)
+    return mean_difference(np.concatenate([first, other]), is_first, units.repeated(2))

@@ -6,8 +6,14 @@ import polars as pl
 
 from vla_attention.analyze.measures.frames import LAYERS_AVG, layer_name
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.show.findings import findings
-from vla_attention.analyze.show.headings import heading, interval_note, title, untrained_warning, wrap
+from vla_attention.analyze.show.findings import few_families_note, findings
+from vla_attention.analyze.show.headings import (
+    heading,
+    interval_note,
+    title,
+    untrained_warning,
+    wrap,
+)
 from vla_attention.analyze.show.numbers import (
     format_number,
     format_percent,
@@ -19,6 +25,7 @@ from vla_attention.analyze.show.numbers import (
 from vla_attention.analyze.show.plot_text import shortened
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
+from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Units
 from vla_attention.analyze.time.time_courses import (
     ALL,
     EPISODE_TIME,
@@ -40,7 +47,11 @@ _SENTENCES = 2
 def time_text(question: Question, courses: TimeCourses, settings: TimeSettings) -> str:
     """The whole text, at most 100 columns wide."""
     parts = [_header(question, courses), _course_section(courses, settings)]
-    parts += [_gripper_section(courses, settings), outcomes_section(courses.outcomes), _counts_section(courses)]
+    parts += [
+        _gripper_section(courses, settings, question.units),
+        outcomes_section(courses.outcomes, question.units),
+        _counts_section(courses),
+    ]
     return "\n\n".join(parts) + "\n"
 
 
@@ -59,7 +70,7 @@ def _header(question: Question, courses: TimeCourses) -> str:
     lines += wrap(
         f"{of_tasks(of.height, of.select('suite', 'task_id').n_unique())}, {_outcomes(of['success'])}; "
         f"{layer}; grouping '{question.grouping.name}'. "
-        f"{interval_note(DEFAULT_LEVEL, question.settings.intervals.words, 'pointwise')}"
+        f"{interval_note(DEFAULT_LEVEL, question.units.words, 'pointwise')}"
     )
     for line in question.remarks:
         lines += wrap(line)
@@ -92,7 +103,7 @@ def _course_section(courses: TimeCourses, settings: TimeSettings) -> str:
     )
 
 
-def _gripper_section(courses: TimeCourses, settings: TimeSettings) -> str:
+def _gripper_section(courses: TimeCourses, settings: TimeSettings, units: Units) -> str:
     above = heading("AT THE FIRST GRIPPER CLOSING")
     if courses.closing.is_empty():
         none = "The stores hold no actions of a gripper whose commands are known, so there is nothing to align at."
@@ -133,10 +144,11 @@ def _gripper_section(courses: TimeCourses, settings: TimeSettings) -> str:
     named = findings(
         courses.change["q"].to_list(), courses.change["quantity"].to_list(), "quantity", "a change", _SENTENCES
     )
+    note += f" {few_families_note(courses.change, 'quantity', units)}"
     return "\n".join([above, *wrap(rule), table, *wrap(named), *wrap(note)])
 
 
-def outcomes_section(outcomes: pl.DataFrame) -> str:
+def outcomes_section(outcomes: pl.DataFrame, units: Units) -> str:
     """Success against failure as text, from `TimeCourses.outcomes`."""
     above = heading("SUCCESS AGAINST FAILURE  means of the episodes' means over replans")
     notes = [f"{row['quantity']}: {row['note']}." for row in outcomes.iter_rows(named=True) if row["note"]]
@@ -168,6 +180,8 @@ def outcomes_section(outcomes: pl.DataFrame) -> str:
         "difference, adjusted for the number of quantities (Benjamini-Hochberg). The table also has Hedges' g and "
         "Cliff's delta."
     )
+    if (outcomes["intervals"] != units.estimand.value).any():
+        note += f" Solved or failed episodes are of fewer than {FEWEST_FAMILIES} families: about these tasks."
     named = findings(
         outcomes["within_tasks_q"].to_list(), outcomes["quantity"].to_list(), "quantity", "a difference", _SENTENCES
     )

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -20,12 +21,12 @@ from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, Tabl
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.statistics.effect_sizes import contrast, contrast_row
+from vla_attention.analyze.statistics.episode_intervals import ABOUT_COLUMNS, Sampling, about_row
 from vla_attention.analyze.statistics.intervals import (
     DEFAULT_LEVEL,
     SHARE,
     UNKNOWN,
     EpisodeStatistic,
-    Estimand,
     ends,
     estimates,
     geometric_mean_over_episodes,
@@ -33,6 +34,7 @@ from vla_attention.analyze.statistics.intervals import (
 )
 from vla_attention.analyze.statistics.many_looks import adjusted_p_values
 from vla_attention.analyze.statistics.summaries import summarize
+from vla_attention.analyze.statistics.units import Units
 from vla_attention.analyze.time.alignment import (
     around_event,
     change_at_event,
@@ -141,14 +143,14 @@ def time_courses(
     fractions = of_layer.groups.partition_by(EPISODE_ID, as_dict=True)
     for key, part in rows.partition_by(EPISODE_ID, as_dict=True, maintain_order=True).items():
         episodes.append(_episode(by_name[key], Tables(part, fractions[key]), quantities, has_actions))
-    estimand = question.settings.intervals
+    sampling = question.sampling
     classes = {ALL: episodes}
     solved = [episode for episode in episodes if episode.success]
     failed = [episode for episode in episodes if episode.success is False]
     if solved and failed:
         classes |= {SUCCESS: solved, FAILURE: failed}
     course = [
-        _course(members, outcome, alignment, quantities, settings, estimand)
+        _course(members, outcome, alignment, quantities, settings, sampling)
         for outcome, members in classes.items()
         for alignment in ((EPISODE_TIME, GRIPPER_CLOSING) if has_actions else (EPISODE_TIME,))
     ]
@@ -158,8 +160,8 @@ def time_courses(
         quantities=quantities,
         course=pl.concat(course),
         closing=_closing_table(episodes if has_actions else [], rows),
-        change=_change_table(episodes, quantities, settings.window, estimand),
-        outcomes=_outcomes_table(episodes, quantities, estimand),
+        change=_change_table(episodes, quantities, settings.window, sampling),
+        outcomes=_outcomes_table(episodes, quantities, sampling),
         autocorrelation=effective_replans_table(of_layer, grouping),
         num_nonfinite=int(sum((~np.isfinite(values)).sum() for values in ratios)),
         unknown_outcomes=sum(episode.success is None for episode in episodes),
@@ -205,7 +207,7 @@ def _course(
     alignment: str,
     quantities: Sequence[str],
     settings: TimeSettings,
-    estimand: Estimand,
+    sampling: Sampling,
 ) -> pl.DataFrame:
     if alignment == EPISODE_TIME:
         aligned = [on_episode_time(e.values, e.starts, e.num_steps, settings.num_bins) for e in episodes]
@@ -218,10 +220,11 @@ def _course(
         places = np.stack([offsets, offsets, offsets], axis=1)
     rows: list[tuple[object, ...]] = []
     if episodes:
-        tasks = _task_numbers(episodes)
+        units = _units(episodes, sampling)
+        decided = units.decided()
         timed = np.stack(aligned)
         statistics = _statistics(timed, quantities)
-        found = estimates(statistics, tasks, estimand)
+        found = estimates(statistics, decided)
         # Bonferroni over the points of one curve: all of it lies within, at the level of a single point.
         together = 1.0 - (1.0 - DEFAULT_LEVEL) / len(places)
         known = np.array([episode.uniform for episode in episodes])
@@ -230,9 +233,9 @@ def _course(
             there = np.isfinite(timed[:, position]).any(axis=1)
             # The baseline of the episodes that the point is of, also where none of their ratios is finite.
             of = statistic.used if statistic.used.any() else there & np.isfinite(known)
-            baseline = estimates([geometric_mean_over_episodes(known[of])], tasks[of])[0] if of.any() else UNKNOWN
+            baseline = estimates([geometric_mean_over_episodes(known[of])], units.part(of))[0] if of.any() else UNKNOWN
             uniform = baseline.value if quantity == RATIO else None
-            num_tasks = len(np.unique(tasks[statistic.used]))
+            num_tasks = units.part(statistic.used).num_tasks
             rows.append(
                 (
                     *(alignment, outcome, quantity, *(float(place) for place in places[position])),
@@ -247,9 +250,10 @@ def _course(
     return pl.DataFrame(rows, schema=schema, orient="row")
 
 
-def _task_numbers(episodes: Sequence[_Episode]) -> NDArray[np.int64]:
-    tasks = sorted({episode.task for episode in episodes})
-    return np.array([tasks.index(episode.task) for episode in episodes])
+def _units(episodes: Sequence[_Episode], sampling: Sampling) -> Units:
+    """The units of episodes, not decided."""
+    tasks = [episode.task for episode in episodes]
+    return sampling.units(pl.DataFrame(tasks, schema={"suite": pl.String, "task_id": pl.Int64}, orient="row"))
 
 
 def _closing_table(episodes: Sequence[_Episode], rows: pl.DataFrame) -> pl.DataFrame:
@@ -262,9 +266,9 @@ def _closing_table(episodes: Sequence[_Episode], rows: pl.DataFrame) -> pl.DataF
 
 
 def _change_table(
-    episodes: Sequence[_Episode], quantities: Sequence[str], window: int, estimand: Estimand
+    episodes: Sequence[_Episode], quantities: Sequence[str], window: int, sampling: Sampling
 ) -> pl.DataFrame:
-    schema = {
+    schema: dict[str, Any] = {
         "quantity": pl.String,
         "change": pl.Float64,
         "low": pl.Float64,
@@ -272,37 +276,39 @@ def _change_table(
         "q": pl.Float64,
         "num_episodes": pl.Int64,
         "num_tasks": pl.Int64,
+        **ABOUT_COLUMNS,
     }
     closers = [
         (e, change_at_event(around_event(e.values, e.closing, window), window))
         for e in episodes
         if e.closing is not None
     ]
+    closers = [(episode, change) for episode, change in closers if np.isfinite(change).any()]
     if not closers:
         return pl.DataFrame(schema=schema)
-    tasks = _task_numbers([episode for episode, _ in closers])
+    units = _units([episode for episode, _ in closers], sampling)
     changes = np.stack([change for _, change in closers])
     statistics = [
         geometric_mean_over_episodes(changes[:, i]) if quantity == RATIO else mean_over_episodes(changes[:, i])
         for i, quantity in enumerate(quantities)
     ]
-    found = estimates(statistics, tasks, estimand)
+    found = estimates(statistics, units.decided())
     q_values = adjusted_p_values(
         [one.p_value(1.0 if quantity == RATIO else 0.0) for quantity, one in zip(quantities, found, strict=True)]
     )
     rows = [
         (
             *(quantity, one.value, *ends(one.interval()), q),
-            *(int(statistic.used.sum()), len(np.unique(tasks[statistic.used]))),
+            *(int(statistic.used.sum()), units.part(statistic.used).num_tasks, *about_row(units).values()),
         )
         for quantity, statistic, one, q in zip(quantities, statistics, found, q_values, strict=True)
     ]
     return pl.DataFrame(rows, schema=schema, orient="row")
 
 
-def _outcomes_table(episodes: Sequence[_Episode], quantities: Sequence[str], estimand: Estimand) -> pl.DataFrame:
+def _outcomes_table(episodes: Sequence[_Episode], quantities: Sequence[str], sampling: Sampling) -> pl.DataFrame:
     """Success against failure on the episodes' means over replans: log2 of the ratio, and fractions."""
-    tasks = _task_numbers(episodes)
+    units = _units(episodes, sampling)
     solved = np.array([episode.success is True for episode in episodes])
     means = np.array([[summarize(column).mean for column in episode.values.T] for episode in episodes], np.float64)
     means[[episode.success is None for episode in episodes]] = np.nan  # in neither class
@@ -310,7 +316,7 @@ def _outcomes_table(episodes: Sequence[_Episode], quantities: Sequence[str], est
     for i, quantity in enumerate(quantities):
         values = means[:, i] / np.log(2.0) if quantity == RATIO else means[:, i]
         names.append("log2_ratio" if quantity == RATIO else f"{quantity}_fraction")
-        found.append(contrast(values, solved, tasks, estimand))
+        found.append(contrast(values, solved, units))
     looks = {name: adjusted_p_values([getattr(one, name).p_value(0.0) for one in found]) for name in _ADJUSTED}
     rows = [
         {"quantity": name, **contrast_row(one, SUCCESS, FAILURE), **{f"{of}_q": looks[of][i] for of in _ADJUSTED}}

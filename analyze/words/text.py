@@ -6,11 +6,12 @@ from typing import Any
 
 import polars as pl
 
+from vla_attention.analyze.show.findings import few_families_note
 from vla_attention.analyze.show.headings import interval_note, wrap
 from vla_attention.analyze.show.numbers import format_interval, format_number
 from vla_attention.analyze.show.text_table import episode_counts, text_table
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
-from vla_attention.analyze.statistics.many_looks import NAMED_AT, fewest_tasks
+from vla_attention.analyze.statistics.many_looks import NAMED_AT, fewest_clusters
 from vla_attention.analyze.words.word_study import WordStudy
 
 _NOTE = (
@@ -35,16 +36,18 @@ def words_text(study: WordStudy) -> str:
         "",
         *wrap(_NOTE),
     ]
-    lines += wrap(interval_note(DEFAULT_LEVEL, study.question.settings.intervals.words))
+    lines += wrap(interval_note(DEFAULT_LEVEL, study.question.units.words))
+    lines += wrap(few_families_note(study.summary, "item", study.question.units))
     return "\n".join(lines)
 
 
 def leading_sentence(study: WordStudy) -> str:
     """Which word, and which layer of a word, is surely above all the others."""
     leaders = study.leaders
-    about = study.question.settings.intervals.words
-    fewest = fewest_tasks(range(study.question.num_tasks), study.question.settings.intervals)
-    some = f" of at least {fewest} tasks" if fewest > 1 else ""
+    units = study.question.units
+    about, fewest = units.words, fewest_clusters(units)
+    which = "of at least {} tasks" if units.families is None else "in tasks of at least {} families"
+    some = f" {which.format(fewest)}" if fewest > 1 else ""
     said = [
         f"{_cell(row)} has a higher lift ({format_number(found.value)}) than each of the other {found.num_items - 1} "
         f"{'words' if 'layer' not in row else 'pairs of word and layer'}{some}"

@@ -13,8 +13,8 @@ from vla_attention.analyze.measures.aggregate import overall_layer
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
-from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
-from vla_attention.analyze.statistics.intervals import POSITIVE, SHARE, Estimand
+from vla_attention.analyze.statistics.episode_intervals import Sampling, means_with_intervals
+from vla_attention.analyze.statistics.intervals import POSITIVE, SHARE
 from vla_attention.analyze.statistics.many_looks import Leader, adjusted_p_values, leader_of_table
 from vla_attention.analyze.stores.selection import site_that
 from vla_attention.analyze.words.word_reading import words_table
@@ -45,12 +45,12 @@ class WordStudy:
     @cached_property
     def summary(self) -> pl.DataFrame:
         """Means over episodes with intervals; see `words_summary`."""
-        return words_summary(self.episodes, self.instruction is not None, estimand=self.question.settings.intervals)
+        return words_summary(self.episodes, self.question.sampling, self.instruction is not None)
 
     @property
     def leaders(self) -> list[tuple[dict[str, Any], Leader]]:
         """The leading word, and the leading (word, layer, head); see `leading_words`."""
-        return leading_words(self.episodes, self.question.settings.intervals)
+        return leading_words(self.episodes, self.question.sampling)
 
     @property
     def layer(self) -> str:
@@ -90,9 +90,9 @@ def site_of_words(root: RootAttributes, wanted: str | None) -> str:
 
 def words_summary(
     table: pl.DataFrame,
+    sampling: Sampling,
     by_place: bool = False,
     layer: str | None = None,
-    estimand: Estimand = Estimand.TASKS_LIKE_THESE,
 ) -> pl.DataFrame:
     """Mean of every word over the episodes that have it, with intervals, from `words_table`.
 
@@ -117,7 +117,7 @@ def words_summary(
     episodes = joined.group_by(*EPISODE_ID, *item, maintain_order=True).agg(
         pl.col("pieces").first(), *(pl.col(name).mean() for name in _VALUES)
     )
-    summary = means_with_intervals(episodes, item, {"pieces": POSITIVE, **_VALUES}, estimand, nulls={"lift": 1.0})
+    summary = means_with_intervals(episodes, item, {"pieces": POSITIVE, **_VALUES}, sampling, nulls={"lift": 1.0})
     summary = summary.drop("pieces_low", "pieces_high", "pieces_episodes")
     is_word = pl.col("kind") == "word"
     summary = pl.concat(
@@ -129,9 +129,7 @@ def words_summary(
     return pl.concat([words, summary.filter(pl.col("kind") == "scale")])
 
 
-def leading_words(
-    table: pl.DataFrame, estimand: Estimand = Estimand.TASKS_LIKE_THESE
-) -> list[tuple[dict[str, Any], Leader]]:
+def leading_words(table: pl.DataFrame, sampling: Sampling) -> list[tuple[dict[str, Any], Leader]]:
     """The word with the highest lift over layers, and the (word, layer, head) with the highest, from `words_table`.
 
     Each with how surely it is above all the others (`many_looks.leader`). A word that occurs twice counts by the mean
@@ -142,6 +140,6 @@ def leading_words(
     found = []
     for which, item in ((overall, ("item",)), (single, ("item", "layer", "head"))):
         episodes = words.filter(which).group_by(*EPISODE_ID, *item, maintain_order=True).agg(pl.col("lift").mean())
-        leading = leader_of_table(episodes, item, "lift", estimand)
+        leading = leader_of_table(episodes, item, "lift", sampling)
         found += [] if leading is None else [leading]
     return found

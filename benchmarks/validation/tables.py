@@ -1,4 +1,4 @@
-"""Means over episodes with the house's intervals: the task is the unit, t over the tasks' means."""
+"""Means over episodes with the house's intervals: the task is the unit, as if no two tasks were related."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
+from vla_attention.analyze.statistics.episode_intervals import Sampling, means_with_intervals
 from vla_attention.analyze.statistics.intervals import NO_LIMITS
+from vla_attention.analyze.statistics.units import Estimand
 
 #: Scale on which a number is averaged and compared, and the way back.
 SCALES = {"log": (np.log, np.exp), "plain": (lambda x: x, lambda x: x)}
@@ -28,7 +29,7 @@ def means(table: pl.DataFrame, by: Sequence[str], value: str = "value", scale: s
     chosen = table.with_columns(pl.Series(value, transformed)).filter(pl.Series(there))
     if not chosen.height:
         return []
-    found = means_with_intervals(chosen, by, {value: NO_LIMITS})
+    found = means_with_intervals(chosen, by, {value: NO_LIMITS}, Sampling(Estimand.INDEPENDENT_TASKS))
     rows = []
     for row in found.iter_rows(named=True):
         numbers = {

@@ -8,6 +8,7 @@ import polars as pl
 from vla_attention.analyze.effects.conditions import Condition, Kind
 from vla_attention.analyze.effects.effect_study import summary_of, with_floors
 from vla_attention.analyze.effects.paired_replans import ALL
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange
 
 TASKS, EPISODES, GROUPS, DRAWS = 6, 3, 8, 30
@@ -44,7 +45,7 @@ def drawn_table(seed: int, planted: float = 0.0) -> pl.DataFrame:
 
 def named(table: pl.DataFrame, floor: str) -> list[str]:
     """The conditions that a sentence names as exceeding a floor."""
-    summary = summary_of(with_floors(table, CONDITIONS)).filter(scope="all", kind=Kind.WITHOUT.value)
+    summary = summary_of(with_floors(table, CONDITIONS), Sampling()).filter(scope="all", kind=Kind.WITHOUT.value)
     return summary.filter(pl.col(floor) > 0, pl.col(f"{floor}_q") <= 0.025)["condition"].to_list()
 
 

@@ -23,6 +23,7 @@ from vla_attention.analyze.heads.head_study import study_heads
 from vla_attention.analyze.heads.layer_time import MOST_BINS, layer_time_table
 from vla_attention.analyze.measures.frames import Tables
 from vla_attention.analyze.measures.steps import MeasuredEpisode
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.schemas.segments import segments_of
 from vla_attention.testing.stores import StoreSpec, contribution_vectors, write_store
 from vla_attention.testing.strategies import episode_tokens, groupings
@@ -122,7 +123,7 @@ def test_no_mass_at_all_gives_an_empty_table():
         {"suite": ["s"] * 2, "task_id": [0] * 2, "episode_index": [0] * 2, "layer": ["0", "1"], "block": [0, 1]}
     )
     groups = cells.with_columns(pl.lit("a").alias("group"), pl.lit(0.0).alias("mass"))
-    assert depth_table(Tables(cells, groups)).is_empty()
+    assert depth_table(Tables(cells, groups), None, Sampling()).is_empty()
 
 
 @pytest.mark.parametrize("num_bins", [1, 4, None])
@@ -136,7 +137,7 @@ def test_a_part_of_the_time_weighs_replans_by_their_share_of_it(num_bins):
         env_step=10 + pl.col("replan") * (pl.col("replan") + 3), num_steps=31 + pl.col("episode_index")
     )
     replans = replans_of(steps, grouping)
-    table = layer_time_table(replans, grouping, num_bins)
+    table = layer_time_table(replans, grouping, Sampling(), num_bins)
     bins = num_bins or 5
     assert table.height == 2 * bins
     starts = np.array([replan * (replan + 3) for replan in range(5)])
@@ -160,7 +161,7 @@ def test_a_part_of_the_time_weighs_replans_by_their_share_of_it(num_bins):
 def test_time_has_no_more_parts_than_replans_and_groups_are_shown_without_a_ratio():
     grouping = custom_grouping(with_ratio=False)
     steps = make_steps(grouping, CUSTOM_KEYS, num_replans=3)
-    short = layer_time_table(replans_of(steps, grouping), grouping)
+    short = layer_time_table(replans_of(steps, grouping), grouping, Sampling())
     assert short["bin"].n_unique() == 3
     assert short["quantity"].unique(maintain_order=True).to_list() == [
         "base_fraction",
@@ -168,12 +169,12 @@ def test_time_has_no_more_parts_than_replans_and_groups_are_shown_without_a_rati
         "nouns_fraction",
     ]
     long = make_steps(grouping, CUSTOM_KEYS, num_replans=40)
-    assert layer_time_table(replans_of(long, grouping), grouping)["bin"].n_unique() == MOST_BINS
+    assert layer_time_table(replans_of(long, grouping), grouping, Sampling())["bin"].n_unique() == MOST_BINS
 
 
 def test_all_ratios_infinite_leave_every_part_of_the_time_empty():
     grouping = default_grouping()
-    table = layer_time_table(replans_of(make_steps(no_denominator=1.0), grouping), grouping)
+    table = layer_time_table(replans_of(make_steps(no_denominator=1.0), grouping), grouping, Sampling())
     assert table["mean"].is_null().all()
     assert (table["num_episodes"] == 0).all()
 
@@ -197,7 +198,7 @@ def test_a_denoise_step_is_the_mean_over_layers_of_its_own_ratios():
     steps = make_steps(denoise_steps=(4, 0, 9), layers=(1, 2))
     measured = [with_denoise_order(episode, (1, 0, 2)) for episode in measured_of(steps, grouping)]
     assert measured[0].selection.denoise_steps == (4, 0, 9)
-    tables = denoise_tables(measured, grouping)
+    tables = denoise_tables(measured, grouping, Sampling())
     table = tables.cells
     assert table["denoise_step"].to_list() == [0, 4, 9]
     for row in table.iter_rows(named=True):

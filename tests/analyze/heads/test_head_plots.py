@@ -30,6 +30,7 @@ from vla_attention.analyze.ratios.plot_layer_profile import plot_layer_profile
 from vla_attention.analyze.show.plot_colours import diverging_colors
 from vla_attention.analyze.show.plot_heat_map import draw_log2_map
 from vla_attention.analyze.show.plot_style import new_figure
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 
 CASES = {
     "one of everything": (
@@ -61,13 +62,13 @@ def test_every_picture_of_every_case_is_drawn_without_a_warning(case, tmp_path):
     steps = make_steps(**({"grouping": grouping} | wanted))
     measured, replans = measured_of(steps, grouping), replans_of(steps, grouping)
     heads = concat_tables([episode_heads(episode, grouping) for episode in measured])
-    tasks = task_tables(episode_tables(replans, grouping), grouping)
+    tasks = task_tables(episode_tables(replans, grouping), grouping, Sampling())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        paths = plot_head_grid(heads_tables(heads, grouping), grouping, tmp_path)
+        paths = plot_head_grid(heads_tables(heads, grouping, Sampling()), grouping, tmp_path)
         paths += plot_layer_profile(tasks, grouping, tmp_path)
-        paths += plot_layer_time(layer_time_table(replans, grouping), replans, grouping, tmp_path)
-        paths += plot_denoise_profile(denoise_tables(measured, grouping), grouping, tmp_path)
+        paths += plot_layer_time(layer_time_table(replans, grouping, Sampling()), replans, grouping, tmp_path)
+        paths += plot_denoise_profile(denoise_tables(measured, grouping, Sampling()), grouping, tmp_path)
     # Layers over time are one table; each of the others is one of cells and one of groups.
     stems = ("head_grid", "layer_profile", "layer_time", "denoise_profile")
     expected = [f"{stem}{end}" for stem in stems for end in (".png", ".pdf", ".csv", "_groups.csv")]
@@ -84,7 +85,7 @@ def test_layers_over_time_are_means_over_episodes_of_what_each_part_of_the_time_
     steps = make_steps(layers=(3, 4), num_replans=6, num_tasks=2, num_episodes=2)
     # Every replan lasts five steps, so that three parts of the time hold two replans each.
     replans = replans_of(steps.with_columns(num_steps=pl.lit(30)), grouping)
-    table = layer_time_table(replans, grouping, num_bins=3)
+    table = layer_time_table(replans, grouping, Sampling(), num_bins=3)
     assert table.height == 2 * 3
     for row in table.iter_rows(named=True):
         part = replans.cells.filter(

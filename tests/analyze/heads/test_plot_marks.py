@@ -16,13 +16,14 @@ from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.ratios.plot_profile_panels import draw_profile
 from vla_attention.analyze.show.plot_heat_map import draw_log2_map, map_height
 from vla_attention.analyze.show.plot_style import new_figure
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.schemas.groupings.grouping import Grouping
 
 
 def drawn(steps: pl.DataFrame, grouping: Grouping):
     """The axes of a profile over layers, laid out."""
     replans = replans_of(steps, grouping)
-    tasks = overall_rows(task_tables(episode_tables(replans, grouping), grouping))
+    tasks = overall_rows(task_tables(episode_tables(replans, grouping), grouping, Sampling()))
     level = tasks.filter(pl.col("layer") != LAYERS_AVG)
     figure = new_figure(7, 5)
     draw_profile(figure, level, grouping, level.cells["layer"].to_list(), "layer", 0.95)
@@ -78,7 +79,7 @@ def test_a_note_on_grey_cells_only_where_there_are_some(tmp_path, monkeypatch):
     some = some.with_columns(pl.when(early).then(0.0).otherwise(pl.col("linguistic_mass")).alias("linguistic_mass"))
     for steps in (make_steps(), make_steps(no_denominator=1.0), some):
         replans = replans_of(steps, grouping)
-        layer_time.plot_layer_time(layer_time_table(replans, grouping), replans, grouping, tmp_path)
+        layer_time.plot_layer_time(layer_time_table(replans, grouping, Sampling()), replans, grouping, tmp_path)
     assert ["Grey" in title for title in titles] == [False, False, True]
 
 

@@ -16,6 +16,7 @@ from vla_attention.analyze.measures.aggregate import (
     task_tables,
 )
 from vla_attention.analyze.measures.frames import LAYERS_AVG
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.schemas.groupings.grouping import Ratio
 
 GROUPING = default_grouping()
@@ -106,7 +107,7 @@ def test_the_average_over_layers_prefers_neither_side():
     tables = []
     for grouping in (GROUPING, inverse):
         episodes = episode_tables(made_up_steps.replans_of(make_steps(), grouping), grouping)
-        tables.append(task_tables(episodes, grouping).cells.filter(layer=LAYERS_AVG, scope="all"))
+        tables.append(task_tables(episodes, grouping, Sampling()).cells.filter(layer=LAYERS_AVG, scope="all"))
     for column in ("geometric_mean", "ratio_lift", "uniform_ratio"):
         forward, backward = (table[column][0] for table in tables)
         assert forward * backward == pytest.approx(1.0)
@@ -119,7 +120,7 @@ def test_ratio_over_uniform_is_the_lift_also_where_a_task_has_no_finite_ratio():
         pl.when(pl.col("task_id") == 1).then(0.0).otherwise(pl.col("linguistic_mass")).alias("linguistic_mass"),
         pl.when(pl.col("task_id") == 1).then(60.0).otherwise(pl.col("linguistic_keys")).alias("linguistic_keys"),
     )
-    row = task_tables(episode_tables(replans_of(steps), GROUPING), GROUPING).cells.row(
+    row = task_tables(episode_tables(replans_of(steps), GROUPING), GROUPING, Sampling()).cells.row(
         by_predicate=(pl.col("scope") == "all") & (pl.col("layer") == LAYERS_AVG), named=True
     )
     assert row["geometric_mean"] / row["uniform_ratio"] == pytest.approx(row["ratio_lift"])
@@ -149,7 +150,7 @@ def test_episode_statistics_are_those_of_numpy():
 
 def test_tasks_are_means_over_episodes_with_intervals_around_them():
     tables = episode_tables(replans_of(STEPS), GROUPING)
-    of_tasks = task_tables(tables, GROUPING)
+    of_tasks = task_tables(tables, GROUPING, Sampling())
     episodes, tasks = flat(tables), flat(of_tasks)
     assert tasks.height == (3 + 1) * 4
     for layer in ("18", LAYERS_AVG):
@@ -171,7 +172,9 @@ def test_tasks_are_means_over_episodes_with_intervals_around_them():
 
 
 def test_one_episode_has_no_interval():
-    tasks = flat(task_tables(episode_tables(replans_of(make_steps(num_tasks=1, num_episodes=1)), GROUPING), GROUPING))
+    tasks = flat(
+        task_tables(episode_tables(replans_of(make_steps(num_tasks=1, num_episodes=1)), GROUPING), GROUPING, Sampling())
+    )
     bounds = [name for name in tasks.columns if name.endswith(("_low", "_high"))]
     assert bounds
     assert all(tasks[name].null_count() == tasks.height for name in bounds)
@@ -180,7 +183,8 @@ def test_one_episode_has_no_interval():
 def test_results_do_not_depend_on_the_order_of_the_rows():
     shuffled = STEPS.sample(fraction=1.0, shuffle=True, seed=1)
     first, second = (
-        flat(task_tables(episode_tables(replans_of(steps), GROUPING), GROUPING)) for steps in (STEPS, shuffled)
+        flat(task_tables(episode_tables(replans_of(steps), GROUPING), GROUPING, Sampling()))
+        for steps in (STEPS, shuffled)
     )
     for name, kind in first.schema.items():
         if kind == pl.Float64:
@@ -194,7 +198,7 @@ def test_groupings_without_a_ratio_give_masses_fractions_and_lifts_only():
     grouping = custom_grouping(with_ratio=False)
     replans = replans_of(make_steps(grouping, CUSTOM_KEYS), grouping)
     episodes = episode_tables(replans, grouping)
-    tasks = task_tables(episodes, grouping)
+    tasks = task_tables(episodes, grouping, Sampling())
     for tables in (replans, episodes, tasks):
         assert {"group", "mass", "fraction", "lift"} <= set(tables.groups.columns)
         assert not [name for name in tables.cells.columns if "ratio" in name or "geometric" in name]
@@ -203,7 +207,7 @@ def test_groupings_without_a_ratio_give_masses_fractions_and_lifts_only():
 
 def test_same_task_ids_of_two_suites_stay_two_tasks():
     steps = pl.concat([make_steps(), make_steps(suite="libero_goal", seed=5)])
-    tasks = task_tables(episode_tables(replans_of(steps), GROUPING), GROUPING)
+    tasks = task_tables(episode_tables(replans_of(steps), GROUPING), GROUPING, Sampling())
     average = tasks.cells.filter(layer=LAYERS_AVG)
     assert average["scope"].to_list() == ["task", "task", "all", "task", "task", "all", "combined"]
     assert one(average, scope="combined")["num_tasks"] == 4

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from vla_attention.analyze.measures.contribution_ratios import contribution_rows, joint_norm
 from vla_attention.analyze.measures.contributions import LINGUISTIC_ROLES, VISUAL_ROLES, contribution_table
 from vla_attention.analyze.measures.selected import load_tokens
-from vla_attention.analyze.statistics.intervals import Estimand
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.stores.selection import select
 from vla_attention.schemas.segments import segment_members, segments_of
 from vla_attention.schemas.stores.reader import open_store
@@ -101,7 +101,7 @@ def test_rows_over_episodes_have_the_three_means_and_what_each_is_of(tmp_path):
     parts = contribution_table(selected, select(store.attributes))
     assert parts is not None
     table = parts.whole
-    rows = contribution_rows(parts, "visual_norm", "linguistic_norm", Estimand.TASKS_LIKE_THESE)
+    rows = contribution_rows(parts, "visual_norm", "linguistic_norm", Sampling())
     assert rows["layer"].to_list() == ["0", "2", "layers_avg"]
     wanted = (pl.col("layer") == 0, pl.col("layer") == 2, pl.lit(True))
     for layer, row in zip(wanted, rows.iter_rows(named=True), strict=True):

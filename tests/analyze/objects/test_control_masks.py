@@ -25,6 +25,7 @@ from vla_attention.analyze.objects.control_masks import (
 from vla_attention.analyze.objects.object_attention import object_tables
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_study import followed_objects, objects_summary
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.intervals import (
     POSITIVE,
     Interval,
@@ -32,6 +33,7 @@ from vla_attention.analyze.statistics.intervals import (
     mean_over_episodes,
     ratio_of_means_over_episodes,
 )
+from vla_attention.analyze.statistics.units import Units
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.testing.stores import every_key_seen
 from vla_attention.testing.tokens import OBJECTS
@@ -95,7 +97,7 @@ def stored(path: Path, **changes) -> Path:
 def bowl_of(path: Path) -> dict:
     tables = object_tables(question_about(path), ObjectSettings(spatial=False))
     of_bowl = (pl.col("camera") == "all") & (pl.col("item") == "akita_black_bowl_1")
-    return objects_summary(tables.objects.whole).filter(of_bowl).row(0, named=True)
+    return objects_summary(tables.objects.whole, Sampling()).filter(of_bowl).row(0, named=True)
 
 
 def test_attention_to_the_middle_has_enrichment_but_none_over_the_control(tmp_path):
@@ -122,7 +124,7 @@ def test_of_an_object_that_does_not_move_the_control_cannot_tell(tmp_path, capsy
     (line, *_) = [line for line in printed.splitlines() if line.lstrip().startswith("[of interest]")]
     assert "cannot tell" in line
     tables = object_tables(question_about(path), ObjectSettings(spatial=False))
-    assert followed_objects(tables.objects.whole) == []
+    assert followed_objects(tables.objects.whole, Sampling()) == []
 
 
 def raw(path: Path, task: int, episode: int, camera: str) -> tuple[np.ndarray, np.ndarray]:
@@ -217,7 +219,7 @@ def made_up_store(generator: np.random.Generator, episodes: int, follow: float) 
     found = controls(sources)
     balanced, tasks = [control.balanced[0, 0, 0] for control in found], np.zeros(episodes)
     statistics = [mean_over_episodes(enrichment, POSITIVE), ratio_of_means_over_episodes(enrichment, balanced)]
-    plain, over = (one.interval() for one in estimates(statistics, tasks))
+    plain, over = (one.interval() for one in estimates(statistics, Units.of(tasks)))
     assert plain is not None
     assert over is not None
     return float(np.mean([control.overlap[0] for control in found])), plain, over

@@ -25,7 +25,8 @@ from vla_attention.analyze.objects.object_attention import ObjectTables, object_
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_study import followed_objects, iou_summary, leading_finder, objects_summary
 from vla_attention.analyze.objects.object_views import site_of_pictures
-from vla_attention.analyze.statistics.intervals import Estimand
+from vla_attention.analyze.statistics.episode_intervals import Sampling
+from vla_attention.analyze.statistics.units import Estimand
 from vla_attention.analyze.words.word_reading import words_table
 from vla_attention.analyze.words.word_study import site_of_words
 from vla_attention.schemas.errors import BadArgument
@@ -218,20 +219,22 @@ def _of_all(objects: pl.DataFrame) -> np.ndarray:
 def test_a_planted_follower_is_found_and_named(follower_store):
     tables = measured(follower_store, per_head=True)
     assert tables.iou is not None
-    names = [(name, found.is_named()) for name, found in followed_objects(tables.objects, Estimand.THESE_TASKS)]
+    names = [
+        (name, found.is_named()) for name, found in followed_objects(tables.objects, Sampling(Estimand.THESE_TASKS))
+    ]
     bowl = {"item": "akita_black_bowl_1"}
     assert names == [
         (bowl | {"layer": "2", "head": 1}, True)
     ]  # the cabinet does not move, and one object leads nothing
-    finder, found = leading_finder(tables.iou, "p90", Estimand.THESE_TASKS)
+    finder, found = leading_finder(tables.iou, "p90", Sampling(Estimand.THESE_TASKS))
     assert (finder["layer"], finder["head"]) == ("2", 1)
     assert found.value > 0.1
-    summary = objects_summary(tables.objects)
+    summary = objects_summary(tables.objects, Sampling())
     bowl = summary.filter((pl.col("camera") == "all") & (pl.col("item") == "akita_black_bowl_1")).row(0, named=True)
     assert bowl["enrichment_low"] > 1.5
     cabinet = summary.filter((pl.col("camera") == "all") & (pl.col("item") == "wooden_cabinet_1")).row(0, named=True)
     assert cabinet["enrichment_high"] < 1.1
-    found = iou_summary(tables.iou).filter(pl.col("threshold") == "p90")
+    found = iou_summary(tables.iou, Sampling()).filter(pl.col("threshold") == "p90")
     assert found.filter(pl.col("item") == "akita_black_bowl_1")["num_episodes"].to_list() == [4, 4]
 
 

@@ -19,7 +19,7 @@ from vla_attention.analyze.ratios.contribution_text import (
     group_contributions_section,
     same_sides,
 )
-from vla_attention.analyze.statistics.intervals import Estimand
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.testing.stores import StoreSpec, write_store
 
@@ -90,7 +90,7 @@ def test_a_block_that_is_named_twice_counts_once_in_the_average_over_layers(tmp_
     assert tables is not None
     table = flat(tables)
     assert table["layer"].unique().sort().to_list() == [0, 2, 4]
-    text = group_contributions_section(tables, question.grouping, "joint", estimand=Estimand.TASKS_LIKE_THESE)
+    text = group_contributions_section(tables, question.grouping, "joint", sampling=Sampling())
     lines = {line.split()[0]: line.split() for line in text.splitlines() if line[:1].strip()}
     means = {layer: table.filter(layer=layer)["images_norm"].mean() for layer in (0, 2)}
     # Episodes have as many replans each, so that the mean over episodes is that over rows.
@@ -105,7 +105,7 @@ def test_a_block_that_is_named_twice_counts_once_in_the_average_over_layers(tmp_
 def test_a_group_without_keys_is_named_and_has_no_column(store):
     grouping = grouping_of(images=("role:image",), nothing=("span:right_wrist_0_rgb & role:image",))
     text = group_contributions_section(
-        tables_of(question_about(store, grouping)), grouping, "joint", estimand=Estimand.TASKS_LIKE_THESE
+        tables_of(question_about(store, grouping)), grouping, "joint", sampling=Sampling()
     )
     assert "The keys of nothing add exactly nothing." in text
     assert "|images|" in text
@@ -115,5 +115,5 @@ def test_a_group_without_keys_is_named_and_has_no_column(store):
 def test_when_every_group_is_cut_the_summary_says_why(store):
     question = question_about(store, grouping_of(word=("word:the",)))
     assert tables_of(question) is None
-    text = group_contributions_section(None, question.grouping, "joint", estimand=Estimand.TASKS_LIKE_THESE)
+    text = group_contributions_section(None, question.grouping, "joint", sampling=Sampling())
     assert "Not of word: contributions are stored for whole segments" in text

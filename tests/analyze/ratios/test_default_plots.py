@@ -16,6 +16,7 @@ from vla_attention.analyze.ratios.plot_attention_fractions import plot_attention
 from vla_attention.analyze.ratios.plot_ratio_distribution import plot_ratio_distribution
 from vla_attention.analyze.ratios.plot_ratio_evolution import evolution_stem, plot_all_evolutions, plot_ratio_evolution
 from vla_attention.analyze.ratios.plot_ratio_per_task import plot_ratio_per_task
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -60,7 +61,7 @@ def test_every_picture_of_every_case_is_drawn_without_a_warning(case, tmp_path):
     steps, grouping = CASES[case]()
     replans = replans_of(steps, grouping)
     episodes = episode_tables(replans, grouping)
-    tasks = task_tables(episodes, grouping)
+    tasks = task_tables(episodes, grouping, Sampling())
     with warnings.catch_warnings():
         # Layout that does not fit, missing glyphs and empty limits are warnings of matplotlib.
         warnings.simplefilter("error")
@@ -94,7 +95,7 @@ def test_data_beside_the_picture_are_those_of_the_picture(tmp_path):
 @pytest.mark.pdf
 def test_same_data_give_the_same_file(tmp_path):
     grouping = default_grouping()
-    tasks = task_tables(episode_tables(replans_of(make_steps(), grouping), grouping), grouping)
+    tasks = task_tables(episode_tables(replans_of(make_steps(), grouping), grouping), grouping, Sampling())
     for folder in ("a", "b"):
         plot_attention_fractions(tasks, grouping, tmp_path / folder)
     for kind in ("png", "pdf", "csv"):
@@ -143,6 +144,6 @@ def test_drawing_leaves_the_settings_of_the_caller_alone(tmp_path):
 
     before = mpl.rcParams.copy()
     grouping = default_grouping()
-    tasks = task_tables(episode_tables(replans_of(make_steps(), grouping), grouping), grouping)
+    tasks = task_tables(episode_tables(replans_of(make_steps(), grouping), grouping), grouping, Sampling())
     plot_attention_fractions(tasks, grouping, tmp_path)
     assert mpl.rcParams.copy() == before

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import polars as pl
 import pytest
 
@@ -7,19 +9,22 @@ from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_groupi
 from vla_attention.analyze.measures.aggregate import episode_tables, task_tables
 from vla_attention.analyze.ratios.summary_text import AnalysedRun, summary_text
 from vla_attention.analyze.ratios.verdict import verdict
+from vla_attention.analyze.statistics.episode_intervals import Sampling
+from vla_attention.analyze.statistics.units import Units
 
 RUN = AnalysedRun(
     stores=["runs/pi05_libero_10.zarr"],
     policy="pi05 (pi05_libero)",
     untrained=False,
     denoise_steps=[0, 9],
+    units=Units.of([0]),
     notes=["Layers 25 = block 7: numbers from 18 on are the published scripts' recorded-call numbers."],
 )
 
 
 def summarise(steps, grouping, run=RUN):
     episodes = episode_tables(replans_of(steps, grouping), grouping)
-    return summary_text(run, grouping, episodes, task_tables(episodes, grouping))
+    return summary_text(run, grouping, episodes, task_tables(episodes, grouping, Sampling()))
 
 
 def two_suites():
@@ -60,7 +65,7 @@ def test_header_says_what_was_analysed():
 
 
 def test_untrained_weights_are_said_first():
-    run = AnalysedRun(stores=["x.zarr"], policy="untrained-tiny", untrained=True, denoise_steps=[0])
+    run = replace(RUN, policy="untrained-tiny", untrained=True)
     text = summarise(*CASES["one"](), run)
     assert text.index("WARNING: the policy has untrained") < text.index("store:")
 

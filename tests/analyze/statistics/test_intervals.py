@@ -20,6 +20,7 @@ from vla_attention.analyze.statistics.intervals import (
     welch_degrees,
 )
 from vla_attention.analyze.statistics.student import student_quantile, two_sided_p
+from vla_attention.analyze.statistics.units import Units
 
 LIKE, THESE = Estimand.TASKS_LIKE_THESE, Estimand.THESE_TASKS
 SAMPLE = np.random.default_rng(3).lognormal(1.0, 0.6, 25)
@@ -28,7 +29,7 @@ POSITIVE_SAMPLES = hnp.arrays(np.float64, st.integers(2, 12), elements=st.floats
 
 
 def one(statistic, tasks, estimand=LIKE):
-    return estimates([statistic], tasks, estimand)[0]
+    return estimates([statistic], Units.of(tasks, estimand))[0]
 
 
 def ends_of(estimate, level=0.95):
@@ -166,8 +167,13 @@ def test_many_of_a_kind_are_the_same_as_one_by_one():
     values, tasks = rng.lognormal(size=(2, 3, 12)), np.repeat(np.arange(3), 4)
     values[0, 1, 5] = np.nan
     for estimand in Estimand:
-        together = estimates([mean_over_episodes(values, POSITIVE), mean_over_episodes(tasks)], tasks, estimand)
-        alone = [estimates([mean_over_episodes(one, POSITIVE)], tasks, estimand)[0] for one in values.reshape(6, 12)]
+        together = estimates(
+            [mean_over_episodes(values, POSITIVE), mean_over_episodes(tasks)], Units.of(tasks, estimand)
+        )
+        alone = [
+            estimates([mean_over_episodes(one, POSITIVE)], Units.of(tasks, estimand))[0]
+            for one in values.reshape(6, 12)
+        ]
         for mine, theirs in zip(together[:-1], alone, strict=True):
             assert mine.value == pytest.approx(theirs.value, rel=1e-14)
             assert mine.error == pytest.approx(theirs.error, rel=1e-12)
@@ -183,13 +189,13 @@ def test_several_statistics_at_once_are_the_same_as_one_by_one():
         mean_over_episodes(np.full(25, np.nan)),
     ]
     for estimand in Estimand:
-        together = estimates(statistics, UNBALANCED, estimand)
+        together = estimates(statistics, Units.of(UNBALANCED, estimand))
         for statistic, estimate in zip(statistics, together, strict=True):
             alone = one(statistic, UNBALANCED, estimand)
             assert estimate.degrees == alone.degrees
             of_both = [[np.nan if x is None else x for x in (which.value, which.error)] for which in (estimate, alone)]
             assert of_both[0] == pytest.approx(of_both[1], rel=1e-12, nan_ok=True)
-    assert estimates([], UNBALANCED) == []
+    assert estimates([], Units.of(UNBALANCED)) == []
 
 
 @pytest.mark.parametrize("level", [0.5, 0.9, 0.95, 0.999])

@@ -9,8 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.intervals import Estimand
 from vla_attention.analyze.statistics.many_looks import adjusted_p_values, leader, leader_of_table
+from vla_attention.analyze.statistics.units import Units
 
 
 @given(st.lists(st.floats(0, 1), max_size=20))
@@ -32,7 +34,7 @@ def test_where_all_items_are_alike_a_leader_is_seldom_named(num_items, num_tasks
     named = 0
     for _ in range(400):
         values = generator.normal(1.0, 0.3, (30, num_items)) + generator.normal(0, 1, (30, 1))
-        named += leader(values, tasks).is_named()
+        named += leader(values, Units.of(tasks)).is_named()
     # Two items alike reach the level, more stay below it; three standard errors of 400 samples are 3.3 %.
     assert named / 400 <= 0.05 + 0.033 * (num_items == 2)
 
@@ -43,12 +45,12 @@ def test_a_planted_leader_is_named_and_two_equal_leaders_are_not(estimand):
     tasks = np.arange(40) // 8
     values = generator.normal(1.0, 0.3, (40, 5))
     values[:, 3] += 0.8
-    found = leader(values, tasks, estimand)
+    found = leader(values, Units.of(tasks, estimand))
     assert found.item == 3
     assert found.num_items == 5
     assert found.is_named(10)
     values[:, 1] = values[:, 3] + generator.normal(0, 0.3, 40)
-    assert not leader(values, tasks, estimand).is_named()
+    assert not leader(values, Units.of(tasks, estimand)).is_named()
 
 
 def test_items_that_share_no_episode_are_compared_between_episodes():
@@ -57,7 +59,7 @@ def test_items_that_share_no_episode_are_compared_between_episodes():
     values[:20, 0] = generator.normal(1.0, 0.2, 20)
     values[20:, 1] = generator.normal(2.0, 0.2, 20)
     tasks = np.repeat([0, 1, 2, 3, 4, 5, 6, 7], 5)
-    found = leader(values, tasks)
+    found = leader(values, Units.of(tasks))
     assert found.item == 1
     assert found.is_named()
 
@@ -67,18 +69,18 @@ def test_an_item_of_one_task_leads_nothing_about_tasks_like_these():
     tasks = np.repeat(np.arange(5), 6)
     values = generator.normal(1.0, 0.05, (30, 3))
     values[:, 2] = np.where(tasks == 0, 3.0 + generator.normal(0, 0.05, 30), np.nan)
-    assert leader(values, tasks).item != 2
-    assert leader(values, tasks).num_items == 2
-    found = leader(values, tasks, Estimand.THESE_TASKS)
+    assert leader(values, Units.of(tasks)).item != 2
+    assert leader(values, Units.of(tasks)).num_items == 2
+    found = leader(values, Units.of(tasks, Estimand.THESE_TASKS))
     assert (found.item, found.num_items) == (2, 3)
     assert found.is_named()
 
 
 def test_one_item_has_nothing_to_lead():
-    assert leader(np.ones((4, 1)), np.zeros(4)) is None
-    assert leader(np.stack([np.ones(4), np.full(4, np.nan)], axis=1), np.zeros(4)) is None
+    assert leader(np.ones((4, 1)), Units.of(np.zeros(4))) is None
+    assert leader(np.stack([np.ones(4), np.full(4, np.nan)], axis=1), Units.of(np.zeros(4))) is None
     # Without spread there is no p-value, and so no name.
-    assert not leader(np.array([[1.0, 2.0]] * 4), np.zeros(4)).is_named()
+    assert not leader(np.array([[1.0, 2.0]] * 4), Units.of(np.zeros(4))).is_named()
 
 
 def test_the_leader_of_a_table_is_named_by_its_columns():
@@ -89,7 +91,41 @@ def test_the_leader_of_a_table_is_named_by_its_columns():
         for word, lift in (("bowl", generator.normal(3, 0.1)), ("the", generator.normal(1, 0.1)))
     ]
     table = pl.DataFrame(rows, schema_overrides={"head": pl.Int64})
-    name, found = leader_of_table(table, ("word", "head"), "lift")
+    name, found = leader_of_table(table, ("word", "head"), "lift", Sampling())
     assert name == {"word": "bowl", "head": None}
     assert found.is_named()
     assert found.value == pytest.approx(table.filter(word="bowl")["lift"].mean())
+
+
+def test_families_are_the_units_of_leaders():
+    """Items of fewer than four families take no part, and families that differ keep a leader from being named."""
+    generator = np.random.default_rng(6)
+    tasks = np.repeat(np.arange(12), 3)
+    families = tasks // 2
+    values = generator.normal(1.0, 0.1, (36, 3))
+    values[:, 1] += 0.5 + generator.normal(0, 0.1, 6)[families]
+    values[:, 2] = np.where(families < 3, 5.0 + values[:, 2], np.nan)
+    found = leader(values, Units.of(tasks, families=families.astype(str)))
+    assert (found.item, found.num_items, found.apart) == (1, 2, ())
+    assert found.is_named()
+    # The same mean difference, but that of two families alone.
+    values[:, 1] = values[:, 0] + np.where(
+        families < 2, 1.5 + generator.normal(0, 0.1, 36), generator.normal(0, 0.1, 36)
+    )
+    assert not leader(values, Units.of(tasks, families=families.astype(str))).is_named()
+    assert leader(values, Units.of(tasks, Estimand.THESE_TASKS)).item == 2
+
+
+def test_a_leader_says_with_which_items_it_shares_too_few_episodes():
+    generator = np.random.default_rng(7)
+    tasks = np.repeat(np.arange(8), 4)
+    values = generator.normal(1.0, 0.1, (32, 3))
+    values[:16, 0] += 1.0
+    values[16:, 0] = np.nan
+    values[:16, 2] = np.nan
+    found = leader(values, Units.of(tasks))
+    assert (found.item, found.apart) == (0, (2,))
+    assert leader(values, Units.of(tasks, Estimand.THESE_TASKS)).apart == (2,)
+    values[12:16, 2] = 1.0  # in one task: its episodes alone would not be compared about tasks like these
+    assert leader(values, Units.of(tasks)).apart == (2,)
+    assert leader(values, Units.of(tasks, Estimand.THESE_TASKS)).apart == ()

@@ -20,6 +20,7 @@ from vla_attention.analyze.statistics.effect_sizes import (
     standardised_mean,
 )
 from vla_attention.analyze.statistics.intervals import Estimand
+from vla_attention.analyze.statistics.units import Units
 
 GENERATOR = np.random.default_rng(8)
 FIRST, SECOND = GENERATOR.normal(1.0, 0.5, 12), GENERATOR.normal(0.4, 0.5, 9)
@@ -51,7 +52,7 @@ def test_a_task_without_which_all_pairs_agree_leaves_the_effect_without_an_inter
     tasks = [0, 0, 1, 1, 2, 2]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        effect = standardised_mean([-1.0, -1.0, -1.0, -1.0, 0.0, 0.0], tasks)
+        effect = standardised_mean([-1.0, -1.0, -1.0, -1.0, 0.0, 0.0], Units.of(tasks))
     assert effect.value == pytest.approx(-2 / 3 / np.std([-1, -1, -1, -1, 0, 0], ddof=1) * (1 - 3 / (4 * 5 - 1)))
     assert effect.error is None
 
@@ -69,11 +70,11 @@ def test_effect_sizes_do_not_depend_on_unit_or_origin(first, second):
 @pytest.mark.parametrize("estimand", Estimand)
 def test_the_contrast_of_one_task_agrees_with_scipy(estimand):
     values, is_first = both(FIRST, SECOND)
-    found = contrast(values, is_first, np.zeros(len(values)), estimand)
+    found = contrast(values, is_first, Units.of(np.zeros(len(values)), estimand))
     assert (found.num_first, found.num_second) == (12, 9)
     assert found.difference.value == pytest.approx(FIRST.mean() - SECOND.mean())
     assert found.within_tasks == found.difference
-    assert mean_difference(values, is_first, np.zeros(len(values)), estimand) == found.difference
+    assert mean_difference(values, is_first, Units.of(np.zeros(len(values)), estimand)) == found.difference
     assert found.hedges_g.value == pytest.approx(hedges_g(FIRST, SECOND))
     assert found.cliffs_delta.value == pytest.approx(cliffs_delta(FIRST, SECOND))
     welch = stats.ttest_ind(FIRST, SECOND, equal_var=False)
@@ -88,7 +89,7 @@ def test_a_contrast_over_common_tasks_is_the_paired_t_test_over_task_means():
     is_first = np.tile([True, True, True, True, False, False], 8)
     values = generator.normal(0, 2.0, 8)[tasks] + 0.3 * is_first + generator.normal(0, 0.4, 48)
     gaps = [values[(tasks == t) & is_first].mean() - values[(tasks == t) & ~is_first].mean() for t in range(8)]
-    found = contrast(values, is_first, tasks)
+    found = contrast(values, is_first, Units.of(tasks))
     for estimate in (found.difference, found.within_tasks):
         assert estimate.p_value(0.0) == pytest.approx(stats.ttest_1samp(gaps, 0.0).pvalue)
         interval = estimate.interval()
@@ -102,7 +103,7 @@ def test_a_contrast_of_different_tasks_is_the_t_test_between_their_means():
     is_first = tasks < 5
     values = generator.normal(0, 1.0, 12)[tasks] + generator.normal(0, 0.4, 48)
     means = np.array([values[tasks == task].mean() for task in range(12)])
-    found = contrast(values, is_first, tasks)
+    found = contrast(values, is_first, Units.of(tasks))
     welch = stats.ttest_ind(means[:5], means[5:], equal_var=False)
     assert found.difference.value == pytest.approx(means[:5].mean() - means[5:].mean())
     assert found.difference.error == pytest.approx(found.difference.value / welch.statistic)
@@ -113,10 +114,10 @@ def test_one_task_on_one_side_shows_nothing_about_tasks_like_these():
     generator = np.random.default_rng(3)
     tasks = np.repeat(np.arange(6), 5)
     values = generator.normal(0, 2.0, 6)[tasks] + generator.normal(0, 0.2, 30)
-    found = contrast(values, tasks == 0, tasks)
+    found = contrast(values, tasks == 0, Units.of(tasks))
     assert found.difference.value is not None
     assert found.difference.interval() is found.difference.p_value(0.0) is None
-    assert contrast(values, tasks == 0, tasks, Estimand.THESE_TASKS).difference.interval() is not None
+    assert contrast(values, tasks == 0, Units.of(tasks, Estimand.THESE_TASKS)).difference.interval() is not None
 
 
 def test_two_failures_beside_many_solved_seldom_exclude_zero():
@@ -124,13 +125,13 @@ def test_two_failures_beside_many_solved_seldom_exclude_zero():
     excluded = 0
     for _ in range(400):
         values, is_first = both(generator.normal(size=20), generator.normal(size=2))
-        excluded += contrast(values, is_first, np.zeros(22)).difference.p_value(0.0) <= 0.05
+        excluded += contrast(values, is_first, Units.of(np.zeros(22))).difference.p_value(0.0) <= 0.05
     assert excluded / 400 <= 0.083  # their own variance alone: 15 %
 
 
 def test_effect_sizes_have_the_jackknifes_standard_error():
     values, is_first = both(FIRST, SECOND)
-    found = contrast(values, is_first, np.zeros(len(values)))
+    found = contrast(values, is_first, Units.of(np.zeros(len(values))))
     for size, estimate in ((hedges_g, found.hedges_g), (cliffs_delta, found.cliffs_delta)):
         variance = 0.0
         for member, other in ((FIRST, SECOND), (SECOND, FIRST)):
@@ -152,7 +153,7 @@ def test_effect_sizes_of_few_episodes_have_no_interval(sizes):
     generator = np.random.default_rng(0)
     for _ in range(50):
         values, is_first = both(generator.normal(size=sizes[0]), generator.normal(size=sizes[1]))
-        found = contrast(values, is_first, np.zeros(len(values)))
+        found = contrast(values, is_first, Units.of(np.zeros(len(values))))
         assert found.cliffs_delta.interval() is found.hedges_g.interval() is None
     row = contrast_row(found, "success", "failure")
     assert row["cliffs_delta"] is not None
@@ -165,7 +166,7 @@ def test_null_samples_seldom_exclude_zero(sizes):
     excluded = {"difference": 0, "hedges_g": 0, "cliffs_delta": 0}
     for _ in range(400):
         values, is_first = both(generator.normal(size=sizes[0]), generator.normal(size=sizes[1]))
-        found = contrast(values, is_first, np.zeros(len(values)))
+        found = contrast(values, is_first, Units.of(np.zeros(len(values))))
         for name in excluded:
             interval = getattr(found, name).interval()
             excluded[name] += interval is not None and not interval.low <= 0 <= interval.high
@@ -174,12 +175,12 @@ def test_null_samples_seldom_exclude_zero(sizes):
 
 def test_the_standardised_mean_of_pairs_is_cohens_d_z_corrected():
     differences = FIRST
-    found = standardised_mean(differences, np.zeros(12))
+    found = standardised_mean(differences, Units.of(np.zeros(12)))
     assert found.value == pytest.approx((1 - 3 / (4 * 11 - 1)) * differences.mean() / differences.std(ddof=1))
     interval = found.interval()
     assert interval.low < found.value < interval.high
-    assert standardised_mean(FIRST[:4], np.zeros(4)).value is None
-    assert standardised_mean(np.ones(9), np.zeros(9)).value is None
+    assert standardised_mean(FIRST[:4], Units.of(np.zeros(4))).value is None
+    assert standardised_mean(np.ones(9), Units.of(np.zeros(9))).value is None
 
 
 def test_a_difference_between_tasks_is_not_one_within_tasks():
@@ -189,7 +190,7 @@ def test_a_difference_between_tasks_is_not_one_within_tasks():
     easy = tasks < 4
     solved = np.where(tasks % 4 < 3, easy, generator.random(len(tasks)) < 0.5)
     values = 2.0 * easy + generator.normal(0, 0.2, len(tasks))
-    found = contrast(values, solved, tasks)
+    found = contrast(values, solved, Units.of(tasks))
     assert found.difference.value > 0.8
     assert found.num_tasks_with_both == 2
     assert abs(found.within_tasks.value) < 0.15
@@ -201,7 +202,7 @@ def test_a_planted_effect_is_found_inside_tasks():
     tasks = np.repeat(np.arange(10), 12)
     solved = generator.random(len(tasks)) < 0.5
     values = generator.normal(0, 1.0, 10)[tasks] + 0.5 * solved + generator.normal(0, 0.3, len(tasks))
-    found = contrast(values, solved, tasks)
+    found = contrast(values, solved, Units.of(tasks))
     assert found.within_tasks.interval().low < 0.5 < found.within_tasks.interval().high
     assert found.within_tasks.interval().low > 0.2
 
@@ -211,7 +212,7 @@ def test_a_planted_effect_is_found_inside_tasks():
 )
 def test_classes_of_none_or_one_are_said_and_not_computed(solved, said):
     values = np.arange(6.0)
-    found = contrast(values, np.arange(6) < solved, np.zeros(6))
+    found = contrast(values, np.arange(6) < solved, Units.of(np.zeros(6)))
     row = contrast_row(found, "success", "failure")
     assert said in row["note"]
     assert row["difference"] is row["hedges_g"] is row["cliffs_delta"] is row["difference_low"] is None
@@ -220,12 +221,12 @@ def test_classes_of_none_or_one_are_said_and_not_computed(solved, said):
 
 def test_values_that_are_not_finite_leave_the_class_they_are_in():
     values = np.array([1.0, np.inf, 2.0, 5.0, np.nan, 6.0])
-    found = contrast(values, np.array([True, True, True, False, False, False]), np.zeros(6))
+    found = contrast(values, np.array([True, True, True, False, False, False]), Units.of(np.zeros(6)))
     assert (found.num_first, found.num_second, found.difference.value) == (2, 2, -4.0)
 
 
 def test_tasks_with_one_outcome_each_have_no_difference_within():
-    found = contrast(np.arange(6.0), np.arange(6) < 3, np.repeat([0, 1], 3))
+    found = contrast(np.arange(6.0), np.arange(6) < 3, Units.of(np.repeat([0, 1], 3)))
     assert found.within_tasks.value is found.within_tasks.interval() is None
     assert found.num_tasks_with_both == 0
     assert "between tasks" in found.note

@@ -12,6 +12,7 @@ import zarr
 from tests.kit.bowl_scene import bowl_tokens, write_bowl_store
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.words.word_reading import words_table
 from vla_attention.analyze.words.word_study import leading_words, words_summary
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
@@ -104,13 +105,13 @@ def test_classes_add_up_to_their_words(reader_store):
 
 def test_a_planted_reader_is_found_and_named(reader_store):
     table = words_table(question_about(reader_store, per_head=True))
-    (word, leading), (cell, leading_cell) = leading_words(table)
+    (word, leading), (cell, leading_cell) = leading_words(table, Sampling())
     assert word == {"item": "bowl"}
     assert cell == {"item": "bowl", "layer": "3", "head": 1}
     assert leading_cell.value > 15
     assert leading.is_named(2)
     assert leading_cell.is_named(2)
-    summary = words_summary(table)
+    summary = words_summary(table, Sampling())
     first = summary.row(0, named=True)
     assert first["item"] == "bowl"
     assert first["lift_low"] > 1.5
@@ -124,11 +125,11 @@ def test_a_word_that_stands_twice_is_one_item_unless_places_are_wanted(reader_st
         .group_by("task_id", "episode_index")
         .agg(pl.col("mass").sum(), pl.col("lift").mean())
     )
-    row = words_summary(table).filter(pl.col("item") == "the").row(0, named=True)
+    row = words_summary(table, Sampling()).filter(pl.col("item") == "the").row(0, named=True)
     assert row["pieces"] == 2
     assert row["mass"] == pytest.approx(both["mass"].mean())
     assert row["lift"] == pytest.approx(both["lift"].mean())
-    places = words_summary(table, by_place=True).filter(pl.col("kind") == "word")
+    places = words_summary(table, Sampling(), by_place=True).filter(pl.col("kind") == "word")
     assert places["item"].to_list() == ["put", "the", "black", "bowl", "on", "the", "plate"]
     assert places["place"].to_list() == list(range(7))
 
@@ -138,7 +139,7 @@ def test_words_of_several_tasks_are_averaged_over_the_episodes_that_have_them(tm
     # replan.
     path = write_store(tmp_path / "tasks.zarr", tasks=(0, 1, 2), episodes=2)
     table = words_table(question_about(path))
-    summary = words_summary(table)
+    summary = words_summary(table, Sampling())
     counts = {row["item"]: (row["num_episodes"], row["num_tasks"]) for row in summary.iter_rows(named=True)}
     assert (counts["the"], counts["on"], counts["drawer"]) == ((6, 3), (4, 2), (2, 1))
     chosen = table.filter((pl.col("layer") == "layers_avg") & (pl.col("item") == "on"))

@@ -367,7 +367,7 @@ def test_a_family_is_a_text_of_one_line(tmp_path, policy):
     with start(tmp_path, policy) as run:
         for family in (3, "two\nlines"):
             with (
-                pytest.raises(BadArgument, match="task.family"),
+                pytest.raises(BadArgument, match=r"task.family"),
                 run.episode(task_id=0, episode_index=0, instruction="", task_family=family),
             ):
                 pass

@@ -1,0 +1,130 @@
+"""Which tasks of the selected episodes are related, and what that means for intervals over several tasks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.statistics.episode_intervals import Sampling, TaskName
+from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Estimand, Units
+from vla_attention.schemas.errors import UserError, listing
+from vla_attention.schemas.safe_text import visible
+
+
+class MixedFamilies(UserError, ValueError):
+    """A task that is of one family in some episodes and of another one in others."""
+
+
+def sampling_of(estimand: Estimand, selected: Iterable[SelectedEpisode]) -> Sampling:
+    """What intervals are about, with the families that the episodes know of their tasks.
+
+    A task has the family that any of its episodes knows: one store may be older than the next.
+
+    Raises:
+        MixedFamilies: episodes of a task know different ones, and intervals are by families.
+    """
+    families: dict[TaskName, str] = {}
+    for item in selected:
+        family, task = item.episode.attributes.task_family, _task_of(item)
+        known = families.setdefault(task, family) if family else ""
+        if known != family and estimand == Estimand.TASKS_LIKE_THESE:
+            raise MixedFamilies(
+                f"Episodes of task {task[1]} of {task[0]} are of the task families '{visible(known)}' and "
+                f"'{visible(family)}' (the latter: {item.episode.name} of {item.store.path}); a task has one family. "
+                "Record them again with one, or choose --intervals independent-tasks or these-tasks."
+            )
+    return Sampling(estimand, families)
+
+
+def units_of(sampling: Sampling, selected: Sequence[SelectedEpisode]) -> Units:
+    """The units of episodes, not decided (`Units.decided`)."""
+    tasks = [_task_of(item) for item in selected]
+    number = {task: i for i, task in enumerate(dict.fromkeys(tasks))}
+    families = [sampling.families.get(task, "") for task in tasks]
+    return Units.of(np.array([number[task] for task in tasks]), sampling.estimand, families)
+
+
+def relation_remarks(sampling: Sampling, selected: Sequence[SelectedEpisode]) -> list[str]:
+    """The lines on how tasks are related that stand above printed numbers."""
+    warning = unknown_families(sampling, selected)
+    return [*([f"WARNING: {warning}"] if warning else []), *family_notes(sampling, selected)]
+
+
+def family_notes(sampling: Sampling, selected: Sequence[SelectedEpisode]) -> tuple[str, ...]:
+    """What intervals over these episodes' tasks are about where it is not what was asked, or assumes something."""
+    tasks = dict.fromkeys(_task_of(item) for item in selected)
+    families = dict.fromkeys(visible(sampling.families[task]) for task in tasks if task in sampling.families)
+    if len(tasks) < 2:
+        return ()
+    if sampling.estimand == Estimand.INDEPENDENT_TASKS:
+        known = f", though they are of {_families(len(families))}" if families else ""
+        return (
+            f"Intervals assume that no two of the {len(tasks)} tasks are related{known}, as --intervals "
+            "independent-tasks asks; where tasks are, such intervals are too narrow.",
+        )
+    units = units_of(sampling, selected)
+    if units.has_enough_families:
+        return ()
+    return (
+        f"Intervals are about these tasks: the {len(tasks)} tasks are of {_families(units.num_families)} "
+        f"({_quoted(families)}), and fewer than {FEWEST_FAMILIES} show nothing about tasks like these. --intervals "
+        "independent-tasks counts tasks as if no two were related.",
+    )
+
+
+def unknown_families(sampling: Sampling, selected: Sequence[SelectedEpisode]) -> str:
+    """That intervals count tasks that seem related as independent, because their families are not known; or nothing."""
+    if sampling.estimand != Estimand.TASKS_LIKE_THESE:
+        return ""
+    instructions = {_task_of(item): visible(item.episode.attributes.instruction) for item in selected}
+    unnamed = [text for task, text in instructions.items() if task not in sampling.families]
+    alike = alike_instructions(unnamed)
+    if alike is None:
+        return ""
+    return (
+        f"Of {len(unnamed)} tasks no family is known, and {alike.number} of their instructions differ in at most one "
+        f"word from another one ({_quoted(alike.examples)}). Such tasks are related: intervals that count them as "
+        "independent are too narrow. --intervals these-tasks does not count them so."
+    )
+
+
+def _quoted(texts: Iterable[str]) -> str:
+    return listing([f"'{text}'" for text in texts], 4)
+
+
+def _families(number: int | None) -> str:
+    return "1 family" if number == 1 else f"{number} families"
+
+
+@dataclass(frozen=True)
+class AlikeInstructions:
+    """`number` instructions differ in at most one word from another one; `examples` are the first two."""
+
+    number: int
+    examples: tuple[str, ...]
+
+
+def alike_instructions(instructions: Sequence[str]) -> AlikeInstructions | None:
+    """The instructions that differ in at most one word from another one; None where none does.
+
+    Words are compared without case. Equal instructions differ in none.
+    """
+    places: dict[tuple[str, ...], list[int]] = {}
+    for number, text in enumerate(instructions):
+        words = text.casefold().split()
+        # Equal but for one word: equal without it, at the same place.
+        for i in range(len(words)):
+            places.setdefault((str(i), *words[:i], *words[i + 1 :]), []).append(number)
+    groups = [group for group in places.values() if len(group) > 1]
+    if not groups:
+        return None
+    first = min(groups)
+    examples = dict.fromkeys(instructions[number] for number in first[:2])
+    return AlikeInstructions(len({number for group in groups for number in group}), tuple(examples))
+
+
+def _task_of(item: SelectedEpisode) -> TaskName:
+    return item.store.suite, item.episode.attributes.task_id
