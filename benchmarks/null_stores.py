@@ -8,6 +8,7 @@ In a null store every key's attention is the same in expectation; episodes and k
     words     every word has the same lift in every layer and head
     objects   attention does not depend on where the objects are
     time      nothing changes when the gripper closes, and solved episodes are as failed ones
+    drift     the same, while attention moves steadily from the text to the pictures
     compare   two runs of the same distribution, paired by initial state
 
 A planted store differs in one place: the attention to the word "the", to the first object, after the gripper closed,
@@ -78,10 +79,13 @@ def plant_of(kind: str, seed: int, planted: bool) -> Callable[[int, int, Episode
             for span in tokens.layout.spans:
                 if span.camera in (tokens.coverage or {}):
                     factor[:, span.start : span.stop] += (FACTOR**3 - 1) * tokens.coverage[span.camera][:, :, 0]
-        elif kind == "time":
+        elif kind in ("time", "drift"):
             factor[REPLANS // 2 :] = np.where(image[REPLANS // 2 :], FACTOR, 1.0)
         elif seed % 2:  # the second run of a comparison
             factor = np.where(image, FACTOR, 1.0)
+        if kind == "drift":
+            time = np.linspace(0.0, 1.0, len(made))[:, None, None, None, None, None]
+            made = made * FACTOR ** (2 * time * image[:, None, None, None, None, :])
         return normalised(made * (factor[:, None, None, None, None, :] if planted else 1.0))
 
     return plant
@@ -104,6 +108,8 @@ SPEC = StoreSpec(
     plant_actions=close_half_way,
     plant_success=lambda task, episode: episode % 2 == 0,
     prompts="same",
+    # Unrelated tasks, though some have the same instruction.
+    task_families={task: f"template {task}" for task in range(TASKS)},
 )
 
 
@@ -116,7 +122,7 @@ def printed(kind: str, number: int, planted: bool, folder: Path) -> str:
         paths.append(str(write_store(folder / f"run{run}.zarr", spec=own)))
     errors = io.StringIO()
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(errors):
-        code = analyze([kind, *paths, "--no-plots", "--output", str(folder / "out")])
+        code = analyze(["time" if kind == "drift" else kind, *paths, "--no-plots", "--output", str(folder / "out")])
     if code:
         raise RuntimeError(errors.getvalue())
     return " ".join((folder / "out" / "summary.txt").read_text(encoding="utf-8").split())
@@ -127,7 +133,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="How often commands name something in null stores.")
     parser.add_argument("--stores", type=int, default=200, help="stores of each kind (default: 200)")
     parser.add_argument("--planted", action="store_true", help="with something to find")
-    parser.add_argument("--kinds", nargs="+", default=["words", "objects", "time", "compare"])
+    parser.add_argument("--kinds", nargs="+", default=["words", "objects", "time", "drift", "compare"])
     arguments = parser.parse_args()
     what = "planted" if arguments.planted else "null"
     print(f"{arguments.stores} {what} stores of {TASKS} tasks x {EPISODES} episodes x {REPLANS} replans each:")

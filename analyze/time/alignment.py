@@ -123,3 +123,32 @@ def change_at_event(around: NDArray[np.float64], window: int) -> NDArray[np.floa
     NaN where a side has no finite value.
     """
     return finite_mean(around[window:]) - finite_mean(around[:window])
+
+
+def change_and_placebo(
+    values: NDArray[np.float64], starts: NDArray[np.int64], event: int, window: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """`change_at_event`, and what it would be if the values drifted all along as they do at other times: (quantity,).
+
+    Every other replan is a placebo event. Its change is divided by the time between the middles of its two sides: near
+    the episode's ends sides are shorter, and a steady drift changes less between them. The mean of these, times that of
+    the event, is what a steady drift gives at the event, too.
+
+    Args:
+        values: (replan, quantity); those that are not finite take no part.
+        starts: (replan,) policy steps before each replan, see `replan_starts`.
+        event: the replan of the event.
+        window: replans on either side.
+
+    Returns:
+        NaN where a side of the event has no finite value; the placebo's also where no other replan has both sides.
+    """
+    times = np.where(np.isfinite(values), starts[:, None].astype(np.float64), np.nan)
+
+    def at(replan: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        of_values, of_times = (change_at_event(around_event(of, replan, window), window) for of in (values, times))
+        return of_values, of_times
+
+    change, apart = at(event)
+    others = [of_values / of_times for of_values, of_times in map(at, range(len(values)))]
+    return change, apart * finite_mean(np.delete(np.array(others), event, axis=0))

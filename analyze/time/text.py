@@ -127,6 +127,8 @@ def _gripper_section(courses: TimeCourses, settings: TimeSettings, units: Units)
             shortened(row["quantity"], 40),
             ("x " if row["quantity"] == RATIO else "") + format_number(row["change"]),
             row_interval(row),
+            *(("x " if row["quantity"] == RATIO else "") + format_number(row[name]) for name in ("placebo", "beyond")),
+            row_interval(row, "beyond"),
             format_number(row["q"]),
             str(row["num_episodes"]),
         ]
@@ -134,16 +136,16 @@ def _gripper_section(courses: TimeCourses, settings: TimeSettings, units: Units)
     ]
     note = (
         f"change: mean over at most {settings.window + 1} replans from the closing on, against at most "
-        f"{settings.window} before it, within each episode; a factor for the ratio, a difference of fractions for "
-        "groups. No causal claim: much else changes then. q: p of no change, adjusted for the number of quantities "
-        "(Benjamini-Hochberg)."
+        f"{settings.window} before it, within each episode (of the ratio a factor). elsewhere: the same at the other "
+        "replans; beyond: without that, so that a steady drift is none. No causal claim: much else changes then. q: p "
+        "of no change, or of none beyond (the larger), adjusted for the number of quantities (Benjamini-Hochberg)."
     )
     if not courses.change["num_episodes"].max():
         return "\n".join([above, *wrap(f"{rule} No episode shows both sides of a closing.")])
-    table = text_table(["quantity", "change", "interval", "q", "episodes"], body, left=(0,))
-    named = findings(
-        courses.change["q"].to_list(), courses.change["quantity"].to_list(), "quantity", "a change", _SENTENCES
-    )
+    header = ["quantity", "change", "interval", "elsewhere", "beyond", "interval", "q", "episodes"]
+    table = text_table(header, body, left=(0,))
+    what = "a change beyond that elsewhere"
+    named = findings(courses.change["q"].to_list(), courses.change["quantity"].to_list(), "quantity", what, _SENTENCES)
     note += f" {few_families_note(courses.change, 'quantity', units)}"
     return "\n".join([above, *wrap(rule), table, *wrap(named), *wrap(note)])
 

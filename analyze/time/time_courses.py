@@ -27,6 +27,7 @@ from vla_attention.analyze.statistics.intervals import (
     SHARE,
     UNKNOWN,
     EpisodeStatistic,
+    Estimate,
     ends,
     estimates,
     geometric_mean_over_episodes,
@@ -37,7 +38,7 @@ from vla_attention.analyze.statistics.summaries import summarize
 from vla_attention.analyze.statistics.units import Units
 from vla_attention.analyze.time.alignment import (
     around_event,
-    change_at_event,
+    change_and_placebo,
     closing_replan,
     episode_timing,
     on_episode_time,
@@ -84,8 +85,10 @@ class TimeCourses:
         closing: one row per episode: its identity, `closing_replan` (null when the gripper never closes) and
             `closing_time` (0 to 1); empty when the stores hold no actions.
         change: one row per quantity: mean change from before to after the closing (a factor for the ratio, a difference
-            for fractions) with `low`, `high` and `q` (Benjamini-Hochberg over the quantities; null: no change), and how
-            many episodes show both sides.
+            for fractions) with `low` and `high`; `placebo`, what it is at the other replans of the same episodes
+            (`alignment.change_and_placebo`), and `beyond`, the change without it, with `beyond_low` and `beyond_high`;
+            `q`: p of no change or of none beyond, the larger (Benjamini-Hochberg over the quantities); how many
+            episodes show both sides.
         outcomes: success against failure, one row per quantity, columns of `effect_sizes.contrast_row`; the ratio as
             log2. `difference_q` and `within_tasks_q` are adjusted for the number of quantities.
         autocorrelation: one row per episode, see `effective_replans.effective_replans_table`.
@@ -265,45 +268,63 @@ def _closing_table(episodes: Sequence[_Episode], rows: pl.DataFrame) -> pl.DataF
     return pl.DataFrame(found, schema={**kinds, "closing_replan": pl.Int64, "closing_time": pl.Float64}, orient="row")
 
 
+_CHANGE_SCHEMA: dict[str, Any] = {
+    "quantity": pl.String,
+    **dict.fromkeys(("change", "low", "high", "placebo", "beyond", "beyond_low", "beyond_high", "q"), pl.Float64),
+    "num_episodes": pl.Int64,
+    "num_tasks": pl.Int64,
+    **ABOUT_COLUMNS,
+}
+
+
 def _change_table(
     episodes: Sequence[_Episode], quantities: Sequence[str], window: int, sampling: Sampling
 ) -> pl.DataFrame:
-    schema: dict[str, Any] = {
-        "quantity": pl.String,
-        "change": pl.Float64,
-        "low": pl.Float64,
-        "high": pl.Float64,
-        "q": pl.Float64,
-        "num_episodes": pl.Int64,
-        "num_tasks": pl.Int64,
-        **ABOUT_COLUMNS,
-    }
-    closers = [
-        (e, change_at_event(around_event(e.values, e.closing, window), window))
-        for e in episodes
-        if e.closing is not None
-    ]
-    closers = [(episode, change) for episode, change in closers if np.isfinite(change).any()]
+    """The table `TimeCourses.change`."""
+    closers, changes, placebos = _changes_at_closing(episodes, window)
     if not closers:
-        return pl.DataFrame(schema=schema)
-    units = _units([episode for episode, _ in closers], sampling)
-    changes = np.stack([change for _, change in closers])
-    statistics = [
-        geometric_mean_over_episodes(changes[:, i]) if quantity == RATIO else mean_over_episodes(changes[:, i])
-        for i, quantity in enumerate(quantities)
-    ]
-    found = estimates(statistics, units.decided())
-    q_values = adjusted_p_values(
-        [one.p_value(1.0 if quantity == RATIO else 0.0) for quantity, one in zip(quantities, found, strict=True)]
+        return pl.DataFrame(schema=_CHANGE_SCHEMA)
+    units = _units(closers, sampling)
+
+    def means(values: NDArray[np.float64]) -> list[EpisodeStatistic]:
+        return [
+            geometric_mean_over_episodes(values[:, i]) if quantity == RATIO else mean_over_episodes(values[:, i])
+            for i, quantity in enumerate(quantities)
+        ]
+
+    statistics = means(changes)
+    found, placebo, beyond = (
+        estimates(of, units.decided()) for of in (statistics, means(placebos), means(changes - placebos))
     )
-    rows = [
-        (
-            *(quantity, one.value, *ends(one.interval()), q),
-            *(int(statistic.used.sum()), units.part(statistic.used).num_tasks, *about_row(units).values()),
-        )
-        for quantity, statistic, one, q in zip(quantities, statistics, found, q_values, strict=True)
+    nulls = [1.0 if quantity == RATIO else 0.0 for quantity in quantities]
+    q_values = adjusted_p_values([_larger_p(*of) for of in zip(found, beyond, nulls, strict=True)])
+    rows = []
+    for i, (quantity, statistic) in enumerate(zip(quantities, statistics, strict=True)):
+        numbers = (found[i].value, *ends(found[i].interval()), placebo[i].value, beyond[i].value)
+        counts = int(statistic.used.sum()), units.part(statistic.used).num_tasks, *about_row(units).values()
+        rows.append((quantity, *numbers, *ends(beyond[i].interval()), q_values[i], *counts))
+    return pl.DataFrame(rows, schema=_CHANGE_SCHEMA, orient="row")
+
+
+def _changes_at_closing(
+    episodes: Sequence[_Episode], window: int
+) -> tuple[list[_Episode], NDArray[np.float64], NDArray[np.float64]]:
+    """The episodes with replans on both sides of the closing, and their changes and placebos, (episode, quantity)."""
+    known = [
+        (episode, *change_and_placebo(episode.values, episode.starts, episode.closing, window))
+        for episode in episodes
+        if episode.closing is not None
     ]
-    return pl.DataFrame(rows, schema=schema, orient="row")
+    known = [of for of in known if np.isfinite(of[1]).any()]
+    return [of[0] for of in known], np.array([of[1] for of in known]), np.array([of[2] for of in known])
+
+
+def _larger_p(change: Estimate, beyond: Estimate, null: float) -> float | None:
+    """p of no change, or of none beyond its placebo: both have to be ruled out (Berger 1982, Technometrics 24)."""
+    p_values = change.p_value(null), beyond.p_value(null)
+    if change.value is None or beyond.value is None or p_values[0] is None or p_values[1] is None:
+        return None
+    return max(p_values[0], p_values[1]) if (change.value > null) == (beyond.value > null) else 1.0
 
 
 def _outcomes_table(episodes: Sequence[_Episode], quantities: Sequence[str], sampling: Sampling) -> pl.DataFrame:

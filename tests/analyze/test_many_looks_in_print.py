@@ -12,12 +12,15 @@ from benchmarks.null_stores import NAMES, printed
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize("kind", ["words", "objects", "time", "compare"])
+KINDS = ["words", "objects", "time", "drift", "compare"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_what_is_planted_is_named(kind, tmp_path):
     assert NAMES.search(printed(kind, 0, planted=True, folder=tmp_path))
 
 
-@pytest.mark.parametrize("kind", ["words", "objects", "time", "compare"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_nothing_is_named_in_null_stores(kind, tmp_path):
     """At most 5 % of null stores print a name: two of four would be most unlikely."""
     named = 0

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
@@ -13,6 +14,7 @@ from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.time.alignment import (
     around_event,
+    change_and_placebo,
     change_at_event,
     closing_replan,
     on_episode_time,
@@ -196,9 +198,62 @@ def test_the_aligned_course_and_the_change_at_the_closing_are_those_of_plain_num
         changes[name] = logs[name][event : event + 4].mean() - logs[name][max(0, event - 3) : event].mean()
     row = courses.change.filter(quantity="ratio").row(0, named=True)
     assert row["change"] == pytest.approx(np.exp(mean_over_tasks(changes)), rel=1e-5)
+    elsewhere = {}
+    for name in closers:
+        slopes = {}
+        for replan in range(1, REPLANS):
+            before, after = range(max(0, replan - 3), replan), range(replan, min(REPLANS, replan + 4))
+            apart = 5 * (np.mean(after) - np.mean(before))
+            slopes[replan] = (logs[name][list(after)].mean() - logs[name][list(before)].mean()) / apart, apart
+        own = slopes.pop(closes_at(*name))[1]
+        elsewhere[name] = own * np.mean([slope for slope, _ in slopes.values()])
+    assert row["placebo"] == pytest.approx(np.exp(mean_over_tasks(elsewhere)), rel=1e-5)
+    beyond = {name: changes[name] - elsewhere[name] for name in closers}
+    assert row["beyond"] == pytest.approx(np.exp(mean_over_tasks(beyond)), rel=1e-5)
+    assert row["beyond_low"] < row["beyond"] < row["beyond_high"] < 1
+    assert row["q"] <= 0.05
     # The planted truth is a half.
     assert row["low"] < 0.5 < row["high"] < 0.6
     assert row["num_episodes"] == len(closers) == 15
+
+
+@given(st.integers(2, 14), st.integers(1, 9), st.data())
+@settings(deadline=None)
+def test_a_steady_drift_has_no_change_beyond_that_elsewhere(replans, window, data):
+    """Whatever the sides' lengths, the steps between replans, and values that are missing."""
+    event = data.draw(st.integers(1, replans - 1))
+    starts = np.cumsum(data.draw(st.lists(st.integers(1, 9), min_size=replans, max_size=replans)))
+    values = np.stack([3.0 - 0.2 * starts, 0.1 * starts, np.full(replans, 2.0)], axis=1)
+    values[data.draw(st.integers(0, replans - 1)), 1] = np.nan
+    change, placebo = change_and_placebo(values, starts, event, window)
+    known = np.isfinite(placebo)
+    assert known[0] == known[2] == (replans > 2)
+    assert change[known] == pytest.approx(placebo[known], abs=1e-9)
+    assert change == pytest.approx(change_at_event(around_event(values, event, window), window), nan_ok=True)
+    if known[0]:
+        values[event:, 0] += 1.0
+        change, placebo = change_and_placebo(values, starts, event, window)
+        assert 0.0 < (change - placebo)[0] < 1.0 + 1e-9  # the other replans' sides hold a part of the step
+
+
+def drifting(task, episode, tokens, rows):
+    """As `plant_rows`, with a drift all along and nothing at the closing."""
+    visual = (tokens.key_role == Role.IMAGE)[:, None, None, None, None, :]
+    noise = np.random.default_rng([10, task, episode]).normal(0, 0.05, REPLANS)
+    logs = 0.1 * np.arange(REPLANS) + noise
+    made = np.where(rows > 0, np.exp(logs[:, None, None, None, None, None] * visual), 0.0)
+    return made / made.sum(axis=-1, keepdims=True)
+
+
+def test_a_steady_drift_is_no_change_at_the_closing(tmp_path):
+    path = write_store(tmp_path / "drift.zarr", spec=replace(SPEC, plant_rows=drifting))
+    found = time_courses(question_about(path), TimeSettings(num_bins=5, window=3))
+    row = found.change.filter(quantity="ratio").row(0, named=True)
+    assert row["low"] > 1.1  # the change alone
+    assert row["beyond_low"] < 1 < row["beyond_high"]
+    assert row["q"] > 0.05
+    said = " ".join(time_text(question_about(path), found, TimeSettings(5, 3)).split())
+    assert "none shows a change beyond that elsewhere" in said
 
 
 def test_the_planted_effect_of_success_is_found(courses):
