@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import polars as pl
 
@@ -20,7 +19,7 @@ from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_views import ALL_CAMERAS, CLASSES, site_of_pictures
 from vla_attention.analyze.statistics.episode_intervals import Sampling, means_with_intervals, task_number
 from vla_attention.analyze.statistics.intervals import POSITIVE, SHARE, quotient_by_episode
-from vla_attention.analyze.statistics.many_looks import Leader, adjusted_p_values, leader_of_table
+from vla_attention.analyze.statistics.many_looks import NamedLeader, adjusted_p_values, leader_of_table
 from vla_attention.schemas.stores.reader import Store
 
 #: An item that covers less than this part of the pictures (one patch of 512) is not ranked by its enrichment.
@@ -73,13 +72,13 @@ class ObjectStudy:
         return iou_summary(self._of_layer(self.tables.iou), self.question.sampling)
 
     @property
-    def followed(self) -> list[tuple[dict[str, Any], Leader]]:
+    def followed(self) -> list[NamedLeader]:
         """Which object is followed more than the others; see `followed_objects`."""
         together = self.tables.objects.filter(pl.col("kind") == "object", pl.col("camera") == ALL_CAMERAS)
         return followed_objects(together, self.question.sampling)
 
     @property
-    def finder(self) -> tuple[dict[str, Any], Leader] | None:
+    def finder(self) -> NamedLeader | None:
         """The layer and head that find the objects of interest; see `leading_finder`."""
         if self.tables.iou is None:
             return None
@@ -166,7 +165,7 @@ def iou_summary(iou: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
     return _ordered(_means(iou.drop_nulls("iou"), (*_ITEM, "threshold"), values, sampling), "iou")
 
 
-def followed_objects(objects: pl.DataFrame, sampling: Sampling) -> list[tuple[dict[str, Any], Leader]]:
+def followed_objects(objects: pl.DataFrame, sampling: Sampling) -> list[NamedLeader]:
     """The object that exceeds its control by the largest factor over layers, and the (object, layer, head) that does.
 
     From `object_tables`, `objects`, all cameras together. Each with how surely it exceeds all the others
@@ -203,7 +202,7 @@ def _linearised(of_item: pl.DataFrame) -> pl.DataFrame:
     return of_item.with_columns(pl.Series(_OVER_CONTROL, values))
 
 
-def leading_finder(iou: pl.DataFrame, threshold: str, sampling: Sampling) -> tuple[dict[str, Any], Leader] | None:
+def leading_finder(iou: pl.DataFrame, threshold: str, sampling: Sampling) -> NamedLeader | None:
     """The (camera, layer, head) whose maps have the highest IoU above chance with the objects of interest."""
     of_interest = (pl.col("kind") == "class") & (pl.col("item") == CLASSES[0])
     found = _single_layers(iou).filter(of_interest, pl.col("threshold") == threshold).drop_nulls("iou")

@@ -10,7 +10,7 @@ from vla_attention.analyze.objects.control_masks import STILL_OVERLAP
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_study import ObjectStudy
 from vla_attention.analyze.objects.object_views import ALL_CAMERAS, item_name
-from vla_attention.analyze.show.findings import few_families_note
+from vla_attention.analyze.show.findings import apart_note, few_families_note
 from vla_attention.analyze.show.headings import interval_note, wrap
 from vla_attention.analyze.show.numbers import format_interval, format_number, plural, row_interval
 from vla_attention.analyze.show.text_table import episode_counts, text_table
@@ -58,14 +58,16 @@ def followed_sentence(study: ObjectStudy) -> str:
     """Which object, and which layer of an object, surely exceeds its control more than all the others do."""
     leaders = study.followed
     about = study.question.units.words
-    named = [
-        f"'{row['item']}'{_place(row)} exceeds its control by a larger factor ({format_number(found.value)}) than each "
-        f"of the other {found.num_items - 1} {'pairs of object and layer' if 'layer' in row else 'objects'}"
-        for row, found in leaders
-        if found.is_named(_NAMES)
+    named = [leading for leading in leaders if leading.found.is_named(_NAMES)]
+    said = [
+        f"'{one.name['item']}'{_place(one.name)} exceeds its control by a larger factor "
+        f"({format_number(one.found.value)}) than each of the other {one.found.num_items - 1} "
+        f"{'pairs of object and layer' if 'layer' in one.name else 'objects'}"
+        for one in named
     ]
-    if named:
-        return f"{'; '.join(named)} (each difference tested at {NAMED_AT:g} / {_NAMES}, about {about})."
+    if said:
+        apart = apart_note(named, "item")
+        return f"{'; '.join(said)} (each difference tested at {NAMED_AT:g} / {_NAMES}, about {about}). {apart}".rstrip()
     if not leaders:
         return "There are no two objects whose control can tell."
     return f"No object, and no layer of an object, is shown to be followed more than all the others (about {about})."
@@ -91,7 +93,7 @@ def _found(study: ObjectStudy) -> str:
     """Which layer surely finds the objects of interest better than all the others."""
     if study.finder is None:
         return "There are no two layers that could find the objects of interest."
-    row, found = study.finder
+    row, found = study.finder.name, study.finder.found
     if not found.is_named(_NAMES):
         return f"None of {found.num_items} layers surely finds the objects of interest better than all the others."
     return (

@@ -106,10 +106,17 @@ def leader(values: ArrayLike, units: Units) -> Leader | None:
     return Leader(first, float(highest[first]), p_value, len(known), tuple(apart))
 
 
-def leader_of_table(
-    table: pl.DataFrame, item: Sequence[str], value: str, sampling: Sampling
-) -> tuple[dict[str, Any], Leader] | None:
-    """`leader` of a table with one row per (episode, item): the leading item's columns `item`, and the leader."""
+@dataclass(frozen=True)
+class NamedLeader:
+    """A leader of a table: its columns `name`, and those of the items in `Leader.apart`."""
+
+    name: dict[str, Any]
+    found: Leader
+    apart: tuple[dict[str, Any], ...]
+
+
+def leader_of_table(table: pl.DataFrame, item: Sequence[str], value: str, sampling: Sampling) -> NamedLeader | None:
+    """`leader` of a table with one row per (episode, item), whose columns `item` name the items."""
     names = table.select(item).unique(maintain_order=True)
     episodes = table.select(EPISODE_COLUMNS).unique(maintain_order=True)
     place = names.with_row_index("_item")
@@ -121,7 +128,9 @@ def leader_of_table(
         numbered[value].cast(pl.Float64).fill_null(np.nan).to_numpy()
     )
     found = leader(wide, sampling.units(episodes).decided())
-    return None if found is None else (names.row(found.item, named=True), found)
+    if found is None:
+        return None
+    return NamedLeader(names.row(found.item, named=True), found, tuple(names.row(i, named=True) for i in found.apart))
 
 
 def fewest_clusters(units: Units) -> int:

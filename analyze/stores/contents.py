@@ -27,6 +27,7 @@ from vla_attention.schemas.stores.store_format import Protocol, RootAttributes
 _EPISODE_COLUMNS = (
     "task_id",
     "task_name",
+    "task_family",
     "instruction",
     "episode_index",
     "initial_state_index",
@@ -43,7 +44,7 @@ def episodes_table(stores: Sequence[Store]) -> pl.DataFrame:
     rows = [
         {"store": str(store.path), "suite": store.suite}
         | {name: getattr(episode.attributes, name) for name in _EPISODE_COLUMNS}
-        | {"instruction": visible(episode.attributes.instruction)}
+        | {name: visible(getattr(episode.attributes, name)) for name in ("instruction", "task_family")}
         for store in stores
         for episode in read_one_by_one(store.episodes)
     ]

@@ -6,7 +6,7 @@ from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.show.findings import few_families_note
+from vla_attention.analyze.show.findings import apart_note, few_families_note
 from vla_attention.analyze.show.headings import interval_note, wrap
 from vla_attention.analyze.show.numbers import format_interval, format_number
 from vla_attention.analyze.show.text_table import episode_counts, text_table
@@ -48,14 +48,16 @@ def leading_sentence(study: WordStudy) -> str:
     about, fewest = units.words, fewest_clusters(units)
     which = "of at least {} tasks" if units.families is None else "in tasks of at least {} families"
     some = f" {which.format(fewest)}" if fewest > 1 else ""
+    named = [leading for leading in leaders if leading.found.is_named(len(leaders))]
     said = [
-        f"{_cell(row)} has a higher lift ({format_number(found.value)}) than each of the other {found.num_items - 1} "
-        f"{'words' if 'layer' not in row else 'pairs of word and layer'}{some}"
-        for row, found in leaders
-        if found.is_named(len(leaders))
+        f"{_cell(one.name)} has a higher lift ({format_number(one.found.value)}) than each of the other "
+        f"{one.found.num_items - 1} {'words' if 'layer' not in one.name else 'pairs of word and layer'}{some}"
+        for one in named
     ]
     if said:
-        return f"{'; '.join(said)} (each difference tested at {NAMED_AT:g} / {len(leaders)}, about {about})."
+        level = f"{NAMED_AT:g} / {len(leaders)}"
+        apart = apart_note(named, "item")
+        return f"{'; '.join(said)} (each difference tested at {level}, about {about}). {apart}".rstrip()
     if not leaders:
         return f"There are no two words{some} to compare."
     return (

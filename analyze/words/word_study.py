@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import polars as pl
 
@@ -15,7 +14,7 @@ from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.statistics.episode_intervals import Sampling, means_with_intervals
 from vla_attention.analyze.statistics.intervals import POSITIVE, SHARE
-from vla_attention.analyze.statistics.many_looks import Leader, adjusted_p_values, leader_of_table
+from vla_attention.analyze.statistics.many_looks import NamedLeader, adjusted_p_values, leader_of_table
 from vla_attention.analyze.stores.selection import site_that
 from vla_attention.analyze.words.word_reading import words_table
 from vla_attention.schemas.errors import BadArgument
@@ -48,7 +47,7 @@ class WordStudy:
         return words_summary(self.episodes, self.question.sampling, self.instruction is not None)
 
     @property
-    def leaders(self) -> list[tuple[dict[str, Any], Leader]]:
+    def leaders(self) -> list[NamedLeader]:
         """The leading word, and the leading (word, layer, head); see `leading_words`."""
         return leading_words(self.episodes, self.question.sampling)
 
@@ -129,7 +128,7 @@ def words_summary(
     return pl.concat([words, summary.filter(pl.col("kind") == "scale")])
 
 
-def leading_words(table: pl.DataFrame, sampling: Sampling) -> list[tuple[dict[str, Any], Leader]]:
+def leading_words(table: pl.DataFrame, sampling: Sampling) -> list[NamedLeader]:
     """The word with the highest lift over layers, and the (word, layer, head) with the highest, from `words_table`.
 
     Each with how surely it is above all the others (`many_looks.leader`). A word that occurs twice counts by the mean

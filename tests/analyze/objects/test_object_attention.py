@@ -220,15 +220,15 @@ def test_a_planted_follower_is_found_and_named(follower_store):
     tables = measured(follower_store, per_head=True)
     assert tables.iou is not None
     names = [
-        (name, found.is_named()) for name, found in followed_objects(tables.objects, Sampling(Estimand.THESE_TASKS))
+        (one.name, one.found.is_named()) for one in followed_objects(tables.objects, Sampling(Estimand.THESE_TASKS))
     ]
     bowl = {"item": "akita_black_bowl_1"}
     assert names == [
         (bowl | {"layer": "2", "head": 1}, True)
     ]  # the cabinet does not move, and one object leads nothing
-    finder, found = leading_finder(tables.iou, "p90", Sampling(Estimand.THESE_TASKS))
-    assert (finder["layer"], finder["head"]) == ("2", 1)
-    assert found.value > 0.1
+    finder = leading_finder(tables.iou, "p90", Sampling(Estimand.THESE_TASKS))
+    assert (finder.name["layer"], finder.name["head"]) == ("2", 1)
+    assert finder.found.value > 0.1
     summary = objects_summary(tables.objects, Sampling())
     bowl = summary.filter((pl.col("camera") == "all") & (pl.col("item") == "akita_black_bowl_1")).row(0, named=True)
     assert bowl["enrichment_low"] > 1.5

@@ -91,10 +91,11 @@ def test_the_leader_of_a_table_is_named_by_its_columns():
         for word, lift in (("bowl", generator.normal(3, 0.1)), ("the", generator.normal(1, 0.1)))
     ]
     table = pl.DataFrame(rows, schema_overrides={"head": pl.Int64})
-    name, found = leader_of_table(table, ("word", "head"), "lift", Sampling())
-    assert name == {"word": "bowl", "head": None}
-    assert found.is_named()
-    assert found.value == pytest.approx(table.filter(word="bowl")["lift"].mean())
+    leading = leader_of_table(table, ("word", "head"), "lift", Sampling())
+    assert leading.name == {"word": "bowl", "head": None}
+    assert leading.apart == ()
+    assert leading.found.is_named()
+    assert leading.found.value == pytest.approx(table.filter(word="bowl")["lift"].mean())
 
 
 def test_families_are_the_units_of_leaders():
