@@ -80,14 +80,19 @@ def unknown_families(sampling: Sampling, selected: Sequence[SelectedEpisode]) ->
     if sampling.estimand != Estimand.TASKS_LIKE_THESE:
         return ""
     instructions = {_task_of(item): visible(item.episode.attributes.instruction) for item in selected}
-    unnamed = [text for task, text in instructions.items() if task not in sampling.families]
-    alike = alike_instructions(unnamed)
+    said = related_instructions([text for task, text in instructions.items() if task not in sampling.families])
+    return f"{said} --intervals these-tasks does not count them so." if said else ""
+
+
+def related_instructions(instructions: Sequence[str]) -> str:
+    """That tasks with these instructions, of which no family is known, seem related; empty where they do not."""
+    alike = alike_instructions(instructions)
     if alike is None:
         return ""
     return (
-        f"Of {len(unnamed)} tasks no family is known, and {alike.number} of their instructions differ in at most one "
-        f"word from another one ({_quoted(alike.examples)}). Such tasks are related: intervals that count them as "
-        "independent are too narrow. --intervals these-tasks does not count them so."
+        f"Of {len(instructions)} tasks no family is known, and {alike.number} of their instructions differ in at most "
+        f"one word from another one ({_quoted(alike.examples)}). Such tasks are related: intervals that count them as "
+        "independent are too narrow."
     )
 
 

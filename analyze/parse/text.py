@@ -8,6 +8,7 @@ import polars as pl
 
 from vla_attention.analyze.measures.aggregate import overall_layer, overall_rows
 from vla_attention.analyze.measures.frames import LAYERS_AVG, layer_name
+from vla_attention.analyze.measures.task_families import related_instructions
 from vla_attention.analyze.published.results_reader import ResultsFile
 from vla_attention.analyze.published.results_tables import (
     ResultsTables,
@@ -192,7 +193,10 @@ def _over_episodes(tables: ResultsTables, layer: str) -> list[str]:
         return [f"{text}; no interval"]
     interval = format_interval(row["geometric_mean_low"], row["geometric_mean_high"])
     about = "tasks like these" if row["num_tasks"] > 1 else "episodes like these"
-    return [f"{text}, {interval_name(DEFAULT_LEVEL)} {interval} (about {about})"]
+    tasks = tables.episodes.cells.select("suite", "task_id", "instruction").unique(maintain_order=True)
+    related = related_instructions(tasks["instruction"].to_list())
+    warning = wrap(f"WARNING: {related}", first="    ", rest="    ") if related else []
+    return [f"{text}, {interval_name(DEFAULT_LEVEL)} {interval} (about {about})", *warning]
 
 
 def _fractions(rows: pl.DataFrame) -> list[str]:

@@ -28,6 +28,7 @@ from vla_attention.analyze.report.section_parts import (
     percent_cell,
     text_cell,
 )
+from vla_attention.analyze.show.findings import few_families_note
 from vla_attention.analyze.show.numbers import format_number, format_percent, interval_name
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.analyze.time.plot_time_course import plot_time_courses
@@ -128,7 +129,9 @@ def word_section(question: Question, folder: Path) -> Section:
     ]
     header = ["word", "class", "episodes", "lift", _INTERVAL, "q", "mass %", "of the text %"]
     caption = "Words of the instructions. q: p of lift 1, adjusted for the number of words (Benjamini-Hochberg)"
-    return Section("words", "Words", [diagram, Paragraph(leading_sentence(study)), Table(caption, header, rows)])
+    few = few_families_note(of_words, "item", study.question.units)
+    said = [Paragraph(leading_sentence(study)), *([Paragraph(few)] if few else [])]
+    return Section("words", "Words", [diagram, *said, Table(caption, header, rows)])
 
 
 def object_section(question: Question, folder: Path) -> Section | None:
@@ -175,8 +178,9 @@ def object_section(question: Question, folder: Path) -> Section | None:
         f"Objects, all cameras together{more}. No value over control: there is none, or it cannot tell because the "
         "object hardly moves. q: p of 1 over control, adjusted (Benjamini-Hochberg)"
     )
-    table = Table(caption, header, rows)
-    return Section("objects", "Objects", [diagram, Paragraph(followed_sentence(study)), table])
+    few = few_families_note(whole, "item", study.question.units)
+    said = [Paragraph(followed_sentence(study)), *([Paragraph(few)] if few else [])]
+    return Section("objects", "Objects", [diagram, *said, Table(caption, header, rows)])
 
 
 def _named(summary: pl.DataFrame, measure: str) -> str:

@@ -246,3 +246,17 @@ def test_rows_of_the_comparison_keep_different_names(few):
         names = row_names(data, few)
         assert len(set(names)) == len(chosen)
         assert max(len(line) for name in names for line in name.splitlines()) <= 48
+
+
+def test_related_tasks_of_a_file_are_warned_of(tmp_path, capsys):
+    """A results file names no families: its intervals count all tasks as independent."""
+    episodes = pi_episodes()
+    tasks = sorted({episode["task_id"] for episode in episodes})
+    assert len(tasks) > 1
+    texts = dict(zip(tasks, ("lift the red cube", "lift the blue cube", "open the drawer"), strict=False))
+    for episode in episodes:
+        episode["task_description"] = texts.get(episode["task_id"], f"turn on stove number {episode['task_id']} now")
+    _, out, _ = run(capsys, "--results", write_published(tmp_path, "libero_10", episodes))
+    said = " ".join(out.split())
+    assert "(about tasks like these) WARNING: Of" in said
+    assert "('lift the red cube', 'lift the blue cube'). Such tasks are related" in said
