@@ -405,3 +405,32 @@ def test_other_interventions_are_noted(stores, tmp_path):
     known = {**stores, "empty": write_store(tmp_path / "empty.zarr", spec=spec)}
     found = compare(opened(known, "base", "empty"))
     assert "base and empty differ in their interventions (none; the instruction empty)." in found.notes
+
+
+def test_differences_over_tasks_are_by_families(tmp_path):
+    """Seven tasks of four families: the error is theirs, in the difference, in its effect size and in the text."""
+    families = dict(enumerate("aaabbcd"))
+    spec = replace(PLAIN, tasks=tuple(families), task_families=families, episodes=2)
+    for name, run in (("first", 0), ("other", 1)):
+        write_store(tmp_path / f"{name}.zarr", spec=replace(spec, plant_rows=planting(run)))
+    stores = {name: tmp_path / f"{name}.zarr" for name in ("first", "other")}
+    found = compare(opened(stores, "first", "other"))
+    row = one(found.differences, scope="all", layer="layers_avg", quantity="log2_ratio")
+    assert (row["num_tasks"], row["num_families"], row["intervals"]) == (7, 4, "tasks-like-these")
+    pairs = found.pairs.filter(layer="layers_avg", quantity="log2_ratio")
+    means = pairs.group_by("task_id").agg(pl.col("difference").mean()).sort("task_id")["difference"].to_numpy()
+    labels = np.array([0, 0, 0, 1, 1, 2, 3])
+    sums, size = np.bincount(labels, means - means.mean()), np.bincount(labels)
+    shares = size**2 / (7 * (7 - size))
+    degrees = 1 / ((size**2).sum() / 49 + shares.sum() ** 2 - (shares**2).sum())
+    reach = stats.t.ppf(0.975, degrees) * np.sqrt((sums**2 / (7 * (7 - size))).sum())
+    assert row["difference"] == pytest.approx(means.mean())
+    assert (row["low"], row["high"]) == pytest.approx((means.mean() - reach, means.mean() + reach))
+    assert row["d_z_low"] < row["d_z"] < row["d_z_high"]
+    said = " ".join(comparison_text(found).split())
+    assert "about tasks like these, by 4 families" in said
+    assert "4 families of tasks where these are the units" in said
+    plain = compare(opened(stores, "first", "other", intervals="independent-tasks"))
+    apart = one(plain.differences, scope="all", layer="layers_avg", quantity="log2_ratio")
+    assert apart["low"] == pytest.approx(stats.ttest_1samp(means, 0).confidence_interval().low)
+    assert "3 tasks where tasks are the units" in " ".join(comparison_text(plain).split())
