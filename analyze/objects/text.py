@@ -57,7 +57,7 @@ def _shares(study: ObjectStudy) -> list[str]:
 def followed_sentence(study: ObjectStudy) -> str:
     """Which object, and which layer of an object, surely exceeds its control more than all the others do."""
     leaders = study.followed
-    about = study.question.units.words
+    about = (leaders[0].units if leaders else study.question.units).words
     named = [leading for leading in leaders if leading.found.is_named(_NAMES)]
     said = [
         f"'{one.name['item']}'{_place(one.name)} exceeds its control by a larger factor "
@@ -99,7 +99,7 @@ def _found(study: ObjectStudy) -> str:
     return (
         f"Objects of interest: the IoU{_place(row)} on {row['camera']} is further above chance (by "
         f"{format_number(found.value)}) than each of the other {found.num_items - 1} (each difference tested at "
-        f"{NAMED_AT:g} / {_NAMES})."
+        f"{NAMED_AT:g} / {_NAMES}, about {study.finder.units.words})."
     )
 
 

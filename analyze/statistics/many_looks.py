@@ -108,11 +108,19 @@ def leader(values: ArrayLike, units: Units) -> Leader | None:
 
 @dataclass(frozen=True)
 class NamedLeader:
-    """A leader of a table: its columns `name`, and those of the items in `Leader.apart`."""
+    """A leader of a table.
+
+    Attributes:
+        name: its columns.
+        found: the leader.
+        apart: the columns of the items in `Leader.apart`.
+        units: what the differences are about: these tasks, where fewer than two items are of enough families.
+    """
 
     name: dict[str, Any]
     found: Leader
     apart: tuple[dict[str, Any], ...]
+    units: Units
 
 
 def leader_of_table(table: pl.DataFrame, item: Sequence[str], value: str, sampling: Sampling) -> NamedLeader | None:
@@ -127,10 +135,15 @@ def leader_of_table(table: pl.DataFrame, item: Sequence[str], value: str, sampli
     wide[numbered["_episode"].to_numpy(), numbered["_item"].to_numpy()] = (
         numbered[value].cast(pl.Float64).fill_null(np.nan).to_numpy()
     )
-    found = leader(wide, sampling.units(episodes).decided())
+    units = sampling.units(episodes).decided()
+    found = leader(wide, units)
+    if found is None and units.families is not None:
+        units = units.about_these_tasks()
+        found = leader(wide, units)
     if found is None:
         return None
-    return NamedLeader(names.row(found.item, named=True), found, tuple(names.row(i, named=True) for i in found.apart))
+    apart = tuple(names.row(i, named=True) for i in found.apart)
+    return NamedLeader(names.row(found.item, named=True), found, apart, units)
 
 
 def fewest_clusters(units: Units) -> int:

@@ -99,6 +99,10 @@ class Units:
         parts = [self.part(chosen) for chosen in classes] or [self]
         if all(part.has_enough_families for part in parts):
             return self
+        return self.about_these_tasks()
+
+    def about_these_tasks(self) -> Units:
+        """The same episodes, with an interval about their own tasks."""
         return replace(self, estimand=Estimand.THESE_TASKS, families=None)
 
     @property

@@ -44,7 +44,7 @@ def words_text(study: WordStudy) -> str:
 def leading_sentence(study: WordStudy) -> str:
     """Which word, and which layer of a word, is surely above all the others."""
     leaders = study.leaders
-    units = study.question.units
+    units = leaders[0].units if leaders else study.question.units
     about, fewest = units.words, fewest_clusters(units)
     which = "of at least {} tasks" if units.families is None else "in tasks of at least {} families"
     some = f" {which.format(fewest)}" if fewest > 1 else ""

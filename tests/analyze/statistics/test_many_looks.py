@@ -117,6 +117,24 @@ def test_families_are_the_units_of_leaders():
     assert leader(values, Units.of(tasks, Estimand.THESE_TASKS)).item == 2
 
 
+def test_where_one_item_alone_is_of_four_families_leaders_are_about_these_tasks():
+    generator = np.random.default_rng(8)
+    rows = [
+        {"suite": "s", "task_id": e % 8, "episode_index": e, "word": word, "lift": generator.normal(lift, 0.1)}
+        for e in range(40)
+        for word, lift in (("the", 3.0), ("bowl", 1.0))
+        if word == "the" or e % 8 < 4
+    ]
+    families = {("s", task): "abcd"[task // 2] for task in range(8)}
+    leading = leader_of_table(pl.DataFrame(rows), ("word",), "lift", Sampling(families=families))
+    assert leading.name == {"word": "the"}
+    assert leading.found.is_named()
+    assert leading.units.words == "these tasks"
+    everywhere = [row | {"word": "on"} for row in rows if row["word"] == "the"]
+    leading = leader_of_table(pl.DataFrame(rows + everywhere), ("word",), "lift", Sampling(families=families))
+    assert (leading.found.num_items, leading.units.words) == (2, "tasks like these, by 4 families")
+
+
 def test_a_leader_says_with_which_items_it_shares_too_few_episodes():
     generator = np.random.default_rng(7)
     tasks = np.repeat(np.arange(8), 4)
