@@ -3,6 +3,7 @@
     python benchmarks/interval_coverage.py                # 2000 simulated stores of every size, some minutes
     python benchmarks/interval_coverage.py --on-disk 20   # and 20 stores that are written to disk and read back
     python benchmarks/interval_coverage.py --only families
+    python benchmarks/interval_coverage.py --store runs/cubes.zarr    # how related the tasks of a store are
 
 The mean log ratios of tasks are drawn from a population with standard deviation `between`. Episodes differ from their
 task by `within` (both in natural logarithms: 0.3 is 30 %), and replans drift around their episode. Coverage:
@@ -36,6 +37,7 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+import vla_attention as va
 from vla_attention.analyze.statistics.intervals import (
     POSITIVE,
     EpisodeStatistic,
@@ -212,6 +214,35 @@ def print_families(num_stores: int, seed: int) -> None:
                 )
 
 
+def intraclass_correlation(values: NDArray[np.float64], families: NDArray[np.intp]) -> float:
+    """Of values (task,) in families (task,): (between - within) / (between + (n0 - 1) within), by analysis of variance.
+
+    With mean squares between and within families and n0 = (T - sum n_g^2 / T) / (G - 1) (Donner 1986, International
+    Statistical Review 54).
+    """
+    size = np.bincount(families)
+    means = np.bincount(families, values) / size
+    between = (size * (means - values.mean()) ** 2).sum() / (len(size) - 1)
+    within = ((values - means[families]) ** 2).sum() / (len(values) - len(size))
+    usual = (len(values) - (size**2).sum() / len(values)) / (len(size) - 1)
+    return float((between - within) / (between + (usual - 1) * within))
+
+
+def print_store(path: Path) -> None:
+    """How related the tasks of a store are in their log ratios, and its three intervals."""
+    run = va.open(path)
+    families = dict(run.episodes.select("task_id", "task_family").iter_rows())
+    ratios = run.ratios("episodes").filter(layer="layers_avg")
+    means = ratios.group_by("task_id").agg(pl.col("log_ratio_mean").mean()).sort("task_id")
+    names = np.unique([families[task] for task in means["task_id"]], return_inverse=True)[1]
+    found = intraclass_correlation(means["log_ratio_mean"].to_numpy(), names)
+    print(f"{path}: {means.height} tasks of {names.max() + 1} families, intraclass correlation {found:.2f}")
+    for estimand in Estimand:
+        row = run.ratios(intervals=estimand).filter(scope="all", layer="layers_avg").row(0, named=True)
+        numbers = [row[f"geometric_mean{end}"] for end in ("", "_low", "_high")]
+        print("  {:18} {:.3f} [{:.3f}, {:.3f}]".format(estimand.value, *numbers))
+
+
 def power(num_tasks: int, num_episodes: int, num_stores: int, seed: int, effect: float) -> tuple[float, float]:
     """How often 0 is excluded: by the interval of a paired comparison, and by a t test over task means."""
     generator = np.random.default_rng([seed, num_tasks, num_episodes])
@@ -290,8 +321,12 @@ def main() -> None:
     parser.add_argument("--stores", type=int, default=2000, help="simulated stores of every size (default: 2000)")
     parser.add_argument("--on-disk", type=int, default=0, metavar="N", help="also N stores of 10 x 5 through files")
     parser.add_argument("--only", choices=("tasks", "families"), help="one of the two tables (default: everything)")
+    parser.add_argument("--store", type=Path, help="instead: the intraclass correlation and the intervals of a store")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
+    if arguments.store is not None:
+        print_store(arguments.store)
+        return
     if arguments.only == "families":
         print_families(arguments.stores, arguments.seed)
         return
