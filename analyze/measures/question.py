@@ -72,13 +72,17 @@ class Question:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """The lines of every result with numbers: what was left out, of what baselines are, related tasks, the notes."""
-        return (
-            *self.skipped,
-            *baseline_notes(self.stores),
-            *relation_remarks(self.sampling, self.selected),
-            *self.notes,
-        )
+        """The lines that every result with numbers has: what was left out, what the baselines are of, and the notes."""
+        return (*self._remarks_on_numbers, *self.notes)
+
+    @property
+    def remarks_on_intervals(self) -> tuple[str, ...]:
+        """`remarks` and, above the notes, how the tasks are related: the lines of every result with intervals."""
+        return (*self._remarks_on_numbers, *relation_remarks(self.sampling, self.selected), *self.notes)
+
+    @property
+    def _remarks_on_numbers(self) -> tuple[str, ...]:
+        return (*self.skipped, *baseline_notes(self.stores))
 
     @property
     def units(self) -> Units:
@@ -105,7 +109,7 @@ class Question:
             layer=layer_name(layer),
             num_episodes=len(self.selected),
             num_tasks=self.num_tasks,
-            notes=self.remarks,
+            notes=self.remarks_on_intervals,
         )
 
 

@@ -72,7 +72,7 @@ def _header(question: Question, courses: TimeCourses) -> str:
         f"{layer}; grouping '{question.grouping.name}'. "
         f"{interval_note(DEFAULT_LEVEL, question.units.words, 'pointwise')}"
     )
-    for line in question.remarks:
+    for line in question.remarks_on_intervals:
         lines += wrap(line)
     return "\n".join(lines)
 

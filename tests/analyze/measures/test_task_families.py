@@ -160,6 +160,8 @@ def test_a_store_without_families_warns_where_instructions_are_alike(tmp_path, c
     assert main([str(alike), "--no-plots", "--output", str(tmp_path / "out")]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "WARNING: Of 4 tasks no family is known, and 2 of their instructions differ in at most one word" in said
+    assert main(["overlay", str(alike), "--no-plots", "--output", str(tmp_path / "out")]) == 0
+    assert "WARNING: Of" not in capsys.readouterr().out  # it prints no interval
     for settings in ({"tasks": (0, 1, 2)}, {"intervals": "these-tasks"}, {"intervals": "independent-tasks"}):
         question = asked(alike, **settings)
         assert unknown_families(question.sampling, question.selected) == ""
