@@ -175,7 +175,10 @@ class Analysis:
     def notes(self) -> list[str]:
         """What to know beside the numbers: what was left out, which steps they are of, other sites."""
         question = self.question
-        notes = [*question.remarks_on_intervals, *_notes(question.stores[0].attributes, question.selection, question.site)]
+        notes = [
+            *question.remarks_on_intervals,
+            *_notes(question.stores[0].attributes, question.selection, question.site),
+        ]
         if self.grouping.ratio is not None and self.without_known_end:
             notes.append(
                 f"No results file in the published format: it states outcome and number of steps of each episode, and "
