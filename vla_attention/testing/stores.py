@@ -60,13 +60,14 @@ class StoreSpec:
     of replans); otherwise each episode has those of `small_tokens`. `prompts`: "changing" (state digits, as in pi0.5)
     or "same". `seed` decides all random numbers. `layers` are blocks of `num_layers`; the other fields of the recording
     are as in `Recording`. `interventions` and `rerun_of` (see `rerun_source`) are what the store says that its run
-    changed and repeated. `task_families`: those of tasks, where they are known. The `plant_` functions replace rows,
-    what uniform attention gives, coverage, actions and outcomes; without them rows are random, every query sees every
-    key that is not masked, and episodes of odd numbers are solved.
+    changed and repeated. The `plant_` functions replace rows, what uniform attention gives, coverage, actions and
+    outcomes; without them rows are random, every query sees every key that is not masked, and episodes of odd numbers
+    are solved.
     """
 
     suite: str = "made_up"
     tasks: tuple[int, ...] = (0, 1)
+    #: Families of tasks, where they are known.
     task_families: Mapping[int, str] = field(default_factory=dict)
     episodes: int = 2
     replans: int = 3
