@@ -41,7 +41,7 @@ def look_at(store: Store, episode: StoredEpisode, verify: bool = False) -> Damag
             f"{store.path} is packed, and captures add nothing to packed stores; vla-analyze verify {store.path} "
             f"checks it, and vla-analyze copy {store.path} NAME.zarr makes a store of folders."
         )
-    problems = check_presence(replace(episode))
+    problems = [problem.text for problem in check_presence(replace(episode))]
     if verify and not problems:
         problems = [fault.problem for fault in episode_faults(store, episode)]
     return DamagedEpisode(episode.name, tuple(problems)) if problems else None

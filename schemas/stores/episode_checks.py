@@ -37,11 +37,12 @@ from vla_attention.schemas.stores.root import group_attributes
 from vla_attention.schemas.stores.store_format import (
     NUMBERS,
     CorruptEpisode,
+    Problem,
     RootAttributes,
 )
 
 
-def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
+def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[Problem]:
     """What is wrong inside an episode, wherever its folder is: metadata, shapes, values, row sums. Reads all of it.
 
     Raises:
@@ -49,7 +50,7 @@ def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[s
     """
     attributes = episode.attributes
     for file in files_of_no_array(root, attributes, episode.files.records):
-        yield f"its seal lists {file}, which belongs to no array of an episode"
+        yield Problem(f"its seal lists {file}, which belongs to no array of an episode")
     # The files of arrays are compared with the seal when the arrays are read.
     for file in episode.files.records:
         if file.endswith("zarr.json"):
@@ -58,22 +59,22 @@ def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[s
     numbers = {name: (len(given),) for name in NUMBERS if (given := getattr(attributes, name))}
     listed = {name: record.shape for name, record in attributes.arrays.items()} | numbers
     for name in sorted(set(shapes) - set(listed)):
-        yield f"{name} is not in the episode"
+        yield Problem(f"{name} is not in the episode")
     for name, shape in listed.items():
         wrong = list(shape_problems(name, shape, shapes.get(name, (attributes.num_replans,))))
-        yield from wrong
+        yield from map(Problem, wrong)
         if not wrong and name not in numbers:
             yield from _guarded(_array_problems(root, episode, name, attributes.arrays[name].sha256))
     for check in (_axis_problems, _token_problems, _camera_problems, _counter_problems):
         yield from _guarded(check(root, episode))
 
 
-def _guarded(check: Iterator[str]) -> Iterator[str]:
+def _guarded(check: Iterator[str]) -> Iterator[Problem]:
     """The problems that a check finds; an array or file that it cannot read is one more."""
     try:
-        yield from check
+        yield from map(Problem, check)
     except CorruptEpisode as error:
-        yield str(error)
+        yield Problem(str(error), error.file)
 
 
 def _metadata_problems(episode: StoredEpisode, file: str) -> Iterator[str]:

@@ -150,14 +150,14 @@ class StoredEpisode:
         try:
             return files.whole(file)
         except CorruptEpisode as error:
-            raise CorruptEpisode(f"Episode {self.name} is damaged: {error}.") from None
+            raise CorruptEpisode(f"Episode {self.name} is damaged: {error}.", error.file) from None
 
     def copy_file(self, file: str, path: Path) -> int:
         """Write one file of the episode to `path`, and return its bytes; raises as `sealed` does."""
         try:
             return self.files.copy(file, path)
         except CorruptEpisode as error:
-            raise CorruptEpisode(f"Episode {self.name} is damaged: {error}.") from None
+            raise CorruptEpisode(f"Episode {self.name} is damaged: {error}.", error.file) from None
 
     @cached_property
     def _opened(self) -> dict[str, zarr.Array[Any]]:
@@ -250,8 +250,8 @@ class StoredEpisode:
         except (IndexError, RemoteFailure):
             raise  # the caller's mistake; a network that fails is no damage
         except Exception as error:  # damaged bytes can make codecs raise anything
-            problem = str(error).rstrip(".")
-            raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {problem}.") from error
+            problem, file = str(error).rstrip("."), getattr(error, "file", None)
+            raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {problem}.", file) from error
         if name.endswith("/key_role") and not values.all():
             raise _lost_chunk(self, name)
         self.refuse_missing(name, values)
@@ -326,7 +326,7 @@ class StoredEpisode:
         try:
             return read()
         except CorruptEpisode as error:
-            raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {error}.") from None
+            raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {error}.", error.file) from None
 
     def refuse_missing(self, name: str, values: NDArray[Any]) -> None:
         """Raise `CorruptEpisode` when values of an array, or sums of them, have the mark of a lost chunk."""

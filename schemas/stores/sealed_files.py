@@ -40,7 +40,7 @@ class SealedFiles:
         if most is None:
             most = DOCUMENT_BYTES if file.endswith("zarr.json") else record.size
         if record.size > most:
-            raise CorruptEpisode(f"its {file} has {record.size:,} bytes; expected at most {most:,}")
+            raise CorruptEpisode(f"its {file} has {record.size:,} bytes; expected at most {most:,}", file)
         # A cache may have kept damaged bytes: they are asked for anew once.
         for fresh in (False, True) if self.source.remembers else (False,):
             try:
@@ -48,10 +48,10 @@ class SealedFiles:
             except RemoteFailure:
                 raise
             except OSError as error:
-                raise CorruptEpisode(_lost(file, error)) from None
+                raise CorruptEpisode(_lost(file, error), file) from None
             if len(content) == record.size and bytes_digest(content) == record.sha256:
                 return content
-        raise CorruptEpisode(_differs(file))
+        raise CorruptEpisode(_differs(file), file)
 
     def check(self, file: str) -> None:
         """Read a file part by part; raises `CorruptEpisode` as `whole` does."""
@@ -99,10 +99,10 @@ class SealedFiles:
             except RemoteFailure:
                 raise
             except OSError as error:
-                raise CorruptEpisode(_lost(file, error)) from None
+                raise CorruptEpisode(_lost(file, error), file) from None
             if digest.hexdigest() == record.sha256:
                 return
-        raise CorruptEpisode(_differs(file))
+        raise CorruptEpisode(_differs(file), file)
 
     def shard(self, file: str) -> SealedShard | None:
         """The shard in a file, of which single chunks can be read; None when the seal does not list its chunks."""
@@ -115,28 +115,28 @@ class SealedFiles:
             except RemoteFailure:
                 raise
             except OSError as error:
-                raise CorruptEpisode(_lost(file, error)) from None
+                raise CorruptEpisode(_lost(file, error), file) from None
         return self._shards[file]
 
-    def problems(self) -> list[str]:
-        """Files that are missing or have another size than in the seal. Reads none of them."""
-        found = []
+    def problems(self) -> dict[str, str]:
+        """What is wrong, by file: it is missing, or has another size than in the seal. Reads none of them."""
+        found = {}
         for file, record in self.records.items():
             try:
                 size = self.source.size(file)
             except RemoteFailure:
                 raise
             except OSError as error:
-                found.append(_lost(file, error))
+                found[file] = _lost(file, error)
                 continue
             if size != record.size:
-                found.append(f"its {file} has {size} bytes; its seal says {record.size}")
+                found[file] = f"its {file} has {size} bytes; its seal says {record.size}"
         return found
 
     def _record(self, file: str) -> FileRecord:
         record = self.records.get(file)
         if record is None:
-            raise CorruptEpisode(f"its {file} does not agree with its seal, which does not list it")
+            raise CorruptEpisode(f"its {file} does not agree with its seal, which does not list it", file)
         return record
 
 

@@ -60,7 +60,7 @@ class SealedArrayStore(Store):
                 if length:
                     problem = shard.problem(number, stored[offset : offset + length])
                     if problem is not None:
-                        raise CorruptEpisode(problem)
+                        raise CorruptEpisode(problem, shard.file)
                     self._check_frame(content[offset : offset + length - CHECKSUM_BYTES], file)
         return _cut(content, byte_range)
 
@@ -72,7 +72,7 @@ class SealedArrayStore(Store):
         check_shard(self._metadata, record, file)
         shard = None if self._metadata.shard_chunks is None else self._files.shard(file)
         if shard is None and self._metadata.shard_chunks is not None:
-            raise CorruptEpisode(f"the seal does not list the chunks of its {file}")
+            raise CorruptEpisode(f"the seal does not list the chunks of its {file}", file)
         return shard
 
     def _part(self, shard: SealedShard, wanted: ByteRequest) -> bytes | None:
@@ -95,7 +95,7 @@ class SealedArrayStore(Store):
         try:
             check_blosc_frame(frame, self._metadata.chunk_bytes, self._metadata.typesize)
         except CorruptEpisode as error:
-            raise CorruptEpisode(f"a chunk of its {file} cannot be decoded: {error}") from None
+            raise CorruptEpisode(f"a chunk of its {file} cannot be decoded: {error}", file) from None
 
     def __eq__(self, other: object) -> bool:
         """Whether both serve the same array of the same folder."""

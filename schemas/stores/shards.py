@@ -124,20 +124,20 @@ class SealedShard:
         checksums = bytes.fromhex(record.chunks)
         size = index_size(len(checksums) // CHECKSUM_BYTES)
         if record.size < size:
-            raise CorruptEpisode(f"its {file} has {record.size} bytes in the seal, and an index of {size}")
+            raise CorruptEpisode(f"its {file} has {record.size} bytes in the seal, and an index of {size}", file)
         for fresh in (False, True) if source.remembers else (False,):
             # One byte more: a file that has grown is not the one that was sealed.
             stored, more = source.parts(file, max(0, record.size - size), (size, 1), fresh=fresh)
             if len(stored) != size or more:
-                raise CorruptEpisode(f"its {file} does not agree with its seal: it has another size")
+                raise CorruptEpisode(f"its {file} does not agree with its seal: it has another size", file)
             if bytes_digest(stored) == record.index:
                 break
         else:
-            raise CorruptEpisode(f"its {file} does not agree with its seal: its index was changed")
+            raise CorruptEpisode(f"its {file} does not agree with its seal: its index was changed", file)
         try:
             return cls(source, file, stored, read_index(stored, record.size), checksums, bytes.fromhex(record.digests))
         except CorruptEpisode as error:
-            raise CorruptEpisode(f"its {file} cannot be read: {error}") from None
+            raise CorruptEpisode(f"its {file} cannot be read: {error}", file) from None
 
     def longest(self) -> int:
         """Bytes of the longest chunk, with its checksum."""
@@ -159,7 +159,7 @@ class SealedShard:
         """
         offset, length = (int(value) for value in self.index[number])
         if length <= CHECKSUM_BYTES:
-            raise CorruptEpisode(f"its {self.file} lacks chunk {number}: it is missing")
+            raise CorruptEpisode(f"its {self.file} lacks chunk {number}: it is missing", self.file)
         stored = np.empty(length, np.uint8) if memory is None else memory[:length]
         problem: str | None = None
         for fresh in (False, True) if self.source.remembers else (False,):
@@ -168,11 +168,11 @@ class SealedShard:
             except RemoteFailure:
                 raise
             except OSError as error:
-                raise CorruptEpisode(f"its {self.file} cannot be read: {error.strerror or error}") from None
+                raise CorruptEpisode(f"its {self.file} cannot be read: {error.strerror or error}", self.file) from None
             problem = self.problem(number, stored[:found])
             if problem is None:
                 return stored[:-CHECKSUM_BYTES]
-        raise CorruptEpisode(str(problem))
+        raise CorruptEpisode(str(problem), self.file)
 
     def problem(self, number: int, stored: Memory) -> str | None:
         """How bytes differ from the sealed chunk of that number, with its checksum, or None."""
@@ -289,10 +289,10 @@ class ShardedLayers:
     def _open(self, file: str) -> SealedShard:
         shard = self.shard(file)
         if shard is None:
-            raise CorruptEpisode(f"the seal does not list the chunks of its {file}")
+            raise CorruptEpisode(f"the seal does not list the chunks of its {file}", file)
         expected = self.blocks_per_shard * self.shape[1] * self.shape[2]
         if len(shard.index) != expected:
-            raise CorruptEpisode(f"its {file} has {expected} chunks, and its seal lists {len(shard.index)}")
+            raise CorruptEpisode(f"its {file} has {expected} chunks, and its seal lists {len(shard.index)}", file)
         return shard
 
     def memory(self) -> LayerMemory:
@@ -332,5 +332,6 @@ class ShardedLayers:
                 check_blosc_frame(frame.data, chunk.nbytes, chunk.itemsize)
                 blosc.decompress(frame, chunk)
             except (CorruptEpisode, RuntimeError, ValueError) as error:
-                raise CorruptEpisode(f"chunk {number} of its {shard.file} cannot be decoded: {error}") from None
+                problem = f"chunk {number} of its {shard.file} cannot be decoded: {error}"
+                raise CorruptEpisode(problem, shard.file) from None
         return values[: self.shape[0]]

@@ -66,12 +66,12 @@ class SingleChunk:
         content = self.files.whole(self.file, WHOLE_FILE_BYTES)
         frame, checksum = content[:-CHECKSUM_BYTES], content[-CHECKSUM_BYTES:]
         if crc32c(frame) != int.from_bytes(checksum, "little"):
-            raise CorruptEpisode(f"the checksum of its {self.file} does not fit")
+            raise CorruptEpisode(f"the checksum of its {self.file} does not fit", self.file)
         values = np.empty(self.shape, self.dtype)
         try:
             check_blosc_frame(frame, values.nbytes, self.typesize)
             blosc.decompress(frame, values)
         except (CorruptEpisode, RuntimeError, ValueError) as error:
-            raise CorruptEpisode(f"its {self.file} cannot be decoded: {error}") from None
+            raise CorruptEpisode(f"its {self.file} cannot be decoded: {error}", self.file) from None
         found: NDArray[Any] = values[index]
         return found

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 from vla_attention.schemas.groupings.vocabulary import SceneObject
@@ -101,7 +101,21 @@ class RunMismatch(StoreError):
 
 
 class CorruptEpisode(StoreError):
-    """An episode whose content does not agree with its attributes or its seal."""
+    """An episode whose content does not agree with its attributes or its seal.
+
+    `file` is the path in the episode of the one file that does not, where one is known.
+    """
+
+    def __init__(self, message: str, file: str | None = None) -> None:
+        super().__init__(message)
+        self.file = file
+
+
+class Problem(NamedTuple):
+    """What is wrong with an episode: a sentence, and the path of the one file that is wrong, where it is known."""
+
+    text: str
+    file: str | None = None
 
 
 @dataclass(frozen=True)

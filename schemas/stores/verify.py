@@ -6,7 +6,7 @@ everything is read (`episode_checks.py`). Foreign files are named and are no fau
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 
 from vla_attention.schemas.documents import decode_json
@@ -21,7 +21,7 @@ from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
 from vla_attention.schemas.stores.root import fields_beyond, group_attributes
 from vla_attention.schemas.stores.seal import SEAL_FILE
-from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, CorruptEpisode
+from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, CorruptEpisode, Problem
 from vla_attention.schemas.stores.store_url import StoreUrl
 from vla_attention.schemas.stores.zip_members import ZipMembers
 
@@ -69,7 +69,8 @@ def verify_store(store: Store, progress: Callable[[int], object] | None = None, 
 
 def episode_report(store: Store, episode: StoredEpisode, *, quick: bool = False) -> EpisodeReport:
     """Look at one episode of a store, and read all of it unless `quick`."""
-    problems = list(dict.fromkeys(_problems(store, episode, quick)))  # several checks may find the same fault
+    # Several checks may find the same fault.
+    problems = list(dict.fromkeys(problem.text for problem in _problems(store, episode, quick)))
     try:
         foreign = foreign_in_episode(episode)
         records = episode.files.records
@@ -135,33 +136,29 @@ def _group_problems(store: Store, file: str) -> Iterator[str]:
         yield "it was changed: its own digest does not fit"
 
 
-def _problems(store: Store, episode: StoredEpisode, quick: bool) -> list[str]:
+def _problems(store: Store, episode: StoredEpisode, quick: bool) -> list[Problem]:
     try:
         _ = episode.attributes
     except CorruptEpisode as error:
-        return [str(error)]
+        return [Problem(str(error), error.file)]
     problems = [] if quick else list(content_problems(store.attributes, episode))
-    said = {file for file in episode.files.records if _is_named(file, problems)}
-    problems += [one for one in check_presence(episode) if not any(_is_named(file, [one]) for file in said)]
+    said = {problem.file for problem in problems} - {None}
+    problems += [one for one in check_presence(episode) if one.file not in said]
     if not quick:
-        problems += _problems_of_bytes(episode, problems)
+        problems += _problems_of_bytes(episode, {problem.file for problem in problems})
     return problems
 
 
-def _problems_of_bytes(episode: StoredEpisode, known: Iterable[str]) -> Iterator[str]:
+def _problems_of_bytes(episode: StoredEpisode, known: Container[str | None]) -> Iterator[Problem]:
     """Bytes that no check before has read: of shards all that is in no chunk, and of a zip what is in no file."""
     elsewhere = isinstance(episode.folder, StoreUrl)
     for file, record in episode.files.records.items():
         # Every chunk of a shard has been compared with its checksum in the seal: it is not fetched a second time.
-        if not (file.endswith("zarr.json") or _is_named(file, known) or (elsewhere and record.chunks)):
+        if not (file.endswith("zarr.json") or file in known or (elsewhere and record.chunks)):
             try:
                 episode.files.check(file)
             except CorruptEpisode as error:
-                yield f"Episode {episode.name} is damaged: {error}."
+                yield Problem(f"Episode {episode.name} is damaged: {error}.", file)
     zipped, source = episode.place, episode.source
     if isinstance(zipped, ZipMembers) and isinstance(source, ZipMembers) and source.frame_digest() != zipped.frame:
-        yield "its zip has other bytes around its files than vla-analyze copy --packed wrote"
-
-
-def _is_named(file: str, problems: Iterable[str]) -> bool:
-    return any(f"its {file} " in problem for problem in problems)
+        yield Problem("its zip has other bytes around its files than vla-analyze copy --packed wrote")

@@ -22,6 +22,7 @@ from vla_attention.capture.store.episode_writer import EpisodeWriter, ReplanRefu
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.claims import holders
 from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import Problem
 
 WORDS = ["--task-id", "0", "--num-episodes", "3"]
 #: The waiting steps of the protocol; the step after them is the policy's first.
@@ -337,7 +338,7 @@ def test_an_episode_that_comes_back_wrong_from_the_disk_is_written_again(
     def damaged(run: Any, episode: Any) -> Iterator[Any]:
         if episode.name == "task000_episode001" and left[0]:
             left[0] -= 1
-            yield "a bit flipped"
+            yield Problem("a bit flipped")
         yield from problems(run, episode)
 
     monkeypatch.setattr(episode_writer, "content_problems", damaged)

@@ -28,7 +28,8 @@ def episode(original, tmp_path) -> Path:
 
 
 def problems(episode: Path) -> list[str]:
-    return check_presence(StoredEpisode(episode, episode.name, open_store(episode.parents[1]).run, STORE_VERSION))
+    stored = StoredEpisode(episode, episode.name, open_store(episode.parents[1]).run, STORE_VERSION)
+    return [problem.text for problem in check_presence(stored)]
 
 
 def test_a_whole_episode_is_present(episode):
