@@ -136,7 +136,7 @@ _SIMULATOR = ("mujoco", "robosuite", "hf-libero", "assets")
 #: Entries that are measured anew in every episode; they say nothing about how runs were captured.
 _MEASURED = ("largest P·V error", "replan blocks without attention", "difference to own setting")
 #: Entries of the policy's configuration that belong to the weights.
-_NAMES_OF_WEIGHTS = ("configuration", "statistics")
+_NAMES_OF_WEIGHTS = ("configuration", "config_name", "statistics")
 
 #: Field -> (its value in a run, why it matters), in the order of messages.
 _FIELDS: dict[str, tuple[Callable[[Run], Any], str]] = {

@@ -27,6 +27,10 @@ class PickleRefused(ValueError):
     """A pickle that holds more than it should; the text completes "it ..."."""
 
 
+class PickleDamaged(PickleRefused):
+    """A pickle that cannot be followed to its end, or no pickle at all."""
+
+
 @dataclass(frozen=True)
 class _Text:
     """A long text, or bytes."""
@@ -136,7 +140,7 @@ def check_pickle(file: IO[bytes], allowed: Mapping[str, Check], *, most_numbers:
     except PickleRefused:
         raise
     except (ValueError, IndexError, KeyError, TypeError, EOFError, OverflowError, UnicodeError) as error:
-        raise PickleRefused(f"is damaged or no pickle ({error})") from error
+        raise PickleDamaged(f"is damaged or no pickle ({error})") from error
 
 
 class _Limited:
@@ -184,7 +188,7 @@ class _Machine:
 
     def _pop(self) -> object:
         if self._marks and len(self._stack) <= self._marks[-1]:
-            raise PickleRefused("is damaged: it takes more from its stack than there is")
+            raise PickleDamaged("is damaged: it takes more from its stack than there is")
         return self._stack.pop()
 
     def _to_mark(self) -> tuple[object, ...]:

@@ -13,7 +13,7 @@ from typing import IO, Any
 import torch
 from torch import Tensor
 
-from vla_attention.capture.foreign_files.pickles import Check, PickleRefused, check_pickle
+from vla_attention.capture.foreign_files.pickles import Check, PickleDamaged, PickleRefused, check_pickle
 
 #: Bytes of a zip's directory. A model of two thousand tensors has 0.2 MB; read, an entry takes ten times as much.
 MAX_DIRECTORY_BYTES = 8_000_000
@@ -49,7 +49,7 @@ def load_torch(source: Path | IO[bytes], allowed: Mapping[str, Check], more_type
             return torch.load(source, map_location="cpu", weights_only=True, mmap=mapped)
     except Exception as error:  # a damaged file raises almost anything
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        raise PickleRefused(f"is damaged ({lines[0].rstrip('.') if lines else type(error).__name__})") from error
+        raise PickleDamaged(f"is damaged ({lines[0].rstrip('.') if lines else type(error).__name__})") from error
 
 
 def check_tensors(values: Iterable[object]) -> None:
@@ -92,7 +92,7 @@ def _pickle_in_zip(file: IO[bytes], size: int) -> bytes:
         with zipfile.ZipFile(_Limited(file)) as opened:
             members = opened.infolist()
     except (zipfile.BadZipFile, struct.error, ValueError, NotImplementedError, OverflowError, EOFError) as error:
-        raise PickleRefused(f"is damaged ({error})") from error
+        raise PickleDamaged(f"is damaged ({error})") from error
     packed = [member.filename for member in members if member.compress_type != zipfile.ZIP_STORED]
     if packed or sum(member.file_size for member in members) > size:
         raise PickleRefused("is a compressed zip, which torch.save does not write")
@@ -107,7 +107,7 @@ def _pickle_in_zip(file: IO[bytes], size: int) -> bytes:
     file.seek(pickles[0].header_offset)
     header = file.read(_LOCAL_HEADER)
     if len(header) < _LOCAL_HEADER:
-        raise PickleRefused("is damaged (its directory leads beyond its end)")
+        raise PickleDamaged("is damaged (its directory leads beyond its end)")
     file.seek(sum(struct.unpack("<HH", header[-4:])), io.SEEK_CUR)
     return file.read(pickles[0].file_size)
 

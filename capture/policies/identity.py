@@ -18,7 +18,8 @@ class PolicySource:
 
     checkpoint: a path, a name on a hub with the commit (`ORG/NAME@COMMIT`), or a description of random weights.
     untrained: the weights are random. configuration: the source of sizes and layout: the checkpoint itself, a named
-    configuration, a case.json. downloads: the commits of all files from the hub, for a store's provenance.
+    configuration, a case.json, in words. config_name: the name of that configuration, where it has one. downloads: the
+    commits of all files from the hub, for a store's provenance.
     """
 
     name: str
@@ -26,6 +27,7 @@ class PolicySource:
     checkpoint_format: str
     untrained: bool
     configuration: str = "built in"
+    config_name: str = ""
     downloads: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -47,7 +49,11 @@ def describe_policy(policy: Policy, source: PolicySource, digest: str, config: d
         num_denoise_steps=policy.num_denoise_steps,
         action_horizon=policy.action_horizon,
         cameras=policy.cameras,
-        config={"configuration": source.configuration, **config},
+        config={
+            "configuration": source.configuration,
+            **({"config_name": source.config_name} if source.config_name else {}),
+            **config,
+        },
     )
 
 

@@ -23,10 +23,8 @@ from vla_attention.schemas.groupings.selector_parser import (
     parse_selector,
 )
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS, SelectorError
-from vla_attention.schemas.groupings.vocabulary import NO_COVERAGE, NO_WORDS, EpisodeTokens, Vocabulary
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
 
-#: What the problem of a name says at a site without any keys of its kind.
-_NO_SUCH_KEYS = (NO_WORDS, NO_COVERAGE, "Existing: none")
 #: A selector that takes no key.
 _NOTHING = Operation("-", Everything(), Everything())
 
@@ -37,12 +35,12 @@ def check_selector(text: str, vocabularies: Mapping[str, Vocabulary]) -> None:
     vocabularies: site -> the names at that site.
     """
     for atom in dict.fromkeys(atoms_of(parse_selector(text))):
-        problems = [_problem(atom, vocabulary) for vocabulary in vocabularies.values()]
-        found = [problem for problem in problems if problem]
+        problems = {site: _problem(atom, vocabulary) for site, vocabulary in vocabularies.items()}
+        found = {site: problem for site, problem in problems.items() if problem}
         if len(found) == len(problems):
             # A site with such keys says which names exist; the others only that they have none.
-            telling = [problem for problem in found if not any(words in problem for words in _NO_SUCH_KEYS)]
-            raise SelectorError(f"Selector '{shortened(text)}': {(telling or found)[0]}")
+            telling = [problem for site, problem in found.items() if _has_keys(atom, vocabularies[site])]
+            raise SelectorError(f"Selector '{shortened(text)}': {(telling or list(found.values()))[0]}")
 
 
 def selector_weights(
@@ -76,6 +74,12 @@ def _problem(atom: Atom, vocabulary: Vocabulary) -> str | None:
         return SELECTOR_KINDS[atom.kind].problem(atom.argument, vocabulary, vocabulary.layout)
     except UserError as error:
         return str(error)
+
+
+def _has_keys(atom: Atom, vocabulary: Vocabulary) -> bool:
+    """Whether a site has keys of an atom's kind at all, whatever their names."""
+    layout = vocabulary.layout
+    return layout is not None and SELECTOR_KINDS[atom.kind].has_keys(vocabulary, layout)
 
 
 def _only(selector: Selector, known: list[Atom]) -> Selector:

@@ -42,11 +42,14 @@ class SelectorKind:
         keys: a function of the argument and an episode's tokens; returns the keys that it takes.
         problem: a function of the argument, the names in all selected episodes and the site's layout; returns what is
             wrong with the argument, as the end of a sentence, or None.
+        has_keys: a function of those names and the layout: whether the site has keys of this kind, whatever their
+            names.
     """
 
     takes: str
     keys: Callable[[str, EpisodeTokens], Membership]
     problem: Callable[[str, Vocabulary, SiteLayout], str | None]
+    has_keys: Callable[[Vocabulary, SiteLayout], bool] = lambda vocabulary, layout: True
 
 
 def no_keys(tokens: EpisodeTokens) -> Membership:
@@ -238,27 +241,51 @@ def _number_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -
     return None  # a range that leaves the site is found when the keys are taken
 
 
+# Whether a site has keys of a kind at all.
+
+
+def _has_cameras(vocabulary: Vocabulary, layout: SiteLayout) -> bool:
+    return bool(layout.cameras)
+
+
+def _has_frames(vocabulary: Vocabulary, layout: SiteLayout) -> bool:
+    return any(span.kind == "latent" for span in layout.spans)
+
+
+def _has_words(vocabulary: Vocabulary, layout: SiteLayout) -> bool:
+    return bool(vocabulary.words)
+
+
+def _has_objects(vocabulary: Vocabulary, layout: SiteLayout) -> bool:
+    return bool(vocabulary.objects)
+
+
 SELECTOR_KINDS: dict[str, SelectorKind] = {
-    "camera": SelectorKind("the patches of one camera", _camera_keys, _camera_problem),
+    "camera": SelectorKind("the patches of one camera", _camera_keys, _camera_problem, _has_cameras),
     "role": SelectorKind("every key with one role", _role_keys, _role_problem),
     "span": SelectorKind("every key of one span", _span_keys, _span_problem),
-    "frame": SelectorKind("every key of one latent frame", _frame_keys, _frame_problem),
-    "word": SelectorKind("every piece of a word of the instruction; a phrase in quotes", _word_keys, _word_problem),
+    "frame": SelectorKind("every key of one latent frame", _frame_keys, _frame_problem, _has_frames),
+    "word": SelectorKind(
+        "every piece of a word of the instruction; a phrase in quotes", _word_keys, _word_problem, _has_words
+    ),
     "words": SelectorKind(
         "the words of the instruction by class: content, stop (a shipped list of function words) or all",
         _words_keys,
         _words_problem,
+        _has_words,
     ),
     "object": SelectorKind(
         "the patches that an object covers, by covered area; @interest, @robot or @background",
         _object_keys,
         _object_problem,
+        _has_objects,
     ),
     "patch": SelectorKind(
         "a region of a camera's patch grid: camera[r0:r1,c0:c1], rows and columns from the top left, "
         "r1 and c1 excluded",
         _patch_keys,
         _patch_problem,
+        _has_cameras,
     ),
     "keys": SelectorKind("keys by number, a-b with both ends", _number_keys, _number_problem),
 }

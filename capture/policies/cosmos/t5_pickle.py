@@ -18,6 +18,7 @@ from torch import Tensor
 from vla_attention.capture.foreign_files.pickles import (
     TENSORS,
     Check,
+    PickleDamaged,
     PickleRefused,
     anything,
     check_pickle,
@@ -127,7 +128,7 @@ def _read(file: BinaryIO, path: Path) -> Any:
         file.seek(0)
         return _RestrictedUnpickler(file).load()
     except (PickleRefused, RefusedPickle) as error:
-        if str(error).startswith("is damaged"):
+        if isinstance(error, PickleDamaged):
             raise BadEmbeddings(f"'{path}' cannot be read as text embeddings: it {error}.") from error
         raise RefusedPickle(
             f"'{path}' was refused: it {error}, and text embeddings need tensors only; nothing of it was executed."

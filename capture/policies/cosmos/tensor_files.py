@@ -10,7 +10,7 @@ from typing import Any
 
 from torch import Tensor
 
-from vla_attention.capture.foreign_files.pickles import TENSORS, PickleRefused
+from vla_attention.capture.foreign_files.pickles import TENSORS, PickleDamaged, PickleRefused
 from vla_attention.capture.foreign_files.regular_files import check_regular
 from vla_attention.capture.foreign_files.torch_files import check_tensors, load_torch
 from vla_attention.capture.policies.safetensors_file import open_safetensors
@@ -74,6 +74,6 @@ def _read_torch(path: Path) -> Any:
 
 def refused(path: Path, error: PickleRefused) -> UnreadableTensors:
     """Return the error for a pickle: `RefusedPickle` for one that is whole and asks for more than tensors."""
-    if str(error).startswith("is damaged"):
+    if isinstance(error, PickleDamaged):
         return UnreadableTensors(f"'{path}' cannot be read as tensors: it {error}, or it is something else.")
     return RefusedPickle(f"'{path}' was refused: it {error}, and tensors do not; nothing of it was executed.")

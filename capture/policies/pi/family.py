@@ -96,7 +96,9 @@ def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
         settings["checkpoint_format"] = identity.checkpoint_format
     if identity.checkpoint_format.startswith("openpi"):
         settings["discrete_state_input"] = identity.config["config"].get("discrete_state_input", False)
-    # A configuration that was derived from the files says more than its name.
+    if "config_name" in identity.config:
+        return settings | {"config_name": identity.config["config_name"]}
+    # Stores of version 1 have the name in these words only, as they were when that version was written.
     named = re.fullmatch(r"openpi's (\w+)", identity.config["configuration"])
     return settings | ({"config_name": named[1]} if named else {})
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -77,11 +78,12 @@ def load_pi_policy(
     folder, options = Path(checkpoint), options or CheckpointOptions()
     found = detect_format(folder, options.checkpoint_format)
     if config is not None:
-        configuration = "given"
+        chosen = ChosenConfig(config, "given")
     else:
-        config, configuration = choose_config(folder, found, options, of_data_set=bool(data or robot))
+        chosen = choose_config(folder, found, options, of_data_set=bool(data or robot))
+        config = chosen.config
     if data is not None:
-        relative = RELATIVE_ACTIONS if configuration.startswith("openpi's pi0_libero") else 0
+        relative = RELATIVE_ACTIONS if chosen.name in _OF_RELATIVE_ACTIONS else 0
         robot = robot_for(folder, found, data, relative_actions=relative)
     if options.discrete_state_input and config is not None:
         _check_state_input(config)
@@ -113,17 +115,41 @@ def load_pi_policy(
         checkpoint=str(checkpoint),
         checkpoint_format=found,
         untrained=False,
-        configuration=configuration,
+        configuration=chosen.source,
+        config_name=chosen.name if chosen.stated else "",
     )
     return PiPolicy(model, prompt_tokenizer, processing, source)
 
 
+#: openpi's configurations of pi0 in LIBERO, whose data have actions relative to the state.
+_OF_RELATIVE_ACTIONS = ("pi0_libero", "pi0_libero_low_mem_finetune")
+
+
+@dataclass(frozen=True)
+class ChosenConfig:
+    """The configuration that a checkpoint is loaded with.
+
+    config: None if the checkpoint's own files determine it. source: where it is from, in words. name: openpi's for it,
+    empty without one. stated: the user named it; otherwise the checkpoint's files imply the name.
+    """
+
+    config: PiConfig | None
+    source: str
+    name: str = ""
+    stated: bool = False
+
+    @classmethod
+    def named(cls, name: str, why: str = "", *, stated: bool = False) -> ChosenConfig:
+        """Openpi's configuration of that name."""
+        return cls(find_config(name), f"openpi's {name}{why}", name, stated)
+
+
 def choose_config(
     folder: Path, found: CheckpointFormat, options: CheckpointOptions, *, of_data_set: bool = False
-) -> tuple[PiConfig | None, str]:
-    """Return the configuration of the options or of a case.json beside the checkpoint, and its source.
+) -> ChosenConfig:
+    """Return the configuration of the options, of a case.json beside the checkpoint, or that the checkpoint implies.
 
-    The configuration is None if the checkpoint's own files determine it. of_data_set: the policy is for the robot of a
+    of_data_set: the policy is for the robot of a
     data set, which the name of the checkpoint's statistics may tell.
     """
     if options.config_name is not None and options.model_config is not None:
@@ -134,22 +160,22 @@ def choose_config(
             "--discrete-state-input out."
         )
     if options.config_name is not None:
-        return find_config(options.config_name), f"openpi's {options.config_name}"
+        return ChosenConfig.named(options.config_name, stated=True)
     if options.model_config is not None:
         path = options.model_config.expanduser()
-        return read_config(path), str(path)
+        return ChosenConfig(read_config(path), str(path))
     beside = folder.absolute().parent / CASE_FILE
     if beside.is_file():
-        return read_config(beside), f"{CASE_FILE} beside the checkpoint"
+        return ChosenConfig(read_config(beside), f"{CASE_FILE} beside the checkpoint")
     if found == "openpi_torch" and states_sizes(folder / CONFIG_FILE):
-        return read_config(folder / CONFIG_FILE), CONFIG_FILE
+        return ChosenConfig(read_config(folder / CONFIG_FILE), CONFIG_FILE)
     if of_data_set and found != "lerobot" and asset_name(folder) == DROID_ASSET:
         name = _droid_config_name(folder, found)
-        return find_config(name), f"openpi's {name} (its statistics are those of '{DROID_ASSET}')"
+        return ChosenConfig.named(name, f" (its statistics are those of '{DROID_ASSET}')")
     if found == "openpi_jax":
         name = implied_config_name(leaf.path for leaf in list_leaves(folder / "params"))
-        return find_config(name), f"openpi's {name} (not stated by the checkpoint)"
-    return None, "config.json and the tensors"
+        return ChosenConfig.named(name, " (not stated by the checkpoint)")
+    return ChosenConfig(None, "config.json and the tensors")
 
 
 def _droid_config_name(folder: Path, found: CheckpointFormat) -> str:

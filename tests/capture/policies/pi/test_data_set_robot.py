@@ -68,10 +68,11 @@ def test_openpi_s_configuration_of_droid_is_known_by_its_statistics(tmp_path, ca
     folder = openpi_checkpoint(tmp_path, case, "droid", 8, 8)
     # This one states small sizes of its own in config.json; a released one does not.
     (folder / "config.json").write_text(json.dumps({"action_dim": 32, "action_horizon": 15}))
-    config, source = choose_config(folder, "openpi_torch", CheckpointOptions(), of_data_set=True)
-    assert config == find_config(name)
-    assert name in source
-    assert choose_config(folder, "openpi_torch", CheckpointOptions())[0] is None
+    chosen = choose_config(folder, "openpi_torch", CheckpointOptions(), of_data_set=True)
+    assert chosen.config == find_config(name)
+    assert (chosen.name, chosen.stated) == (name, False)
+    assert name in chosen.source
+    assert choose_config(folder, "openpi_torch", CheckpointOptions()).config is None
 
 
 def test_openpi_s_numbers_of_droid():
