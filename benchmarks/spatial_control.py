@@ -61,7 +61,7 @@ def intervals_of_store(
             maps = blob * np.exp(generator.normal(0, 0.3, (REPLANS, SIZE**2))) * (1 + follow * area[..., 0])
             maps /= maps.sum(axis=-1, keepdims=True)
             enrichment.append((maps * area[..., 0]).sum(axis=-1).mean() / area.mean())
-            sources.append(control_source(maps[:, None, None], area, episodes - 1))
+            sources.append(control_source([(maps[:, None, None], area)], episodes - 1))
         balanced += [control.balanced[0, 0, 0] for control in controls(sources)]
     of_task = np.repeat(np.arange(tasks), episodes)
     statistics = [mean_over_episodes(enrichment, POSITIVE), ratio_of_means_over_episodes(enrichment, balanced)]

@@ -5,7 +5,9 @@ whatever it is. Objects stand elsewhere in other episodes of the task, so the sa
 episodes: a map that does not depend on where the object is gets the same there.
 
     enrichment of a map on masks    share of the map's attention in them / share of the picture that they cover, both
-                                    means over replans
+                                    means over replans; over several cameras sum W S / sum W A, with W the map's
+                                    attention to a camera, S the share of it in the masks, and A the share of the
+                                    picture that they cover: a mean of the cameras' enrichments, so it lies between them
     control of an episode           the enrichment of its maps on the masks of other episodes of its task, mean over
                                     these episodes; with no other episode, on its own masks half an episode away
     enrichment over control         mean enrichment / mean control, over episodes
@@ -47,7 +49,9 @@ class ControlSource:
     """What the control needs of one picture (a camera, or all side by side) of one episode.
 
     Attributes:
-        maps: mean over replans of the attention maps, each scaled to the sum 1, (layer, head, patch) float32.
+        maps: mean over replans of the attention maps, (layer, head, patch) float32: of each camera scaled to the sum
+            1, times the camera's mean share of the replan's attention.
+        patches: number of patches of each camera, in order.
         masks: covered areas at a few replans, which are control masks of other episodes, (mask, patch, item) float32.
         compared: the same at the replans at which masks are compared, (replan, patch, item).
         half_way: enrichment of the maps on the episode's own masks half an episode away, (layer, head, item), and the
@@ -55,6 +59,7 @@ class ControlSource:
     """
 
     maps: Floats
+    patches: tuple[int, ...]
     masks: Floats
     compared: Floats
     half_way: tuple[Array, Array] | None = None
@@ -89,25 +94,33 @@ class Control:
         return Control(self.enrichment[..., chosen], self.balanced[..., chosen], self.overlap[chosen])
 
 
-def control_source(maps: NDArray[np.floating], area: Floats, num_others: int) -> ControlSource:
-    """What the control needs of an episode's maps (replan, layer, head, patch) and covered areas (replan, patch, item).
+def control_source(cameras: Sequence[tuple[NDArray[np.floating], Floats]], num_others: int) -> ControlSource:
+    """What the control needs of an episode's cameras: maps (replan, layer, head, patch), areas (replan, patch, item).
 
-    num_others: other episodes of its task. A replan whose map is all 0 is in no mean.
+    num_others: other episodes of its task. A replan at which a camera's map is all 0 is in no mean of that camera's.
     """
-    with np.errstate(invalid="ignore", divide="ignore"):
-        scaled = maps / maps.sum(axis=-1, keepdims=True, dtype=np.float64)
+    masses = [maps.sum(axis=-1, keepdims=True, dtype=np.float64) for maps, _ in cameras]
+    area = np.concatenate([covered for _, covered in cameras], axis=1)
     replans = len(area)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        scaled = [maps / mass for (maps, _), mass in zip(cameras, masses, strict=True)]
+        weights = [finite_mean(mass / sum(masses)) for mass in masses]  # (layer, head, 1)
     half_way = None
     if num_others == 0 and replans > 1:
-        away = area[half_an_episode_away(replans)]
-        shares = np.matmul(scaled, away[:, None].astype(np.float64))  # (replan, layer, head, item)
-        covered = area.mean(axis=(0, 1), dtype=np.float64)
+        away = half_an_episode_away(replans)
+        attended, even = np.zeros((2, *scaled[0].shape[1:-1], area.shape[2]))
+        for own, weight, (_, covered) in zip(scaled, weights, cameras, strict=True):
+            shares = np.matmul(own, covered[away][:, None].astype(np.float64))  # (replan, layer, head, item)
+            attended += weight * finite_mean(shares)
+            even += weight * covered.mean(axis=(0, 1), dtype=np.float64)
         with np.errstate(invalid="ignore", divide="ignore"):
-            enrichment = np.where(covered > 0, finite_mean(shares) / covered, np.nan)
-        overlaps = [mean_overlap(own[None], other[None]) for own, other in zip(area, away, strict=True)]
+            enrichment = np.where(even > 0, attended / even, np.nan)
+        overlaps = [mean_overlap(own[None], other[None]) for own, other in zip(area, area[away], strict=True)]
         half_way = enrichment, finite_mean(np.stack(overlaps))
+    whole = [weight * finite_mean(own) for own, weight in zip(scaled, weights, strict=True)]
     return ControlSource(
-        maps=finite_mean(scaled).astype(np.float32),
+        maps=np.concatenate(whole, axis=-1).astype(np.float32),
+        patches=tuple(covered.shape[1] for _, covered in cameras),
         masks=area[replans_of_masks(replans, num_others)],
         compared=area[_spaced(replans, _MOST_COMPARED)],
         half_way=half_way,
@@ -136,15 +149,20 @@ def offsets(num_episodes: int) -> NDArray[np.int64]:
     return 1 + _spaced(num_episodes - 1, MOST_MASKS)
 
 
-def enrichment_on(maps: NDArray[np.floating], masks: NDArray[np.floating]) -> Array:
-    """Share of each map in each mask / the mask's share of the picture.
+def enrichment_on(maps: NDArray[np.floating], masks: NDArray[np.floating], patches: Sequence[int]) -> Array:
+    """Share of each map in each mask / the share that the same attention to each camera, spread evenly, has there.
 
-    maps: (..., patch) with the sum 1; masks: covered areas (patch, item), means over replans. Returns (..., item); NaN
-    where a mask covers nothing.
+    maps: (..., patch) with the sum 1; masks: covered areas (patch, item), means over replans; patches: of each camera,
+    in order. Returns (..., item); NaN where a mask covers nothing.
     """
-    area = masks.mean(axis=0, dtype=np.float64)
+    even: Array = np.zeros((*maps.shape[:-1], masks.shape[1]))
+    first = 0
+    for count in patches:
+        own = slice(first, first + count)
+        even += maps[..., own].sum(axis=-1, keepdims=True, dtype=np.float64) * masks[own].mean(axis=0, dtype=np.float64)
+        first += count
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.where(area > 0, (maps @ masks).astype(np.float64) / area, np.nan)
+        return np.where(even > 0, (maps @ masks).astype(np.float64) / even, np.nan)
 
 
 def mean_overlap(first: NDArray[np.floating], second: NDArray[np.floating]) -> Array:
@@ -170,7 +188,7 @@ def controls(sources: Sequence[ControlSource]) -> list[Control]:
             continue
         maps = np.stack([sources[e].maps for e in shown])
         masks = np.stack([sources[e].masks[:, :, i].mean(axis=0) for e in shown], axis=-1)
-        pairs = enrichment_on(maps, masks)  # (episode, layer, head, episode)
+        pairs = enrichment_on(maps, masks, sources[0].patches)  # (episode, layer, head, episode)
         steps = offsets(len(shown))
         of_maps, of_masks = np.zeros((2, len(shown), *shape[:2]))
         for position, e in enumerate(shown):

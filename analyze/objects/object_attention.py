@@ -90,13 +90,16 @@ def object_tables(question: Question, settings: ObjectSettings | None = None, ke
             area_share  covered area / area of these cameras' pictures, mean over replans
             enrichment  share of this camera's mass / area_share, of these means: 1 is what attention gives that is
                         uniform over the picture. A mean of quotients would give a sliver that is in sight at one
-                        replan as much weight as all other replans.
+                        replan as much weight as all other replans. Of all cameras together: sum W S / sum W A, with W
+                        the camera's share of all cameras' mass, S the item's share of the camera's mass, A its
+                        area_share there. This is a mean of the cameras' enrichments and lies between them; to
+                        prefer a camera that shows the item larger is no enrichment.
             control_enrichment  the same of these maps on the item's masks of other episodes of the task
             control_balanced    stands for it in intervals
             control_overlap     how much these masks overlap with the episode's own (see `control_masks` for all three;
                         null where there is no control)
         times: one row per (episode, replan, camera, item) of the layers' and heads' mean: `share`, `area_share`,
-            `env_step`.
+            `even_share` (the share if each camera's attention were uniform over its picture), `env_step`.
         pointing: with `settings.spatial`, one row per (episode, layer or "layers_avg"[, head], camera, item): means
             over denoise steps and over the replans at which the item has a mask (`mask_replans` of `num_replans`; null
             where there is none):
@@ -274,11 +277,7 @@ def _measure_episode(
         tables |= {"pointing": _pointing_part(episode), "iou": _iou_part(episode)}
     pictures = {ALL_CAMERAS: views, **{view.camera: [view] for view in views}}
     sources = {
-        name: control_source(
-            np.concatenate([averaged[view.camera] for view in seen], axis=-1),
-            np.concatenate([view.area for view in seen], axis=1),
-            episodes_of[task_of(item)] - 1,
-        )
+        name: control_source([(averaged[view.camera], view.area) for view in seen], episodes_of[task_of(item)] - 1)
         for name, seen in pictures.items()
     }
     axes = [layers.columns, head_axis(selection), items]
@@ -320,12 +319,16 @@ def _measure_maps(maps: NDArray[np.float32], view: View, settings: ObjectSetting
 
 @dataclass(frozen=True)
 class _Shares:
-    """Per replan, with "layers_avg": (replan, layer, head, item) or, for areas, (replan, item)."""
+    """Per replan, with "layers_avg": (replan, layer, head, item) or, for areas, (replan, item).
+
+    even_share: of attention that is uniform over each camera's picture. enrichment: (layer, head, item).
+    """
 
     mass: Array
     share: Array
-    camera_share: Array
+    even_share: Array
     area_share: Array
+    enrichment: Array
 
 
 def _shares(episode: _Episode) -> dict[str, _Shares]:
@@ -340,27 +343,37 @@ def _shares(episode: _Episode) -> dict[str, _Shares]:
     image = np.asarray(sum(of_camera.values()))
     area = {view.camera: view.area.sum(axis=1, dtype=np.float64) for view in views}
     patches = {view.camera: view.grid.num_patches for view in views}
+
+    def enrichment(cameras: Sequence[str]) -> Array:
+        """Sum W S / sum W A over cameras, see `object_tables`."""
+        attended, even = np.zeros((2, *mass[cameras[0]].shape[1:]))
+        for camera in cameras:
+            weight, covered = finite_mean(of_camera[camera] / image), (area[camera] / patches[camera]).mean(axis=0)
+            attended += weight * np.nan_to_num(finite_mean(mass[camera] / of_camera[camera]))
+            even += weight * covered
+        return np.where(even > 0, attended / even, np.nan)
+
     result = {}
     with np.errstate(invalid="ignore", divide="ignore"):
+        even = {camera: of_camera[camera] / image * (area[camera] / patches[camera])[:, None, None] for camera in mass}
         total = np.asarray(sum(mass.values()))
         whole = np.asarray(sum(area.values())) / sum(patches.values())
-        result[ALL_CAMERAS] = _Shares(total, total / image, total / image, whole)
+        evenly = np.asarray(sum(even.values()))
+        result[ALL_CAMERAS] = _Shares(total, total / image, evenly, whole, enrichment(list(mass)))
         for camera, values in mass.items():
-            result[camera] = _Shares(values, values / image, values / of_camera[camera], area[camera] / patches[camera])
+            covered = area[camera] / patches[camera]
+            result[camera] = _Shares(values, values / image, even[camera], covered, enrichment([camera]))
     return result
 
 
 def _objects_part(episode: _Episode) -> pl.DataFrame:
     parts = []
     for camera, shares in _shares(episode).items():
-        camera_share, area_share = finite_mean(shares.camera_share), shares.area_share.mean(axis=0)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            enrichment = np.where(area_share > 0, camera_share / area_share, np.nan)
         values = {
             "mass": shares.mass.mean(axis=0),
             "share": finite_mean(shares.share),
-            "area_share": area_share,
-            "enrichment": enrichment,
+            "area_share": shares.area_share.mean(axis=0),
+            "enrichment": shares.enrichment,
         }
         parts.append(episode.table(camera, [episode.layers.columns, head_axis(episode.selection)], values))
     return pl.concat(parts)
@@ -371,7 +384,11 @@ def _times_part(episode: _Episode) -> pl.DataFrame:
     parts = []
     for camera, shares in _shares(episode).items():
         # The last layer is "layers_avg", or the only one; heads that were kept apart are averaged.
-        values = {"share": finite_mean(shares.share[:, -1], 1), "area_share": shares.area_share}
+        values = {
+            "share": finite_mean(shares.share[:, -1], 1),
+            "area_share": shares.area_share,
+            "even_share": finite_mean(shares.even_share[:, -1], 1),
+        }
         parts.append(episode.table(camera, [replans], values))
     return pl.concat(parts)
 

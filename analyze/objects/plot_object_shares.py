@@ -40,6 +40,7 @@ _PHASES = np.linspace(0.0, 1.0, 21)
 #: Objects beside robot and background that have a colour of their own; the others are shown together.
 _MOST = 9
 _OTHERS = "other objects"
+_COLUMNS = ("share", "area_share", "even_share")
 
 
 @drawn_in_our_style
@@ -48,8 +49,9 @@ def plot_object_shares(study: ObjectStudy, folder: Path) -> list[Path]:
 
     Left: shares of the example episode's image attention, stacked by object. Middle: mean over episodes by class, over
     the episode's time from 0 to 1 (replans interpolated linearly), with pointwise intervals; dashed: covered area, what
-    uniform attention gives. Right: enrichment at each time, sum of the episodes' shares / sum of their covered areas;
-    dotted: the control, the enrichment of the same maps on masks of other episodes, where it can tell.
+    uniform attention gives. Right: enrichment at each time, share / what attention gives that is uniform over each
+    camera's picture, mean over episodes; dotted: the control, the enrichment of the same maps on masks of other
+    episodes, where it can tell.
     """
     example = study.example
     together = pl.col("camera") == ALL_CAMERAS
@@ -140,11 +142,11 @@ def _draw_classes(
         part = whole.filter((pl.col("kind") == "class") & (pl.col("item") == name))
         if part.is_empty():
             continue
-        share, area, episodes = _by_phase(part)
+        (share, area, even), episodes = _by_phase(part)
         units = sampling.units(episodes).decided()
         shares = _with_intervals([mean_over_episodes(column, SHARE) for column in share.T], units)
         with np.errstate(divide="ignore", invalid="ignore"):  # where the object is out of view
-            of_episodes = [mean_over_episodes(column, POSITIVE) for column in (share / area).T]
+            of_episodes = [mean_over_episodes(column, POSITIVE) for column in (share / even).T]
         enrichments = _with_intervals(of_episodes, units)
         covered, color = area.mean(axis=0), CLASS_COLORS[name]
         label = name if len(share) == whole.select(EPISODE_ID).unique().height else f"{name} (n = {len(share)})"
@@ -176,7 +178,7 @@ def _draw_classes(
     uniform_line(enrichment_axes)
     drawn_values = data.select("enrichment", "enrichment_low", "enrichment_high", "control_enrichment")
     ratio_axis(enrichment_axes.yaxis, np.append(drawn_values.to_numpy().astype(float), 1.0))
-    enrichment_axes.set_ylabel("enrichment (attention / area, logarithmic)")
+    enrichment_axes.set_ylabel("enrichment (share / uniform over each picture, logarithmic)")
     for target in (axes, enrichment_axes):
         target.set_xlabel("time in the episode (0: first replan, 1: last)")
         target.set_xlim(0, 1)
@@ -197,14 +199,14 @@ def _with_intervals(
     return np.array(values), np.array(low), np.array(high)
 
 
-def _by_phase(part: pl.DataFrame) -> tuple[NDArray[np.float64], NDArray[np.float64], pl.DataFrame]:
-    """Share and area (episode, phase) by linear interpolation over each episode's replans, and the episodes."""
-    shares, areas = [], []
+def _by_phase(part: pl.DataFrame) -> tuple[NDArray[np.float64], pl.DataFrame]:
+    """Shares (column, episode, phase), see `_COLUMNS`, interpolated over each episode's replans, and the episodes."""
+    found = []
     episodes = part.select(EPISODE_ID).unique(maintain_order=True)
     for _, episode in part.group_by(EPISODE_ID, maintain_order=True):
         ordered = episode.sort("replan")
         last = ordered.height - 1
         phase = ordered["replan"].to_numpy() / last if last else np.zeros(1)
-        shares.append(np.interp(_PHASES, phase, ordered["share"].cast(pl.Float64).to_numpy()))
-        areas.append(np.interp(_PHASES, phase, ordered["area_share"].to_numpy()))
-    return np.array(shares), np.array(areas), episodes
+        columns = [ordered[name].cast(pl.Float64).to_numpy() for name in _COLUMNS]
+        found.append([np.interp(_PHASES, phase, column) for column in columns])
+    return np.array(found).swapaxes(0, 1), episodes

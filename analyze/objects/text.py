@@ -24,8 +24,9 @@ _NAMES = 3
 _SHARES_NOTE = (
     "share: of the attention on all cameras' patches. area: covered part of the picture. enrichment: share of the "
     "picture's attention / area, quotients of an episode's means, mean over episodes (1: attention that is uniform "
-    "over the picture). over control: mean enrichment / mean enrichment of the same maps on the object's masks of "
-    "other episodes of the task (1: attention that does not depend on where the object is). cannot tell: these masks "
+    "over each picture; all cameras: the mean of theirs, by attention times area). over control: mean enrichment / "
+    "mean enrichment of the same maps on the object's masks of other episodes of the task (1: attention that does not "
+    "depend on where the object is). cannot tell: these masks "
     f"overlap with the object's by {STILL_OVERLAP:.0%} or more, because it hardly moves; -: there are no other masks. "
     "q: p of 1 over control, adjusted for the number of classes or objects (Benjamini-Hochberg)."
 )

@@ -215,7 +215,7 @@ def made_up_store(generator: np.random.Generator, episodes: int, follow: float) 
         maps = blob * np.exp(generator.normal(0, 0.3, (replans, SIZE**2))) * (1 + follow * area[..., 0])
         maps /= maps.sum(axis=-1, keepdims=True)
         enrichment.append((maps * area[..., 0]).sum(axis=-1).mean() / area.mean())
-        sources.append(control_source(maps[:, None, None], area.astype(np.float32), episodes - 1))
+        sources.append(control_source([(maps[:, None, None], area.astype(np.float32))], episodes - 1))
     found = controls(sources)
     balanced, tasks = [control.balanced[0, 0, 0] for control in found], np.zeros(episodes)
     statistics = [mean_over_episodes(enrichment, POSITIVE), ratio_of_means_over_episodes(enrichment, balanced)]

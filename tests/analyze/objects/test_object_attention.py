@@ -100,6 +100,13 @@ def test_shares_and_enrichment_equal_sums_over_raw_rows(follower_store):
     for row in own.iter_rows(named=True):
         cameras = CAMERAS if row["camera"] == "all" else (row["camera"],)
         masses, areas, seen, images = [], [], [], []
+        attended, even = 0.0, 0.0
+        for camera in cameras:
+            there = mean[:, spans[camera]]
+            covered = coverage[camera][:, :, members_of(row["kind"], row["item"])].sum(axis=2)
+            of_all = np.mean([there[i].sum() / sum(mean[i, spans[c]].sum() for c in CAMERAS) for i in range(len(mean))])
+            attended += of_all * ((there * covered).sum(axis=1) / there.sum(axis=1)).mean()
+            even += of_all * covered.mean()
         for replan in range(len(mean)):
             area = {c: coverage[c][replan][:, members_of(row["kind"], row["item"])].sum(axis=1) for c in cameras}
             masses.append(sum(float((mean[replan, spans[c]] * area[c]).sum()) for c in cameras))
@@ -107,10 +114,56 @@ def test_shares_and_enrichment_equal_sums_over_raw_rows(follower_store):
             seen.append(sum(mean[replan, spans[c]].sum() for c in cameras))
             images.append(sum(mean[replan, spans[c]].sum() for c in CAMERAS))
         masses, seen = np.array(masses), np.array(seen)
+        assert row["enrichment"] == pytest.approx(attended / even, rel=1e-5)
         assert row["mass"] == pytest.approx(masses.mean(), rel=1e-5)
         assert row["share"] == pytest.approx((masses / np.array(images)).mean(), rel=1e-5)
         assert row["area_share"] == pytest.approx(np.mean(areas), rel=1e-5)
-        assert row["enrichment"] == pytest.approx((masses / seen).mean() / np.mean(areas), rel=1e-5)
+        if len(cameras) == 1:
+            assert row["enrichment"] == pytest.approx((masses / seen).mean() / np.mean(areas), rel=1e-5)
+
+
+def prefers_one_camera(tokens):
+    """Uniform attention within each camera, with nine times as much to the second one."""
+    weight = np.ones(tokens.layout.num_keys)
+    span = tokens.layout.camera_span(CAMERAS[1])
+    weight[span.start : span.stop] = 9.0
+    return weight
+
+
+def test_enrichment_of_all_cameras_lies_between_theirs_whichever_is_preferred(tmp_path):
+    # The plate fills the second camera's picture, to which nine parts of ten of the attention go.
+    tokens = bowl_tokens(replans=2)
+    coverage = bowl_coverage(2, 16)
+    plate = [thing.name for thing in OBJECTS].index("plate_1")
+    coverage[CAMERAS[1]] *= 0.4 / coverage[CAMERAS[1]].sum(axis=2, keepdims=True)
+    coverage[CAMERAS[1]][:, :, plate] += 0.6
+    large = EpisodeTokens(tokens.layout, tokens.key_role, tokens.prompts, tokens.prompt_index, OBJECTS, coverage)
+
+    def preferring(task, episode, tokens, rows):
+        values = attend_uniformly(task, episode, tokens, rows) * prefers_one_camera(tokens)
+        return values / values.sum(axis=-1, keepdims=True)
+
+    path = write_bowl_store(tmp_path / "a.zarr", tokens=large, plant_rows=preferring, tasks=(0,), episodes=2)
+    objects = measured(path, ObjectSettings(spatial=False)).objects
+    of_plate = objects.filter(pl.col("item") == "plate_1", pl.col("camera") == "all")
+    # Attention that is even within each picture prefers no object: 1, where share / area is above 1.3.
+    np.testing.assert_allclose(of_plate["enrichment"], 1.0, rtol=1e-4)
+    np.testing.assert_allclose(of_plate["control_enrichment"], 1.0, rtol=1e-4)
+    assert (of_plate["share"] / of_plate["area_share"] > 1.3).all()
+    times = measured(path, ObjectSettings(spatial=False)).times.filter(item="plate_1", camera="all")
+    np.testing.assert_allclose(times["share"] / times["even_share"], 1.0, rtol=1e-4)
+
+
+def test_enrichment_of_all_cameras_is_a_mean_of_the_cameras(follower_store):
+    objects = measured(follower_store, ObjectSettings(spatial=False)).objects
+    keys = ["task_id", "episode_index", "layer", "kind", "item"]
+    of_camera = objects.filter(pl.col("camera") != "all").group_by(keys)
+    for name in ("enrichment", "control_enrichment"):
+        bounds = of_camera.agg(pl.col(name).min().alias("low"), pl.col(name).max().alias("high"))
+        both = objects.filter(pl.col("camera") == "all").join(bounds, on=keys).drop_nulls([name, "low"])
+        assert both.height > 0
+        assert (both[name] >= both["low"] - 1e-6).all()
+        assert (both[name] <= both["high"] + 1e-6).all()
 
 
 def moved_ious(values: np.ndarray, mask: set[int], percentile: float, replan: int, size: int) -> list[float]:
