@@ -248,7 +248,7 @@ class _Keys:
         self.values[site.name] = values = np.full((count, numbers.shape[1]), np.nan, dtype=np.float32)
         values[own] = numbers
         self.valid[site.name] = valid = np.zeros(count, dtype=bool)
-        valid[own] = call.allowed(place.queries)[0].any(dim=0).cpu().numpy()
+        valid[own] = call.allowed(place.queries)[0].any(dim=(0, 1)).cpu().numpy()
         self.rounding[site.name] = _ROUNDING.get(call.precision, _ROUNDING["float32"])
 
     def there(self, site: str) -> NDArray[np.bool_]:

@@ -338,7 +338,7 @@ def _asked(url: str, ask: Any) -> Any:
                 f"{url} cannot be read: its server sent {slow.received:,} bytes in {slow.seconds:.0f} s; expected at "
                 f"least {SLOWEST_BYTES_A_SECOND:,} a second. Try again later, or from elsewhere."
             ) from None
-        raise RemoteFailure(f"{url} cannot be read: its server sent nothing for {slow.seconds:.2g} s.") from None
+        raise RemoteFailure(f"{url} cannot be read: its server sent nothing for {slow.seconds:.1f} s.") from None
     except TimeoutError:
         raise RemoteFailure(f"{url} cannot be read: its server sent nothing for {ANSWER_WITHIN_S:g} s.") from None
     except OSError as error:

@@ -18,6 +18,7 @@ from tests.kit.crashes import run_child
 from tests.kit.durable_stores import SPEC, leftovers, store_bytes, write_store
 from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.analyze.merge.merging import merge_stores
+from vla_attention.schemas.stores.packed_index import LIST_AGAIN
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 
@@ -86,7 +87,13 @@ def test_a_process_that_ends_at_a_boundary_leaves_whole_stores(stores, tmp_path,
         killed += code != 0
         target = folder / ("a.zarr" if name == "capture" else "out.zarr")
         for store in [*given, *([target.name] if target.exists() else [])]:
-            assert verify_store(open_store(folder / store)) == [], (number, store)
+            faults = verify_store(open_store(folder / store))
+            # A zip that the index does not list yet is a fault, whose sentence says that the same command lists it.
+            assert all(fault.where.endswith(".zip") and LIST_AGAIN in fault.problem for fault in faults), (
+                number,
+                store,
+            )
+            assert not faults or (name == "pack" and store == target.name), (number, store)
         WORK[name](folder)
         for store in (*given, target.name):
             assert store_bytes(folder / store) == store_bytes(whole / store), (number, store)

@@ -61,6 +61,7 @@ KINDS: tuple[FileKind, ...] = (
     FileKind("rows", _IN_EPISODE + r"[^/]+/rows/.*", ("patches",)),
     FileKind("sums of rows", _IN_EPISODE + r"[^/]+/row_sum/.*", ("spans",)),
     FileKind("masses of segments", _IN_EPISODE + r"[^/]+/atoms/.*", ("spans",)),
+    FileKind("uniform attention", _IN_EPISODE + r"[^/]+/uniform/.*", ("spans",)),
     FileKind("roles of keys", _IN_EPISODE + r"[^/]+/key_role/.*", ("spans", "words")),
     FileKind("contributions", _IN_EPISODE + r"[^/]+/contribution/.*", ("contributions",)),
     FileKind("state and actions", _IN_EPISODE + r"(state|actions|dataset_actions)/.*", ("time", "rest")),

@@ -9,7 +9,7 @@ A `StoreSpec` decides every number in its store, so that what a reader must find
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
 from vla_attention.capture.store.recorded_rows import RecordedRows
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run
+from vla_attention.schemas.groupings.key_counts import uniform_of_roles
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.layout import SiteLayout
@@ -303,6 +304,7 @@ def expected_arrays(spec: StoreSpec, task: int, episode: int) -> dict[str, NDArr
                 for row, of in zip(rows, members, strict=True)
             ]
         ),
+        "joint/uniform": _uniform_once([record.rows["joint"].uniform for record in records], roles),
         "joint/key_role": roles,
         "env_step": np.array([record.env_step for record in records], dtype=np.int32),
         "noise_seed": np.array([record.noise_seed for record in records], dtype=np.int64),
@@ -316,6 +318,20 @@ def expected_arrays(spec: StoreSpec, task: int, episode: int) -> dict[str, NDArr
     for camera in records[0].coverage:
         arrays[f"objects/{camera}"] = np.stack([record.coverage[camera] for record in records])
     return arrays
+
+
+def _uniform_once(uniform: Sequence[NDArray[np.float32] | None], roles: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """What uniform attention gives at each replan, once along every axis (but keys) along which it is the same."""
+    given = [
+        uniform_of_roles(role)[None, None, None, None] if one is None else one
+        for one, role in zip(uniform, roles, strict=True)
+    ]
+    cells = np.broadcast_shapes(*(one.shape for one in given))
+    whole = np.stack([np.broadcast_to(one, cells) for one in given]).astype(np.float32)
+    for axis in range(whole.ndim - 1):
+        first = whole.take([0], axis=axis)
+        whole = first if (whole == first).all() else whole
+    return whole
 
 
 def contribution_vectors(spec: StoreSpec, tokens: EpisodeTokens, seed: list[int], replan: int) -> NDArray[np.float64]:
