@@ -66,14 +66,30 @@ def baseline_notes(stores: Sequence[Store]) -> tuple[str, ...]:
     In policies that `vla-capture` builds all queries of a replan see the same keys, but for a growing span, which is
     counted; in other policies of torch nobody noted who sees what.
     """
-    names = [
-        store.path.name
-        for store in stores
-        if store.attributes.store_version == 1 and store.attributes.policy.checkpoint_format == CALLERS_MODULES
-    ]
+    names = [store.path.name for store in stores if _is_recorded_in_version_1(store)]
     if not names:
         return ()
     return (
         f"Baselines of {listing(names)} (version 1) are of the keys that any query of any layer sees; where queries or "
         "layers see different keys, lifts are off. A new recording has baselines by query and layer.",
     )
+
+
+def contribution_notes(stores: Sequence[Store]) -> tuple[str, ...]:
+    """The line about stores of version 1 whose contributions may not be what keys add; empty where there are none."""
+    names = [
+        store.path.name
+        for store in stores
+        if _is_recorded_in_version_1(store) and store.attributes.recording.contributions
+    ]
+    if not names:
+        return ()
+    return (
+        f"Contributions of {listing(names)} (version 1) end at the output projection; where the policy has a gate or a "
+        "norm behind it, they are off. A new recording follows them to the residual stream.",
+    )
+
+
+def _is_recorded_in_version_1(store: Store) -> bool:
+    attributes = store.attributes
+    return attributes.store_version == 1 and attributes.policy.checkpoint_format == CALLERS_MODULES

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from vla_attention.analyze.measures.baselines import baseline_notes
+from vla_attention.analyze.measures.baselines import baseline_notes, contribution_notes
 from vla_attention.analyze.measures.frames import layer_name
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
@@ -82,7 +82,7 @@ class Question:
 
     @property
     def _remarks_on_numbers(self) -> tuple[str, ...]:
-        return (*self.skipped, *baseline_notes(self.stores))
+        return (*self.skipped, *baseline_notes(self.stores), *contribution_notes(self.stores))
 
     @property
     def units(self) -> Units:

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import polars as pl
 
-from vla_attention.analyze.measures.baselines import baseline_notes
+from vla_attention.analyze.measures.baselines import baseline_notes, contribution_notes
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.sinks import SinkRule
 from vla_attention.analyze.measures.task_families import family_notes, unknown_families
@@ -74,6 +74,7 @@ def caveats(analysis: Analysis, masses: Mapping[str, float], sinks: pl.DataFrame
         *_rounding(question),
         *(Caveat("Left out", line, True) for line in question.skipped),
         *(Caveat("Baseline of version 1", line, True) for line in baseline_notes(question.stores)),
+        *(Caveat("Contributions of version 1", line, True) for line in contribution_notes(question.stores)),
         *_related_tasks(question),
         *(Caveat("Chosen part", line) for line in question.notes),
     ]

@@ -18,7 +18,7 @@ from tests.kit.questions import question_about
 from tests.kit.raw_rows import FEW
 from tests.kit.uniform_cases import TABLE, tokens_of_case, write_case
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.measures.baselines import baseline_notes, uniform_keys
+from vla_attention.analyze.measures.baselines import baseline_notes, contribution_notes, uniform_keys
 from vla_attention.analyze.measures.question_settings import settings_from_keywords
 from vla_attention.analyze.measures.sinks import SinkRule, search_sinks
 from vla_attention.analyze.overlay.overlay_data import episode_overlay, ratios_of
@@ -169,18 +169,21 @@ def test_a_baseline_of_version_1_that_may_be_of_too_many_keys_is_noted():
 
 @pytest.mark.parametrize("command", ["", "heads", "words", "time", "groups", "overlay"])
 def test_every_analysis_says_so_once(tmp_path, capsys, command):
-    (note,) = baseline_notes([open_store(FOLDER / "library.zarr")])
+    store = open_store(FOLDER / "library.zarr")
+    notes = baseline_notes([store]) + (() if command == "groups" else contribution_notes([store]))
     where = [] if command == "groups" else ["--output", str(tmp_path / "out")]
     plots = [] if command in ("groups", "overlay") else ["--no-plots"]
     for name, count in (("library", 1), ("joint", 0)):
         assert main([*filter(None, [command]), str(FOLDER / f"{name}.zarr"), *where, *plots]) == 0
         said = capsys.readouterr()
-        assert " ".join((said.out + said.err).split()).count(note) == count, name
+        for note in notes:
+            assert " ".join((said.out + said.err).split()).count(note) == count, name
 
 
 def test_the_report_has_it_among_its_caveats(tmp_path):
-    (note,) = baseline_notes([open_store(FOLDER / "library.zarr")])
+    store = open_store(FOLDER / "library.zarr")
     assert main(["report", str(FOLDER / "library.zarr"), "--output", str(tmp_path / "a.html")]) == 0
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
-    assert text.count(note) == 2, "as a banner, and in the list"
+    for note in baseline_notes([store]) + contribution_notes([store]):
+        assert text.count(note) == 2, "as a banner, and in the list"
     assert "Baseline of version 1" in text
