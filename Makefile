@@ -9,7 +9,7 @@
 #   make notebooks   the notebooks of examples/, run from beginning to end, in an environment of its own (.venv-notebooks)
 #   make fuzz        made-up bytes for every parser of files, for SECONDS=3600, in an environment of its own (.venv-fuzz)
 #   make docs        the documentation site, into site/, in an environment of its own (.venv-docs)
-#   make pictures    the pictures of README and guides, from the run of make capture
+#   make pictures    the pictures and printed samples of README and guides, from the run of make capture
 #   make screenshots the pictures of the viewer's page in docs/viewer.md, from the same run, in this machine's Chromium
 #   make test-slurm  an array job on the SLURM that sbatch reaches from here (opt-in; installs nothing)
 #   make setup       the whole environment        make setup-analyze   the laptop's part of it
@@ -106,6 +106,7 @@ docs: .venv-docs/installed
 
 pictures: .venv/analyze-installed
 	$(BIN)/python docs/make_pictures.py --run $(STORE)
+	$(BIN)/python docs/make_samples.py
 
 screenshots: .venv/capture-installed
 	$(BIN)/python docs/make_screenshots.py $(STORE)

@@ -1,7 +1,7 @@
-"""Make the golden stores of version 1 and the numbers that they must give: python -m tests.golden.make_stores FOLDER
+"""Make golden stores of today's version and the numbers that they must give: python -m tests.golden.make_stores FOLDER
 
-They were made once, when version 1 was frozen, and stay as they are: `tests/schemas/stores/test_golden_stores.py` holds
-that today's code gives the same numbers. A later version gets stores of its own beside them. FOLDER is empty or new.
+Those of a version are made once, before it is frozen, and stay as they are: today's code has to give the same numbers
+(`tests/schemas/stores/test_golden_stores.py`). FOLDER is empty or new.
 """
 
 from __future__ import annotations
@@ -11,19 +11,21 @@ from pathlib import Path
 
 import pytest
 
-from tests.kit.golden_stores import NAMES, write_tables
+from tests.kit.golden_stores import STORES, write_tables
 from tests.kit.small_torch_policy import SmallPolicy, given, small_layout
 from tests.kit.still_scene import capture_without_simulator
+from tests.kit.uniform_cases import TABLE, write_case
 from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import STORE_VERSION
 
 _WHERE = ("--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", "0", "1", "--num-episodes", "1")
 
 
 def make_stores(folder: Path) -> None:
-    """Write the five stores and their tables into a folder."""
+    """Write the stores and their tables into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
         capture_without_simulator(patch)
@@ -34,7 +36,9 @@ def make_stores(folder: Path) -> None:
     copy_store(open_store(folder / "joint.zarr"), folder / "packed.zarr", (), packed=True)
     changes = ("--check", "0", "--knockout", "camera:base_0_rgb")
     _run("rerun", str(folder / "joint.zarr"), *changes, "--store", str(folder / "rerun.zarr"))
-    for name in NAMES:
+    (masks,) = (case for case in TABLE["stored"] if case["name"] == "masks differ along every axis")
+    write_case(folder / "masks.zarr", masks, masks["weights"])
+    for name in STORES[STORE_VERSION]:
         write_tables(folder / f"{name}.zarr", folder / name)
 
 
