@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shlex
+import subprocess
+import sys
 from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import find_spec
@@ -142,3 +144,28 @@ def test_pictures_have_a_text_and_are_small(document):
     for text, target in re.findall(r"!\[(.*?)\]\((.*?)\)", text_of(document)):
         assert len(text) > 15, target
         assert (document.parent / target).stat().st_size < 300_000, target
+
+
+def test_samples_are_found_and_cut_as_their_comments_say(tmp_path):
+    page = tmp_path / "a.md"
+    comment = "<!-- sample: vla-analyze heads --help | 1 3-4 -->\n\n```\nold\n```\n"
+    page.write_text(f"before\n\n{comment}after\n")
+    program = [sys.executable, ROOT / "docs" / "make_samples.py", page]
+    assert subprocess.run(program, check=True, capture_output=True, text=True).stdout == f"{page}: 1 samples\n"
+    lines = page.read_text().split("\n")
+    assert (lines[0], lines[2], lines[-3:]) == ("before", comment.split("\n")[0], ["```", "after", ""])
+    assert lines[6] == "..."
+    assert len(lines[5:-3]) == 4
+    page.write_text(page.read_text().replace("--help", "--lost"))
+    assert subprocess.run(program, check=False, capture_output=True).returncode == 2
+
+
+def test_every_sample_is_of_this_programs_commands():
+    found = [
+        found for page in DOCUMENTS for found in re.findall(r"^<!-- sample: (.*) -->$", text_of(page), re.MULTILINE)
+    ]
+    assert found
+    for line in found:
+        assert all(
+            command.split()[0] in ("vla-analyze", "vla-capture") for command in line.split(" | ")[0].split(" && ")
+        )
