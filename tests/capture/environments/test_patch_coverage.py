@@ -86,6 +86,29 @@ def test_wrong_input_is_refused(segmentation: np.ndarray, rows: int, columns: in
         patch_coverage(segmentation, 2, rows, columns, **STRAIGHT)
 
 
+@given(pictures, grids, st.booleans(), st.booleans())
+def test_rows_and_columns_are_reversed_each_by_its_own_flag(segmentation, grid, flip_rows, flip_columns):
+    """Pictures without symmetry tell rows from columns; no mirrored picture has the coverage of the turned one."""
+    flipped = np.flipud(segmentation) if flip_rows else segmentation
+    flipped = np.fliplr(flipped) if flip_columns else flipped
+    found = patch_coverage(segmentation, NUM_OBJECTS, *grid, flip_rows=flip_rows, flip_columns=flip_columns)
+    np.testing.assert_allclose(found, fine_grained(flipped, *grid), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("flip_rows", "flip_columns", "order"),
+    [
+        (False, False, [0, 1, 2, 3]),
+        (True, False, [2, 3, 0, 1]),
+        (False, True, [1, 0, 3, 2]),
+        (True, True, [3, 2, 1, 0]),
+    ],
+)
+def test_four_patches_are_in_the_order_of_the_models_picture(flip_rows, flip_columns, order):
+    found = patch_coverage(np.array([[0, 1], [2, 3]]), 4, 2, 2, flip_rows=flip_rows, flip_columns=flip_columns)
+    assert found.argmax(axis=1).tolist() == order
+
+
 def test_rows_alone_can_be_reversed_and_only_the_middle_seen():
     segmentation = np.zeros((8, 8), dtype=int)
     segmentation[0, :] = 1  # an edge that half of the side does not reach

@@ -127,6 +127,7 @@ def test_the_store_says_what_was_replayed(tmp_path, capsys):
     assert stored.attrs["dataset_action_count"] == [4, 4, 3]
     np.testing.assert_array_equal(stored["dataset_actions"][2, :3], made[2].columns["action"][6:9])
     assert stored["actions"].shape == (3, 4, 6)
+    assert len(set(stored.attrs["noise_seed"])) == 3
     # Pictures of 64 x 96 are fitted into 28 x 28; their stripes are still to be told apart.
     for camera, first in (("base_0_rgb", 200), ("left_wrist_0_rgb", 250)):
         frames = stored[f"frames/{camera}"][:]

@@ -75,6 +75,7 @@ def test_prompt_picture_and_noise_are_those_that_the_model_saw(pi_store, tmp_pat
     assert {prompt.instruction_text for prompt in new.attributes.prompts} == {""}
     assert not (new.read("joint/key_role") == Role.INSTRUCTION).any()
     assert not np.isin(new.read("noise_seed"), old.read("noise_seed")).any()
+    assert len(set(new.attributes.noise_seed)) == new.attributes.num_replans == 3
     assert new.attributes.instruction == old.attributes.instruction
     assert_applied_again(target, capsys)
 
