@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,7 +48,7 @@ def open_base(path: Path, task_ids: Sequence[int] | None = None, num_episodes: i
             of_task[task_id] += 1
             kept.append(episode)
     for episode in kept:
-        damaged = look_at(store, episode)
+        damaged = look_at(store, episode, read_only=True)
         if damaged is not None:
             raise CorruptEpisode(
                 f"Cannot rerun {path}: {damaged.describe().rstrip('.')}; vla-capture repair moves such episodes aside."
@@ -56,8 +57,18 @@ def open_base(path: Path, task_ids: Sequence[int] | None = None, num_episodes: i
 
 
 def instructions_of(store: Store) -> dict[int, str]:
-    """Return the instruction of each task that the store has an episode of, by task id."""
-    return {episode.attributes.task_id: episode.attributes.instruction for episode in store.episodes}
+    """Return the instruction of each task that the whole store has an episode of, by task id.
+
+    Also of tasks that `open_base` was not asked for: the prompt of another task is one. Of those, damaged episodes are
+    left out, which are not run again.
+    """
+    found = {episode.attributes.task_id: episode.attributes.instruction for episode in store.episodes}
+    for episode in open_store(store.path).episodes:
+        task_id, _ = parse_episode_name(episode.name)
+        if task_id not in found:
+            with suppress(CorruptEpisode):
+                found[task_id] = episode.attributes.instruction
+    return found
 
 
 def check_may_change(store: Store, interventions: Interventions) -> None:

@@ -37,7 +37,7 @@ def check_on_store(interventions: Interventions, base: Store, *, allow_empty: bo
     prompt = interventions.prompt
     instructions = instructions_of(base)
     if prompt is not None and prompt.kind == "synonyms":
-        check_synonyms(prompt, instructions.values())
+        check_synonyms(prompt, [episode.attributes.instruction for episode in base.episodes])
     if prompt is not None and prompt.kind == "task" and prompt.task_id not in instructions:
         raise BadArgument(
             f"Cannot use the prompt of task {prompt.task_id}: {base.path} has no episode of it, and thus not its "

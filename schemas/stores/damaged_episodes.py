@@ -34,9 +34,14 @@ class DamagedEpisode:
         return f"{first}{more}."
 
 
-def look_at(store: Store, episode: StoredEpisode, verify: bool = False) -> DamagedEpisode | None:
-    """Return what is wrong with an episode, or None. `verify`: read all of it, as `vla-analyze verify` does."""
-    if episode.place is not None:
+def look_at(
+    store: Store, episode: StoredEpisode, verify: bool = False, *, read_only: bool = False
+) -> DamagedEpisode | None:
+    """Return what is wrong with an episode, or None.
+
+    verify: read all of it, as `vla-analyze verify` does. read_only: nothing is added to the store, which may be packed.
+    """
+    if episode.place is not None and not read_only:
         raise StoreError(
             f"{store.path} is packed, and captures add nothing to packed stores; vla-analyze verify {store.path} "
             f"checks it, and vla-analyze copy {store.path} NAME.zarr makes a store of folders."
