@@ -22,6 +22,18 @@ _READERS: dict[Queries, str] = {
 }
 
 
+def readers(queries: Queries, query_selector: str = "") -> str:
+    """Whose attention changes, in words."""
+    return _READERS[queries] + (f" of '{query_selector}'" if query_selector else "")
+
+
+def queries_suffix(queries: Queries, query_selector: str = "") -> str:
+    """The end of a condition's name that says for whom keys are cut; empty for the action queries."""
+    if queries == "action":
+        return ""
+    return f"_queries_{queries}" + (f"_of_{query_selector}" if query_selector else "")
+
+
 @dataclass(frozen=True)
 class KeyKnockout:
     """Keys whose attention is taken away: log(1 - w) is added to the logits of a key of weight w.
@@ -73,11 +85,11 @@ class KeyKnockout:
         what = "all keys but" if self.keep else "the keys of"
         if self.random_seed is not None:
             what = f"random keys (seed {self.random_seed}), as many as {what}"
-        readers = _READERS[self.queries]
-        readers += f" of '{self.query_selector}'" if self.query_selector else ""
         strength = "" if self.weight == 1 else f" with the weight {self.weight:g}"
         places = _describe_places(self.layers, self.heads, self.denoise_steps)
-        return f"{what} '{self.selector}' knocked out{strength} for {readers}{places}"
+        return (
+            f"{what} '{self.selector}' knocked out{strength} for {readers(self.queries, self.query_selector)}{places}"
+        )
 
 
 @dataclass(frozen=True)

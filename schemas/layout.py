@@ -28,8 +28,8 @@ ROLE_DTYPE = np.uint8
 #: Groups and arrays of an episode beside those of its sites.
 RESERVED_NAMES = frozenset(
     {
-        *("actions", "camera_frames", "dataset_action_count", "dataset_actions", "denoise_time", "env_step", "frames"),
-        *("noise_seed", "objects", "prompt_index", "seal", "state", "zarr.json"),
+        *("actions", "base_actions", "camera_frames", "dataset_action_count", "dataset_actions", "denoise_time"),
+        *("env_step", "frames", "noise_seed", "objects", "prompt_index", "seal", "state", "zarr.json"),
     }
 )
 

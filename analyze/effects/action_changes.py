@@ -12,6 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.analyze.show.numbers import row_interval
+from vla_attention.analyze.statistics.intervals import estimates, ratio_of_means_over_episodes
+from vla_attention.analyze.statistics.units import Units
 from vla_attention.analyze.time.alignment import GRIPPER
 
 Array = NDArray[np.float64]
@@ -24,6 +27,26 @@ LEAST_SPREAD = 0.01
 #: A dimension that another noise seed changes by more than this many spreads is more than half noise: two draws of
 #: noise of variance v differ by 2 v on average.
 MOST_NOISE = 1.0
+#: Why such a dimension is not compared.
+MOSTLY_NOISE = "mostly noise"
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Root mean square change by another noise seed over all replans and steps, in spreads.
+
+    change: (dimension,); NaN where there is no spread. low, high: ends (dimension,) of its interval over the episodes,
+    NaN where there is none (a single episode).
+    """
+
+    change: Array
+    low: Array
+    high: Array
+
+    def cells(self, dimension: int) -> tuple[float, str]:
+        """The change of a dimension, and its interval as text."""
+        bounds = {"low": float(self.low[dimension]), "high": float(self.high[dimension])}
+        return float(self.change[dimension]), "-" if np.isnan(bounds["low"]) else row_interval(bounds)
 
 
 @dataclass(frozen=True)
@@ -33,13 +56,13 @@ class ActionSpread:
     Attributes:
         spread: (dimension,) standard deviation over all replans and all steps of their chunks.
         used: (dimension,) bool, the dimensions that are compared.
-        noise: (dimension,) root mean square change by another noise seed, in spreads; None where it is not known.
+        noise: change by another noise seed; None where it is not known.
         reasons: (dimension,) why a dimension is not compared; empty for those that are.
     """
 
     spread: Array
     used: NDArray[np.bool_]
-    noise: Array | None = None
+    noise: Noise | None = None
     reasons: tuple[str, ...] = ()
 
     @property
@@ -61,28 +84,37 @@ def action_spread(actions: Sequence[Array], dimensions: Sequence[int] | None = N
     return ActionSpread(spread, moves & chosen, reasons=tuple(reasons))
 
 
-def with_noise(spread: ActionSpread, noise: Array, leave_out: bool) -> ActionSpread:
+def with_noise(spread: ActionSpread, noise: Noise, leave_out: bool) -> ActionSpread:
     """The same with the change by another noise seed; `leave_out`: dimensions that are mostly noise are not compared.
 
-    Such a dimension would make every effect as large as its noise. Where all of them are, all are kept.
+    Such a dimension would make every effect as large as its noise. It is left out where the whole interval lies above
+    `MOST_NOISE`, so that no chance of the episodes decides; where all of them would be, all are kept.
     """
-    mostly = spread.used & (noise > MOST_NOISE)
+    mostly = spread.used & (noise.low > MOST_NOISE)
     if not leave_out or mostly[spread.used].all():
         return replace(spread, noise=noise)
-    reasons = ["mostly noise" if drop else reason for drop, reason in zip(mostly, spread.reasons, strict=True)]
+    reasons = [MOSTLY_NOISE if drop else reason for drop, reason in zip(mostly, spread.reasons, strict=True)]
     return replace(spread, used=spread.used & ~mostly, noise=noise, reasons=tuple(reasons))
 
 
-def change_per_dimension(pairs: Sequence[tuple[Array, Array]], spread: Array) -> Array:
-    """Root mean square change (dimension,) over all replans and steps, in spreads; NaN where there is no spread.
+def noise_of(pairs: Sequence[tuple[Array, Array]], spread: Array) -> Noise:
+    """The change by another noise seed, with its interval over episodes.
 
-    pairs: actions (replan, step, dimension) of the base and of a rerun.
+    pairs: per episode the actions (replan, step, dimension) of the base and of a rerun.
     """
-    squares = np.sum([((other - base) ** 2).sum(axis=(0, 1)) for base, other in pairs], axis=0)
-    number = sum(base.shape[0] * base.shape[1] for base, _ in pairs)
+    squares = np.array([((other - base) ** 2).sum(axis=(0, 1)) for base, other in pairs]).T  # (dimension, episode)
+    number = np.array([base.shape[0] * base.shape[1] for base, _ in pairs], dtype=np.float64)
+    statistic = ratio_of_means_over_episodes(squares, np.broadcast_to(number, squares.shape))
+    # The episodes are those of which the units are, whatever their tasks.
+    found = estimates([statistic], Units.of(np.zeros(len(pairs))))
+    # Several episodes that do not differ agree on the value; a single one says nothing of others.
+    alike = (np.nan, np.nan) if len(pairs) < 2 else None
+    intervals = [(one.interval(), one.value) for one in found]
+    ends = np.array([(own.low, own.high) if own else alike or (value, value) for own, value in intervals], np.float64)
+    values = np.array([[one.value for one in found], *ends.T], dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
-        result: Array = np.where(spread > 0, np.sqrt(squares / number) / spread, np.nan)
-    return result
+        change, low, high = np.where(spread > 0, np.sqrt(values) / spread, np.nan)
+    return Noise(change, low, high)
 
 
 def root_mean_square_change(base: Array, other: Array, spread: ActionSpread, steps: NDArray[np.int64]) -> Array:

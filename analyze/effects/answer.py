@@ -2,32 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from vla_attention.analyze.effects.conditions import FLOORS, Kind
 from vla_attention.analyze.effects.effect_study import EffectStudy
-from vla_attention.analyze.effects.group_rows import GroupRow, group_rows
+from vla_attention.analyze.effects.group_rows import GroupRow, group_rows, readers_of
 from vla_attention.analyze.ratios.answer import ratio_sentence
 from vla_attention.analyze.show.findings import findings
 from vla_attention.analyze.show.numbers import format_number, row_interval
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
+from vla_attention.schemas.interventions import readers
 from vla_attention.schemas.stores.store_format import CALLERS_MODULES
 
 #: Sentences that name conditions after looking at all: beyond noise, and beyond random keys.
 _SENTENCES = 2
 _MODALITIES = ("visual", "linguistic")
+_ACTION, _ALL = readers("action"), readers("all")
+#: What a knockout leaves, by for whom it is.
+_REACH = {
+    _ACTION: " alone (what other keys took over from them still reaches the action)",
+    _ALL: " (no other key can carry them on)",
+}
 
 
 def answer_lines(study: EffectStudy) -> list[str]:
     """The sentences, each to be wrapped by itself."""
     if not study.conditions:
         return ["No rerun was given, only rollouts: there are no effects on single actions."]
-    grouping = study.analysis.grouping
-    rows = {row.name: row for row in group_rows(study)}
+    grouping, rows = study.analysis.grouping, group_rows(study)
     # Where a site has one of the modalities only (Cosmos), the grouping has no ratio.
     sides = _MODALITIES if grouping.ratio is None else (*grouping.ratio.numerator, *grouping.ratio.denominator)
     lines = [noise_sentence(study)]
-    lines += [side_sentence(rows[name], name) for name in sides if name in rows]
+    lines += [side_sentence(row) for name in sides for row in rows if row.name == name]
+    lines.append(for_whom(rows))
     if study.analysis.headline is not None:
         measured, every = study.measured[0], study.analysis.overall["num_episodes"]
         where = "the same replans"
@@ -57,9 +65,24 @@ def noise_sentence(study: EffectStudy) -> str:
     )
 
 
-def side_sentence(row: GroupRow, name: str) -> str:
+def for_whom(rows: Sequence[GroupRow]) -> str:
+    """For whom the groups' keys were cut, and what that leaves; empty without a group."""
+    found = [readers for readers in readers_of(rows) if readers]
+    if not found:
+        return ""
+    if found == [_ACTION]:
+        return (
+            f"Keys were cut for {_ACTION} alone: what other keys took over from them still reaches the action, and "
+            f"does not where keys are cut for {_ALL} (--knockout-queries all)."
+        )
+    if len(found) == 1:
+        return f"Keys were cut for {found[0]}{_REACH.get(found[0], '')}."
+    return f"Names say for whom keys were cut: for {'; for '.join(one + _REACH.get(one, '') for one in found)}."
+
+
+def side_sentence(row: GroupRow) -> str:
     """What the action does without a group, and with that group alone."""
-    parts = []
+    parts, name = [], row.label
     if row.without is not None:
         parts.append(f"Without {name} the action changes by {_amount(row.without)}{_verdict(row.without)}")
     if row.only is not None:

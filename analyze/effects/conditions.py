@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from vla_attention.schemas.interventions import Interventions, KeyKnockout
+from vla_attention.schemas.interventions import Interventions, KeyKnockout, queries_suffix, readers
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store
 
@@ -77,11 +77,28 @@ class Condition:
 
     @property
     def group_name(self) -> str:
-        """The group's name: the end of a name such as `without_visual`, else its selectors."""
+        """The group's name: `visual` of `without_visual` or `without_visual_queries_all`, else its selectors.
+
+        For whom keys were cut is `readers`, and no part of the group's name.
+        """
         for prefix in _PREFIXES:
             if self.name.startswith(prefix) and len(self.name) > len(prefix):
-                return self.name.removeprefix(prefix)
+                return self._without_queries(self.name.removeprefix(prefix))
         return self.group.text if self.group is not None else self.name
+
+    def _without_queries(self, name: str) -> str:
+        for suffix in {queries_suffix(knockout.queries) for knockout in self.interventions.keys} - {""}:
+            stem, found, rest = name.rpartition(suffix)
+            if found and stem and (not rest or rest.startswith("_of_")):
+                return stem
+        return name
+
+    @property
+    def readers(self) -> str:
+        """Whose attention was changed, in words; empty where that of nobody was."""
+        words = [readers(knockout.queries, knockout.query_selector) for knockout in self.interventions.keys]
+        words += [readers(change.queries) for change in self.interventions.attention]
+        return visible(" and ".join(dict.fromkeys(words)))
 
     def is_control_of(self, other: Condition) -> bool:
         """Whether this run knocked out random keys, as many as the other one, and is like it in all else."""

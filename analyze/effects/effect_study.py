@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from vla_attention.analyze.effects.action_changes import (
     ActionSpread,
     action_spread,
-    change_per_dimension,
+    noise_of,
     with_noise,
 )
 from vla_attention.analyze.effects.conditions import FLOORS, Condition, Kind
@@ -36,11 +36,13 @@ from vla_attention.analyze.effects.paired_replans import (
 )
 from vla_attention.analyze.effects.reruns import BaseAndReruns, open_reruns
 from vla_attention.analyze.effects.rollouts import ROLLOUT_COLUMNS, rollout_pairs, rollout_summary
+from vla_attention.analyze.effects.same_calls import held_by_one
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens
 from vla_attention.analyze.ratios.analysis import Analysis, analyse
+from vla_attention.analyze.show.numbers import format_number
 from vla_attention.analyze.statistics.episode_intervals import Sampling, means_of_all_and_of_tasks
 from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE, SHARE
 from vla_attention.analyze.statistics.many_looks import adjusted_p_values
@@ -178,7 +180,7 @@ def study_of(analysis: Analysis, opened: BaseAndReruns, dimensions: Sequence[int
         rollout_episodes=pl.concat([table for table, _ in rollouts])
         if rollouts
         else pl.DataFrame(schema=ROLLOUT_COLUMNS),
-        notes=(*notes, *_notes(pairings, attention), *unpaired),
+        notes=(*notes, *_notes(pairings, attention), *_drifts(pairings, spread), *unpaired),
     )
 
 
@@ -251,7 +253,7 @@ def _spread(
                     raise
     if not pairs:
         return spread
-    return with_noise(spread, change_per_dimension(pairs, spread.spread), leave_out=dimensions is None)
+    return with_noise(spread, noise_of(pairs, spread.spread), leave_out=dimensions is None)
 
 
 def _episodes_of(pairing: Pairing, spread: ActionSpread, attention: dict[Any, GroupAttention]) -> pl.DataFrame:
@@ -313,22 +315,49 @@ def _has_keys(attention: NDArray[np.float64] | None, replans: int = 1, kind: Kin
 
 
 def _notes(pairings: Sequence[Pairing], attention: dict[Any, GroupAttention]) -> list[str]:
-    """Which episodes have no partner. A series lacks those with a replan without a key of its group.
+    """Which episodes have no partner, and which inputs could not be compared.
 
-    Conditions that lack the same episodes share a note.
+    A series lacks the episodes with a replan without a key of its group. Conditions with the same gaps share a note.
     """
     names: dict[str, list[str]] = {}
     for pairing in pairings:
-        group = pairing.condition.group
-        known = attention[group].values if group is not None else {}
+        condition, gaps = pairing.condition, []
+        known = attention[condition.group].values if condition.group is not None else {}
         empty = [name for name in pairing.missing if name in known and not _has_keys(known[name]).all()]
         kept = replace(pairing, missing=tuple(name for name in pairing.missing if name not in empty))
         if kept.gap:
-            names.setdefault(kept.gap, []).append(pairing.condition.name)
+            gaps.append(kept.gap)
+        held = (held_by_one(base.item.store, base.item.episode, condition.store, own) for base, own in pairing.pairs)
+        unknown = list(dict.fromkeys(name for one in held for name in one))
+        if unknown:
+            gaps.append(f"was not compared with the base in the {listing(unknown)}, which one of the two stores lacks")
+        for gap in gaps:
+            names.setdefault(gap, []).append(condition.name)
     return [
         f"{found[0]} {gap}." if len(found) == 1 else f"Each of {len(found)} conditions ({listing(found, 3)}) {gap}."
         for gap, found in names.items()
     ]
+
+
+def _drifts(pairings: Sequence[Pairing], spread: ActionSpread) -> list[str]:
+    """How far unchanged reruns are from the base's actions, a sentence for each that is not equal to them."""
+    notes = []
+    for pairing in pairings:
+        if pairing.condition.kind != Kind.NOTHING:
+            continue
+        largest, where = 0.0, ""
+        for base, own in pairing.pairs:
+            changes = changes_of(base, actions_of(base, own, pairing.condition), spread)
+            chunks = changes[:, CHANGES.index("effect_chunk")]
+            if chunks.max() > largest:
+                largest, where = float(chunks.max()), f"replan {int(chunks.argmax())} of {base.name}"
+        if largest:
+            notes.append(
+                f"{pairing.condition.name} changes nothing, and its actions are not those of the base: they differ by "
+                f"up to {format_number(largest)} of their spread ({where}). Effects that are not far above that are "
+                "none."
+            )
+    return notes
 
 
 def with_floors(episodes: pl.DataFrame, conditions: Sequence[Condition]) -> pl.DataFrame:

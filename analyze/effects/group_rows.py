@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from vla_attention.analyze.effects.conditions import Condition, Kind
@@ -16,6 +17,7 @@ class GroupRow:
 
     Attributes:
         name: the group's.
+        label: the name, with for whom its keys were cut where rows differ in it; no two rows have the same.
         condition: the run without the group, or where there is none the run with the group alone.
         without: the row of `EffectStudy.summary` without the group; None where there is no such rerun.
         only: the same with the group alone.
@@ -23,6 +25,7 @@ class GroupRow:
     """
 
     name: str
+    label: str
     condition: Condition
     without: dict[str, Any] | None
     only: dict[str, Any] | None
@@ -39,7 +42,22 @@ def group_rows(study: EffectStudy) -> list[GroupRow]:
         alone = [other for other in alone if other is not reverse]
     rows += [_row(study, condition, None, condition) for condition in alone]
     order = {name: i for i, name in enumerate(study.analysis.grouping.names)}
-    return sorted(rows, key=lambda row: (order.get(row.name, len(order)), -_effect(row)))
+    ordered = sorted(rows, key=lambda row: (order.get(row.name, len(order)), -_effect(row)))
+    return [replace(row, label=label) for row, label in zip(ordered, _labels(ordered), strict=True)]
+
+
+def readers_of(rows: Sequence[GroupRow]) -> list[str]:
+    """For whom the keys of rows were cut, in words, each once."""
+    return list(dict.fromkeys(row.condition.readers for row in rows))
+
+
+def _labels(rows: Sequence[GroupRow]) -> list[str]:
+    alike = len(readers_of(rows)) < 2
+    labels = [row.name if alike else f"{row.name}, {row.condition.readers}" for row in rows]
+    return [
+        label if labels.count(label) == 1 else f"{label} ({row.condition.name})"
+        for label, row in zip(labels, rows, strict=True)
+    ]
 
 
 def _effect(row: GroupRow) -> float:
@@ -50,4 +68,5 @@ def _effect(row: GroupRow) -> float:
 def _row(study: EffectStudy, condition: Condition, without: Condition | None, only: Condition | None) -> GroupRow:
     rows = [None if one is None else study.of(one) for one in (without, only)]
     known = next(row for row in rows if row is not None)
-    return GroupRow(condition.group_name, condition, rows[0], rows[1], {name: known[name] for name in MEASURES})
+    attention = {name: known[name] for name in MEASURES}
+    return GroupRow(condition.group_name, condition.group_name, condition, rows[0], rows[1], attention)

@@ -15,12 +15,12 @@ from vla_attention.analyze.effects.action_changes import (
     root_mean_square_change,
 )
 from vla_attention.analyze.effects.conditions import Condition
+from vla_attention.analyze.effects.same_calls import check_same_calls
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.time.alignment import episode_timing, on_episode_time
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
-from vla_attention.schemas.stores.store_format import StoreError
 
 Array = NDArray[np.float64]
 
@@ -134,25 +134,10 @@ def actions_of(base: BaseEpisode, rerun: StoredEpisode, condition: Condition) ->
     """Actions (replan, step, dimension) of an episode of a condition.
 
     Raises:
-        StoreError: the rerun has other replans than the base, or actions of another shape, or was given other states.
+        StoreError: the rerun is of other policy calls than the base, see `same_calls.check_same_calls`.
     """
-    actions = rerun.read("actions").astype(np.float64)
-    steps = rerun.read("env_step").astype(np.int64)
-    if not np.array_equal(steps, base.env_step) or actions.shape != base.actions.shape:
-        raise StoreError(
-            f"{base.name} of {condition.store.path} has {len(steps)} replans and actions of the shape {actions.shape}, "
-            f"and in its base {len(base.env_step)} and {base.actions.shape}: these are not the same replans; make the "
-            "rerun again."
-        )
-    # A base that was recorded again with the same settings has the digest of the one that was rerun.
-    if not (base.item.episode.has("state") and rerun.has("state")):
-        return actions
-    own, others = base.item.episode.read("state"), rerun.read("state")
-    if own.shape != others.shape or not np.allclose(own, others, rtol=1e-5, atol=1e-6):
-        raise StoreError(
-            f"{base.name} of {condition.store.path} was made from other states of the robot than its base has: the "
-            "base was recorded again since; make the rerun again."
-        )
+    check_same_calls(base.item.store, base.item.episode, condition.store, rerun)
+    actions: Array = rerun.read("actions").astype(np.float64)
     return actions
 
 

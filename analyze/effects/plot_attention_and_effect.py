@@ -16,7 +16,7 @@ from vla_attention.analyze.show.numbers import interval_name, of_tasks
 from vla_attention.analyze.show.plot_axes import legend_above, uniform_line
 from vla_attention.analyze.show.plot_colours import DATA_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
-from vla_attention.analyze.show.plot_text import explain, shortened, title
+from vla_attention.analyze.show.plot_text import broken, explain, title
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def _name_points(axes: Axes, rows: list[GroupRow], measure: str) -> None:
     def up(effect: float) -> float:
         return (effect - bottom) / (top - bottom)
 
-    shown = [(row.name, row.without) for row in rows if row.without is not None]
+    shown = [(row.label, row.without) for row in rows if row.without is not None]
     places = [(across(row[measure]), up(row["effect"])) for _, row in shown]
     points = [(x - _GAP / 2, x + _GAP / 2, y - _LINE / 4, y + _LINE / 4) for x, y in places]
     bars: list[_Box] = []
@@ -113,12 +113,13 @@ def _name_points(axes: Axes, rows: list[GroupRow], measure: str) -> None:
             bars.append((x, x, up(row["effect_low"]), up(row["effect_high"])))
     names: list[_Box] = []
     for (name, _), (x, y) in sorted(zip(shown, places, strict=True), key=lambda item: -item[1][1]):
-        text = shortened(name, 20)
-        width = _CHARACTER * len(text)
+        text = broken(name, 24)
+        lines_of_name = text.split("\n")
+        width, tall = _CHARACTER * max(map(len, lines_of_name)), _LINE * len(lines_of_name)
         found: list[tuple[int, str, float, _Box]] = []
         for align, lines in _PLACES:
             start, height = x + _GAP if align == "left" else x - _GAP - width, y + lines * _LINE
-            box = (start, start + width, height - _LINE / 2, height + _LINE / 2)
+            box = (start, start + width, height - tall / 2, height + tall / 2)
             inside = box[0] >= 0 and box[1] <= 1 and box[2] >= 0 and box[3] <= 1
             if inside and not any(_overlap(box, other) for other in (*names, *points)):
                 found.append((sum(_overlap(box, bar) for bar in bars), align, height, box))
@@ -145,7 +146,7 @@ def _overlap(one: _Box, other: _Box) -> bool:
 def _table(rows: list[GroupRow]) -> pl.DataFrame:
     names = [f"{name}{end}" for name in ("mass", "lift", "norm", "effect") for end in ("", "_low", "_high")]
     found = [
-        {"group": row.name, "num_episodes": row.without["num_episodes"], "keys": row.without["keys"]}
+        {"group": row.label, "num_episodes": row.without["num_episodes"], "keys": row.without["keys"]}
         | {name: row.without[name] for name in names}
         for row in rows
         if row.without is not None

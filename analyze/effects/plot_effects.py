@@ -17,7 +17,7 @@ from vla_attention.analyze.show.numbers import format_number, interval_name, of_
 from vla_attention.analyze.show.plot_axes import legend_above, note_at_row, ratio_axis, uniform_line
 from vla_attention.analyze.show.plot_colours import NOTE_COLOR, STRIPE_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
-from vla_attention.analyze.show.plot_text import explain, shortened, title
+from vla_attention.analyze.show.plot_text import broken, explain, title
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 
 if TYPE_CHECKING:
@@ -57,7 +57,8 @@ def plot_effects(study: EffectStudy, folder: Path) -> list[Path]:
     """Draw every condition; returns the paths of png, pdf and csv."""
     rows, noise = _rows(study), [study.of(condition) for condition in study.of_kind(Kind.NOISE)]
     shown = rows[:_MOST]
-    figure = new_figure(9.4, 1.9 + 0.34 * max(len(shown), 3))
+    lines = [max(1.0, 0.6 * (row.label.count("\n") + 1)) for row in shown]
+    figure = new_figure(9.4, 1.9 + 0.34 * max(sum(lines), 3))
     _title(figure, study, len(rows))
     table = _table(rows, noise)
     if not shown:
@@ -95,12 +96,12 @@ def _rows(study: EffectStudy) -> list[_Row]:
     for group in group_rows(study):
         points = {"without": group.without, "only": group.only, "random": _random_of(study, group.condition)}
         known = next(row for row in (group.without, group.only) if row is not None)
-        rows.append(_Row(shortened(group.name, 30), {k: row for k, row in points.items() if row is not None}, known))
+        rows.append(_Row(broken(group.label, 30), {k: row for k, row in points.items() if row is not None}, known))
     floor = (Kind.WITHOUT, Kind.ONLY, Kind.RANDOM, Kind.NOISE)
     for condition in study.conditions:
         if condition.kind not in floor:
             row = study.of(condition)
-            rows.append(_Row(shortened(condition.name, 30), {"other": row}, row))
+            rows.append(_Row(broken(condition.name, 30), {"other": row}, row))
     return rows
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import polars as pl
 
+from vla_attention.analyze.effects.action_changes import MOSTLY_NOISE
 from vla_attention.analyze.effects.answer import answer_lines, beyond
 from vla_attention.analyze.effects.conditions import FLOORS, Condition, Kind
 from vla_attention.analyze.effects.effect_study import EffectStudy
@@ -14,7 +16,7 @@ from vla_attention.analyze.effects.paired_replans import ALL, PHASES, stores_exe
 from vla_attention.analyze.show.findings import few_families_note
 from vla_attention.analyze.show.headings import heading, interval_note, note_lines, wrap
 from vla_attention.analyze.show.numbers import format_number, format_percent, format_signed, of_tasks, row_interval
-from vla_attention.analyze.show.plot_text import shortened
+from vla_attention.analyze.show.plot_text import broken
 from vla_attention.analyze.show.text_table import text_table
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 
@@ -71,7 +73,7 @@ def _groups(study: EffectStudy) -> str:
 
 def _group_cells(row: GroupRow, with_norm: bool) -> list[str]:
     known, without, only = row.attention, row.without, row.only
-    cells = [shortened(row.name, 24), *(format_number(known[name]) for name in ("keys", "mass", "lift"))]
+    cells = [broken(row.label, 24), *(format_number(known[name]) for name in ("keys", "mass", "lift"))]
     cells += [format_number(known["norm"])] if with_norm else []
     return [*cells, *_effect(without), _of(without, "over_noise"), _of(without, "random"), *_effect(only)]
 
@@ -95,7 +97,7 @@ def _others(study: EffectStudy) -> str:
     rows = [study.of(condition) for condition in shown]
     body = [
         [
-            shortened(row["condition"], 30),
+            broken(row["condition"], 30),
             *_effect(row),
             _of(row, "over_noise"),
             format_number(row["angle"]),
@@ -114,7 +116,7 @@ def _every(study: EffectStudy) -> str:
     body = []
     for condition in study.conditions:
         row = study.of(condition)
-        cells = [shortened(condition.name, 24), str(row["num_episodes"]), *_effect(row)]
+        cells = [broken(condition.name, 24), str(row["num_episodes"]), *_effect(row)]
         cells += [_of(row, "over_noise"), row_interval(row, "over_noise"), format_number(row["effect_chunk"])]
         body.append([*cells, format_number(row["angle"]), format_percent(row["gripper_flips"])])
     note = (
@@ -136,7 +138,7 @@ def _floors(study: EffectStudy) -> str:
     body = []
     for condition in tested:
         row = study.of(condition)
-        cells = [shortened(condition.name, 24)]
+        cells = [broken(condition.name, 24)]
         for name in ("minus_noise", "minus_random"):
             cells += [format_signed(row[name]), row_interval(row, name), format_number(row[f"{name}_q"])]
         body.append(cells)
@@ -157,7 +159,7 @@ def _phases(study: EffectStudy) -> str:
     }
     header = ["condition", *(text for phase in PHASES for text in (phase.removesuffix(" third"), "interval"))]
     body = [
-        [shortened(one.name, 24), *(cell for phase in PHASES for cell in _effect(of_phase.get((one.name, phase))))]
+        [broken(one.name, 24), *(cell for phase in PHASES for cell in _effect(of_phase.get((one.name, phase))))]
         for one in study.conditions
     ]
     return "\n".join([heading("THIRDS OF THE EPISODE  effect"), text_table(header, body, left=(0,))])
@@ -170,7 +172,7 @@ def _tasks(study: EffectStudy) -> str:
         return ""
     effect = {(row["task_id"], row["condition"]): row for row in rows.iter_rows(named=True)}
     shown = _most_telling(study)
-    header = ["task", "n", *(shortened(one.name, 14) for one in shown)]
+    header = ["task", "n", *(broken(one.name, 14) for one in shown)]
     body = []
     for task in tasks["task_id"]:
         found = [effect.get((task, one.name)) for one in shown]
@@ -195,7 +197,7 @@ def _rollouts(study: EffectStudy) -> str:
     header = ["condition", "pairs", "base solves", "solves", "difference", "interval", "steps", "interval"]
     body = [
         [
-            shortened(row["condition"], 30),
+            broken(row["condition"], 30),
             str(row["num_episodes"]),
             format_percent(row["success_base"], 0),
             format_percent(row["success"], 0),
@@ -217,16 +219,17 @@ def _rollouts(study: EffectStudy) -> str:
 
 def _dimensions(study: EffectStudy) -> str:
     spread = study.spread
-    noise = [None] * len(spread.spread) if spread.noise is None else spread.noise.tolist()
+    number = len(spread.spread)
+    noise = [(None, "-")] * number if spread.noise is None else [spread.noise.cells(i) for i in range(number)]
     body = [
-        [str(i), format_number(float(spread.spread[i])), format_number(noise[i]), spread.reasons[i] or "yes"]
-        for i in range(len(spread.spread))
+        [str(i), format_number(float(spread.spread[i])), format_number(value), interval, spread.reasons[i] or "yes"]
+        for i, (value, interval) in enumerate(noise)
     ]
-    table = text_table(["dimension", "spread", "noise", "compared"], body, left=(3,))
+    table = text_table(["dimension", "spread", "noise", "interval", "compared"], body, left=(4,))
     note = (
         "spread: standard deviation of the base's actions. noise: root mean square change by another noise seed, in "
-        "spreads; without --dimensions, those above 1 are left out, as they are more noise than movement (all are kept "
-        "where all would be)."
+        f"spreads, with a {DEFAULT_LEVEL:.0%} interval over episodes; without --dimensions, those whose interval lies "
+        "above 1 are left out, as they are more noise than movement (all are kept where all would be)."
     )
     return "\n".join([heading("UNITS  dimensions of the action"), table, *wrap(note)])
 
@@ -234,7 +237,13 @@ def _dimensions(study: EffectStudy) -> str:
 def _left_out(study: EffectStudy) -> str:
     """Which dimensions of the action are not compared."""
     named = [f"{i} ({reason})" for i, reason in enumerate(study.spread.reasons) if reason]
-    return "\n".join(note_lines([f"not compared: dimensions {', '.join(named)} of the action."])) if named else ""
+    if not named:
+        return ""
+    same = ""
+    if any(reason == MOSTLY_NOISE for reason in study.spread.reasons):
+        used = " ".join(str(i) for i in np.flatnonzero(study.spread.used))
+        same = f" To compare with another policy, give both the same: --dimensions {used}."
+    return "\n".join(note_lines([f"not compared: dimensions {', '.join(named)} of the action.{same}"]))
 
 
 def _notes(study: EffectStudy) -> str:

@@ -59,7 +59,7 @@ def effect_section(analysis: Analysis, given: Sequence[Path], folder: Path) -> S
     ]
     rows = group_rows(study)
     if study.conditions:
-        told = [f"{row.name} {format_number(row.without['effect'])}" for row in rows if row.without is not None]
+        told = [f"{row.label} {format_number(row.without['effect'])}" for row in rows if row.without is not None]
         alternative = f"Points with intervals: effects without each group: {', '.join(told[:12]) or 'none'}."
         parts.append(drawn(lambda where: plot_effects(study, where), folder, alternative, "Effects on the action."))
     if rows:
@@ -73,7 +73,7 @@ def effect_section(analysis: Analysis, given: Sequence[Path], folder: Path) -> S
 
 
 def _cells(row: GroupRow) -> list[Cell]:
-    cells = [text_cell(row.name), percent_cell(row.attention["mass"]), number_cell(row.attention["lift"])]
+    cells = [text_cell(row.label), percent_cell(row.attention["mass"]), number_cell(row.attention["lift"])]
     cells += [*_effect(row.without), *(number_cell(_of(row.without, name)) for name in ("over_noise", "random"))]
     return [*cells, *_effect(row.only)]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from typing import Any
 
 from vla_attention.analyze.show.headings import WIDTH
@@ -21,13 +22,13 @@ def text_table(
 
     Args:
         header: column names.
-        rows: cells, one sequence per row.
+        rows: cells, one sequence per row; a cell of several lines makes its row as high.
         left: numbers of the columns that are aligned to the left.
         last: header of one more column of running text, wrapped into what is left of the width.
         texts: that column's texts, one per row.
         width: width of the page; only the running text gives way.
     """
-    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    widths = [max(len(part) for row in [header, *rows] for part in row[i].split("\n")) for i in range(len(header))]
     gap = "  " if sum(widths) + 2 * (len(widths) - 1) <= width else " "
 
     def line(cells: Sequence[str]) -> str:
@@ -35,18 +36,23 @@ def text_table(
             cell.ljust(widths[i]) if i in left else cell.rjust(widths[i]) for i, cell in enumerate(cells)
         ).rstrip()
 
+    def lines_of(cells: Sequence[str]) -> list[str]:
+        parts = zip_longest(*(cell.split("\n") for cell in cells), fillvalue="")
+        return [line(part) for part in parts]
+
     if texts is None:
-        body = [line(row) for row in rows]
-        return "\n".join([line(header), *_rule([line(header), *body]), *body])
+        head, body = lines_of(header), [part for row in rows for part in lines_of(row)]
+        return "\n".join([*head, *_rule([*head, *body]), *body])
     indent = sum(widths) + len(gap) * len(widths)
     room = max(20, width - indent)
     lines = []
     for row, text in zip(rows, texts, strict=True):
         wrapped = textwrap.wrap(text, room) or [""]
-        lines.append((line(row).ljust(indent) + wrapped[0]).rstrip())
-        lines += [" " * indent + more for more in wrapped[1:]]
-    head = line(header).ljust(indent) + last
-    return "\n".join([head, *_rule([head, *lines]), *lines])
+        beside = zip_longest(lines_of(row), wrapped, fillvalue="")
+        lines += [(cells.ljust(indent) + more).rstrip() for cells, more in beside]
+    head = lines_of(header)
+    head[0] = head[0].ljust(indent) + last
+    return "\n".join([*head, *_rule([*head, *lines]), *lines])
 
 
 def _rule(lines: Sequence[str]) -> list[str]:

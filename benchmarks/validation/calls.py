@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from vla_attention.analyze.effects.action_changes import (
     ActionSpread,
     action_spread,
-    change_per_dimension,
+    noise_of,
     root_mean_square_change,
     with_noise,
 )
@@ -81,7 +81,7 @@ def units_of(policy: Any, store: Store, folder: Path, say: Callable[[str], None]
     spread = spread_of(store)
     again = changed_episodes(policy, store, lambda episode: {"noise": NOISE}, _ALL_REPLANS, folder, say)
     pairs = [(episode.base, episode.actions["noise"]) for episode in again]
-    return with_noise(spread, change_per_dimension(pairs, spread.spread), leave_out=True)
+    return with_noise(spread, noise_of(pairs, spread.spread), leave_out=True)
 
 
 def chosen_replans(number: int, count: int) -> NDArray[np.int64]:

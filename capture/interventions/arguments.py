@@ -18,6 +18,8 @@ from vla_attention.schemas.interventions import (
     PromptChange,
 )
 
+#: Who does not read what is knocked out, unless the command line says it.
+DEFAULT_QUERIES = "action"
 _QUERIES = ("action", "all", "prefix", "prefix:SELECTOR")
 _PROMPTS = ("empty", "shuffled", "shuffled:SEED", "task:N", "text:TEXT", "synonyms:FILE")
 _IMAGES = ("blank", "noise", "noise:SEED", "rotated", "shifted:ROWS,COLUMNS", "masked:OBJECT", "filled:OBJECT")
@@ -39,10 +41,10 @@ def add_intervention_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--keep", metavar="SELECTOR", help="knock out all other valid keys, but no action keys")
     group.add_argument(
         "--knockout-queries",
-        default="action",
         metavar="QUERIES",
-        help="who does not read them: action (default: the action queries), all (every query that could carry the "
-        "information on), prefix (pi: pictures and prompt only) or prefix:SELECTOR (those tokens of it)",
+        help="who does not read them: action (the action queries, the default but for the words of a series), all "
+        "(every query that could carry the information on), prefix (pi: pictures and prompt only) or prefix:SELECTOR "
+        "(those tokens of it)",
     )
     for name, what in (("layers", "layers"), ("heads", "attention heads"), ("steps", "denoise steps")):
         group.add_argument(
@@ -94,7 +96,7 @@ def read_interventions(arguments: argparse.Namespace, name: str = "") -> Interve
     Raises:
         BadArgument: an option cannot be read, or has nothing to act on.
     """
-    queries, query_selector = _queries(arguments.knockout_queries)
+    queries, query_selector = _queries(arguments.knockout_queries or DEFAULT_QUERIES)
     places = {
         "layers": _numbers(arguments.knockout_layers),
         "heads": _numbers(arguments.knockout_heads),
@@ -133,7 +135,7 @@ def _refuse_idle(arguments: argparse.Namespace, knocks_out: bool, changes_attent
     for option, given, used, needs in (
         ("--random-keys", arguments.random_keys is not None, knocks_out, "--knockout or --keep"),
         ("--knockout-weight", arguments.knockout_weight is not None, knocks_out, "--knockout or --keep"),
-        ("--knockout-queries", arguments.knockout_queries != "action", changes_attention, "--knockout or --attention"),
+        ("--knockout-queries", arguments.knockout_queries is not None, changes_attention, "--knockout or --attention"),
         ("--knockout-layers", arguments.knockout_layers is not None, changes_attention, "--knockout or --attention"),
         ("--knockout-heads", arguments.knockout_heads is not None, changes_attention, "--knockout or --attention"),
         ("--knockout-steps", arguments.knockout_steps is not None, changes_attention, "--knockout or --attention"),

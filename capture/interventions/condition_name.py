@@ -13,7 +13,7 @@ from vla_attention.schemas.interventions import (
     Interventions,
     KeyKnockout,
     PromptChange,
-    Queries,
+    queries_suffix,
 )
 
 #: Longest name; what is longer is cut, and the store says the whole.
@@ -35,14 +35,15 @@ def condition_name(interventions: Interventions) -> str:
     parts += [_of_prompt(interventions.prompt)] if interventions.prompt else []
     parts += [_of_image(change) for change in interventions.images]
     parts += [f"noise_{interventions.noise.seed}"] if interventions.noise else []
-    name = "+".join(_plain(part) for part in parts)
+    name = "+".join(plain(part) for part in parts)
     if len(name) <= _LONGEST:
         return name
     digest = hashlib.sha256("+".join(parts).encode("utf-8", "replace")).hexdigest()[:_DIGEST]
     return f"{name[: _LONGEST - _DIGEST - 1]}_{digest}"
 
 
-def _plain(text: str) -> str:
+def plain(text: str) -> str:
+    """Return a selector, or a part of a name, as letters, digits, `_` and `.`."""
     for operator, word in _OPERATORS:
         text = text.replace(operator, word)
     return re.sub(r"_+", "_", re.sub(r"[^\w.]+", "_", text)).strip("_")
@@ -52,15 +53,14 @@ def _of_knockout(change: KeyKnockout) -> str:
     kind = "random" if change.random_seed is not None else "only" if change.keep else "without"
     if change.random_seed is not None and change.keep:
         kind = "random_only"
-    name = f"{kind}_{change.selector}{_of_queries(change.queries)}"
-    name += f"_of_{change.query_selector}" if change.query_selector else ""
+    name = f"{kind}_{change.selector}{queries_suffix(change.queries, change.query_selector)}"
     name += _of_places(change.layers, change.heads, change.denoise_steps)
     name += "" if change.weight == 1 else f"_weight_{change.weight:g}"
     return name + _of_seed(change.random_seed or 0)
 
 
 def _of_attention(change: AttentionScale | AttentionUniform) -> str:
-    places = _of_queries(change.queries) + _of_places(change.layers, change.heads, change.denoise_steps)
+    places = queries_suffix(change.queries) + _of_places(change.layers, change.heads, change.denoise_steps)
     if isinstance(change, AttentionUniform):
         return f"uniform_{change.selector}{places}"
     return f"{change.selector}_times_{change.factor:g}{places}"
@@ -89,10 +89,6 @@ def _signed(number: int, positive: str, negative: str) -> str:
 
 def _of_seed(seed: int) -> str:
     return f"_seed_{seed}" if seed else ""
-
-
-def _of_queries(queries: Queries) -> str:
-    return "" if queries == "action" else f"_queries_{queries}"
 
 
 def _of_places(*places: tuple[int, ...] | None) -> str:

@@ -113,7 +113,12 @@ def _add_series_arguments(parser: argparse.ArgumentParser) -> None:
         help="for every group of a built-in grouping or TOML file: without it, with it alone, and without as many "
         "random keys; and once with another noise seed",
     )
-    group.add_argument("--words", action="store_true", help="with --series: every word of the instructions, too")
+    group.add_argument(
+        "--words",
+        action="store_true",
+        help="with --series: every word of the instructions, too; they are cut for all queries unless "
+        "--knockout-queries is given",
+    )
     group.add_argument("--objects", action="store_true", help="with --series: every object of the scenes, too")
     group.add_argument(
         "--output-dir",

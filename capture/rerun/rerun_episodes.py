@@ -66,7 +66,7 @@ def rerun_episode(
     """Rerun one episode and commit it; returns its folder.
 
     Outcome, number of steps, environment steps and object coverage are those of the stored episode: nothing is
-    executed.
+    executed. With interventions the stored actions are kept beside the changed ones, to know the base again by them.
     """
     attributes, recording = calls.attributes, store.attributes.recording
     start = EpisodeStart(
@@ -96,6 +96,7 @@ def rerun_episode(
                     noise_seed=repeater.noise_seed(calls, replan),
                     coverage=calls.coverage_of(replan),
                     dataset_actions=calls.dataset_actions_of(replan),
+                    base_actions=None if store.attributes.interventions.is_none else calls.actions[replan],
                 )
             )
             progress.update(replan + 1, calls.num_replans)

@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.capture.interventions.condition_name import plain
 from vla_attention.capture.interventions.resolution import episode_vocabularies
 from vla_attention.schemas.errors import UserError, listing
 from vla_attention.schemas.groupings.builtin_groupings import find_grouping
 from vla_attention.schemas.groupings.grouping import REST
 from vla_attention.schemas.groupings.selector_weights import selector_weights
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
-from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange
+from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange, queries_suffix, readers
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import Store
 
@@ -37,7 +38,7 @@ class SeriesCondition:
 
 @dataclass(frozen=True)
 class Series:
-    """The reruns of a series in the order in which they are made, and lines about what it leaves out."""
+    """The reruns of a series in the order in which they are made, and lines: for whom keys are cut, what is missing."""
 
     conditions: tuple[SeriesCondition, ...]
     notes: tuple[str, ...]
@@ -52,7 +53,13 @@ class _GroupKeys:
 
 
 def plan_series(
-    base: Store, grouping: str, template: KeyKnockout, noise_seed: int, *, words: bool = False, objects: bool = False
+    base: Store,
+    grouping: str,
+    template: KeyKnockout,
+    noise_seed: int,
+    *,
+    words: KeyKnockout | None = None,
+    objects: bool = False,
 ) -> Series:
     """Plan the reruns of a store.
 
@@ -62,9 +69,10 @@ def plan_series(
     Args:
         base: the store.
         grouping: name or file of a grouping; groups that take the rest (`*`) are left out.
-        template: places, queries, weight and seed of all knockouts; its selector is not used.
+        template: places, queries, weight and seed of all knockouts but those of words; its selector is not used.
         noise_seed: of the condition `noise`.
-        words, objects: further groups, one for every word of the instructions, and for every object of the scenes.
+        words: the same for further groups, one for every word of the instructions; None for no such groups.
+        objects: whether there are further groups, one for every object of the scenes.
     """
     sites = [site.name for site in base.attributes.sites]
     tokens: dict[str, TokensOfSites] = {
@@ -72,15 +80,17 @@ def plan_series(
     }
     vocabularies = episode_vocabularies(list(tokens.values()))
     groups = {
-        **_groups_of(grouping, vocabularies),
-        **(_words(vocabularies) if words else {}),
-        **(_objects(vocabularies) if objects else {}),
+        name: replace(template, selector=selector) for name, selector in _groups_of(grouping, vocabularies).items()
     }
+    if words is not None:
+        groups |= {name: replace(words, selector=selector) for name, selector in _words(vocabularies).items()}
+    if objects:
+        groups |= {name: replace(template, selector=selector) for name, selector in _objects(vocabularies).items()}
     everywhere = frozenset(tokens)
     conditions = [SeriesCondition(Interventions("noise", noise=NoiseChange(noise_seed)), everywhere)]
-    absent, notes = [], []
-    for name, selector in groups.items():
-        keys = _keys_of(selector, tokens, vocabularies)
+    absent, notes = [], [_for_whom(template, words)]
+    for name, given in groups.items():
+        keys = _keys_of(given.selector, tokens, vocabularies)
         if not keys.episodes:
             absent.append(name)
             continue
@@ -89,23 +99,37 @@ def plan_series(
                 f"Group '{name}': {len(everywhere) - len(keys.episodes)} of {len(everywhere)} episodes are left out, "
                 "in which some replan has no key of it."
             )
-        knockout = replace(template, selector=selector, keep=False, random_seed=None)
-        conditions.append(_condition(f"without_{name}", knockout, keys.episodes))
-        conditions.append(_condition(f"only_{name}", replace(knockout, keep=True), keys.episodes))
+        knockout = replace(given, keep=False, random_seed=None)
+        conditions.append(_condition("without", name, knockout, keys.episodes))
+        conditions.append(_condition("only", name, replace(knockout, keep=True), keys.episodes))
         if keys.with_control:
-            random = replace(knockout, random_seed=template.random_seed or 0)
-            conditions.append(_condition(f"random_{name}", random, keys.with_control))
+            random = replace(knockout, random_seed=given.random_seed or 0)
+            conditions.append(_condition("random", name, random, keys.with_control))
         if keys.with_control != keys.episodes:
             notes.append(
                 f"Group '{name}' has a random control in {len(keys.with_control)} of {len(keys.episodes)} episodes: in "
                 "the others some replan has fewer keys outside of it than inside."
             )
     if absent:
-        notes.insert(0, f"Left out, as no episode has valid keys of them in all of its replans: {listing(absent, 40)}.")
+        notes.insert(1, f"Left out, as no episode has valid keys of them in all of its replans: {listing(absent, 40)}.")
     return Series(tuple(conditions), tuple(notes))
 
 
-def _condition(name: str, knockout: KeyKnockout, episodes: frozenset[str]) -> SeriesCondition:
+def _for_whom(template: KeyKnockout, words: KeyKnockout | None) -> str:
+    of_groups = readers(template.queries, template.query_selector)
+    of_words = "" if words is None else readers(words.queries, words.query_selector)
+    if of_words in ("", of_groups):
+        return f"Keys are cut for {of_groups}; --knockout-queries chooses others."
+    return (
+        f"Keys of words are cut for {of_words}, those of other groups for {of_groups}; --knockout-queries chooses one "
+        "for both."
+    )
+
+
+def _condition(kind: str, group: str, knockout: KeyKnockout, episodes: frozenset[str]) -> SeriesCondition:
+    """A condition whose name says for whom the keys are cut, as that of a single rerun does."""
+    of_queries = plain(queries_suffix(knockout.queries, knockout.query_selector))
+    name = "_".join(part for part in (kind, group, of_queries) if part)
     return SeriesCondition(Interventions(name, keys=(knockout,)), episodes)
 
 

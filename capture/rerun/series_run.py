@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vla_attention.capture.command_line import check_writable
@@ -36,13 +36,15 @@ class SeriesRun:
         """Plan the series of the arguments. Needs no policy; errors come before the minutes for loading one."""
         _refuse_own_interventions(arguments)
         template = _template(arguments)
+        # A word acts through the pictures that have read it: cut for the action queries alone, it seems to do nothing.
+        words = template if arguments.knockout_queries is not None else replace(template, queries="all")
         check_places(Interventions(keys=(template,)), base.attributes.policy)
         series = plan_series(
             base,
             arguments.series,
             template,
             base.attributes.protocol.seed + 1 if arguments.noise_seed is None else arguments.noise_seed,
-            words=arguments.words,
+            words=words if arguments.words else None,
             objects=arguments.objects,
         )
         check_may_change(base, series.conditions[0].interventions)
@@ -56,13 +58,13 @@ class SeriesRun:
             say(note)
         calls_of = {episode.name: episode.attributes.num_replans for episode in self.base.episodes}
         conditions = self.series.conditions
+        changes = [interventions_for(condition.interventions, rerun.policy) for condition in conditions]
         calls = [calls_of[name] for condition in conditions for name in condition.episodes]
         time = "" if seconds_of_call is None else f", about {_duration(sum(calls) * seconds_of_call)} if none is there"
         say(f"Series: {len(conditions)} conditions, {sum(calls)} policy calls{time}. Folder: {self.folder}")
         say(rerun.describe_disk(self.folder, calls))
         impossible = []
-        for number, condition in enumerate(conditions, start=1):
-            changed = interventions_for(condition.interventions, rerun.policy)
+        for number, (condition, changed) in enumerate(zip(conditions, changes, strict=True), start=1):
             say(f"[{number}/{len(conditions)}] {condition.name}: {changed.describe()}")
             try:
                 self._write(rerun, condition, changed)

@@ -60,6 +60,7 @@ def replan_record(
     noise_seed: int,
     coverage: Mapping[str, NDArray[np.float32]] | None = None,
     dataset_actions: NDArray[np.float64] | None = None,
+    base_actions: NDArray[np.float64] | None = None,
     constant_cameras: frozenset[str] = frozenset(),
 ) -> ReplanRecord:
     """Return what is stored of a policy call; see `ReplanRecord`."""
@@ -75,6 +76,7 @@ def replan_record(
         camera_frames=policy_input.camera_frames if recording.frames else {},
         coverage=coverage or {},
         dataset_actions=dataset_actions,
+        base_actions=base_actions,
         constant_cameras=constant_cameras,
     )
 

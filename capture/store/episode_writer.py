@@ -56,8 +56,9 @@ class ReplanRecord:
     `rows` and `key_role` are per site. `state` is (state_dim,), `actions` (horizon, action_dim) as given to the
     environment, `frames` and `camera_frames` per policy camera (row, column, channel) uint8, `coverage` per policy
     camera (patch, object) float32. `dataset_actions` (steps, action_dim) are those that a data set has from this replan
-    on, fewer at the end of its episode. What is None is not known; all replans of an episode know the same.
-    `constant_cameras`: cameras of the simulator whose picture is of one colour.
+    on, fewer at the end of its episode. `base_actions` (horizon, action_dim) are those that the base has for this call,
+    in a rerun. What is None is not known; all replans of an episode know the same. `constant_cameras`: cameras of the
+    simulator whose picture is of one colour.
     """
 
     env_step: int
@@ -71,6 +72,7 @@ class ReplanRecord:
     camera_frames: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
     coverage: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     dataset_actions: NDArray[np.float64] | None = None
+    base_actions: NDArray[np.float64] | None = None
     constant_cameras: frozenset[str] = frozenset()
 
 
@@ -175,7 +177,7 @@ class EpisodeWriter:
             given, expected = list(getattr(record, what)), list(getattr(first, what))
             if given != expected:
                 yield f"it has {what} of the cameras {listing(given)}, the first replan of {listing(expected)}"
-        for what in ("noise_seed", "state", "actions", "dataset_actions"):
+        for what in ("noise_seed", "state", "actions", "dataset_actions", "base_actions"):
             values, before = getattr(record, what), getattr(first, what)
             if (values is None) is not (before is None):
                 yield f"it has {'no' if values is None else 'a'} {what}, other than the first replan"
@@ -259,9 +261,10 @@ class EpisodeWriter:
         states = [record.state for record in records if record.state is not None]
         if states:
             self.write("state", np.stack(states), ("replan", "state_dim"))
-        actions = [record.actions for record in records if record.actions is not None]
-        if actions:
-            self.write("actions", np.stack(actions), ("replan", "horizon", "action_dim"))
+        for name in ("actions", "base_actions"):
+            actions = [given for record in records if (given := getattr(record, name)) is not None]
+            if actions:
+                self.write(name, np.stack(actions), ("replan", "horizon", "action_dim"))
         self._write_dataset_actions([r.dataset_actions for r in records if r.dataset_actions is not None])
         for camera in records[0].frames:
             frames = np.stack([record.frames[camera] for record in records])

@@ -15,6 +15,7 @@ NAME.zarr/                            attributes: `RootAttributes`
     state                             (replan, state_dim); only where it is known
     actions                           (replan, horizon, action_dim), as given to the environment; only where known
     dataset_actions                   (replan, horizon, action_dim), those of the data set; only where there are some
+    base_actions                      (replan, horizon, action_dim), those of its base; in a rerun with interventions
     frames/<camera>                   (replan, row, column, channel) uint8, as the model sees it
     camera_frames/<camera>            the same, as the camera gave it; only where `frames` is a rounded model input
     objects/<camera>                  (replan, patch, object) float32

@@ -175,7 +175,9 @@ def test_effects_are_those_of_vla_analyze_on_the_stores_of_vla_capture_rerun(wor
     table = study.episodes.filter(phase="all", kind="without")
     policy = load_policy(base.path)
     spread = units_of(policy, base, tmp_path / "units", quiet)
-    np.testing.assert_allclose(spread.noise, study.spread.noise, rtol=1e-6)
+    assert spread.noise is not None
+    assert study.spread.noise is not None
+    np.testing.assert_allclose(spread.noise.change, study.spread.noise.change, rtol=1e-6)
     assert spread.left_out == study.spread.left_out
     changes = {"words": without("role:instruction")}
     ours = changed_episodes(policy, base, lambda episode: changes, 99, tmp_path / "calls", quiet)

@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.capture.store.episode_writer import ReplanRecord
+from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange, PromptChange
-from vla_attention.testing.stores import PlantActions, StoreSpec, rerun_source, write_store
+from vla_attention.testing.stores import (
+    PlantActions,
+    StoreSpec,
+    commit,
+    denoise_times,
+    episode_records,
+    rerun_source,
+    root_attributes,
+    write_store,
+)
 
 TASKS, EPISODES, REPLANS = (0, 1, 2), 2, 6
 STEPS, DIMENSIONS = 5, 7
@@ -88,6 +100,20 @@ def write_rerun(path: Path, base: Path, planted: PlantedRerun, **changes: object
         **changes,  # type: ignore[arg-type]
     )
     return write_store(path, spec=spec)
+
+
+def write_with(
+    path: Path, spec: StoreSpec, change: Callable[[int, int, int, ReplanRecord], ReplanRecord], **start: object
+) -> Path:
+    """A store in which (task, episode, replan, record) give the record that is written, and episodes other facts."""
+    store = open_run(path, root_attributes(spec), "new", durable=False)
+    for task, episode in spec.names:
+        given, records = episode_records(spec, task, episode)
+        with store.episode(replace(given, **start), denoise_times(spec), len(records)) as writer:  # type: ignore[arg-type]
+            for replan, record in enumerate(records):
+                writer.append(change(task, episode, replan, record))
+            commit(writer, spec, task, episode)
+    return path
 
 
 def write_series(folder: Path, base: Path, names: tuple[str, ...] = tuple(PLANTED)) -> Path:

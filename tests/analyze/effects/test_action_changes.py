@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from vla_attention.analyze.effects.action_changes import (
+    Noise,
     action_spread,
-    change_per_dimension,
     first_angle,
     gripper_flips,
+    noise_of,
     root_mean_square_change,
     with_noise,
 )
@@ -76,10 +77,15 @@ def test_a_dimension_that_is_mostly_noise_is_left_out_unless_it_was_chosen():
     moved = generator.normal(size=shape) * signal
     base, other = (moved + generator.normal(size=shape) * noise for _ in range(2))
     spread = action_spread([base])
-    change = change_per_dimension([(base[:50], other[:50]), (base[50:], other[50:])], spread.spread)
-    np.testing.assert_allclose(change, np.sqrt(2) * noise / np.hypot(signal, noise), rtol=0.06)
+    episodes = [slice(0, 50), slice(50, 120), slice(120, None)]
+    change = noise_of([(base[part], other[part]) for part in episodes], spread.spread)
+    np.testing.assert_allclose(change.change, np.sqrt(2) * noise / np.hypot(signal, noise), rtol=0.06)
     assert with_noise(spread, change, leave_out=True).left_out == (1,)
     assert with_noise(spread, change, leave_out=True).reasons == ("", "mostly noise", "")
     assert with_noise(spread, change, leave_out=False).left_out == ()
     alone = action_spread([base], dimensions=(1,))
+    # A single episode has no interval, and two that differ have a wide one: nothing is left out by chance.
+    assert with_noise(spread, noise_of([(base, other)], spread.spread), leave_out=True).left_out == ()
+    near = Noise(np.array([0.3, 1.086, 0.4]), np.array([0.2, 0.948, 0.3]), np.array([0.4, 1.2, 0.5]))
+    assert with_noise(spread, near, leave_out=True).left_out == ()
     assert with_noise(alone, change, leave_out=True).used.tolist() == [False, True, False]

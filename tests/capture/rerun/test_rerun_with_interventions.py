@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 
 import numpy as np
 import pytest
 
 from tests.capture.rerun.test_rerun import refused
+from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.capture.__main__ import main
-from vla_attention.schemas.interventions import KeyKnockout, NoiseChange
+from vla_attention.capture.rerun.arguments import add_rerun_arguments
+from vla_attention.capture.rerun.series_run import SeriesRun
+from vla_attention.schemas.interventions import KeyKnockout, NoiseChange, queries_suffix
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.verify import verify_store
@@ -32,7 +36,10 @@ def assert_applied_again(target, capsys) -> None:
     assert "made again without any change: bit-equal" in capsys.readouterr().out
     assert open_store(again).attributes.interventions == open_store(target).attributes.interventions
     for old, new in zip(open_store(target).episodes, open_store(again).episodes, strict=True):
-        assert old.attributes.arrays == new.attributes.arrays
+        arrays, again = ({**one.attributes.arrays} for one in (old, new))
+        # The base of each is another one.
+        assert again.pop("base_actions") == arrays["actions"] != arrays.pop("base_actions")
+        assert arrays == again
 
 
 def test_a_knockout_is_exact_stored_and_applied_again(pi_store, tmp_path, capsys):
@@ -124,6 +131,7 @@ def test_wrong_interventions_are_one_sentence_and_leave_no_store(pi_store, cosmo
     assert "Unknown object 'ball'" in said("--image", "base_0_rgb=masked:ball")
     assert "leaves a query without any key" in said("--knockout", "*")
     assert "has no episode of it" in said("--prompt", "task:5")
+    assert "has no episode of it" in said("--prompt", "task:5", "--task-id", "0")
     assert "There is no head 8" in said("--knockout", "role:image", "--knockout-heads", "8")
     assert "--words belongs to a series" in said("--words")
     masked = "The group 'camera:right_wrist_0_rgb' of an intervention has no key in 12 of 12 replans"
@@ -173,16 +181,95 @@ def test_a_series_has_every_group_and_word_with_its_controls(pi_store, tmp_path,
     assert "Left out, as no episode has valid keys of them in all of its replans: pads." in said
     assert "Group 'word_lift': 1 of 2 episodes are left out" in said
     assert "policy calls, about" in said
+    assert "Keys of words are cut for all queries, those of other groups for the action queries;" in said
+    assert "without_word_green_queries_all: the keys of 'word:\"green\"' knocked out for all queries, layers 2" in said
     names = {path.stem for path in folder.iterdir()}
-    assert {"noise", "without_upper", "only_upper", "random_upper", "without_red", "without_word_green"} <= names
+    assert {"noise", "without_upper", "only_upper", "random_upper", "without_red"} <= names
+    assert {f"{kind}_word_green_queries_all" for kind in ("without", "only", "random")} <= names
     assert not any("pads" in name or "rest" in name for name in names)
+    assert all(name.endswith("_queries_all") for name in names if "word_" in name)
     base = open_store(pi_store)
-    for name, episodes in (("without_upper", 2), ("only_upper", 2), ("without_word_lift", 1)):
+    for name, episodes, queries in (
+        ("without_upper", 2, "action"),
+        ("only_upper", 2, "action"),
+        ("without_word_lift_queries_all", 1, "all"),
+    ):
         store = open_store(folder / f"{name}.zarr")
         assert store.attributes.interventions.name == name
         assert store.attributes.interventions.keys[0].layers == (2,)
+        assert store.attributes.interventions.keys[0].queries == queries
         assert store.attributes.rerun_of.run == base.run
         assert len(store.episodes) == episodes
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     assert main([*words, "--task-id", "0", "1"]) == 0
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
+
+
+def plan(pi_store, *words: str) -> SeriesRun:
+    parser = argparse.ArgumentParser()
+    given = ["rerun", str(pi_store), "--series", "default", "--words", *words]
+    add_rerun_arguments(parser, given)
+    return SeriesRun.planned(parser.parse_args(given[1:]), open_store(pi_store))
+
+
+@pytest.mark.parametrize(
+    ("words", "of_words", "of_groups", "said"),
+    [
+        (
+            (),
+            "_queries_all",
+            "",
+            "Keys of words are cut for all queries, those of other groups for the action queries;",
+        ),
+        (("--knockout-queries", "action"), "", "", "Keys are cut for the action queries;"),
+        (("--knockout-queries", "all"), "_queries_all", "_queries_all", "Keys are cut for all queries;"),
+        (
+            ("--knockout-queries", "prefix:role:image"),
+            "_queries_prefix_of_role_image",
+            "_queries_prefix_of_role_image",
+            "for the prefix's queries of 'role:image';",
+        ),
+    ],
+    ids=["default", "action", "all", "prefix"],
+)
+def test_names_of_a_series_say_for_whom_words_and_groups_are_cut(pi_store, tmp_path, words, of_words, of_groups, said):
+    """Words for all queries, unless the command line says it; groups for the action queries. Nothing is run."""
+    series = plan(pi_store, "--output-dir", str(tmp_path / "series"), *words).series
+    names = {condition.name for condition in series.conditions}
+    for kind in ("without", "only", "random"):
+        assert f"{kind}_word_cube{of_words}" in names
+    assert {f"without_visual{of_groups}", f"only_visual{of_groups}"} <= names
+    for condition in series.conditions:
+        for knockout in condition.interventions.keys:
+            assert condition.name.endswith(queries_suffix(knockout.queries, knockout.query_selector.replace(":", "_")))
+    assert said in series.notes[0]
+
+
+def test_words_for_all_queries_cannot_be_limited_to_denoise_steps(pi_store, tmp_path, capsys):
+    """The prefix runs once; nothing is written before that is said."""
+    folder = tmp_path / "series"
+    words = ("--series", "default", "--words", "--output-dir", folder, "--knockout-steps", "1", "--check", "0")
+    assert "use the queries 'action', or all denoise steps" in refused(capsys, "rerun", pi_store, *words)
+    assert not folder.exists()
+
+
+def test_the_prompt_of_a_task_that_is_not_run_again_is_known(pi_store, tmp_path):
+    target = tmp_path / "other.zarr"
+    words = ("--prompt", "task:1", "--task-id", "0", "--num-episodes", "1", "--check", "0")
+    assert main(["rerun", str(pi_store), *words, "--store", str(target)]) == 0
+    (episode,) = open_store(target).episodes
+    base = {episode.attributes.task_id: episode.attributes.instruction for episode in open_store(pi_store).episodes}
+    assert episode.attributes.task_id == 0
+    assert base[0] != base[1]
+    prompts = episode.tokens(open_store(target).attributes, "joint").prompts
+    assert all(base[1] in prompt.text and base[0] not in prompt.text for prompt in prompts)
+
+
+def test_a_packed_base_is_read(pi_store, tmp_path):
+    packed = tmp_path / "packed.zarr"
+    copy_store(open_store(pi_store), packed, (), packed=True)
+    before = sorted((path, path.stat().st_mtime_ns) for path in packed.rglob("*"))
+    words = ("--noise-seed", "1", "--task-id", "0", "--check", "1")
+    assert main(["rerun", str(packed), *words, "--store", str(tmp_path / "noise.zarr")]) == 0
+    assert len(open_store(tmp_path / "noise.zarr").episodes) == 2
+    assert sorted((path, path.stat().st_mtime_ns) for path in packed.rglob("*")) == before

@@ -1,0 +1,215 @@
+"""A rerun is paired with its base only where both hold the same inputs: one input of one replan is another, and said.
+
+Every store names the same base and has the base's actions and digest; only the named input differs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.kit.reruns import BASE, PLANTED, base_actions, changed_actions, knockout, write_with
+from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.effects.effect_study import study_effects
+from vla_attention.analyze.effects.text import effects_text
+from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.schemas.interventions import ImageChange, Interventions, NoiseChange, PromptChange
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import StoreError
+from vla_attention.testing.stores import rerun_source, write_store
+
+SPEC = replace(BASE, tasks=(0, 1), frames=True, plant_actions=base_actions)
+CUT = knockout("without_state", "role:state")
+#: The replan that is another one.
+WHERE = (1, 0, 3)
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    return write_store(tmp_path_factory.mktemp("same_calls") / "base.zarr", spec=SPEC)
+
+
+def spec_of(base, interventions):
+    planted = replace(PLANTED["without_state"], interventions=interventions)
+    return replace(
+        SPEC, plant_actions=changed_actions(planted), interventions=interventions, rerun_of=rerun_source(base)
+    )
+
+
+def at(change):
+    """A change of one replan of one episode."""
+
+    def changed(task, episode, replan, record):
+        return change(record) if (task, episode, replan) == WHERE else record
+
+    return changed
+
+
+def another_picture(camera):
+    def change(record):
+        frame = record.frames[camera].copy()
+        frame[0, 0, 0] ^= 1  # one bit of one number
+        return replace(record, frames={**record.frames, camera: frame})
+
+    return change
+
+
+def another_prompt(record):
+    return replace(record, prompt=replace(record.prompt, text=record.prompt.text + " "))
+
+
+def another_state(record):
+    return replace(record, state=np.nextafter(record.state, np.inf))
+
+
+def another_seed(record):
+    return replace(record, noise_seed=record.noise_seed ^ 1)
+
+
+INPUTS = {
+    "environment step": (lambda record: replace(record, env_step=record.env_step + 1), "another environment step"),
+    "noise seed": (another_seed, "another noise seed"),
+    "prompt": (another_prompt, "another prompt"),
+    "state": (another_state, "another state of the robot"),
+    "picture": (another_picture("left_wrist_0_rgb"), "another picture of camera 'left_wrist_0_rgb'"),
+    "two": (
+        lambda record: another_seed(another_state(record)),
+        "another noise seed and another state of the robot",
+    ),
+}
+
+
+def refused(base, path):
+    with pytest.raises(StoreError) as caught:
+        study_effects(base, [path], AnalysisSettings())
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_one_other_input_of_one_replan_is_named(base, tmp_path, name):
+    change, said = INPUTS[name]
+    path = write_with(tmp_path / "rerun.zarr", spec_of(base, CUT), at(change))
+    assert refused(base, path) == (
+        f"Replan 3 of task001_episode000 of {path} was given {said} than in its base {base}, which the condition does "
+        "not change: the base was recorded again since, or the rerun is of another one; make the rerun again."
+    )
+
+
+def test_it_is_one_sentence_of_the_command(base, tmp_path, capsys):
+    path = write_with(tmp_path / "rerun.zarr", spec_of(base, CUT), at(another_state))
+    assert main(["effects", str(base), str(path), "--output", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert "another state of the robot" in said
+    assert said.count("\n") == 1
+
+
+def test_the_first_replan_is_named_and_what_differs_there(base, tmp_path):
+    def everywhere(task, episode, replan, record):
+        record = another_seed(record) if replan >= 2 else record
+        return another_prompt(record) if replan >= 4 else record
+
+    said = refused(base, write_with(tmp_path / "rerun.zarr", spec_of(base, CUT), everywhere))
+    assert said.startswith("Replan 2 of task000_episode000")
+    assert "was given another noise seed than" in said
+
+
+@pytest.mark.parametrize(
+    ("interventions", "free", "held"),
+    [
+        (Interventions("noise", noise=NoiseChange(1)), ["noise seed"], ["prompt", "state", "picture"]),
+        (
+            Interventions("prompt_empty", prompt=PromptChange("empty")),
+            ["prompt"],
+            ["noise seed", "state", "picture"],
+        ),
+        (
+            Interventions("blank", images=(ImageChange("left_wrist_0_rgb", "blank"),)),
+            ["picture"],
+            ["noise seed", "state", "prompt"],
+        ),
+        (
+            Interventions("blank", images=(ImageChange("base_0_rgb", "blank"),)),
+            [],
+            ["noise seed", "state", "prompt", "picture"],
+        ),
+    ],
+    ids=["noise", "prompt", "picture", "another picture"],
+)
+def test_what_a_condition_changes_may_differ_and_nothing_else(base, tmp_path, interventions, free, held):
+    for name in free:
+        path = write_with(tmp_path / f"{name}.zarr", spec_of(base, interventions), at(INPUTS[name][0]))
+        assert study_effects(base, [path], AnalysisSettings()).conditions
+    for name in held:
+        path = write_with(tmp_path / f"{name}.zarr", spec_of(base, interventions), at(INPUTS[name][0]))
+        assert INPUTS[name][1] in refused(base, path)
+
+
+def test_a_rerun_of_a_run_with_another_prompt_has_that_prompt(tmp_path):
+    """The base's own change is in what its calls were given, and a rerun repeats it."""
+    own = Interventions("prompt_empty", prompt=PromptChange("empty"))
+    base = write_store(tmp_path / "base.zarr", spec=replace(SPEC, interventions=own))
+    spec = spec_of(base, own)
+    assert study_effects(base, [write_store(tmp_path / "same.zarr", spec=spec)], AnalysisSettings()).conditions
+    path = write_with(tmp_path / "other.zarr", spec, at(another_prompt))
+    assert "another prompt" in refused(base, path)
+
+
+@pytest.mark.parametrize("fact", ["instruction", "task_name"])
+def test_another_task_of_the_same_number_is_named(base, tmp_path, fact):
+    path = write_with(tmp_path / "rerun.zarr", spec_of(base, CUT), lambda *given: given[-1], **{fact: "dance"})
+    said = refused(base, path)
+    assert "is of the task 'dance'" in said or "('dance')" in said
+    assert "these are not the same episodes; make the rerun again" in said
+
+
+def test_actions_that_the_rerun_found_in_its_base_are_those_of_the_base(base, tmp_path):
+    spec = spec_of(base, CUT)
+
+    def found(difference):
+        def change(task, episode, replan, record):
+            actions = base_actions(task, episode, SPEC.replans)[replan]
+            return replace(record, base_actions=actions + difference * ((task, episode, replan) == WHERE))
+
+        return change
+
+    assert study_effects(base, [write_with(tmp_path / "a.zarr", spec, found(0.0))], AnalysisSettings()).conditions
+    path = write_with(tmp_path / "b.zarr", spec, found(1e-9))
+    assert refused(base, path) == (
+        f"Replan 3 of task001_episode000 has other actions in {base} than in the base of which {path} was made: the "
+        "base was recorded again since; make the rerun again."
+    )
+
+
+def test_an_unchanged_rerun_with_other_actions_is_named(base, tmp_path):
+    def moved(task, episode, replan, record):
+        return replace(record, actions=record.actions + 0.01 * ((task, episode, replan) == WHERE))
+
+    spec = replace(SPEC, rerun_of=rerun_source(base))
+    for name, change, notes in (("same", lambda *given: given[-1], 0), ("moved", moved, 1)):
+        path = write_with(tmp_path / f"{name}.zarr", spec, change)
+        study = study_effects(base, [path], AnalysisSettings())
+        assert len(study.notes) == notes
+    assert "moved changes nothing, and its actions are not those of the base" in study.notes[0]
+    assert "(replan 3 of task001_episode000)" in study.notes[0]
+
+
+def test_what_only_one_of_both_stores_holds_is_said(base, tmp_path):
+    path = write_store(tmp_path / "rerun.zarr", spec=replace(spec_of(base, CUT), frames=False))
+    study = study_effects(base, [path], AnalysisSettings())
+    assert study.notes == (
+        "without_state was not compared with the base in the pictures of camera 'base_0_rgb', pictures of camera "
+        "'left_wrist_0_rgb', which one of the two stores lacks.",
+    )
+    assert "was not compared" in effects_text(study)
+
+
+def test_equal_pictures_are_compared_without_being_read(base, tmp_path, monkeypatch):
+    path = write_store(tmp_path / "rerun.zarr", spec=spec_of(base, CUT))
+    reader = type(open_store(base).episodes[0])
+    read, names = reader.read, []
+    monkeypatch.setattr(reader, "read", lambda self, name, *index: (names.append(name), read(self, name, *index))[1])
+    study_effects(base, [path], AnalysisSettings())
+    assert names
+    assert not [name for name in names if name.startswith("frames/")]
