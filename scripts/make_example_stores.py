@@ -7,7 +7,7 @@ Usage: python scripts/make_example_stores.py [--folder vla_attention/example_sto
                           words are the same: their embeddings are replaced by their mean. Without pictures
 `cubes_reruns/`           the first episode of each task of cubes.zarr again: with other noise, without the pictures' or
                           the instruction's keys, with these alone, without as many random keys, and without any
-                          query that reads the instruction. Actions and little attention
+                          query that reads the instruction. Actions and attention of the same layers, without pictures
 
 Takes about two minutes on two cores. The same machine, libraries and number of threads give the same stores, but for
 the times and versions in their provenance. `tests/package/test_example_stores.py` reads what is there.
@@ -65,7 +65,8 @@ def make(folder: Path) -> None:
     must(capture, "pi", "--checkpoint", one_colour(Path("one_colour")), *rollouts, "--no-frames", "--store", other)
     grouping = Path("see-read.toml")
     grouping.write_text(GROUPING)
-    recorded = ("--no-frames", "--no-contributions", "--layers", "0", "--heads", "0", "--denoise-steps", "last")
+    # The layers, heads and denoise steps of the base: the viewer compares what both recorded.
+    recorded = ("--no-frames", "--no-contributions")
     must(capture, "rerun", store, "--series", grouping, "--num-episodes", "1", *recorded, "--output-dir", reruns)
     unread = ("--knockout", "role:instruction", "--knockout-queries", "all", "--name", "unread_linguistic")
     must(

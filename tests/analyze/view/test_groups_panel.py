@@ -7,6 +7,7 @@ Numbers on the page are compared with the tables `episodes`, `episodes_groups` (
 from __future__ import annotations
 
 import math
+import re
 import shlex
 import subprocess
 import sys
@@ -160,6 +161,63 @@ def test_clicked_groups_have_the_numbers_of_the_command(store, tmp_path):
         wait_until_ready(page)
         measured(panel_of(page), 4)
         assert groups_of(panel) == {name: text for name, text in groups.items() if name != "rest"}
+
+
+def patches_below(page: Any, camera: str, points: list[tuple[float, float]]) -> np.ndarray:
+    """The patches (row, column) that are shown at points of a picture, 0 to 1 from its left and top, as a mask."""
+    seen = page.evaluate("window.viewer.shown().store.root.policy.cameras.map(({name, ...view}) => [name, view])")
+    grids = page.evaluate("window.viewer.shown().site.layout.spans.map(({camera, grid}) => [camera, grid])")
+    view, grid = dict(seen)[camera], {name: grid for name, grid in grids if name}[camera]
+    mask = np.zeros((grid["rows"], grid["columns"]), dtype=bool)
+    for x, y in points:
+        across, down = (1 - x if view["mirrored"] else x), (y if view["upright"] else 1 - y)
+        mask[int(down * grid["rows"]), int(across * grid["columns"])] = True
+    return mask
+
+
+@pytest.mark.parametrize("size", [(1280, 900), (800, 700)], ids=str)
+def test_a_drag_without_a_group_paints_the_patches_below_the_pointer(store, size):
+    # The panel is below the window's edge: what takes the focus there moves the picture away from the pointer.
+    size = {"width": size[0], "height": size[1]}
+    with shown_page(store, query="?episode=task001_episode000", viewport=size) as page:
+        panel = panel_of(page)
+        panel.locator("button.brush").click()
+        canvas = page.locator(".main canvas[data-camera='base_0_rgb']")
+        canvas.scroll_into_view_if_needed()
+        box, scrolled = canvas.bounding_box(), page.evaluate("scrollY")
+        points = [(0.02 + 0.96 * i / 20, 0.06 + 0.3 * i / 20) for i in range(21)]
+        for i, (x, y) in enumerate(points):
+            page.mouse.move(box["x"] + x * box["width"], box["y"] + y * box["height"])
+            if i == 0:
+                page.mouse.down()
+            page.wait_for_timeout(20)  # a hand takes its time: what the page does meanwhile is done
+        page.mouse.up()
+        assert canvas.bounding_box() == box
+        assert page.evaluate("scrollY") == scrolled
+        assert page.evaluate("document.activeElement.tagName") != "INPUT"
+        measured(panel)
+        expected = patches_below(page, "base_0_rgb", points)
+        assert 1 < expected.sum() < expected.size
+        ((name, selector),) = groups_of(panel).items()
+        assert name == "patches"
+        masses = va.open(store).masses("replans", groups=[f"patches={selector}"], tasks=1)
+        assert masses.filter(group="patches")["keys"].unique().to_list() == [expected.sum()]
+        painted = np.zeros_like(expected)
+        for r0, r1, c0, c1 in re.findall(r"base_0_rgb\[(\d+):(\d+),(\d+):(\d+)\]", selector):
+            painted[int(r0) : int(r1), int(c0) : int(c1)] = True
+        assert painted.tolist() == expected.tolist()
+
+
+def test_keys_paint_one_patch_after_the_other(store):
+    with shown_page(store, query="?episode=task001_episode000", viewport={"width": 1280, "height": 900}) as page:
+        panel = panel_of(page)
+        panel.locator("button.brush").click()
+        page.locator(".main canvas[data-camera='base_0_rgb']").focus()
+        for key in ("Enter", " ", "ArrowDown", " "):
+            page.keyboard.press(key)
+        measured(panel)
+        ((_, selector),) = groups_of(panel).items()
+        assert re.fullmatch(r"patch:base_0_rgb\[0:2,(\d):(\d)\]", selector)
 
 
 def test_a_grouping_of_whole_segments_at_one_layer_and_head(store, tmp_path):

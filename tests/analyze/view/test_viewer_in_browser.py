@@ -230,6 +230,77 @@ def test_a_run_and_its_rerun_stand_side_by_side(view, server, store, rerun):
     view.page.locator(f"{pair} canvas").first.wait_for(state="hidden")
 
 
+@pytest.fixture(scope="module")
+def light(store) -> Path:
+    """The first episodes again with less recorded, as light reruns are."""
+    changed = Interventions("noise", prompt=PromptChange("text", text="do nothing"))
+    less = replace(SPEC, seed=8, layers=(1, 4), denoise_steps=(9,), heads=(1,), rerun_of=rerun_source(store))
+    return write_store(store.parent / "light.zarr", spec=replace(less, interventions=changed))
+
+
+def test_side_by_side_are_means_over_what_both_recorded(browser, store, light):
+    pair = '[data-panel="compare"]'
+    sides = (("left", store), ("right", light))
+    common = {"layers": [1, 4], "denoise": 9, "heads": 1}
+    with served(store, light) as running, watched_page(browser) as watched:
+        # The lighter store is shown first, or stands beside.
+        for link, places in (
+            ("?other=1:task000_episode000", sides),
+            ("?store=1&other=0:task000_episode000", sides[::-1]),
+        ):
+            watched.open(f"{running.link}{link}&replan=1")
+            watched.page.wait_for_selector(f'{pair}[data-ready="1"]')
+            said = watched.page.locator(pair).inner_text()
+            assert "Means are over what both recorded: layers 1, 4; denoise step 9; head 1." in said
+            for side, (_, place) in zip(("left", "right"), places, strict=True):
+                steps = {"tasks": 0, **common}
+                row = va.open(place).ratios("replans", **steps).filter(episode_index=0, replan=1, layer="layers_avg")
+                ratio = row["ratio_lift"][0] * row["uniform_ratio"][0]
+                assert watched.value(f'{pair} [data-compare="{side}-ratio"]') == pytest.approx(ratio, rel=1e-5)
+                assert watched.value(f'{pair} [data-compare="{side}-ratio-lift"]') == pytest.approx(
+                    row["ratio_lift"][0], rel=1e-5
+                )
+                columns = watched.page.locator(f"{pair} section .about").all_inner_texts()
+                assert all("mean of 2 layers, head 1, denoise step 9" in column for column in columns)
+        # Only where the timeline is of the same cells is the other's ratio a line of it.
+        assert watched.page.locator(".timeline").inner_text().count("ratio of") == 1
+        watched.open(f"{running.link}?other=1:task000_episode000")
+        watched.page.wait_for_selector(f'{pair}[data-ready="1"]')
+        assert "ratio of" not in watched.page.locator(".timeline").inner_text()
+        assert watched.complaints == []
+
+
+@pytest.mark.parametrize(
+    ("query", "sentence"),
+    [
+        ("layer=3", "light.zarr has no layer 3. Choose one that both recorded (1, 4), or the mean over layers."),
+        (
+            "layer=4&denoise=0",
+            "light.zarr has no denoise step 0. Choose one that both recorded (9), or the mean over denoise steps.",
+        ),
+        ("head=0", "light.zarr has no head 0. Choose one that both recorded (1), or the mean over heads."),
+    ],
+)
+def test_side_by_side_refuses_what_one_did_not_record(browser, store, light, query, sentence):
+    pair = '[data-panel="compare"]'
+    with served(store, light) as running, watched_page(browser) as watched:
+        watched.open(f"{running.link}?other=1:task000_episode000&{query}")
+        watched.page.wait_for_selector(f'{pair}[data-ready="1"]')
+        assert watched.page.inner_text(f'{pair} [role="alert"]') == sentence
+        assert not watched.page.locator(f"{pair} .compare-table").is_visible()
+        assert not watched.page.locator(f"{pair} canvas").first.is_visible()
+
+
+def test_side_by_side_of_nothing_in_common_is_a_sentence(browser, store, tmp_path):
+    other = write_store(tmp_path / "b.zarr", spec=replace(SPEC, layers=(0, 1)))
+    third = write_store(tmp_path / "c.zarr", spec=replace(SPEC, layers=(4, 5)))
+    with served(other, third) as running, watched_page(browser) as watched:
+        watched.open(f"{running.link}?other=1:task000_episode000")
+        watched.page.wait_for_selector('[data-panel="compare"][data-ready="1"]')
+        said = watched.page.inner_text('[data-panel="compare"] [role="alert"]')
+    assert said == "There is no layer that both recorded: b.zarr has 0, 1, c.zarr 4, 5."
+
+
 def test_only_the_chunks_that_are_shown_are_read(browser, store):
     with served(store) as running, watched_page(browser) as watched:
         watched.open(f"{running.link}?layer=0&denoise=0")

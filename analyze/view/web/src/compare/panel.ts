@@ -3,8 +3,9 @@ import "./compare.css";
 import { button, choice, element } from "../page/dom";
 import { type EpisodeColumn, episodeColumn } from "../page/episode_column";
 import { type PageContext, type PanelInstance, registerPanel } from "../page/panels";
-import { loadShown, type Shown } from "../page/shown";
+import { loadShown, selectionAt, type Shown, siteOf } from "../page/shown";
 import { sentenceOf, StoreError } from "../store/errors";
+import { commonCells } from "./common_cells";
 import { differenceRows } from "./difference_table";
 import { alignedValues, matchingReplan } from "./matching";
 
@@ -125,9 +126,24 @@ class ComparePanel implements PanelInstance {
       const steps = shown.episode.document.env_step;
       const others = episode.document.env_step;
       const replan = matchingReplan(steps, shown.replan, others, episode.numReplans);
-      const other = await loadShown(store, episode, { ...state, replan, site: shown.site.layout.name });
+      const there = { ...state, replan, site: shown.site.layout.name };
+      const { meanOf, said } = commonCells(
+        { name: shown.store.entry.name, root: shown.store.root, site: shown.site },
+        { name: store.entry.name, root: store.root, site: siteOf(episode, there) },
+        state,
+      );
+      // Of fewer layers, denoise steps and heads than the page shows, this episode is read again.
+      const { selection } = selectionAt(shown.site, state, meanOf);
+      const isShown = JSON.stringify(selection) === JSON.stringify(shown.selection);
+      const [here, other] = await Promise.all([
+        isShown ? shown : loadShown(shown.store, shown.episode, state, meanOf),
+        loadShown(store, episode, there, meanOf),
+      ]);
       if (asked !== this.#asked) return;
-      this.#draw(shown, other);
+      this.#draw(here, other, said);
+      this.#drawSeries(isShown ? here : null, other);
+      this.host.dataset.ready = "1";
+      this.host.dataset.shown = `${other.store.entry.name}:${other.episode.name}:${other.replan}`;
     } catch (failure) {
       if (asked !== this.#asked) return;
       this.#end("");
@@ -137,7 +153,7 @@ class ComparePanel implements PanelInstance {
     }
   }
 
-  #draw(shown: Shown, other: Shown): void {
+  #draw(shown: Shown, other: Shown, said: string): void {
     this.#failure.hidden = true;
     this.#pair.hidden = false;
     this.#left.show(shown);
@@ -148,16 +164,19 @@ class ComparePanel implements PanelInstance {
     const [a, b] = [shown, other].map(({ episode, replan }) => episode.document.env_step[replan]);
     const far = a !== undefined && b !== undefined && a !== b;
     this.#place.textContent = `replan ${shown.replan} beside replan ${other.replan}`;
-    this.#note.textContent =
+    const pairs =
       a === undefined || b === undefined
-        ? "Replans of equal number stand side by side: environment steps are not known. Both pictures have one colour scale."
-        : `Replans at the nearest environment step stand side by side${far ? ` (here ${a} and ${b})` : ""}. Both pictures have one colour scale.`;
-    this.#drawSeries(shown, other);
-    this.host.dataset.ready = "1";
-    this.host.dataset.shown = `${other.store.entry.name}:${other.episode.name}:${other.replan}`;
+        ? "Replans of equal number stand side by side: environment steps are not known."
+        : `Replans at the nearest environment step stand side by side${far ? ` (here ${a} and ${b})` : ""}.`;
+    this.#note.textContent = `${said} ${pairs} Both pictures have one colour scale.`.trim();
   }
 
-  #drawSeries(shown: Shown, other: Shown): void {
+  /** The other's ratio as a line of the timeline; `shown` is null where that is of other layers, denoise steps or heads. */
+  #drawSeries(shown: Shown | null, other: Shown): void {
+    if (!shown) {
+      this.#endSeries();
+      return;
+    }
     if (this.#seriesOf?.[0] === shown.numbers && this.#seriesOf[1] === other.numbers) return;
     this.#seriesOf = [shown.numbers, other.numbers];
     const { env_step: steps } = shown.episode.document;
@@ -172,10 +191,14 @@ class ComparePanel implements PanelInstance {
     this.#pair.hidden = true;
     this.#failure.hidden = true;
     this.#note.textContent = note;
-    if (this.#seriesOf) this.page.timeline.setSeries(SERIES, null);
-    this.#seriesOf = null;
+    this.#endSeries();
     delete this.host.dataset.ready;
     delete this.host.dataset.shown;
+  }
+
+  #endSeries(): void {
+    if (this.#seriesOf) this.page.timeline.setSeries(SERIES, null);
+    this.#seriesOf = null;
   }
 }
 

@@ -83,7 +83,7 @@ class GroupsPanel implements PanelInstance {
         "A group is a set of keys: patches, words, objects. Type a selector, or begin a group and click. ",
         "Numbers are means over the stored queries; outlined are the patches of which a group takes a fifth or more.",
       ),
-      element("div", { class: "group-bar" }, this.#base.host, button("New group", () => this.#add()), element("label", { class: "beside" }, "Open TOML ", file)),
+      element("div", { class: "group-bar" }, this.#base.host, button("New group", () => this.#lines.focus(this.#add())), element("label", { class: "beside" }, "Open TOML ", file)),
       this.#lines.host,
       element(
         "div",
@@ -147,11 +147,11 @@ class GroupsPanel implements PanelInstance {
     this.#edit({ lines: this.#draft.lines.map((one, i) => (i === line ? { ...one, ...change } : one)) });
   }
 
+  /** A new group, into which clicks go. The focus stays where it is: it would scroll the page below a stroke of the brush. */
   #add(name = "group"): number {
     const names = this.#draft.lines.map((line) => line.name);
     this.#active = names.length;
     this.#edit({ lines: [...this.#draft.lines, { name: freeName(name, names), selector: "" }] });
-    this.#lines.focus(this.#active);
     return this.#active;
   }
 

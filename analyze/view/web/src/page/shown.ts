@@ -42,12 +42,25 @@ export interface Shown {
   readonly baselineNote: string;
 }
 
+/** Numbers of layers, denoise steps and heads. */
+export interface CellNumbers {
+  readonly layers: readonly number[];
+  readonly denoise: readonly number[];
+  readonly heads: readonly number[];
+}
+
 /** Decoded bytes up to which the rows of a whole episode are read for one selection. */
 const WHOLE_EPISODE_BYTES = 128_000_000;
 
-function positions(wanted: OneOrMean, recorded: readonly number[], what: string, missing: string[]): number[] {
+function positions(
+  wanted: OneOrMean,
+  recorded: readonly number[],
+  meanOf: readonly number[],
+  what: string,
+  missing: string[],
+): number[] {
   // A block that two numbers name counts once in a mean.
-  if (wanted === "mean") return recorded.flatMap((number, i) => (recorded.indexOf(number) === i ? [i] : []));
+  if (wanted === "mean") return recorded.flatMap((number, i) => (recorded.indexOf(number) === i && meanOf.includes(number) ? [i] : []));
   let nearest = 0;
   recorded.forEach((number, i) => {
     if (Math.abs(number - wanted) < Math.abs(recorded[nearest]! - wanted)) nearest = i;
@@ -56,8 +69,15 @@ function positions(wanted: OneOrMean, recorded: readonly number[], what: string,
   return [nearest];
 }
 
-/** The positions that a state names at a site, and what of it does not exist there. */
-export function selectionAt(site: SiteInfo, state: ViewState): { selection: Selection; missing: string[] } {
+/**
+ * The positions that a state names at a site, and what of it does not exist there. `meanOf`: what means are over; some of
+ * it is recorded.
+ */
+export function selectionAt(
+  site: SiteInfo,
+  state: ViewState,
+  meanOf: CellNumbers = site,
+): { selection: Selection; missing: string[] } {
   const missing: string[] = [];
   let query = state.query;
   if (query !== "mean" && query >= site.numQueries) {
@@ -65,9 +85,9 @@ export function selectionAt(site: SiteInfo, state: ViewState): { selection: Sele
     query = "mean";
   }
   const selection = {
-    layers: positions(state.layer, site.layers, "layer", missing),
-    denoise: positions(state.denoise, site.denoise, "denoise step", missing),
-    heads: positions(state.head, site.heads, "head", missing),
+    layers: positions(state.layer, site.layers, meanOf.layers, "layer", missing),
+    denoise: positions(state.denoise, site.denoise, meanOf.denoise, "denoise step", missing),
+    heads: positions(state.head, site.heads, meanOf.heads, "head", missing),
     query: site.numQueries === 1 ? ("mean" as const) : query,
   };
   return { selection, missing };
@@ -143,15 +163,15 @@ async function picturesOf(episode: Episode, site: SiteInfo, replan: number): Pro
   return new Map(await Promise.all(cameras.map(async (camera) => [camera, await episode.frame(camera, replan)] as const)));
 }
 
-/** Read all that a state shows of an episode. */
-export async function loadShown(store: Store, episode: Episode, state: ViewState): Promise<Shown> {
+/** Read all that a state shows of an episode. `meanOf`: what means are over, where that is not all that was recorded. */
+export async function loadShown(store: Store, episode: Episode, state: ViewState, meanOf?: CellNumbers): Promise<Shown> {
   const missing: string[] = [];
   if (state.site !== null && !episode.sites.some((site) => site.layout.name === state.site)) {
     missing.push(`the episode has no site ${state.site}: ${episode.firstSite.layout.name} is shown`);
   }
   const site = siteOf(episode, state);
   const name = site.layout.name;
-  const { selection, missing: axes } = selectionAt(site, state);
+  const { selection, missing: axes } = selectionAt(site, state, meanOf);
   missing.push(...axes);
   const replan = Math.min(state.replan, episode.numReplans - 1);
   if (replan !== state.replan) missing.push(`the episode has no replan ${state.replan}: its last is ${replan}`);
