@@ -22,7 +22,7 @@ _EXAMPLES = """examples:
   vla-analyze view runs/cubes.zarr --site public/cubes               a folder for a web server
 
 The page is served to this machine only, to whoever has the printed link, until Ctrl-C. It asks nothing of any other
-place.
+place. With the same stores and the same --port the link stays the same.
 """
 
 
@@ -88,9 +88,10 @@ def _serve(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None
     from vla_attention.analyze.show.browser import open_in_browser
     from vla_attention.analyze.view.server import ViewerServer
 
-    with ViewerServer(stores, arguments.port) as server:
+    with ViewerServer(stores, arguments.port, keep_link=True) as server:
+        again = f"; with --port {server.port} its link stays the same" if server.keeps_link else ""
         # At once, also into a file that somebody follows.
-        print(f"The page: {server.link}\nIt is served to this machine only, until Ctrl-C.", flush=True)
+        print(f"The page: {server.link}\nIt is served to this machine only, until Ctrl-C{again}.", flush=True)
         if not arguments.no_open:
             open_in_browser(server.link)
         server.serve_forever()

@@ -8,7 +8,6 @@ holds.
 from __future__ import annotations
 
 import json
-import secrets
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from http import HTTPStatus
@@ -16,6 +15,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from typing import Any
 
+from vla_attention.analyze.view.kept_token import kept_token, new_token
 from vla_attention.analyze.view.paths import (
     PAGE_FILES,
     BadRange,
@@ -77,16 +77,22 @@ class Answer:
 class ViewerServer(ThreadingHTTPServer):
     """The server of some stores. `link` opens the page; `sent` counts the bytes of the stores' files by path.
 
-    Raises `BadArgument` for a port that cannot be had; 0 is any free one.
+    Args:
+        stores: what the page shows.
+        port: of the link; 0 is any free one.
+        keep_link: whether to take the link that these stores had on this port before. `keeps_link` says whether they
+            will have this one again.
+
+    Raises:
+        BadArgument: the port cannot be had.
     """
 
     daemon_threads = True
 
-    def __init__(self, stores: Sequence[ServedStore], port: int = 0, token: str | None = None) -> None:
+    def __init__(self, stores: Sequence[ServedStore], port: int = 0, *, keep_link: bool = False) -> None:
         if not 0 <= port < 2**16:
             raise BadArgument(f"Cannot use --port {port}; expected a number from 1 to 65535, or 0 for any free port.")
         self.stores = tuple(stores)
-        self.token = secrets.token_urlsafe(24) if token is None else token
         self.page = _page()
         self.sent: dict[str, int] = {}
         try:
@@ -94,11 +100,21 @@ class ViewerServer(ThreadingHTTPServer):
         except OSError as error:
             reason = error.strerror or error
             raise BadArgument(f"Cannot use --port {port}: {reason}. Leave it out for any free port.") from None
+        # Only who has the port writes its token.
+        places = [store.place for store in self.stores]
+        kept = kept_token(places, self.port) if keep_link else None
+        self.keeps_link = kept is not None
+        self.token = kept or new_token()
+
+    @property
+    def port(self) -> int:
+        """The port that it has."""
+        return int(self.server_address[1])
 
     @property
     def link(self) -> str:
         """The address of the page."""
-        return f"http://{LOOPBACK}:{self.server_address[1]}/{self.token}/"
+        return f"http://{LOOPBACK}:{self.port}/{self.token}/"
 
     def handle_error(self, *_: object) -> None:
         """A browser that closes a connection is no error; every other one was answered."""

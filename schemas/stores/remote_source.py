@@ -27,6 +27,7 @@ from vla_attention.schemas.stores.bounded_fetch import TooSlow, asked_within, fe
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder, Memory, copy_into, split
 from vla_attention.schemas.stores.hub_address import HUB_PROTOCOL, HubAddress, stated_commit
 from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
+from vla_attention.schemas.user_cache import user_cache
 
 FOLDER_VARIABLE = "VLA_REMOTE_CACHE"
 SIZE_VARIABLE = "VLA_REMOTE_CACHE_SIZE"
@@ -249,7 +250,6 @@ def kept_bytes() -> KeptBytes | None:
     given = os.environ.get(FOLDER_VARIABLE, "").strip()
     if given.casefold() in _OFF:
         return None
-    home = Path(os.environ.get("XDG_CACHE_HOME", "") or Path.home() / ".cache")
     size = os.environ.get(SIZE_VARIABLE, "").strip()
     most = parse_bytes(size) if size else DEFAULT_BYTES
     if most is None:
@@ -257,7 +257,7 @@ def kept_bytes() -> KeptBytes | None:
             f"{SIZE_VARIABLE}={size} is no size; expected a number of bytes, or one with a unit, as in 500MB or 10GB. "
             f"To keep nothing, set {FOLDER_VARIABLE}=off."
         )
-    return KeptBytes(Path(given).absolute() if given else home / "vla-attention" / "remote", most)
+    return KeptBytes(Path(given).absolute() if given else user_cache("remote"), most)
 
 
 def _file_system(url: str) -> tuple[Any, str]:

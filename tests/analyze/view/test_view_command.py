@@ -223,12 +223,18 @@ def test_what_is_no_store_is_refused_with_a_sentence(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("signal", "code", "word"), [("SIGINT", 130, "stopped"), ("SIGTERM", 143, "stopped by SIGTERM")]
 )
-def test_it_ends_with_one_sentence(store, signal, code, word):
+def test_it_ends_with_one_sentence(store, signal, code, word, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     moment = after_call("vla_attention.analyze.view.server", "ViewerServer", "service_actions")
     done = run_stopped("vla_attention.analyze", ["view", str(store), "--no-open"], moment, signal=signal)
     assert done.returncode == code
-    assert re.match(r"The page: http://127\.0\.0\.1:\d+/[\w-]{32}/\n", done.stdout)
+    found = re.match(r"The page: (http://127\.0\.0\.1:(\d+)/[\w-]{32}/)\n.*; with --port (\d+) its", done.stdout)
+    assert found
+    assert found[2] == found[3]
     assert done.stderr.strip() == f"vla-analyze view: {word}; nothing was left half written."
+    # Started again on the same port, it has the same link.
+    again = ["view", str(store), "--no-open", "--port", found[3]]
+    assert run_stopped("vla_attention.analyze", again, moment, signal=signal).stdout == done.stdout
 
 
 def test_a_browser_is_opened_before_a_screen_only():
