@@ -76,14 +76,15 @@ def replan_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Ta
     Masses are averaged over denoise steps and heads first; fractions, lifts and ratios follow from these means.
 
     In "layers_avg", as the published scripts define it, masses are means over the layers, fractions and lifts of groups
-    follow from these means, and the ratio is the mean of the layers' finite ratios (null when none is finite; the
-    published scripts write 0 there). `log2_ratio` and `ratio_lift`, from which the headline is made, are those of the
-    geometric mean of the layers' finite positive ratios: the inverse ratio then has the inverse mean.
+    follow from these means. `ratio` is the one ratio of a replan that texts, pictures and the viewer show: the
+    geometric mean of the layers' finite positive ratios (the inverse ratio has the inverse mean), so that `ratio_lift`
+    is ratio / uniform_ratio and `log2_ratio` its logarithm. `ratio_mean` is the mean of the layers' finite ratios (null
+    when none is finite; the published scripts write 0 there).
 
     Returns:
         cells: `EPISODE_KEYS`, replan, env_step, layer, layer_number, block, row_sum, valid_mass, num_valid; with a
-            ratio numerator_mass, denominator_mass, uniform_ratio, ratio, nonfinite_layers (1 where the ratio is
-            infinite or undefined; in "layers_avg" the number of layers left out), ratio_lift, log2_ratio.
+            ratio numerator_mass, denominator_mass, uniform_ratio, ratio, ratio_mean, nonfinite_layers (1 where the
+            ratio is infinite or undefined; in "layers_avg" the number of layers left out), ratio_lift, log2_ratio.
         groups: suite, task_id, episode_index, replan, env_step, layer, layer_number, block, group, mass, fraction,
             keys, density, lift.
     """

@@ -77,13 +77,15 @@ def replan_values(measured: MeasuredEpisode | Sequence[MeasuredEpisode], groupin
         above, below = sides(mass, grouping)
         of_layers = ratio(above, below)[:, : len(episodes[0].selection.layers)]
         left_out = ~np.isfinite(of_layers)
-        value = layers.with_average(of_layers, mean=finite_mean)
         of_uniform = uniform_ratio(uniform_mass, grouping)[:, : len(episodes[0].selection.layers)]
         uniform = _uniform_with_average(of_uniform, of_layers, layers)
-        cells |= {"numerator_mass": above, "denominator_mass": below, "uniform_ratio": uniform, "ratio": value}
+        cells |= {"numerator_mass": above, "denominator_mass": below, "uniform_ratio": uniform}
+        # The ratio of a replan: the mean of logarithms over layers has no preference for either side. The published
+        # scripts take the mean of the ratios.
+        value = layers.with_average(of_layers, mean=finite_geometric_mean)
+        cells |= {"ratio": value, "ratio_mean": layers.with_average(of_layers, mean=finite_mean)}
         cells["nonfinite_layers"] = layers.with_average(left_out.astype(np.int64), mean=np.sum)
-        # The mean of logarithms over layers has no preference for either side; the published mean of ratios has.
-        cells |= relative_to_uniform(layers.with_average(of_layers, mean=finite_geometric_mean), uniform)
+        cells |= relative_to_uniform(value, uniform)
     return ReplanValues(
         cells, lambda: group_measures(mass, valid_mass, num_keys, uniform_mass, uniform_valid).columns()
     )
@@ -118,9 +120,9 @@ def episode_tables(replans: Tables, grouping: Grouping) -> Tables:
     Returns:
         cells: `EPISODE_KEYS`, layer, layer_number, block, num_replans, row_sum and num_valid (means); with a ratio
             numerator_mass, denominator_mass  means
-            ratio_mean, ratio_std, ratio_median, ratio_min, ratio_max   over the finite ratios
+            ratio_mean, ratio_std, ratio_median, ratio_min, ratio_max   over the replans' finite `ratio_mean`
             ratio_of_means      mean numerator mass / mean denominator mass
-            log_ratio_mean      mean log ratio over finite positive ratios
+            log_ratio_mean      mean over the replans of the logarithm of `ratio`, where it is finite and positive
             num_nonfinite       replans whose ratio is infinite or undefined
             geometric_left_out  replans whose ratio has no finite logarithm (not finite, or 0)
             nonfinite_layers    sum over replans of the layers left out of "layers_avg"
@@ -204,7 +206,7 @@ def _needed(grouping: Grouping) -> tuple[str, ...]:
     plain = ("row_sum", "num_valid")
     if grouping.ratio is None:
         return plain
-    of_ratio = ("numerator_mass", "denominator_mass", "ratio", "log2_ratio", "nonfinite_layers", "uniform_ratio")
+    of_ratio = ("numerator_mass", "denominator_mass", "ratio_mean", "log2_ratio", "nonfinite_layers", "uniform_ratio")
     return (*plain, *of_ratio, "ratio_lift")
 
 
@@ -220,7 +222,7 @@ def _cells_over(replans: _Parts, values: Mapping[str, NDArray[Any]], grouping: G
     }
     if grouping.ratio is None:
         return found
-    finite, logs = only_finite(values["ratio"]), only_finite(values["log2_ratio"])
+    finite, logs = only_finite(values["ratio_mean"]), only_finite(values["log2_ratio"])
     above, below = replans.mean(values["numerator_mass"]), replans.mean(values["denominator_mass"])
     log_ratio = replans.mean(logs) * np.log(2.0)
     return found | {

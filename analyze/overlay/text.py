@@ -35,11 +35,13 @@ def overlay_text(study: OverlayStudy) -> str:
             cells += [format_number(float(share)), format_number(float(shown.max())), f"{row},{column}"]
         rows.append(cells)
     item = overlay.item
+    several = overlay.ratio is not None and len(study.question.selection.layers) > 1
+    legend = f"ratio: geometric mean of the layers. {_LEGEND}" if several else _LEGEND
     lines = [
         *wrap_all(study.question.remarks),
         *wrap(f"{item.store.suite} {item.episode.name}: {visible(item.episode.attributes.instruction)}"),
         text_table(header, rows),
-        *wrap(_LEGEND),
+        *wrap(legend),
         "",
         *wrap(orientation_note(overlay)),
     ]

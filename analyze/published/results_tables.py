@@ -136,6 +136,8 @@ def _replans(rows: pl.DataFrame, grouping: Grouping) -> Tables:
         pl.col("visual_mass").alias("numerator_mass"),
         pl.col("linguistic_mass").alias("denominator_mass"),
         uniform.alias("uniform_ratio"),
+        # A file says one ratio; over layers it is the published mean of ratios.
+        pl.col("ratio").alias("ratio_mean"),
         (pl.col("ratio") / uniform).fill_nan(None).alias("ratio_lift"),
         pl.col("ratio").log(2.0).alias("log2_ratio"),
         pl.when(pl.col("layer") == LAYERS_AVG)

@@ -142,7 +142,8 @@ def _with_sides(replans: Tables, grouping: Grouping, proxy: FrameProxy | None) -
     above, below = (np.where(same, keys, np.nan) for keys in (above, below))
     table = cells.with_columns(
         pl.col("env_step").alias("step"),
-        pl.when(pl.col("ratio").is_finite()).then(pl.col("ratio")).alias(_RATIO),
+        # Over layers the published mean of ratios.
+        pl.when(pl.col("ratio_mean").is_finite()).then(pl.col("ratio_mean")).alias(_RATIO),
         (visual * queries).alias("visual_mass"),
         (linguistic * queries).alias("linguistic_mass"),
         (visual / total).fill_nan(None).alias("visual_fraction"),

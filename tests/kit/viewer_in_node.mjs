@@ -101,9 +101,10 @@ function measured(one) {
     numerator_mass: cells((value) => value.ratio.numerator),
     denominator_mass: cells((value) => value.ratio.denominator),
     ratio: cells((value) => value.ratio.value),
+    ratio_mean: cells((value) => value.ratio.mean),
     uniform_ratio: cells((value) => value.ratio.uniform),
     ratio_lift: cells((value) => value.ratio.lift),
-    log2_ratio: cells((value) => Math.log2(value.ratio.geometric)),
+    log2_ratio: cells((value) => Math.log2(value.ratio.value)),
   };
   return {
     names: resolved.names,

@@ -74,7 +74,7 @@ def test_infinite_and_undefined_ratios_differ_and_are_counted():
     assert episode["ratio_of_means"] == np.inf
 
 
-def test_layers_avg_is_the_published_definition():
+def test_layers_avg_is_the_geometric_mean_and_has_the_published_one_by_name():
     steps = make_steps(num_tasks=1, num_episodes=1, num_replans=3, denoise_steps=(0,))
     # One layer of one replan without text: its ratio is infinite and must not enter the mean of ratios.
     hit = (pl.col("replan") == 1) & (pl.col("layer") == 25)
@@ -88,7 +88,12 @@ def test_layers_avg_is_the_published_definition():
         layers = replans.filter(replan=replan)
         row = one(average, replan=replan)
         ratio = layers["ratio"].to_numpy()
-        assert row["ratio"] == pytest.approx(ratio[np.isfinite(ratio)].mean())
+        finite = ratio[np.isfinite(ratio)]
+        assert row["ratio_mean"] == pytest.approx(finite.mean())
+        assert row["ratio"] == pytest.approx(np.exp(np.log(finite).mean()))
+        assert row["log2_ratio"] == pytest.approx(np.log2(row["ratio"]))
+        assert row["ratio_lift"] == pytest.approx(row["ratio"] / row["uniform_ratio"])
+        assert layers["ratio_mean"].to_list() == layers["ratio"].to_list()
         assert row["nonfinite_layers"] == (1 if replan == 1 else 0)
         masses = {name: layers[f"{name}_mass"].to_numpy().mean() for name in GROUPING.names}
         assert row["visual_mass"] == pytest.approx(masses["visual"])
@@ -97,7 +102,7 @@ def test_layers_avg_is_the_published_definition():
 
 def test_layers_avg_without_a_finite_ratio_is_null_not_zero():
     average = replans_of(make_steps(no_denominator=1.0)).cells.filter(layer=LAYERS_AVG)
-    assert average["ratio"].null_count() == average.height
+    assert average["ratio"].null_count() == average["ratio_mean"].null_count() == average.height
     assert average["nonfinite_layers"].unique().to_list() == [3]
 
 
@@ -133,7 +138,7 @@ def test_episode_statistics_are_those_of_numpy():
     for layer in ("18", LAYERS_AVG):
         part = replans.filter(task_id=2, episode_index=1, layer=layer)
         row = one(episodes, task_id=2, episode_index=1, layer=layer)
-        ratio = part["ratio"].fill_null(np.nan).to_numpy()
+        ratio = part["ratio_mean"].fill_null(np.nan).to_numpy()
         finite = ratio[np.isfinite(ratio)]
         assert row["num_replans"] == 6
         assert row["num_nonfinite"] == 6 - len(finite)

@@ -67,7 +67,7 @@ def test_the_published_verdict_stands_beside_what_uniform_attention_gives(tmp_pa
     path, replans = ours(tmp_path)
     _, out, _ = run(capsys, "--results", path)
     cells = replans.cells.filter(layer="layers_avg")
-    lift = np.mean(cells["ratio"].to_numpy() / (512 / 14))
+    lift = np.mean(cells["ratio_mean"].to_numpy() / (512 / 14))
     first, *more = out.split("→ Model is VISUAL-dominant (prefers visual features)\n")[1].splitlines()
     said = " ".join([first, *more[:2]])
     assert "Uniform attention: 36.57 (512 over 14 keys), which the guide calls the same" in " ".join(said.split())
@@ -220,7 +220,7 @@ def test_mistakes_end_with_one_sentence(tmp_path, capsys, monkeypatch, words, me
 def test_a_file_written_from_a_table_and_its_table_say_the_same(tmp_path, capsys):
     path, replans = ours(tmp_path)
     _, out, _ = run(capsys, "--results", path)
-    ratios = replans.cells.filter(layer="layers_avg")["ratio"].to_numpy()
+    ratios = replans.cells.filter(layer="layers_avg")["ratio_mean"].to_numpy()
     assert f"  Mean:   {ratios.mean():.3f} ± {ratios.std():.3f}" in out
 
 

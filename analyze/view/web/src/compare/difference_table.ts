@@ -21,7 +21,7 @@ function linesOf(left: Shown, right: Shown): Line[] {
   const [a, b] = [left, right].map((shown) => shown.numbers.replans[shown.replan]!.ratio);
   const lines: Line[] = [];
   if (a && b) {
-    lines.push({ name: "ratio", label: "visual / linguistic", left: a.geometric, right: b.geometric, factor: true });
+    lines.push({ name: "ratio", label: "visual / linguistic", left: a.value, right: b.value, factor: true });
     lines.push({ name: "ratio-lift", label: "its lift", left: a.lift, right: b.lift, factor: true });
   }
   const names = [...new Set([...left.numbers.present, ...right.numbers.present])];

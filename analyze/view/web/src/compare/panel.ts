@@ -180,7 +180,7 @@ class ComparePanel implements PanelInstance {
     if (this.#seriesOf?.[0] === shown.numbers && this.#seriesOf[1] === other.numbers) return;
     this.#seriesOf = [shown.numbers, other.numbers];
     const { env_step: steps } = shown.episode.document;
-    const ratios = other.numbers.replans.map(({ ratio }) => ratio?.geometric ?? null);
+    const ratios = other.numbers.replans.map(({ ratio }) => ratio?.value ?? null);
     const values = alignedValues(steps, shown.episode.numReplans, other.episode.document.env_step, ratios);
     const has = values.some((value) => value !== null);
     const name = `ratio of ${other.store.entry.name === shown.store.entry.name ? "" : `${other.store.entry.name} `}${other.episode.name}`;

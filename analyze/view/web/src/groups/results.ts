@@ -94,7 +94,7 @@ export class Results {
     const present = presentGroups(this.#measured);
     const lines =
       measure === "ratio"
-        ? [{ name: "ratio", style: { colour: "#0072B2", dash: "" }, values: replans.map((one) => one.ratio!.geometric) }]
+        ? [{ name: "ratio", style: { colour: "#0072B2", dash: "" }, values: replans.map((one) => one.ratio!.value) }]
         : present.map((group) => ({
             name: names[group]!,
             style: styles[group]!,
@@ -144,7 +144,7 @@ export class Results {
     const several = this.#measured!.layers > 1;
     this.#ratio.replaceChildren(
       several ? "Ratio (geometric mean of layers) " : "Ratio ",
-      number("ratio", now.ratio.geometric),
+      number("ratio", now.ratio.value),
       ", uniform attention would give ",
       number("uniform-ratio", now.ratio.uniform),
       ", lift ",

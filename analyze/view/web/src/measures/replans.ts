@@ -21,13 +21,13 @@ export interface ReplanValues {
   readonly ratio?: {
     readonly numerator: number;
     readonly denominator: number;
-    /** Of a mean over layers: the mean of the layers' finite ratios. */
+    /** The ratio of this replan; of a mean over layers the geometric mean of the layers' ratios. */
     readonly value: number;
+    /** The same, but of a mean over layers the mean of the layers' finite ratios, as the published scripts have it. */
+    readonly mean: number;
     /** What uniform attention gives; of a mean over layers the geometric mean of those layers whose ratio counts. */
     readonly uniform: number;
-    /** The same, but of a mean over layers the geometric mean of the layers' ratios. */
-    readonly geometric: number;
-    /** geometric / uniform */
+    /** value / uniform */
     readonly lift: number;
   };
 }
@@ -77,10 +77,10 @@ export function replanValues(
     };
     const ratios = layers.map((layer) => quotient(of(layer)));
     const one = ratios.length === 1;
-    const value = one ? ratios[0]! : finiteMean(ratios);
-    const geometric = one ? ratios[0]! : finiteGeometricMean(ratios);
+    const value = one ? ratios[0]! : finiteGeometricMean(ratios);
+    const ofRatios = one ? ratios[0]! : finiteMean(ratios);
     const expected = uniformOfLayers(given.map(quotient), ratios);
-    return { ...values, ratio: { numerator, denominator, value, uniform: expected, geometric, lift: geometric / expected } };
+    return { ...values, ratio: { numerator, denominator, value, mean: ofRatios, uniform: expected, lift: value / expected } };
   });
 }
 
@@ -114,9 +114,9 @@ export function episodeValues(replans: readonly ReplanValues[]): EpisodeValues {
       const mean = (measure: keyof GroupMeasures): number => finiteMean(replans.map((one) => one.groups[measure][group]!));
       return { mass: mean("mass"), fraction: mean("fraction"), keys: mean("keys"), lift: mean("lift") };
     }),
-    geometricMean: finiteGeometricMean(ratios.map((one) => one.geometric)),
+    geometricMean: finiteGeometricMean(ratios.map((one) => one.value)),
     uniformRatio: finiteGeometricMean(ratios.map((one) => one.uniform)),
     ratioLift: finiteGeometricMean(ratios.map((one) => one.lift)),
-    numNonfinite: ratios.filter((one) => !Number.isFinite(one.value)).length,
+    numNonfinite: ratios.filter((one) => !Number.isFinite(one.mean)).length,
   };
 }

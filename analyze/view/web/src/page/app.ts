@@ -237,7 +237,7 @@ export class App {
     if (before?.episode !== shown.episode) document.title = `${shown.episode.name}: ${visible(shown.episode.document.instruction).slice(0, 80)}`;
     if (!shown.state.playing) {
       const ratio = shown.numbers.replans[shown.replan]!.ratio;
-      this.#announce(`Replan ${shown.replan}${ratio ? `, ratio ${ratio.geometric.toPrecision(3)}` : ""}`);
+      this.#announce(`Replan ${shown.replan}${ratio ? `, ratio ${ratio.value.toPrecision(3)}` : ""}`);
     }
   }
 

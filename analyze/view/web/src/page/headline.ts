@@ -49,7 +49,7 @@ export class Headline {
       // Of several layers both are geometric means, so that the lift is the ratio over the uniform one.
       const several = selection.layers.length > 1;
       const mean = several ? " (geometric mean of layers)" : "";
-      this.#ratio.show(ratio.geometric, formatNumber(ratio.geometric), mean);
+      this.#ratio.show(ratio.value, formatNumber(ratio.value), mean);
       this.#uniform.show(ratio.uniform, formatNumber(ratio.uniform));
       this.#lift.show(ratio.lift, `×${formatNumber(ratio.lift)}`);
     } else {

@@ -30,7 +30,7 @@ export function rowsOfTimeline({ grouping, present, replans }: EpisodeNumbers): 
         {
           name: "ratio",
           colour: "var(--accent)",
-          values: replans.map((replan) => replan.ratio!.geometric),
+          values: replans.map((replan) => replan.ratio!.value),
           uniform: replans.map((replan) => replan.ratio!.uniform),
           unit: "",
         },
