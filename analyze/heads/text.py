@@ -27,6 +27,7 @@ from vla_attention.analyze.statistics.episode_intervals import means_with_interv
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL, NO_LIMITS, POSITIVE
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
+from vla_attention.schemas.layout import Role
 
 #: Sinks that are printed; the table has all.
 _MOST_SINKS = 12
@@ -286,10 +287,12 @@ def sinks_text(search: SinkSearch, rule: SinkRule) -> str:
     num_tasks, num_heads = keys.select("suite", "task_id").n_unique(), int(keys["num_heads"][0])
     beyond = cannot_fire(search.num_valid, rule)
     if sinks.is_empty():
-        nearest = keys.sort("largest_mass", descending=True).row(0, named=True)
+        counted = keys.filter(pl.col("role") != Role.ACTION.label)
+        nearest = (counted if counted.height else keys).sort("largest_mass").row(-1, named=True)
         text = (
-            f"No key takes {rule}. The key that comes nearest, {nearest['description']} ({nearest['role']}), takes on "
-            f"average {format_percent(nearest['largest_mass'])} of a row in one head of task {nearest['task_id']}, and "
+            f"No key takes {rule} (keys of the policy's own actions are not counted). The key that comes nearest, "
+            f"{nearest['description']} ({nearest['role']}), takes on average "
+            f"{format_percent(nearest['largest_mass'])} of a row in one head of task {nearest['task_id']}, and "
             f"{format_number(nearest['times_uniform'])} x its uniform share over all heads."
         )
         others = "Other rules: --sink-factor, --sink-share, --sink-mass."
@@ -316,9 +319,10 @@ def sinks_text(search: SinkSearch, rule: SinkRule) -> str:
     if merged.height > _MOST_SINKS:
         lines.append(f"{merged.height - _MOST_SINKS} more in sinks.parquet.")
     note = (
-        f"Searched task by task and head by head. heads: share of the layers' {num_heads:d} heads in which the key "
-        f"takes {rule}; by mass: the latter. mass: mean share of the valid keys' mass; most: in the head where it is "
-        "largest. values: length of what the key adds per unit of mass, beside all other valid keys together (small: "
+        "Searched task by task and head by head; keys of the policy's own actions are not counted. "
+        f"heads: share of the layers' {num_heads:d} heads in which the key takes {rule}; by mass: the latter. mass: "
+        "mean share of the valid keys' mass; most: in the head where it is largest. values: length of what the key "
+        "adds per unit of mass, beside all other valid keys together (small: "
         f"below {SMALL_VALUES:g}); ?: not recorded, or the key is one of several in a segment, and contributions are "
         f"of whole segments. *: in at least {rule.heads:.0%} of the heads; vla-analyze ratios --without-sinks (with "
         f"the same --sink options) takes these out. {beyond}"

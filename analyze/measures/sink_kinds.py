@@ -22,9 +22,11 @@ from numpy.typing import NDArray
 from vla_attention.analyze.measures.contribution_ratios import has_all_heads, joint_norm, segment_masses, selected_gram
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.schemas.layout import INVALID_ROLES
+from vla_attention.schemas.layout import INVALID_ROLES, Role
 from vla_attention.schemas.segments import segment_members
 
+#: Roles of keys that hold nothing of scene, instruction or state. A sink of another role may be what a head reads.
+WITHOUT_CONTENT = (Role.BOS, Role.TEMPLATE, Role.BLANK, Role.LEARNED)
 #: Below this value ratio, a sink's values are called small.
 SMALL_VALUES = 0.5
 
@@ -52,6 +54,13 @@ def kind_name(value_ratio: float | None) -> str:
     if value_ratio is None:
         return "?"
     return "small" if value_ratio < SMALL_VALUES else "large"
+
+
+def may_be_empty(role: str, value_ratio: float | None) -> bool:
+    """Whether a sink may carry no information: its values are small, or not known and its role is without content."""
+    if value_ratio is None:
+        return role in {each.label for each in WITHOUT_CONTENT}
+    return value_ratio < SMALL_VALUES
 
 
 def _value_ratio(question: Question, suite: str, task: int, key: int, blocks: list[int]) -> float | None:

@@ -18,6 +18,9 @@ Heads differ: a key can take half of one head's rows and nothing of another's, a
 nothing. A key that is a sink in one head alone may be what this head looks for, however. `--without-sinks` therefore
 takes out keys that are sinks in at least the share `heads` of the selected layers' heads (`widespread`), for all heads.
 
+Keys of the policy's own actions are none: the action queries compute these keys with each other, and the keys are on no
+side of a ratio of pictures and words.
+
 Sinks are found per task, because the text depends on the instruction and the scene on the task. The rule cannot tell a
 sink from a key that deserves attention in most rows: look at the listed keys before you use a corrected number.
 """
@@ -37,7 +40,7 @@ from vla_attention.analyze.measures.baselines import uniform_keys
 from vla_attention.analyze.measures.kept import measured_once
 from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_episode
 from vla_attention.analyze.measures.sink_kinds import value_ratios
 from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.show.progress import progress_bar
@@ -251,12 +254,14 @@ def search_of(question: Question, shares: Sequence[KeyShares], rule: SinkRule) -
         valid = [item.valid for item in items]
         num_valid = float(np.mean([item.num_valid.mean() for item in items]))
         keys = np.flatnonzero(np.any([part.any(axis=0) for part in valid], axis=0))
-        by_mass = held > np.maximum(rule.mass, 2.0 * uniform)
+        described = pl.DataFrame([_describe(int(key), items, valid) for key in keys], schema=_DESCRIPTION, orient="row")
+        counted = np.zeros(held.shape[2], dtype=bool)
+        counted[keys] = (described["role"] != Role.ACTION.label).to_numpy()
+        by_mass = counted & (held > np.maximum(rule.mass, 2.0 * uniform))
         # A share is a mean of quotients: rounding must not put one half below 0.5.
-        is_sink = by_mass | (above >= rule.share - _ROUNDING)
+        is_sink = by_mass | (counted & (above >= rule.share - _ROUNDING))
         count = is_sink.sum(axis=(0, 1))
         num_heads = above.shape[0] * above.shape[1]
-        described = pl.DataFrame([_describe(int(key), items, valid) for key in keys], schema=_DESCRIPTION, orient="row")
         labels = [pl.lit(suite).alias("suite"), pl.lit(task, dtype=pl.Int64).alias("task_id")]
         mean_mass = held.mean(axis=(0, 1))
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -343,6 +348,23 @@ def without_sinks(question: Question, sinks: pl.DataFrame, rule: SinkRule) -> Qu
     num_valid = max(float(item.num_valid.mean()) for item in question.selected)
     notes = (*question.notes, describe_sinks(sinks, len(_tasks(question)), rule, num_valid))
     return replace(question, selected=selected, grouping=grouping, notes=notes)
+
+
+def sinks_of_sides(question: Question, sinks: pl.DataFrame) -> pl.DataFrame:
+    """The sinks that are keys of a side of the question's ratio; all of them where it has none."""
+    ratio = question.grouping.ratio
+    if ratio is None:
+        return sinks
+    names = question.grouping.names
+    sides = [names.index(name) for name in (*ratio.numerator, *ratio.denominator)]
+    counted: set[tuple[str, int, int]] = set()
+    for suite, task in sinks.select("suite", "task_id").unique().iter_rows():
+        for i in _tasks(question)[suite, task]:
+            weights = resolve_episode(question.grouping, question.selected[i]).weights
+            keys = np.flatnonzero((weights[:, :, sides] > 0).any(axis=(0, 2)))
+            counted.update((suite, task, int(key)) for key in keys)
+    of_sides = [row in counted for row in sinks.select("suite", "task_id", "key").iter_rows()]
+    return sinks.filter(pl.Series(of_sides, dtype=pl.Boolean))
 
 
 def merged_sinks(sinks: pl.DataFrame) -> pl.DataFrame:

@@ -10,7 +10,8 @@ import polars as pl
 
 from vla_attention.analyze.measures.baselines import baseline_notes, contribution_notes
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.sinks import SinkRule
+from vla_attention.analyze.measures.sink_kinds import may_be_empty
+from vla_attention.analyze.measures.sinks import SinkRule, merged_sinks, sinks_of_sides
 from vla_attention.analyze.measures.task_families import family_notes, unknown_families
 from vla_attention.analyze.ratios.analysis import Analysis, site_without_a_side
 from vla_attention.analyze.ratios.summary_text import FEW_EPISODES
@@ -54,7 +55,7 @@ def caveats(analysis: Analysis, masses: Mapping[str, float], sinks: pl.DataFrame
     Args:
         analysis: the tables.
         masses: of `role_masses`.
-        sinks: of `merged_sinks`; None when nobody looked for sinks.
+        sinks: `SinkSearch.sinks`; None when nobody looked for sinks.
     """
     question = analysis.question
     found = [
@@ -67,7 +68,7 @@ def caveats(analysis: Analysis, masses: Mapping[str, float], sinks: pl.DataFrame
         *_padding(masses),
         *_cameras(masses),
         *_beginning(masses),
-        *_sinks(sinks),
+        *_sinks(question, sinks),
         *_queries(question),
         *_parts_of_the_model(question),
         *_compute_type(question),
@@ -210,23 +211,44 @@ def _beginning(masses: Mapping[str, float]) -> list[Caveat]:
     return [Caveat("Beginning of sequence", sentence)]
 
 
-def _sinks(sinks: pl.DataFrame | None) -> list[Caveat]:
+def _sinks(question: Question, sinks: pl.DataFrame | None) -> list[Caveat]:
     if sinks is None:
         sentence = (
             "This report did not look for keys that take far more than their share; vla-analyze heads lists them."
         )
         return [Caveat("Sinks", sentence)]
-    sinks = sinks.filter("widespread")
+    sinks = merged_sinks(sinks_of_sides(question, sinks.filter("widespread")))
     if sinks.is_empty():
         return []
     share = format_percent(float(sinks["mean_mass"].sum()), 0)
     sentence = (
         f"{plural(sinks.height, 'key')} {'take' if sinks.height > 1 else 'takes'} far more than the share of a key in "
         f"{SinkRule().heads:.0%} or more of the layers' heads ({listing(sinks['description'].to_list(), 3)}), "
-        f"together {share} of the attention to valid keys in the tasks that have them. They may carry no information, "
-        "and they change the ratio: compare with --without-sinks."
+        f"together {share} of the attention to valid keys in the tasks that have them. "
+        f"{_what_sinks_hold(sinks)} They change the {'fractions' if question.grouping.ratio is None else 'ratio'}: "
+        "compare with --without-sinks."
     )
     return [Caveat("Sinks", sentence, True)]
+
+
+def _what_sinks_hold(sinks: pl.DataFrame) -> str:
+    """Sentences on merged sinks: which may be empty, which are read, and of which nothing recorded tells."""
+    kinds: dict[str, list[str]] = {"empty": [], "read": [], "unknown": []}
+    for role, description, values in sinks.select("role", "description", "value_ratio").iter_rows():
+        kind = "empty" if may_be_empty(role, values) else "unknown" if values is None else "read"
+        kinds[kind].append(description)
+    said = {
+        "empty": "may carry no information",
+        "read": "do carry information, as much for their mass as other keys",
+        "unknown": "have words, pixels or state as content, which these heads may look for",
+    }
+    parts = [
+        f"{'they' if len(names) == sinks.height else f'some ({listing(names, 3)})'} {said[kind]}"
+        for kind, names in kinds.items()
+        if names
+    ]
+    text = "; ".join(parts)
+    return f"{text[0].upper()}{text[1:]}."
 
 
 def _queries(question: Question) -> list[Caveat]:

@@ -11,7 +11,7 @@ import jinja2
 
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.role_masses import role_masses
-from vla_attention.analyze.measures.sinks import SinkSearch, merged_sinks, search_sinks
+from vla_attention.analyze.measures.sinks import SinkSearch, search_sinks
 from vla_attention.analyze.ratios.analysis import Analysis, analyse
 from vla_attention.analyze.report.caveats import Caveat, caveat_section, caveats
 from vla_attention.analyze.report.deviation_section import deviation_section
@@ -60,7 +60,7 @@ def report_html(analysis: Analysis, settings: ReportSettings) -> str:
     """One self-contained HTML page on an analysis. The same analysis gives the same page, to the byte."""
     question = analysis.question
     search = search_sinks(question) if settings.rows else None
-    notes = caveats(analysis, role_masses(question), None if search is None else merged_sinks(search.sinks))
+    notes = caveats(analysis, role_masses(question), None if search is None else search.sinks)
     found = []
     with tempfile.TemporaryDirectory() as folder:
         makers = _section_makers(analysis, notes, search, Path(folder), settings)

@@ -66,8 +66,9 @@ def sink_section(search: SinkSearch) -> Section:
     """Keys that take far more than their share in a head, by the default rule."""
     sinks, beyond = merged_sinks(search.sinks), cannot_fire(search.num_valid, SinkRule())
     explanation = Paragraph(
-        f"A sink is a key that takes {SinkRule()}. Trained transformers put attention that nothing needs on "
-        "a few such keys, and their values may be near zero; a mass includes them like any other key. "
+        f"A sink is a key that takes {SinkRule()}; keys of the policy's own actions are not counted. Trained "
+        "transformers put attention that nothing needs on a few keys without content, often the first one, whose "
+        "values may be near zero; a key of a word or a patch may be what a head looks for. A mass includes both. "
         f"{beyond}".rstrip()
     )
     if sinks.is_empty():

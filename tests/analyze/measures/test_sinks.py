@@ -20,9 +20,17 @@ from vla_attention.analyze.heads.head_study import study_heads
 from vla_attention.analyze.heads.row_metrics import RowOptions, row_metrics
 from vla_attention.analyze.heads.text import sinks_text
 from vla_attention.analyze.measures.selected import resolve_all
-from vla_attention.analyze.measures.sink_kinds import kind_name
-from vla_attention.analyze.measures.sinks import SinkRule, describe_sinks, key_sums, search_sinks, without_sinks
+from vla_attention.analyze.measures.sink_kinds import kind_name, may_be_empty
+from vla_attention.analyze.measures.sinks import (
+    SinkRule,
+    describe_sinks,
+    key_sums,
+    search_sinks,
+    sinks_of_sides,
+    without_sinks,
+)
 from vla_attention.analyze.measures.steps import measure_episodes, step_tables
+from vla_attention.example_stores import CUBES
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
@@ -75,8 +83,9 @@ def test_sinks_are_the_keys_that_a_loop_over_raw_rows_finds(data):
         above, held = shares_of(raw, rule.factor)
         of_task = found.filter(task_id=raw.order[0])
         uniform = (1 / raw.valid.sum(axis=1)).mean()
-        by_mass = held > max(rule.mass, 2 * uniform)
-        sinks = by_mass | (above >= rule.share - 1e-9)
+        others = ~(tokens.static_roles == int(Role.ACTION)).any(axis=0)  # the policy's own actions are no sinks
+        by_mass = (held > max(rule.mass, 2 * uniform)) & others
+        sinks = by_mass | ((above >= rule.share - 1e-9) & others)
         assert sorted(of_task["key"]) == np.flatnonzero(sinks.any(axis=(0, 1))).tolist()
         assert of_task["mean_mass"].is_sorted(descending=True)
         of_heads = search.heads.filter(task_id=raw.order[0])
@@ -98,6 +107,51 @@ def test_sinks_are_the_keys_that_a_loop_over_raw_rows_finds(data):
                 assert (row["patch_row"], row["patch_column"]) == divmod(key - span.start, span.grid.columns)
             else:
                 assert row["patch_row"] is None
+
+
+def test_keys_of_the_policys_own_actions_are_no_sinks():
+    """In the example store the action queries read each other: six of their keys take five times their share."""
+    question = question_about(CUBES)
+    search = search_sinks(question)
+    actions = search.keys.filter(role="action")
+    assert (actions["times_uniform"] > 4).any()
+    assert actions.select("sink_heads", "heads_by_mass").sum().row(0) == (0, 0)
+    assert not actions["widespread"].any()
+    assert set(search.sinks["role"]) == {"instruction", "image", "template", "state"}
+    assert not set(search.heads["key"]) & set(actions["key"])
+    assert "keys of the policy's own actions are not counted" in " ".join(sinks_text(search, SinkRule()).split())
+    # So they stay where everything is computed without sinks.
+    without = without_sinks(question, search.sinks, SinkRule())
+    assert not {key for item in without.selected for key in item.without} & set(actions["key"])
+
+
+def test_sinks_of_a_side_are_keys_that_the_ratio_counts():
+    question = question_about(CUBES)
+    sinks = search_sinks(question).sinks
+    assert sinks_of_sides(question, sinks).equals(sinks.filter(pl.col("role") != "state"))
+    assert sinks_of_sides(question_about(CUBES, groups=("state=role:state",)), sinks).equals(sinks)
+    words = question_about(CUBES, groups=("noun=word:cube", "state=role:state"), ratio="noun/state")
+    assert set(sinks_of_sides(words, sinks)["role"]) == {"state"}
+    verb = question_about(CUBES, groups=("verb=word:touch", "seen=role:image"), ratio="verb/seen")
+    of_verb = pl.col("description").str.contains("touch") | (pl.col("role") == "image")
+    assert sinks_of_sides(verb, sinks).equals(sinks.filter(of_verb))
+
+
+@pytest.mark.parametrize(
+    ("role", "values", "empty"),
+    [
+        ("bos", None, True),
+        ("template", None, True),
+        ("instruction", None, False),
+        ("image", None, False),
+        ("state", None, False),
+        ("bos", 1.2, False),
+        ("bos", 0.1, True),
+        ("instruction", 0.1, True),
+    ],
+)
+def test_only_keys_without_content_or_with_small_values_may_be_empty(role, values, empty):
+    assert may_be_empty(role, values) == empty
 
 
 def test_a_block_that_is_named_twice_does_not_count_twice(tmp_path):

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import jinja2
 import numpy as np
+import polars as pl
 import pytest
 
 import vla_attention.testing.stores as kit
@@ -17,6 +18,7 @@ from tests.kit.questions import question_about
 from tests.kit.reruns import write_base, write_series
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.measures.role_masses import role_masses
+from vla_attention.analyze.measures.sinks import search_sinks
 from vla_attention.analyze.ratios.analysis import Analysis, analyse
 from vla_attention.analyze.report.caveats import caveats
 from vla_attention.analyze.report.overlay_section import choose_episodes
@@ -25,6 +27,7 @@ from vla_attention.analyze.report.ratio_curve import ratio_curve
 from vla_attention.analyze.report.report_settings import ReportSettings
 from vla_attention.analyze.report.section_parts import Cell, Table, interval_cell, number_cell
 from vla_attention.analyze.show.numbers import format_number
+from vla_attention.example_stores import CUBES
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.store_format import CALLERS_MODULES
@@ -195,6 +198,32 @@ def test_untrained_weights_and_compute_types_are_caveats(analysis: Analysis) -> 
             (file, "vla-capture replay with another --instruction"),
         ):
             assert how in next(note.sentence for note in given if note.topic == "Attention and dependence")
+
+
+def sink_caveat(analysis: Analysis, sinks: pl.DataFrame) -> str:
+    return next((note.sentence for note in caveats(analysis, {}, sinks) if note.topic == "Sinks"), "")
+
+
+def test_sinks_with_content_are_not_called_empty_and_actions_are_not_named() -> None:
+    question = question_about(CUBES)
+    analysis, sinks = analyse(question), search_sinks(question).sinks
+    said = sink_caveat(analysis, sinks)
+    assert said.startswith("2 keys take far more than the share")
+    assert "touch" in said
+    assert "actions" not in said
+    assert "no information" not in said
+    assert "They have words, pixels or state as content, which these heads may look for." in said
+    assert said.endswith("They change the ratio: compare with --without-sinks.")
+    # With their values it can be told.
+    for values, expected in ((0.2, "They may carry no information."), (1.5, "They do carry information")):
+        assert expected in sink_caveat(analysis, sinks.with_columns(pl.lit(values).alias("value_ratio")))
+    verb = pl.col("description").str.contains("touch")
+    mixed = sinks.with_columns(pl.when(verb).then(pl.lit("bos")).otherwise("role").alias("role"))
+    said = sink_caveat(analysis, mixed)
+    assert re.search(r"Some \(key 130 [^;]*\) may carry no information; some \(key 108 [^;]*\) have words", said)
+    # Keys on no side of the ratio do not change it.
+    of_state = analyse(question_about(CUBES, groups=("noun=word:cube", "state=role:state"), ratio="noun/state"))
+    assert sink_caveat(of_state, sinks.filter(verb)) == ""
 
 
 def no_words(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
