@@ -17,7 +17,7 @@ import zarr
 
 import vla_attention as va
 from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answers
-from tests.kit.golden_stores import FOLDER, NAMES
+from tests.kit.golden_stores import FOLDER, NAMES, STORES
 from tests.kit.http_ranges import serve
 from vla_attention.analyze.measures.baselines import baseline_notes
 from vla_attention.analyze.measures.question import ask
@@ -45,18 +45,25 @@ QUERIES = {
     "rerun": ("?head=2&replan=1",),
 }
 
+#: Each store in both versions; `test_uniform_cases.py` has what only version 2 can say.
+CASES = [(f"version{version}/{name}", query) for version in STORES for name in NAMES for query in QUERIES[name]]
+
 
 @pytest.fixture(scope="module")
 def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], dict[str, Any]]:
-    asked = [(name, query) for name in NAMES for query in QUERIES[name]]
-    with serve(FOLDER) as served:
+    with serve(FOLDER.parent) as served:
         questions = [
-            PageQuestion(f"{served.url}/", f"{name}.zarr/", query=query, packed=name == "packed")
-            for name, query in asked
+            PageQuestion(
+                f"{served.url}/{name.partition('/')[0]}/",
+                f"{name.partition('/')[2]}.zarr/",
+                query=query,
+                packed=name.endswith("packed"),
+            )
+            for name, query in CASES
         ]
         found = page_answers(tmp_path_factory.mktemp("page"), questions)
-    assert [answer.get("failure") for answer in found] == [None] * len(asked)
-    return dict(zip(asked, found, strict=True))
+    assert [answer.get("failure") for answer in found] == [None] * len(CASES)
+    return dict(zip(CASES, found, strict=True))
 
 
 def settings_of(query: str, site: str) -> tuple[dict[str, Any], int]:
@@ -68,19 +75,18 @@ def settings_of(query: str, site: str) -> tuple[dict[str, Any], int]:
     )
 
 
-CASES = [(name, query) for name in NAMES for query in QUERIES[name]]
 each_case = pytest.mark.parametrize(("name", "query"), CASES)
 
 
 @each_case
 def test_what_is_to_know_of_the_baseline_is_pythons_sentence(answers, name, query):
-    assert answers[name, query]["note"] == "".join(baseline_notes(va.open(FOLDER / f"{name}.zarr").stores))
+    assert answers[name, query]["note"] == "".join(baseline_notes(va.open(FOLDER.parent / f"{name}.zarr").stores))
 
 
 @each_case
 def test_ratio_and_masses_of_every_replan(answers, name, query):
     answer = answers[name, query]
-    run = va.open(FOLDER / f"{name}.zarr")
+    run = va.open(FOLDER.parent / f"{name}.zarr")
     asked, _ = settings_of(query, answer["site"])
     which = (pl.col("task_id") == 0) & (pl.col("episode_index") == 0)
     mean = pl.col("layer") == "layers_avg"
@@ -106,7 +112,7 @@ def test_ratio_and_masses_of_every_replan(answers, name, query):
 @each_case
 def test_the_lift_of_every_head(answers, name, query):
     answer = answers[name, query]
-    run = va.open(FOLDER / f"{name}.zarr")
+    run = va.open(FOLDER.parent / f"{name}.zarr")
     asked, replan = settings_of(query, answer["site"])
     asked = {field: value for field, value in asked.items() if field in ("site", "denoise")}
     mine = (pl.col("task_id") == 0) & (pl.col("episode_index") == 0) & (pl.col("replan") == replan)
@@ -114,9 +120,13 @@ def test_the_lift_of_every_head(answers, name, query):
     cells = run.ratios("steps", grouping="default", per_head=True, **asked).filter(mine)
     cell = ["layer", "head"]
     valid = cells.group_by(cell, maintain_order=True).agg(pl.col("valid_mass").mean() / pl.col("num_valid").first())
-    of_groups = masses.group_by([*cell, "group"], maintain_order=True).agg(pl.col("mass", "keys").mean())
+    of_groups = masses.group_by([*cell, "group"], maintain_order=True).agg(
+        pl.col("mass", "keys").mean(), pl.col("lift").is_not_null().any().alias("seen")
+    )
     joined = of_groups.join(valid, on=cell, maintain_order="left")
-    expected = joined.select(pl.when(pl.col("keys") > 0).then(pl.col("mass") / pl.col("keys") / pl.col("valid_mass")))
+    expected = joined.select(
+        pl.when((pl.col("keys") > 0) & pl.col("seen")).then(pl.col("mass") / pl.col("keys") / pl.col("valid_mass"))
+    )
     shown = [float(value) for layer in answer["cells"] for head in layer for value in head.values()]
     np.testing.assert_allclose(shown, expected.to_series().fill_null(math.nan).to_numpy(), rtol=CLOSE, atol=1e-12)
 
@@ -126,7 +136,8 @@ def test_rows_patches_words_and_their_readers(answers, name, query):
     answer = answers[name, query]
     asked, replan = settings_of(query, answer["site"])
     question = ask(
-        va.open(FOLDER / f"{name}.zarr").stores, settings_from_keywords(grouping="default", per_head=True, **asked)
+        va.open(FOLDER.parent / f"{name}.zarr").stores,
+        settings_from_keywords(grouping="default", per_head=True, **asked),
     )
     item = question.selected[0]
     read = layer_rows(item.store.attributes, item.episode, question.selection, answer["site"])
@@ -159,7 +170,9 @@ def test_pictures_have_the_pixels_of_vla_analyze_overlay(answers, name, query):
         assert answer["site"] == "cross"
         return
     asked, replan = settings_of(query, answer["site"])
-    study = study_overlay(va.open(FOLDER / f"{name}.zarr").stores, settings_from_keywords(grouping="default", **asked))
+    study = study_overlay(
+        va.open(FOLDER.parent / f"{name}.zarr").stores, settings_from_keywords(grouping="default", **asked)
+    )
     item = study.question.selected[0]
     overlay = episode_overlay(study.question, item, list(study.overlay.maps), ratios_of(study.question, item))
     assert [camera["camera"] for camera in answer["cameras"]] == list(overlay.maps)
