@@ -53,7 +53,7 @@ def readers_of(rows: Sequence[GroupRow]) -> list[str]:
 
 def _labels(rows: Sequence[GroupRow]) -> list[str]:
     alike = len(readers_of(rows)) < 2
-    labels = [row.name if alike else f"{row.name}, {row.condition.readers}" for row in rows]
+    labels = [row.name if alike else f"{row.name} (for {row.condition.readers})" for row in rows]
     return [
         label if labels.count(label) == 1 else f"{label} ({row.condition.name})"
         for label, row in zip(labels, rows, strict=True)

@@ -5,6 +5,7 @@ Only plots are left out, which the tests of each command draw.
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -12,18 +13,24 @@ from pathlib import Path
 import pytest
 
 from tests.kit.lerobot_data_sets import H264, made_up_episodes, write_data_set
+from vla_attention.__main__ import main as every_command
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 
 DOCS = Path(__file__).parents[2] / "docs"
-PROGRAMS = {"vla-capture": capture, "vla-analyze": analyze}
+NOTEBOOKS = sorted((DOCS.parent / "examples").glob("*.ipynb"))
+PROGRAMS = {"vla-capture": capture, "vla-analyze": analyze, "vla-attention": every_command}
 #: Questions of `vla-analyze` that draw plots beside their text; a store in their place is the first one.
 PLOTTED = ("ratios", "heads", "words", "objects", "time", "deviation", "effects", "compare", "groups")
 
 
 def walk(page: str) -> int:
     """Run the blocks of a tutorial in their order, in the working directory; returns the number of commands."""
-    text = (DOCS / page).read_text(encoding="utf-8")
+    return run_blocks((DOCS / page).read_text(encoding="utf-8"), page)
+
+
+def run_blocks(text: str, page: str) -> int:
+    """Run the blocks of a text in their order, in the working directory; returns the number of commands."""
     commands = 0
     for language, block in re.findall(r"^```(bash|python|toml)\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
         if language == "toml":
@@ -32,7 +39,7 @@ def walk(page: str) -> int:
             exec(compile(block, page, "exec"), {})
         else:
             for line in block.replace("\\\n", " ").splitlines():
-                program, *arguments = shlex.split(line)
+                program, *arguments = shlex.split(line, comments=True)
                 if (
                     program == "vla-analyze"
                     and arguments[0].endswith((".zarr", *PLOTTED))
@@ -65,3 +72,13 @@ def test_your_robots_data(tmp_path, monkeypatch, capsys):
     write_data_set(tmp_path / "data" / "so101_pick", "v3.0", episodes, video=H264)
     assert walk("your-robot.md") == 9
     assert "standard deviations of the data set's actions" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+def test_commands_in_the_text_of_notebooks(tmp_path, monkeypatch, capsys, notebook):
+    """`make notebooks` runs the cells of code; these commands stand in cells of text."""
+    monkeypatch.chdir(tmp_path)
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    text = "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
+    assert run_blocks(text, notebook.name) == (5 if notebook.stem == "interventions" else 0)
