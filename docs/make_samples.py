@@ -2,7 +2,7 @@
 
 Usage: python docs/make_samples.py [PAGE ...]
 
-A sample is a block that follows a comment `<!-- sample: COMMAND && COMMAND | LINES -->`. The commands are run, and the
+A sample is a block that follows a comment `<!-- sample: COMMAND && COMMAND :: LINES -->`. The commands are run, and the
 last one's output becomes the block: all of it, or LINES such as `1-6 20-25`, with `...` for what lies between. Another
 processor gives other last digits, because actions differ there, and with them episodes. `make pictures` runs this.
 """
@@ -20,7 +20,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 PROGRAMS = {"vla-analyze": "vla_attention.analyze", "vla-capture": "vla_attention.capture"}
 _SAMPLE = re.compile(
-    r"^<!-- sample: (?P<commands>[^|\n]+?)(?: \| (?P<lines>[\d -]+))? -->\n\n?```(?P<language>\w*)\n(?P<text>.*?)^```",
+    r"^<!-- sample: (?P<commands>[^\n]+?)(?: :: (?P<lines>[\d -]+))? -->\n\n?```(?P<language>\w*)\n(?P<text>.*?)^```",
     re.M | re.S,
 )
 
