@@ -3,6 +3,7 @@
 #   make capture     run a policy in simulation and record its attention (installs torch and the simulators)
 #   make analyze     masses, ratios, tables and pictures from a store (installs the laptop's small set only)
 #   make test        formatting, types, all tests, and the package as others install it
+#   make test-thorough   more cases of attacks and damages, and ten times as many random examples (an hour or more)
 #   make test-policies   policies of transformers 5 and LeRobot, in environments of their own (.venv-transformers, .venv-lerobot)
 #   make test-remote stores in S3, on moto's server on this machine, in an environment of its own (.venv-remote)
 #   make viewer      the page of `vla-analyze view` from its sources in analyze/view/web (needs node and npm)
@@ -63,9 +64,10 @@ check: .venv/capture-installed
 unit: .venv/capture-installed
 	$(PYTEST) $(ARGS)
 
-# Ten times as many random examples; for changes of formulas, file formats and readers.
+# Every case of the tests that try many of a kind, and ten times as many random examples; for changes of formulas, file
+# formats and readers.
 test-thorough: .venv/capture-installed
-	$(PYTEST) --hypothesis-profile thorough -m "not simulator" $(ARGS)
+	$(PYTEST) --thorough --hypothesis-profile thorough -m "thorough or not simulator" $(ARGS)
 
 # Source distribution, wheel, and their use from environments outside the checkout.
 package: .venv/capture-installed

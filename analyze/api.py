@@ -7,19 +7,25 @@ The examples run as tests, with `store` and `other` being paths of small stores,
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Unpack, get_args
+from typing import TYPE_CHECKING, Literal, Unpack, get_args
 
 import polars as pl
 
-from vla_attention.analyze.measures.frames import Tables
+from vla_attention.analyze.measures.frames import TableInParts, Tables
 from vla_attention.analyze.measures.question import KnownEpisodes, Question, ask
-from vla_attention.analyze.measures.question_settings import AnalysisSettings, SettingKeywords, settings_from_keywords
+from vla_attention.analyze.measures.question_settings import (
+    AnalysisSettings,
+    SettingKeywords,
+    check_name,
+    given_only,
+    settings_from_keywords,
+)
 from vla_attention.analyze.ratios.analysis import Analysis, analyse
 from vla_attention.analyze.stores.contents import describe_store, episodes_table, header_lines, one_line
 from vla_attention.analyze.stores.selection import check_combinable
-from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.store_format import RootAttributes
 from vla_attention.schemas.stores.store_url import store_place
@@ -123,7 +129,7 @@ class OpenStores:
         return self._level(level, settings).groups
 
     def _level(self, level: LevelName, settings: SettingKeywords) -> Tables:
-        _check_name("level", level, get_args(LevelName))
+        check_name("level", level, get_args(LevelName))
         tables: Tables = getattr(self.analysis(**settings), level)
         return tables
 
@@ -188,8 +194,7 @@ class OpenStores:
         """
         from vla_attention.analyze.groups.group_preview import preview_groups
 
-        _check_name("table", table, ("groups", "words", "overlaps"))
-        return _frame(preview_groups(self.ask(**settings)), table)
+        return _chosen(table, ("groups", "words", "overlaps"), lambda: preview_groups(self.ask(**settings)))
 
     def heads(
         self,
@@ -206,7 +211,7 @@ class OpenStores:
         from vla_attention.analyze.heads.head_study import study_heads
 
         tables = study_heads(self.ask(**settings)).tables()
-        _check_name("table", table, tables)
+        check_name("table", table, tables)
         return tables[table]
 
     def row_metrics(
@@ -222,7 +227,7 @@ class OpenStores:
         """
         from vla_attention.analyze.heads.row_metrics import row_metrics
 
-        _check_name("table", table, ("rows", "groups"))
+        check_name("table", table, ("rows", "groups"))
         level = row_metrics(self.ask(**settings))
         return level.cells if table == "rows" else level.groups
 
@@ -236,8 +241,7 @@ class OpenStores:
         """
         from vla_attention.analyze.measures.sinks import search_sinks
 
-        _check_name("table", table, ("sinks", "heads"))
-        return _frame(search_sinks(self.ask(**settings)), table)
+        return _chosen(table, ("sinks", "heads"), lambda: search_sinks(self.ask(**settings)))
 
     def words(
         self, table: Literal["summary", "episodes"] = "summary", **settings: Unpack[SettingKeywords]
@@ -250,8 +254,8 @@ class OpenStores:
         """
         from vla_attention.analyze.words.word_study import study_words
 
-        _check_name("table", table, ("summary", "episodes"))
-        return _frame(study_words(self.stores, settings_from_keywords(**settings)), table)
+        asked = settings_from_keywords(**settings)
+        return _chosen(table, ("summary", "episodes"), lambda: study_words(self.stores, asked))
 
     def objects(
         self,
@@ -272,7 +276,7 @@ class OpenStores:
         from vla_attention.analyze.objects.object_settings import ObjectSettings
         from vla_attention.analyze.objects.object_study import study_objects
 
-        _check_name("table", table, ("objects", "summary", "times", "pointing", "iou"))
+        check_name("table", table, ("objects", "summary", "times", "pointing", "iou"))
         options = ObjectSettings(spatial=table in ("pointing", "iou"))
         study = study_objects(self.stores, settings_from_keywords(**settings), options)
         return study.summary if table == "summary" else getattr(study.tables, table).whole
@@ -294,9 +298,9 @@ class OpenStores:
         """
         from vla_attention.analyze.time.time_courses import TimeSettings, time_courses
 
-        _check_name("table", table, ("course", "closing", "change", "outcomes", "autocorrelation"))
-        given = {name: value for name, value in (("num_bins", bins), ("window", window)) if value is not None}
-        return _frame(time_courses(self.ask(**settings), TimeSettings(**given)), table)
+        known = ("course", "closing", "change", "outcomes", "autocorrelation")
+        options = TimeSettings(**given_only(num_bins=bins, window=window))
+        return _chosen(table, known, lambda: time_courses(self.ask(**settings), options))
 
     def compare(
         self,
@@ -319,12 +323,10 @@ class OpenStores:
         from vla_attention.analyze.compare.comparison import compare_stores
         from vla_attention.analyze.compare.runs import RunArgument
 
-        _check_name("table", table, ("differences", "estimates", "pairs", "unpaired"))
+        known = ("differences", "estimates", "pairs", "unpaired")
         both = self, other if isinstance(other, OpenStores) else open_stores(other)
-        arguments = [
-            RunArgument(name, tuple(one.path for one in run.stores)) for name, run in zip(names, both, strict=True)
-        ]
-        return _frame(compare_stores(arguments, settings_from_keywords(**settings), allow_mismatch), table)
+        runs = [RunArgument(name, tuple(one.path for one in run.stores)) for name, run in zip(names, both, strict=True)]
+        return _chosen(table, known, lambda: compare_stores(runs, settings_from_keywords(**settings), allow_mismatch))
 
     def effects(
         self,
@@ -347,13 +349,12 @@ class OpenStores:
         """
         from vla_attention.analyze.effects.effect_study import study_effects
 
-        _check_name("table", table, ("summary", "episodes", "rollouts", "rollout_episodes"))
-        if len(self.stores) > 1:
-            raise BadArgument(
-                f"Effects are those of reruns of one store; {len(self.stores)} are open: open one of them."
-            )
+        known, stores = ("summary", "episodes", "rollouts", "rollout_episodes"), self.stores
+        if len(stores) > 1:
+            raise BadArgument(f"Effects are those of reruns of one store; {len(stores)} are open: open one of them.")
         paths = [Path(reruns)] if isinstance(reruns, (str, Path)) else [Path(path) for path in reruns]
-        return _frame(study_effects(self.stores[0].path, paths, settings_from_keywords(**settings), dimensions), table)
+        asked = settings_from_keywords(**settings)
+        return _chosen(table, known, lambda: study_effects(stores[0].path, paths, asked, dimensions))
 
     def deviation(
         self,
@@ -374,9 +375,9 @@ class OpenStores:
         """
         from vla_attention.analyze.deviation.deviation_study import study_deviation
 
-        _check_name("table", table, ("summary", "dimensions", "attention", "replans"))
-        study = study_deviation(self.ask(**settings))
-        return _frame(study, {"summary": "phases", "attention": "correlations"}.get(table, table))
+        check_name("table", table, ("summary", "dimensions", "attention", "replans"))
+        member = {"summary": "phases", "attention": "correlations"}.get(table, table)
+        return _chosen(member, (member,), lambda: study_deviation(self.ask(**settings)))
 
     def overlay(
         self,
@@ -400,7 +401,7 @@ class OpenStores:
         """
         from vla_attention.analyze.overlay.overlay_study import study_overlay
 
-        _check_name("measure", measure, ("lift", "share"))
+        check_name("measure", measure, ("lift", "share"))
         study = study_overlay(
             self.stores,
             settings_from_keywords(**settings),
@@ -434,11 +435,8 @@ class OpenStores:
         from vla_attention.analyze.report.page import report_file, write_report
         from vla_attention.analyze.report.report_settings import ReportSettings
 
-        shown: dict[str, Any] = {
-            name: count for name, count in (("episodes", episodes), ("replans", replans)) if count is not None
-        }
         file = report_file(Path(path))
-        write_report(self.ask(**settings), file, ReportSettings(**shown))
+        write_report(self.ask(**settings), file, ReportSettings(**given_only(episodes=episodes, replans=replans)))
         return file
 
     def __str__(self) -> str:
@@ -453,12 +451,8 @@ class OpenStores:
         return "\n  ".join([str(self), *lines])
 
 
-def _check_name(what: str, given: str, known: Collection[str]) -> None:
-    """Raise `BadArgument` unless the name exists."""
-    if given not in known:
-        raise BadArgument(f"Unknown {what} '{given}'.{did_you_mean(given, known)} Existing: {listing(known)}.")
-
-
-def _frame(tables: object, name: str) -> pl.DataFrame:
-    frame: pl.DataFrame = getattr(tables, name)
-    return frame
+def _chosen(table: str, known: Collection[str], study: Callable[[], object]) -> pl.DataFrame:
+    """A table of a study, which is made once the name is known to exist."""
+    check_name("table", table, known)
+    found: pl.DataFrame | TableInParts = getattr(study(), table)
+    return found if isinstance(found, pl.DataFrame) else found.whole

@@ -11,8 +11,10 @@ from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.store_url import store_place
 
 if TYPE_CHECKING:
+    from vla_attention.analyze.measures.question import Question
     from vla_attention.analyze.measures.question_settings import AnalysisSettings
     from vla_attention.analyze.measures.sinks import SinkRule
+    from vla_attention.analyze.show.answer import Answer
     from vla_attention.schemas.stores.reader import Store
 
 
@@ -37,6 +39,13 @@ def stores_of(arguments: argparse.Namespace) -> list[Store]:
     from vla_attention.schemas.stores.reader import open_store
 
     return [open_store(path) for path in arguments.stores]
+
+
+def question_of(arguments: argparse.Namespace) -> Question:
+    """The question that the arguments ask of their stores."""
+    from vla_attention.analyze.measures.question import ask
+
+    return ask(stores_of(arguments), settings_of(arguments))
 
 
 def add_grouping(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
@@ -112,6 +121,14 @@ def add_intervals(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_question(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
+    """--grouping and the like, the selection, and --intervals; returns the group of the selection."""
+    add_grouping(parser)
+    selection = add_selection(parser)
+    add_intervals(parser)
+    return selection
+
+
 def add_output(parser: argparse.ArgumentParser, default: str = "results/STORE/GROUPING") -> argparse._ArgumentGroup:
     """--output, --no-plots and --pdf."""
     output = parser.add_argument_group("output")
@@ -171,6 +188,11 @@ def settings_of(arguments: argparse.Namespace) -> AnalysisSettings:
             value = getattr(arguments, name)
             values[field.name] = tuple(value) if isinstance(value, list) else value
     return AnalysisSettings(**values)
+
+
+def show(answer: Answer, folder: Path, arguments: argparse.Namespace) -> int:
+    """Show an answer as the arguments of `add_output` say; returns the exit code."""
+    return answer.show(folder, pictures=not arguments.no_plots)
 
 
 def output_folder(arguments: argparse.Namespace, name: str) -> Path:

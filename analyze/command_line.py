@@ -13,7 +13,7 @@ from pathlib import Path
 from vla_attention.analyze.commands import COMMANDS, DEFAULT_COMMAND
 from vla_attention.schemas.command_line import run_command
 from vla_attention.schemas.errors import BadArgument, UnknownName, UserError, did_you_mean, listing
-from vla_attention.schemas.threads import use_threads
+from vla_attention.schemas.threads import add_threads, use_threads
 
 #: Episodes are measured in threads (`stores.parallel`); matrix products that start threads too make them slower.
 _ONE_THREAD_EACH = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -53,11 +53,9 @@ def build_parser(name: str) -> argparse.ArgumentParser:
     command = import_module(f"vla_attention.analyze.{name or DEFAULT_COMMAND}.command")
     parser: argparse.ArgumentParser
     parser = command.build_parser(prog=f"vla-analyze {name}") if name == DEFAULT_COMMAND else command.build_parser()
-    parser.add_argument(
-        "--threads",
-        type=int,
-        metavar="N",
-        help="threads that measure episodes, at most 4 (default: OMP_NUM_THREADS, else the cores of this process)",
+    add_threads(
+        parser,
+        "threads that measure episodes, at most 4 (default: OMP_NUM_THREADS, else the cores of this process)",
     )
     if name != "cache":
         parser.add_argument(

@@ -60,8 +60,7 @@ def make_policy(name: str, device: str = "cpu", dtype: str = "float32") -> Any:
     import torch
 
     from vla_attention.capture.policies.pi import embedded
-    from vla_attention.capture.policies.pi.model import PiModel
-    from vla_attention.capture.policies.pi.model_weights import model_from_state
+    from vla_attention.capture.policies.pi.model import PiModel, model_from_state
     from vla_attention.capture.policies.pi.policy import PiPolicy
     from vla_attention.capture.policies.pi.processing import OpenpiProcessing
 

@@ -16,19 +16,16 @@ from pathlib import Path
 
 from measurement import Table, measured, write_rows
 
-from vla_attention.capture.arguments import build_parser
-from vla_attention.capture.capture_run import plan_protocol, plan_recording
+from vla_attention.capture.budget.trial import run_trial
+from vla_attention.capture.commands.arguments import build_parser
 from vla_attention.capture.environments.base import EnvironmentSettings
-from vla_attention.capture.environments.suites import list_tasks
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.policies.policy import stored_picture_sizes
-from vla_attention.capture.run_settings import run_settings
-from vla_attention.capture.store.disk_estimate import estimate_disk
-from vla_attention.capture.store.measured_size import SampleOfReplans, mean_size
-from vla_attention.capture.trial import run_trial
+from vla_attention.capture.run.capture_run import plan_run
+from vla_attention.capture.run.run_settings import run_settings
+from vla_attention.capture.store.disk_estimate import SampleOfReplans, estimate_disk, mean_size
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.interventions import Interventions
-from vla_attention.schemas.stores.store_format import FORMAT_NAME, STORE_VERSION, RootAttributes
 
 BITS = (4, 7, 10, 12, 23)
 
@@ -58,12 +55,8 @@ def samples_of(case: Case, assets: Path | None) -> tuple[list[SampleOfReplans], 
     arguments = build_parser().parse_args([*case.words.split(), "--store", "none.zarr"])
     settings = run_settings(arguments)
     policy = arguments.family.build(arguments, "cpu")
-    protocol = plan_protocol(settings, policy.default_protocol, policy)
-    recording = plan_recording(settings.recording, policy)[0]
-    attributes = RootAttributes(
-        FORMAT_NAME, STORE_VERSION, policy.identity(), protocol, recording, policy.sites, {"made": "by a benchmark"}
-    )
-    tasks, environment = list_tasks(settings.suite), EnvironmentSettings(policy.default_protocol, assets)
+    plan = plan_run(settings, policy, {"made": "by a benchmark"})
+    attributes, tasks, environment = plan.attributes, plan.tasks, EnvironmentSettings(plan.evaluation, assets)
 
     def sample(task: int, **options: int) -> SampleOfReplans:
         changes = RunChanges(Interventions(), {})
@@ -71,7 +64,7 @@ def samples_of(case: Case, assets: Path | None) -> tuple[list[SampleOfReplans], 
 
     tried = [sample(task) for task in case.tried]
     written = [sample(task, most_replans=case.replans) for task in case.written]
-    return tried, written, stored_picture_sizes(policy, protocol.image_size)
+    return tried, written, stored_picture_sizes(policy, attributes.protocol.image_size)
 
 
 def main() -> int:

@@ -1,9 +1,10 @@
-"""The part `kill` of `reliability.py`: captures that end in every way, and what is in their stores then.
+"""The part `kill` of `reliability.py`: runs that end in every way, and what is in their stores then.
 
-Every case captures with the command line in a forked process. Where it says "simulator", that is the real one (the
-suite `cubes`); the other cases have a `StillScene`, because they are about files only. After each case the episodes
-that were committed before have to be the same to the byte, and the checks of `vla-analyze verify` have to accept the
-store. Later cases of a series go on with its store; one that is complete has to be the undisturbed one, to the byte.
+Every case runs the command line in a forked process: a capture, or a rerun or replay where its name says so. Where it
+says "simulator", that is the real one (the suite `cubes`); other captures have a `StillScene`, because they are about
+files only. After each case the episodes that were committed before have to be the same to the byte, and the checks of
+`vla-analyze verify` have to accept the store. Later cases of a series go on with its store; one that is complete has to
+be the undisturbed one, to the byte.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from contextlib import redirect_stdout
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from random import Random
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 from reliability_state import Results
@@ -32,21 +33,23 @@ EXIT_SIGTERM, EXIT_CTRL_C, EXIT_REFUSED = 75, 130, 2
 #: Small episodes, so that a store is complete after some kills.
 _TASKS, _EPISODES = (0, 1), 3
 _ARGUMENTS = "pi --checkpoint untrained-tiny --task-suite cubes --replan-steps 4 --max-steps 12"
+#: Where the policy calls come from: so many simulators (0: a still scene), a store, or a data set.
+Calls = int | Literal["rerun", "replay"]
 _NOBODY = 65534
 #: The longest pause after the first episode's beginning, of which nobody knows yet how long it takes.
 _PAUSE_S = 1.0
 
 
 @dataclass(frozen=True)
-class Capture:
-    """A capture of three episodes of each task into a store, for a process of its own.
+class Run:
+    """A run of three episodes of each task into a store, for a process of its own.
 
-    simulators: 0 for a still scene.
-    before: called first, with the path of the store.
+    source: of a rerun the store, of a replay the data set. before: called first, with the path of the store.
     """
 
     store: Path
-    simulators: int
+    calls: Calls
+    source: Path
     before: Callable[[Path], object] = field(default=lambda store: None)
     tasks: tuple[int, ...] = _TASKS
 
@@ -54,11 +57,17 @@ class Capture:
         """Run the command line."""
         from vla_attention.capture.__main__ import main
 
-        if not self.simulators:
+        if self.calls == 0:
             capture_without_simulator(pytest.MonkeyPatch())
         self.before(self.store)
-        given = [*_ARGUMENTS.split(), "--task-id", *map(str, self.tasks), "--num-episodes", str(_EPISODES)]
-        return main([*given, "--num-envs", str(self.simulators or 1), "--store", str(self.store), "--resume"])
+        if self.calls == "rerun":
+            words = ["rerun", str(self.source), "--noise-seed", "3", "--check", "0"]
+        elif self.calls == "replay":
+            words = ["replay", str(self.source), "--checkpoint", "untrained-tiny", "--every", "2"]
+        else:
+            words = [*_ARGUMENTS.split(), "--task-id", *map(str, self.tasks), "--num-episodes", str(_EPISODES)]
+            words += ["--num-envs", str(self.calls or 1)]
+        return main([*words, "--store", str(self.store), "--resume"])
 
 
 @dataclass
@@ -67,8 +76,9 @@ class Series:
 
     name: str
     folder: Path
-    simulators: int
+    calls: Calls
     reference: Path
+    source: Path
     tasks: tuple[int, ...] = _TASKS
 
     @property
@@ -88,7 +98,8 @@ class Series:
     def start(self, before: Callable[[Path], object] = lambda store: None) -> int:
         """Start a capture; returns its process."""
         (self.folder / "log").unlink(missing_ok=True)
-        return forks.start(Capture(self.store, self.simulators, before, self.tasks), log=self.folder / "log")
+        run = Run(self.store, self.calls, self.source, before, self.tasks)
+        return forks.start(run, log=self.folder / "log")
 
     def mid_episode(self, process: int, random: Random) -> bool:
         """Wait for a random moment of an episode, after none to two others were committed; False if all end before.
@@ -144,12 +155,13 @@ class Series:
 def run(folder: Path, results: Results, counts: dict[str, int]) -> None:
     """Try every series up to its count; cases that the results have are not repeated."""
     prepare()
-    import vla_attention.capture.environments.cubes.table  # noqa: F401
+    import vla_attention.capture.environments.cubes.table
+    import vla_attention.capture.replay.family_replay
+    import vla_attention.capture.rerun.command  # noqa: F401
 
-    for simulators in (0, 1):
-        _reference(folder, simulators)
-    for name, (simulators, cases) in SERIES.items():
-        series = Series(name, folder / name.replace(" ", "_"), simulators, _reference(folder, min(simulators, 1)))
+    for name, (calls, cases) in SERIES.items():
+        reference = _reference(folder, min(calls, 1) if isinstance(calls, int) else calls)
+        series = Series(name, folder / name.replace(" ", "_"), calls, reference, _source(folder, calls))
         missing = results.missing(name, range(counts.get(name, 0)))
         if missing:
             series.begin()
@@ -162,13 +174,30 @@ def run(folder: Path, results: Results, counts: dict[str, int]) -> None:
             shutil.rmtree(series.folder)
 
 
-def _reference(folder: Path, simulators: int, tasks: tuple[int, ...] = _TASKS) -> Path:
-    """The undisturbed store, which one capture fills."""
-    path = folder / f"undisturbed{simulators}-{len(tasks)}" / "run.zarr"
+def _source(folder: Path, calls: Calls) -> Path:
+    """What a rerun or a replay takes its policy calls from; of captures a path at which nothing is."""
+    if calls == "rerun":
+        return _reference(folder, 0)
+    data = folder / "data"
+    if calls == "replay" and not data.exists():
+        forks.answer_of(_write_data_set, data)
+    return data
+
+
+def _write_data_set(folder: Path) -> str:
+    from tests.kit.lerobot_data_sets import made_up_episodes, write_data_set  # in the fork: it imports polars
+
+    made = made_up_episodes((6,) * (len(_TASKS) * _EPISODES), ("image", "wrist_image"), state=8, action=7)
+    return str(write_data_set(folder, "v2.1", made))
+
+
+def _reference(folder: Path, calls: Calls, tasks: tuple[int, ...] = _TASKS) -> Path:
+    """The undisturbed store, which one run fills."""
+    path = folder / f"undisturbed{calls}-{len(tasks)}" / "run.zarr"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
         log = path.with_name("log")
-        if forks.wait(forks.start(Capture(path, simulators, tasks=tasks), log=log)):
+        if forks.wait(forks.start(Run(path, calls, _source(folder, calls), tasks=tasks), log=log)):
             raise AssertionError(log.read_text())
         if faults := forks.answer_of(faults_of, path):
             raise AssertionError(str(faults))
@@ -259,7 +288,8 @@ def all_but_one(series: Series) -> None:
 
 def _count_changes(series: Series) -> int:
     counted: list[Callable[[], int]] = []
-    count = Capture(series.store, 0, lambda path: counted.append(end_before(path.parent, -1)), series.tasks)
+    before: Callable[[Path], object] = lambda path: counted.append(end_before(path.parent, -1))  # noqa: E731
+    count = Run(series.store, 0, series.source, before, series.tasks)
     with (series.folder / "log").open("w") as log, redirect_stdout(log):
         count()
     return counted[0]()
@@ -293,7 +323,7 @@ def _full_disk(series: Series, missing: list[int]) -> Iterator[dict[str, Any]]:
         disk.mkdir()
         subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={most}", "none", str(disk)], check=True)
         try:
-            small = Series(series.name, disk, 0, series.reference)
+            small = Series(series.name, disk, 0, series.reference, series.source)
             code = forks.wait(small.start())
             refused = small.case(case, {}, code, {EXIT_REFUSED})
             before = small.committed()
@@ -329,14 +359,18 @@ def _become_nobody(store: Path) -> None:
     assert not os.access(store, os.W_OK)
 
 
-#: Name of a series -> number of simulators (0: a still scene), its cases.
-SERIES: dict[str, tuple[int, Callable[[Series, list[int]], Iterator[dict[str, Any]]]]] = {
+#: Name of a series -> where its policy calls come from, its cases.
+SERIES: dict[str, tuple[Calls, Callable[[Series, list[int]], Iterator[dict[str, Any]]]]] = {
     "SIGKILL, one simulator": (1, _signalled(signal.SIGKILL, {-signal.SIGKILL})),
     "SIGKILL, two simulators": (2, _signalled(signal.SIGKILL, {-signal.SIGKILL})),
     "SIGTERM, one simulator": (1, _signalled(signal.SIGTERM, {EXIT_SIGTERM})),
     "SIGTERM, two simulators": (2, _signalled(signal.SIGTERM, {EXIT_SIGTERM})),
     "Ctrl-C, one simulator": (1, _signalled(signal.SIGINT, {EXIT_CTRL_C})),
     "Ctrl-C, two simulators": (2, _signalled(signal.SIGINT, {EXIT_CTRL_C})),
+    "SIGKILL, rerun": ("rerun", _signalled(signal.SIGKILL, {-signal.SIGKILL})),
+    "SIGKILL, replay": ("replay", _signalled(signal.SIGKILL, {-signal.SIGKILL})),
+    "SIGTERM, rerun": ("rerun", _signalled(signal.SIGTERM, {EXIT_SIGTERM})),
+    "SIGTERM, replay": ("replay", _signalled(signal.SIGTERM, {EXIT_SIGTERM})),
     "a simulator killed": (2, _simulator_killed),
     "killed before each change of a file": (0, _every_boundary),
     "killed within a file": (0, _grown(kill=True)),
@@ -352,6 +386,10 @@ COUNTS = {
     "SIGTERM, two simulators": 5,
     "Ctrl-C, one simulator": 10,
     "Ctrl-C, two simulators": 5,
+    "SIGKILL, rerun": 60,
+    "SIGKILL, replay": 60,
+    "SIGTERM, rerun": 5,
+    "SIGTERM, replay": 5,
     "a simulator killed": 10,
     "killed before each change of a file": 10_000,
     "killed within a file": 40,

@@ -150,7 +150,7 @@ def parts_rows(store: Path, rounds: int) -> Table:
     from vla_attention.analyze.measures.question_settings import AnalysisSettings
     from vla_attention.analyze.ratios.analysis import analyse
     from vla_attention.analyze.stores.parallel import episodes_with
-    from vla_attention.analyze.words.word_reading import words_table
+    from vla_attention.analyze.words.word_study import words_table
     from vla_attention.schemas.stores.reader import open_store
 
     words = AnalysisSettings(groups=("soup=word:soup", "v=role:image"), ratio="v/soup")

@@ -27,7 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if_stopped = _IF_LOOKING if given and given[0] in _RECORD_NOTHING else IF_STOPPED
 
     def run() -> int:
-        from vla_attention.capture.command_line import run_capture_command
+        from vla_attention.capture.commands.command_line import run_capture_command
 
         return run_capture_command("vla-capture", lambda termination: _run(given, termination), lambda: 0, if_stopped)
 
@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(given: Sequence[str], termination: Termination) -> int:
-    from vla_attention.capture.arguments import build_parser
+    from vla_attention.capture.commands.arguments import build_parser
 
     arguments = build_parser(given).parse_args(given)
     exit_code: int = arguments.command(arguments, termination)

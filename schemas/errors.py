@@ -1,4 +1,4 @@
-"""Errors that a user can cause, and the sentence each of them ends with.
+"""Errors that a user can cause, and the sentence each of them ends with: names, numbers, control characters in it.
 
 Every class is also the builtin that fits, so library callers may catch either. The command lines print the message
 of a `UserError` as one sentence and exit with code 2; anything else is a defect and keeps its traceback.
@@ -11,7 +11,6 @@ from collections.abc import Iterable
 from itertools import islice
 
 from vla_attention.schemas.limits import COMPARED_NAMES, NAME_CHARACTERS, SENTENCE_CHARACTERS, SHOWN_CHARACTERS
-from vla_attention.schemas.visible_text import visible
 
 
 class UserError(Exception):
@@ -64,6 +63,17 @@ def listing(names: Iterable[object], limit: int = 12) -> str:
     return shown if len(items) <= limit else f"{shown} and {len(items) - limit} more"
 
 
+def runs_of(numbers: Iterable[int]) -> list[list[int]]:
+    """Return ascending numbers in runs of those that follow each other, for a message."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    return runs
+
+
 def did_you_mean(given: str, existing: Iterable[str]) -> str:
     """Return " Did you mean 'x'?" for the nearest existing name, or an empty string when nothing is near."""
     if len(given) > NAME_CHARACTERS:
@@ -81,3 +91,27 @@ def unknown_name(kind: str, given: str, existing: Iterable[str]) -> UnknownName:
     """Build the error for a name that does not exist: what was given, the nearest name, and what exists."""
     names = list(existing)
     return UnknownName(f"Unknown {kind} '{shortened(given)}'.{did_you_mean(given, names)} Existing: {listing(names)}.")
+
+
+def plural(count: int, noun: str) -> str:
+    """`1 task`, `2 tasks`, `2 quantities`."""
+    if count == 1:
+        return f"1 {noun}"
+    return f"{count} {noun[:-1]}ies" if noun.endswith("ty") else f"{count} {noun}s"
+
+
+#: torch, MuJoCo, robosuite and what belongs to them.
+INSTALL_CAPTURE = "pip install 'vla-attention[capture]', or 'make setup' in a checkout"
+#: LIBERO without what it declares (see requirements-libero.txt, which has the same versions).
+INSTALL_LIBERO = "pip install --no-deps hf-libero==0.1.4 bddl==1.0.1, or 'make setup' in a checkout"
+
+
+def visible(text: str, keep: str = "") -> str:
+    r"""Text with its unprintable characters as escapes, for instance \x1b, \n or \u202e.
+
+    Unprintable are control and format characters, line and paragraph separators, spaces other than the plain one, and
+    code points without a character (`str.isprintable`). Characters in `keep` stay as they are.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in keep else c.encode("unicode_escape").decode("ascii") for c in text)

@@ -7,7 +7,7 @@ has the formulas; the arithmetic is in `capture/interventions/`. Groups of keys 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -168,12 +168,13 @@ class PromptChange:
 
     def describe(self) -> str:
         """The intervention in words."""
+        pairs = [f"{visible(word)} by {visible(synonym)}" for word, synonym in self.synonyms.items()]
         return {
             "empty": "the instruction empty",
             "shuffled": f"the instruction's words shuffled (seed {self.seed})",
             "task": f"the instruction of task {self.task_id}",
             "text": f"the instruction '{visible(self.text)}'",
-            "synonyms": f"{len(self.synonyms)} words replaced by synonyms ({listing(_pairs(self.synonyms), 6)})",
+            "synonyms": f"{len(self.synonyms)} words replaced by synonyms ({listing(pairs, 6)})",
         }[self.kind]
 
 
@@ -308,10 +309,6 @@ def _check_places(selector: str, *places: Sequence[int] | None) -> None:
 def _check_seed(what: str, seed: int | None) -> None:
     if seed is not None and seed < 0:
         raise BadArgument(f"The seed of {what} is {seed}; expected 0 or more.")
-
-
-def _pairs(synonyms: Mapping[str, str]) -> list[str]:
-    return [f"{visible(word)} by {visible(synonym)}" for word, synonym in synonyms.items()]
 
 
 def _describe_readers(queries: Queries) -> str:

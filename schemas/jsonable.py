@@ -213,9 +213,9 @@ def _dataclass_decoder(declared: type) -> Callable[[Any], Any]:
         if plain and tuple(given) == names:
             items = tuple(given.values())
             if tuple(map(type, items)) == kinds:
-                found = known.get(items)
-                if found is not None:
-                    return found
+                shared = known.get(items)
+                if shared is not None:
+                    return shared
                 if all(type(item) is not int or -WHOLE_NUMBER <= item < WHOLE_NUMBER for item in items):
                     return remember(items)
         if not decoders:

@@ -316,9 +316,9 @@ def prompt_at(sites: Sequence[SiteLayout], layout: SiteLayout, prompt: Prompt) -
     pieces = []
     for piece in prompt.pieces:
         span = next((span for span in texts if span.start <= piece.key < span.stop), None)
-        own = None if span is None else spans.get(span.name)
-        if span is not None and own is not None and piece.key - span.start < own.num_keys:
-            pieces.append(replace(piece, key=piece.key - span.start + own.start))
+        span_here = None if span is None else spans.get(span.name)
+        if span is not None and span_here is not None and piece.key - span.start < span_here.num_keys:
+            pieces.append(replace(piece, key=piece.key - span.start + span_here.start))
     return replace(prompt, pieces=tuple(pieces))
 
 

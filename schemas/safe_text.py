@@ -18,9 +18,9 @@ from typing import IO, Any
 from urllib.parse import quote
 
 from vla_attention.schemas.errors import BadArgument, shortened
+from vla_attention.schemas.errors import visible as visible
 from vla_attention.schemas.limit_checks import check_at_most
 from vla_attention.schemas.limits import LINE_CHARACTERS, NAME_CHARACTERS, TEXT_CHARACTERS
-from vla_attention.schemas.visible_text import visible as visible
 
 #: Beside letters and digits, what stays as it is in `file_part`.
 _PLAIN = re.compile(r"[\w ._+=,@-]")

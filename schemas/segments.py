@@ -75,8 +75,8 @@ def weights_on_segments(weights: NDArray[np.float32], members: NDArray[np.bool_]
         if not keys.size:
             continue
         # A segment is a part of a span: looking at all keys for each of them would take ten times as long.
-        own = slice(keys[0], keys[-1] + 1)
-        inside, values = members[:, own, segment, None], weights[:, own]
+        keys_of_segment = slice(keys[0], keys[-1] + 1)
+        inside, values = members[:, keys_of_segment, segment, None], weights[:, keys_of_segment]
         highest = np.where(inside, values, -np.inf).max(axis=1)
         lowest = np.where(inside, values, np.inf).min(axis=1)
         present = inside.any(axis=1)

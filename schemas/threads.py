@@ -16,8 +16,13 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from vla_attention.schemas.control_groups import own_groups, text_of
 from vla_attention.schemas.errors import BadArgument
+
+if TYPE_CHECKING:
+    import argparse
 
 _OPENMP = "OMP_NUM_THREADS"
 _SLURM = ("SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE")
@@ -38,6 +43,11 @@ class Threads:
         """Return a line for the terminal."""
         how = "" if self.source == "--threads" else "; --threads N changes it"
         return f"Threads: {self.number} ({self.source}{how})."
+
+
+def add_threads(parser: argparse._ActionsContainer, threads: str) -> None:
+    """Add `--threads`, whose value `use_threads` takes. `threads`: whose they are, and how many without it."""
+    parser.add_argument("--threads", type=int, metavar="N", help=threads)
 
 
 def choose_threads(given: int | None, environment: Mapping[str, str], cores: int, quota: float | None) -> Threads:
@@ -127,7 +137,7 @@ def count_cores(processors: Iterable[int], root: Path = Path("/")) -> int:
         root: folder in place of /, for tests.
     """
     topology = "sys/devices/system/cpu/cpu{}/topology/thread_siblings_list"
-    return len({_text(root / topology.format(number)) or str(number) for number in processors})
+    return len({text_of(root / topology.format(number)) or str(number) for number in processors})
 
 
 def cpu_quota(root: Path = Path("/")) -> float | None:
@@ -150,41 +160,28 @@ def cpu_quota(root: Path = Path("/")) -> float | None:
 
 def _cpu_groups(root: Path) -> list[tuple[Path, Path, int]]:
     """Return (where the tree is mounted, this process's group below it, version) of each tree that limits the CPU."""
-    own = {}
-    for line in _text(root / "proc/self/cgroup").splitlines():
-        number, controllers, path = line.split(":", 2)
-        if number == "0" and not controllers:
-            own[2] = path
-        elif "cpu" in controllers.split(","):
-            own[1] = path
-    found = []
-    for line in _text(root / "proc/self/mountinfo").splitlines():
+    paths = own_groups(root, "cpu")
+    groups = []
+    for line in text_of(root / "proc/self/mountinfo").splitlines():
         before, _, after = line.partition(" - ")
         tree, mount = before.split()[3:5]
         kind, _, options = after.split(maxsplit=2)
         version = {"cgroup2": 2, "cgroup": 1}.get(kind)
-        if version not in own or (version == 1 and "cpu" not in options.split(",")):
+        if version not in paths or (version == 1 and "cpu" not in options.split(",")):
             continue
         # A container without a namespace of its own sees its group's path on the host, and that group as the mount.
-        group = Path(own[version])
+        group = Path(paths[version])
         below = group.relative_to(tree) if group.is_relative_to(tree) else group.relative_to("/")
-        found.append((root / mount.lstrip("/"), below, version))
-    return found
+        groups.append((root / mount.lstrip("/"), below, version))
+    return groups
 
 
 def _quota_of(folder: Path, version: int) -> float | None:
     if version == 2:
-        words = _text(folder / "cpu.max").split()
+        words = text_of(folder / "cpu.max").split()
     else:
-        words = [_text(folder / f"cpu.cfs_{name}_us").strip() for name in ("quota", "period")]
+        words = [text_of(folder / f"cpu.cfs_{name}_us").strip() for name in ("quota", "period")]
     # `max` and -1 stand for no limit; a group that is not visible from here has no file.
     if len(words) != 2 or not all(word.isdecimal() for word in words) or int(words[1]) == 0:
         return None
     return int(words[0]) / int(words[1])
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError:
-        return ""

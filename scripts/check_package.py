@@ -46,7 +46,7 @@ import importlib.util, sys
 import vla_attention as va
 heavy = [name for name in ("torch", "zarr", "polars", "numpy", "matplotlib") if name in sys.modules]
 assert not heavy, f"import vla_attention loads {heavy}"
-bare = [name for name in ("analyze", "capture", "schemas", "tests") if importlib.util.find_spec(name)]
+bare = [name for name in ("analyze", "capture", "schemas", "tests", "examples") if importlib.util.find_spec(name)]
 assert not bare, f"these names can be imported beside vla_attention: {bare}"
 assert all(hasattr(va, name) for name in va.__all__), va.__all__
 print(va.__version__, va.__file__)

@@ -17,7 +17,7 @@ import yaml
 import vla_attention as va
 from scripts.site_hooks import OUTSIDE
 from vla_attention.analyze.commands import COMMANDS, DEFAULT_COMMAND
-from vla_attention.capture.arguments import build_parser
+from vla_attention.capture.commands.arguments import build_parser
 from vla_attention.capture.policies.families import policy_families
 
 ROOT = Path(__file__).resolve().parents[1]

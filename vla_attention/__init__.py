@@ -151,8 +151,7 @@ def _module_of_the_recorder(name: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name != "torch":
             raise
-        from vla_attention.schemas.errors import MissingDependency
-        from vla_attention.schemas.installing import INSTALL_CAPTURE
+        from vla_attention.schemas.errors import INSTALL_CAPTURE, MissingDependency
 
         raise MissingDependency(
             f"torch is not installed, and va.record and va.inspect need it: {INSTALL_CAPTURE}."

@@ -144,7 +144,7 @@ def _analyze_commands() -> Iterator[Command]:
 
 
 def _capture_commands() -> Iterator[Command]:
-    from vla_attention.capture.arguments import build_parser
+    from vla_attention.capture.commands.arguments import build_parser
 
     names = _subparsers(build_parser())
     yield Command("vla-capture", tuple(names), ("--help",), {})

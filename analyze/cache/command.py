@@ -30,9 +30,8 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the cache's contents, or remove them."""
-    from vla_attention.analyze.cache.housekeeping import clear, kept_segments
+    from vla_attention.analyze.cache.housekeeping import clear, describe_cache, kept_files
     from vla_attention.analyze.cache.places import FOLDER_VARIABLE, cache_place
-    from vla_attention.analyze.cache.text import describe_cache
     from vla_attention.analyze.show.numbers import format_bytes
     from vla_attention.schemas.errors import BadArgument
 
@@ -41,10 +40,10 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"The cache is off: {FOLDER_VARIABLE} says so. Unset it, or name a folder by it.")
         return 0
     if not arguments.clear:
-        print(describe_cache(place, kept_segments(place.folder)))
+        print(describe_cache(place, kept_files(place.folder)))
         return 0
     removed = clear(place.folder)
-    if left := kept_segments(place.folder):
+    if left := kept_files(place.folder):
         raise BadArgument(
             f"{len(left)} files in {place.folder} cannot be removed, for instance {left[0].path}: they belong to "
             "somebody else. Ask them, or name another folder by VLA_CACHE."

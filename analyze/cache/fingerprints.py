@@ -42,11 +42,11 @@ def file_state(episode: StoredEpisode) -> bytes | None:
     newest, stats = 0, []
     for name, path in paths.items():
         try:
-            found = os.stat(path)
+            status = os.stat(path)
         except OSError:
             return None
-        newest = max(newest, found.st_mtime_ns, found.st_ctime_ns)
-        stats.append(f"{name} {found.st_ino} {found.st_size} {found.st_mtime_ns} {found.st_ctime_ns}")
+        newest = max(newest, status.st_mtime_ns, status.st_ctime_ns)
+        stats.append(f"{name} {status.st_ino} {status.st_size} {status.st_mtime_ns} {status.st_ctime_ns}")
     if newest > (time.time() - SETTLED_SECONDS) * 1e9:
         return None
     return hashlib.sha256("\n".join(stats).encode()).digest()

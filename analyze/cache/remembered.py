@@ -1,6 +1,6 @@
 """Measuring episodes once: what the cache holds is taken from it, the rest is measured and put there.
 
-The key of a record is the question (what is measured, with all its arguments, and the arithmetic), the digest of the
+The key of a file is the question (what is measured, with all its arguments, and the arithmetic), the digest of the
 episode's seal, and the state of the episode's files (`fingerprints`). The cache changes no number and raises no error:
 where it cannot be read or written, everything is measured.
 """
@@ -9,32 +9,51 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
-
-from vla_attention.analyze.cache.arithmetic import arithmetic_version
-from vla_attention.analyze.cache.array_bytes import arrays_from_bytes, arrays_to_bytes
+import vla_attention
 from vla_attention.analyze.cache.fingerprints import file_state
 from vla_attention.analyze.cache.housekeeping import make_room
+from vla_attention.analyze.cache.kept_files import ENDING, Arrays, kept_bytes, read_arrays, write_file
 from vla_attention.analyze.cache.places import CachePlace, cache_place, check_cache_place
-from vla_attention.analyze.cache.segments import (
-    Record,
-    SegmentWriter,
-    find_records,
-    question_digest,
-    read_record,
-    touch,
-)
 from vla_attention.schemas.stores.reader import StoredEpisode
 
-Arrays = dict[str, NDArray[Any]]
-#: A long run fills several segments, so that room is made by parts of it.
-_SEGMENT_BYTES = 256_000_000
+#: The sources that numbers depend on: how bytes become rows, selectors weights, and rows measures.
+_SOURCES = (
+    "schemas/*.py",
+    "schemas/groupings/*.py",
+    "schemas/groupings/word_lists/*",
+    "schemas/stores/*.py",
+    "analyze/stores/*.py",
+    "analyze/measures/*.py",
+    "analyze/heads/*.py",
+    "analyze/words/*.py",
+)
+
+
+@cache
+def arithmetic_version() -> str:
+    """A digest of the sources that make the numbers, of numpy's version and of the machine's order of bytes.
+
+    A number that somebody must raise with every change would be forgotten once, and the cache would then give numbers
+    of the arithmetic before.
+    """
+    digest = hashlib.sha256(f"numpy {version('numpy')} {sys.byteorder} {sys.version_info[:2]}".encode())
+    package = Path(vla_attention.__file__).parent
+    for pattern in _SOURCES:
+        for file in sorted(package.glob(pattern)):
+            if file.is_file():
+                content = file.read_bytes()
+                digest.update(f"\n{file.relative_to(package)} {len(content)}\n".encode())
+                digest.update(content)
+    return digest.hexdigest()
 
 
 @dataclass(frozen=True)
@@ -55,7 +74,7 @@ class CachedQuestion:
     def digest(self) -> bytes:
         """The digest of what is measured and of the arithmetic that does it."""
         given = {"what": self.what, "arguments": self.arguments, "arithmetic": arithmetic_version()}
-        return question_digest(json.dumps(given, sort_keys=True))
+        return hashlib.sha256(json.dumps(given, sort_keys=True).encode()).digest()
 
 
 def remembered(
@@ -81,106 +100,66 @@ def remembered(
         yield from measure(range(len(episodes)))
         return
     check_cache_place(place)
-    cache = _Lookup(question, place)
+    files = _Files(question, place)
     extra = arguments or [None] * len(episodes)
-    keys = [_episode_key(episode, one) for episode, one in zip(episodes, extra, strict=True)]
     # Before anything is measured: a file that changes in the meantime makes what is kept of it invalid.
-    states = [file_state(episode) for episode in episodes]
-    records = [() if state is None else cache.records(key, state) for key, state in zip(keys, states, strict=True)]
-    missing = [i for i, found in enumerate(records) if not found]
+    keys = [files.key(episode, one) for episode, one in zip(episodes, extra, strict=True)]
+    missing = files.missing(keys)
     if progress is not None and len(missing) < len(episodes):
         progress(len(episodes) - len(missing))
-    with _Keeper(cache.digest, question.about, place) as keeper:
-        measured = iter(measure(missing) if missing else ())
-        for i, (key, state, found) in enumerate(zip(keys, states, records, strict=True)):
+    measured = iter(measure(missing) if missing else ())
+    to_measure = set(missing)
+    try:
+        for i, key in enumerate(keys):
             # Read when its turn comes: numbers of thousands of episodes would not fit into memory.
-            arrays = cache.read(found, key)
+            arrays = None if i in to_measure or key is None else files.read(key)
             if arrays is None:
-                arrays = next(iter(measure([i]))) if found else next(measured)
-                if state is not None:
-                    keeper.add(key, state, arrays)
+                arrays = next(measured) if i in to_measure else next(iter(measure([i])))
+                if key is not None:
+                    files.keep(key, arrays)
             yield arrays
+    finally:
+        # Although nothing may have been written: the cache may hold what a larger VLA_CACHE_SIZE had room for.
+        make_room(place)
 
 
-def _episode_key(episode: StoredEpisode, arguments: Any) -> bytes:
-    return hashlib.sha256(f"{episode.seal.digest}\n{json.dumps(arguments, sort_keys=True)}".encode()).digest()
-
-
-class _Lookup:
-    """The records of one question in the cache."""
+class _Files:
+    """The files of one question in the cache. Numbers do not depend on whether they can be read or written."""
 
     def __init__(self, question: CachedQuestion, place: CachePlace) -> None:
-        self.digest = question.digest
-        self._records = find_records(question_folder(place, self.digest), self.digest)
-        self._touched: set[str] = set()
-
-    def records(self, key: bytes, state: bytes) -> Sequence[Record]:
-        """Those of an episode that is as it was."""
-        return [record for record in self._records.get(key, ()) if record.state == state]
-
-    def read(self, records: Sequence[Record], key: bytes) -> Arrays | None:
-        """The arrays of the first record that is whole."""
-        found = (self._read(record, key) for record in records)
-        return next((arrays for arrays in found if arrays is not None), None)
-
-    def _read(self, record: Record, key: bytes) -> Arrays | None:
-        content = read_record(record, key, self.digest)
-        if content is None:
-            return None
-        if str(record.segment) not in self._touched:
-            touch(record.segment)
-            self._touched.add(str(record.segment))
-        try:
-            return arrays_from_bytes(content)
-        except (TypeError, ValueError):
-            return None  # its digest is right: somebody else wrote it
-
-
-def question_folder(place: CachePlace, digest: bytes) -> Path:
-    """The folder of the segments of one question."""
-    return place.folder / digest.hex()[:32]
-
-
-class _Keeper:
-    """Writes what was measured into the cache, as long as that can be done."""
-
-    def __init__(self, digest: bytes, about: str, place: CachePlace) -> None:
-        self._digest, self._about, self._place = digest, about, place
-        self._writer: SegmentWriter | None = self._new()
-        self._finished = 0
-
-    def _new(self) -> SegmentWriter:
-        return SegmentWriter(question_folder(self._place, self._digest), self._digest, self._about)
-
-    def add(self, key: bytes, state: bytes, arrays: Arrays) -> None:
-        if self._writer is None:
-            return
-        content = arrays_to_bytes(arrays)
+        self._digest, self._about = question.digest, question.about
+        self._folder = place.folder / self._digest.hex()[:32]
         # A question that alone is larger than the cache keeps its first episodes: dropping them for later ones would
         # leave nothing for the next time.
-        if self._finished + self._writer.size_with(content) > self._place.most_bytes:
-            self._stop()
-            return
+        self._room = place.most_bytes
+
+    def key(self, episode: StoredEpisode, arguments: Any) -> bytes | None:
+        """The digest of question and episode, as its files are at the moment; None when these are not to be trusted."""
+        state = file_state(episode)
+        if state is None:
+            return None
+        about = f"{episode.seal.digest}\n{json.dumps(arguments, sort_keys=True)}\n".encode()
+        return hashlib.sha256(self._digest + state + about).digest()
+
+    def missing(self, keys: Sequence[bytes | None]) -> list[int]:
+        """The positions of the keys without a file."""
         try:
-            if self._writer.size > _SEGMENT_BYTES:
-                self._writer.close()
-                self._finished += self._writer.size
-                self._writer = self._new()
-            self._writer.add(key, state, content)
+            names = set(os.listdir(self._folder))
         except OSError:
-            self._stop()  # no room on the disk, or a folder that others own: numbers do not depend on it
+            names = set()
+        return [i for i, key in enumerate(keys) if key is None or self._path(key).name not in names]
 
-    def _stop(self) -> None:
-        if self._writer is not None:
-            with suppress(OSError):  # what cannot be flushed is a record that is not whole
-                self._writer.close()
-            self._finished += self._writer.size
-            self._writer = None
+    def read(self, key: bytes) -> Arrays | None:
+        return read_arrays(self._path(key), key)
 
-    def __enter__(self) -> _Keeper:
-        return self
+    def keep(self, key: bytes, arrays: Arrays) -> None:
+        content = kept_bytes(key, self._about, arrays)
+        self._room -= len(content)
+        if self._room >= 0:
+            try:
+                write_file(self._path(key), content)
+            except OSError:
+                self._room = -1  # no room on the disk, or a folder that others own
 
-    def __exit__(self, *_: object) -> None:
-        self._stop()
-        # Although nothing may have been written: the cache may hold what a larger VLA_CACHE_SIZE had room for.
-        make_room(self._place)
+    def _path(self, key: bytes) -> Path:
+        return self._folder / f"{key.hex()[:32]}{ENDING}"

@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vla_attention.analyze.arguments import add_grouping, add_intervals, add_output, add_selection, settings_of
-from vla_attention.analyze.show.screen import fitted, write_whole
+from vla_attention.analyze.arguments import add_output, add_question, settings_of, show
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
@@ -43,9 +42,7 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="FIELD",
         help="compare although the runs differ in this field; may be repeated",
     )
-    add_grouping(parser)
-    add_selection(parser)
-    add_intervals(parser)
+    add_question(parser)
     add_output(parser, "results/A-vs-B/compare")
     return parser
 
@@ -54,28 +51,27 @@ def run(arguments: argparse.Namespace) -> int:
     """Print the comparison; write tables and pictures."""
     from vla_attention.analyze.compare.comparison import compare_stores
     from vla_attention.analyze.compare.runs import parse_runs
-    from vla_attention.analyze.compare.text import comparison_text
-    from vla_attention.analyze.show.output_files import write_parquet
+    from vla_attention.analyze.compare.text import comparison_sections
+    from vla_attention.analyze.show.answer import Answer
     from vla_attention.analyze.show.plot_text import shortened
 
     comparison = compare_stores(parse_runs(arguments.runs), settings_of(arguments), arguments.allow_mismatch)
-    text = comparison_text(comparison)
-    joined = shortened("-vs-".join(comparison.names).replace("/", "-"), 100)
-    folder: Path = arguments.output or Path("results") / joined / "compare"
-    files = write_parquet(
-        folder,
-        comparison=comparison.differences,
-        pairs=comparison.pairs,
-        runs=comparison.estimates,
-        unpaired=comparison.unpaired,
-    )
-    files.append(write_whole(folder, text))
-    if not arguments.no_plots:
+
+    def draw(folder: Path) -> list[Path]:
         from vla_attention.analyze.compare.plot_forest import plot_forest
         from vla_attention.analyze.compare.plot_paired_differences import plot_paired_differences
 
-        files += plot_forest(comparison, folder)
+        files = plot_forest(comparison, folder)
         for name in comparison.runs_with_common_tasks:
             files += plot_paired_differences(comparison, name, folder)
-    print(fitted(text, folder, files))
-    return 0
+        return files
+
+    tables = {
+        "comparison": comparison.differences,
+        "pairs": comparison.pairs,
+        "runs": comparison.estimates,
+        "unpaired": comparison.unpaired,
+    }
+    joined = shortened("-vs-".join(comparison.names).replace("/", "-"), 100)
+    folder = arguments.output or Path("results") / joined / "compare"
+    return show(Answer(comparison_sections(comparison), tables, draw), folder, arguments)

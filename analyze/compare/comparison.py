@@ -19,13 +19,19 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
 from vla_attention.analyze.compare.replan_pairs import intervention_notes, is_rerun, with_paired_replans
 from vla_attention.analyze.compare.runs import Run, RunArgument, check_comparable, noted_differences, open_runs
-from vla_attention.analyze.measures.aggregate import baseline_logs, episode_tables, overall_layer, replans_of
-from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables, float_values
+from vla_attention.analyze.measures.aggregate import (
+    baseline_logs,
+    episode_tables,
+    episode_tables_of,
+    overall_layer,
+    replan_tables,
+)
+from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables, concat_tables, float_values
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.measures.steps import measure_episodes
 from vla_attention.analyze.measures.task_families import relation_remarks, sampling_of, units_of
 from vla_attention.analyze.statistics.effect_sizes import contrast, standardised_mean
 from vla_attention.analyze.statistics.episode_intervals import ABOUT_COLUMNS, Sampling, about_row
@@ -132,8 +138,8 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
     grouping = runs[0].question.grouping
     selected = [item for run in runs for item in run.question.selected]
     sampling = sampling_of(runs[0].question.settings.intervals, selected)
-    replans = [replans_of(run.question) for run in runs]
-    levels = [episode_tables(of_run, grouping) for of_run in replans]
+    measured = [measure_episodes(run.question) for run in runs]
+    levels = [episode_tables_of(of_run, grouping) for of_run in measured]
     having = {name for level in levels for name in level.groups_with_mass()}
     filled = [name for name in grouping.names if name in having]
     tables = [_episode_values(run, level, filled, "seed" in allowed) for run, level in zip(runs, levels, strict=True)]
@@ -142,10 +148,11 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
         [_estimates(run.name, table, quantities, sampling) for run, table in zip(runs, tables, strict=True)]
     )
     differences, pairs, unpaired = [], [], []
-    for run, table, of_run in zip(runs[1:], tables[1:], replans[1:], strict=True):
+    for run, table, of_run in zip(runs[1:], tables[1:], measured[1:], strict=True):
         joined = _pair(tables[0], table, quantities)
         if is_rerun(runs[0], run):
-            sides = with_paired_replans(replans[0], of_run, run.name)
+            base, again = (concat_tables(replan_tables(one, grouping).parts) for one in (measured[0], of_run))
+            sides = with_paired_replans(base, again, run.name)
             first, other = (
                 _episode_values(one, episode_tables(side, grouping), filled, False)
                 for one, side in zip((runs[0], run), sides, strict=True)
@@ -263,8 +270,8 @@ def _pairs_table(run: str, joined: pl.DataFrame, quantities: Sequence[str]) -> p
 
 def _without_partner(table: pl.DataFrame, joined: pl.DataFrame, side: str, run: str, other: str) -> pl.DataFrame:
     keys = ["suite", "task_id", "episode_index"]
-    found = joined.select("suite", "task_id", pl.col(f"episode_{side}").alias("episode_index")).unique()
-    alone = table.select(keys).unique(maintain_order=True).join(found, on=keys, how="anti", maintain_order="left")
+    paired = joined.select("suite", "task_id", pl.col(f"episode_{side}").alias("episode_index")).unique()
+    alone = table.select(keys).unique(maintain_order=True).join(paired, on=keys, how="anti", maintain_order="left")
     return alone.select(pl.lit(run).alias("run"), pl.lit(other).alias("compared_with"), pl.all())
 
 
@@ -273,15 +280,17 @@ def _paired(joined: pl.DataFrame, quantities: Sequence[str], sampling: Sampling)
     for scope, part in _scopes(joined):
         given = sampling.units(part)
         units = given.decided()
-        values = [_numbers(part, f"{quantity}_difference") for quantity in quantities]
+        values = [float_values(part[f"{quantity}_difference"]) for quantity in quantities]
         statistics = [mean_over_episodes(value) for value in values]
-        found = estimates(statistics, units)
-        for quantity, value, statistic, one in zip(quantities, values, statistics, found, strict=True):
+        differences = estimates(statistics, units)
+        for quantity, value, statistic, one in zip(quantities, values, statistics, differences, strict=True):
             used = statistic.used
             counts = {"num_tasks": units.part(used).num_tasks, **about_row(given)}
             counts |= dict.fromkeys(("num_pairs", "num_first", "num_other"), int(used.sum()))
             sides = {
-                f"mean_{side}": _mean(np.where(used, _numbers(part, f"{quantity}_{side}"), np.nan), units)
+                f"mean_{side}": estimates(
+                    [mean_over_episodes(np.where(used, float_values(part[f"{quantity}_{side}"]), np.nan))], units
+                )[0].value
                 for side in ("first", "other")
             }
             of = {**scope, "quantity": quantity, "paired": True, **counts, **sides}
@@ -307,7 +316,7 @@ def _unpaired(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str
         if is_other.all() or not is_other.any():
             continue  # a task of one run only
         for quantity in quantities:
-            found = contrast(_numbers(part, quantity), is_other, units)
+            difference = contrast(float_values(part[quantity]), is_other, units)
             rows.append(
                 {
                     **scope,
@@ -315,15 +324,15 @@ def _unpaired(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str
                     "paired": False,
                     "num_tasks": units.num_tasks,
                     "num_families": units.num_families,
-                    "intervals": found.estimand.value,
+                    "intervals": difference.estimand.value,
                     "num_pairs": 0,
-                    "num_first": found.num_second,
-                    "num_other": found.num_first,
-                    "mean_first": found.mean_second,
-                    "mean_other": found.mean_first,
+                    "num_first": difference.num_second,
+                    "num_other": difference.num_first,
+                    "mean_first": difference.mean_second,
+                    "mean_other": difference.mean_first,
                 }
-                | _difference_row(found.difference)
-                | _effect(HEDGES_G, found.hedges_g)
+                | _difference_row(difference.difference)
+                | _effect(HEDGES_G, difference.hedges_g)
             )
     return pl.DataFrame(rows, schema=_DIFFERENCE_SCHEMA)
 
@@ -395,22 +404,22 @@ def _estimates(run: str, table: pl.DataFrame, quantities: Sequence[str], samplin
         units = sampling.units(part)
         statistics = {
             ("ratio" if quantity == LOG2_RATIO else quantity): geometric_mean_over_episodes(
-                _numbers(part, "log_ratio_mean")
+                float_values(part["log_ratio_mean"])
             )
             if quantity == LOG2_RATIO
-            else mean_over_episodes(_numbers(part, quantity), SHARE)
+            else mean_over_episodes(float_values(part[quantity]), SHARE)
             for quantity in quantities
         }
         if LOG2_RATIO in quantities:
-            statistics["ratio_lift"] = geometric_mean_over_episodes(np.log(_numbers(part, "ratio_lift")))
+            statistics["ratio_lift"] = geometric_mean_over_episodes(np.log(float_values(part["ratio_lift"])))
         names = {"run": run, "suite": part["suite"][0], "layer": part["layer"][0], "block": part["block"][0]}
         counts = {"num_tasks": units.num_tasks, **about_row(units), "num_episodes": part.height}
-        found = estimates(list(statistics.values()), units.decided())
-        for (name, statistic), one in zip(statistics.items(), found, strict=True):
+        values = estimates(list(statistics.values()), units.decided())
+        for (name, statistic), one in zip(statistics.items(), values, strict=True):
             low, high = ends(one.interval())
             row = {**names, **counts, "quantity": name, "value": one.value, "low": low, "high": high}
             if name == "ratio":
-                logs = baseline_logs(_numbers(part, "uniform_ratio"), _numbers(part, "log_ratio_mean"))
+                logs = baseline_logs(float_values(part["uniform_ratio"]), float_values(part["log_ratio_mean"]))
                 baseline = geometric_mean_over_episodes(logs)
                 row["uniform_ratio"] = estimates([baseline], units)[0].value
                 row["episodes_without_ratio"] = statistic.num_left_out
@@ -428,11 +437,3 @@ _ESTIMATE_SCHEMA = {
     **dict.fromkeys(("value", "low", "high", "uniform_ratio"), pl.Float64),
     **dict.fromkeys(("episodes_without_ratio", "num_nonfinite"), pl.Int64),
 }
-
-
-def _numbers(part: pl.DataFrame, column: str) -> NDArray[np.float64]:
-    return float_values(part[column])
-
-
-def _mean(values: NDArray[np.float64], units: Units) -> float | None:
-    return estimates([mean_over_episodes(values)], units)[0].value

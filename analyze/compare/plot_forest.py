@@ -14,6 +14,7 @@ from vla_attention.analyze.measures.frames import layer_name
 from vla_attention.analyze.show.numbers import interval_name, plural
 from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, legend_above, note_at_row, ratio_axis
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, NOTE_COLOR, SERIES_COLORS
+from vla_attention.analyze.show.plot_rows import draw_estimate, draw_uniform
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, ratio_name, title, wrapped
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
@@ -134,23 +135,9 @@ def _estimates_panel(
             suite = row["suite"]
             where = axes.get_yaxis_transform()
             axes.text(0.01, place - 0.62, suite, transform=where, size=8, weight="bold", va="center")
-        _estimate(
-            axes,
-            place,
-            row["value"],
-            row["low"],
-            row["high"],
-            run_style(comparison.names.index(row["run"])),
-        )
+        _estimate(axes, place, row["value"], (row["low"], row["high"]), run_style(comparison.names.index(row["run"])))
         if is_ratio and row["uniform_ratio"] is not None:
-            axes.plot(
-                [row["uniform_ratio"]] * 2,
-                [place - 0.4, place + 0.4],
-                "--",
-                color=BASELINE_COLOR,
-                linewidth=1.2,
-                zorder=1,
-            )
+            draw_uniform(axes, place, row["uniform_ratio"], 0.4)
         note_at_row(axes, place, f"n = {row['num_episodes']}")
     axes.grid(axis="x")
     if is_ratio:
@@ -183,18 +170,16 @@ def _differences_panel(
             continue
         style = run_style(comparison.names.index(row["run"]))
         value, low, high = (scale(row[name]) for name in names)
-        _estimate(axes, place, value, low, high, style)
+        _estimate(axes, place, value, (low, high), style)
         text = f"n = {plural(row['num_pairs'], 'pair')}" if row["paired"] else "not paired"
         note_at_row(axes, place, text)
     axes.grid(axis="x")
 
 
 def _estimate(
-    axes: Axes, place: float, value: float | None, low: float | None, high: float | None, style: Mapping[str, Any]
+    axes: Axes, place: float, value: float | None, bounds: Sequence[float | None], style: Mapping[str, str]
 ) -> None:
     if value is None or not np.isfinite(value):
         note_at_row(axes, place, "no finite ratio", x=0.01)
-        return
-    if low is not None and high is not None:
-        axes.plot([low, high], [place, place], color=style["color"], linewidth=2.0, zorder=3)
-    axes.plot(value, place, style["marker"], color=style["color"], markersize=6.5, markeredgecolor="white", zorder=4)
+    else:
+        draw_estimate(axes, place, value, bounds, style["color"], style["marker"])

@@ -13,17 +13,15 @@ from vla_attention.analyze.compare.comparison import LOG2_RATIO, Comparison
 from vla_attention.analyze.compare.plot_forest import factor_axis
 from vla_attention.analyze.measures.frames import layer_name
 from vla_attention.analyze.show.numbers import interval_name, plural
-from vla_attention.analyze.show.plot_axes import legend_above, note_at_row, scattered
-from vla_attention.analyze.show.plot_colours import DATA_COLOR, DOT_COLOR, NOTE_COLOR, STRIPE_COLOR
+from vla_attention.analyze.show.plot_axes import note_at_row
+from vla_attention.analyze.show.plot_colours import NOTE_COLOR, STRIPE_COLOR
+from vla_attention.analyze.show.plot_rows import MANY_ROWS, draw_dots, draw_estimate, label_rows, legend_of_rows
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, task_label, title, wrapped
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-#: From this many tasks on, a row is one line high.
-_MANY = 24
 
 
 def stem_of(name: str) -> str:
@@ -42,7 +40,7 @@ def plot_paired_differences(
     rows = comparison.differences.filter(*of_run, pl.col("quantity") == quantity, pl.col("scope") != "suite")
     pairs = comparison.pairs.filter(*of_run, pl.col("quantity") == quantity)
     tasks = rows.filter(pl.col("scope") == "task")
-    few = tasks.height <= _MANY
+    few = tasks.height <= MANY_ROWS
     figure = new_figure(9, 1.7 + (0.42 if few else 0.2) * (rows.height + 0.5))
     which = layer_name(layer, "mean over layers", "block")
     first = comparison.names[0]
@@ -76,16 +74,10 @@ def plot_paired_differences(
     for place, row in enumerate(rows.iter_rows(named=True)):
         _draw_row(axes, place, row, pairs, quantity, generator, few)
     several = tasks["suite"].n_unique() > 1
-    axes.set_yticks(range(rows.height), [_label(row, several, few) for row in rows.iter_rows(named=True)])
-    axes.set_ylim(rows.height - 0.4, -0.6)
-    axes.tick_params(axis="y", length=0)
-    axes.grid(axis="x")
-    axes.plot([], [], "o", color=DATA_COLOR, markersize=6, label="mean")
-    if rows["low"].is_not_null().any():
-        axes.plot([], [], color=DATA_COLOR, linewidth=2, label=interval_name(level))
-    if paired:
-        axes.scatter([], [], s=14, color=DOT_COLOR, linewidths=0, label="single pair")
-    legend_above(axes, 3, handlelength=1.5)
+    shown = rows.iter_rows(named=True)
+    label_rows(axes, ["all tasks" if row["scope"] == "all" else task_label(row, several, few) for row in shown])
+    interval = interval_name(level) if rows["low"].is_not_null().any() else ""
+    legend_of_rows(axes, 3, "mean", interval, "single pair" if paired else "")
     return save_figure(figure, folder, stem_of(name), rows)
 
 
@@ -105,26 +97,14 @@ def _draw_row(
     if total:
         axes.axhspan(place - 0.5, place + 0.5, color=STRIPE_COLOR, linewidth=0, zorder=0)
     else:
-        own = pairs.filter((pl.col("suite") == row["suite"]) & (pl.col("task_id") == row["task_id"]))
-        values = own["difference"].drop_nulls().to_numpy()
+        of_task = pairs.filter((pl.col("suite") == row["suite"]) & (pl.col("task_id") == row["task_id"]))
+        values = of_task["difference"].drop_nulls().to_numpy()
         values = values[np.isfinite(values)]
-        places = scattered(generator, place, len(values))
-        axes.scatter(scaled(values), places, s=14 if few else 8, color=DOT_COLOR, alpha=0.8, linewidths=0, zorder=2)
-    if row["low"] is not None:
-        ends = [scaled(row["low"]), scaled(row["high"])]
-        axes.plot(ends, [place, place], color=DATA_COLOR, linewidth=2.0 if few else 1.4, zorder=3)
+        draw_dots(axes, place, scaled(values), generator, few)
     if row["difference"] is not None:
-        axes.plot(
-            scaled(row["difference"]), place, "D" if total else "o", color=DATA_COLOR, markersize=6.5 if few else 4.5,
-            markeredgecolor="white", zorder=4,
-        )  # fmt: skip
+        bounds = [None if row[end] is None else scaled(row[end]) for end in ("low", "high")]
+        draw_estimate(axes, place, scaled(row["difference"]), bounds, marker="D" if total else "o", few=few)
     else:
         note_at_row(axes, place, "no difference to show", x=0.01)
     n = f"n = {row['num_pairs']}" if row["paired"] else f"n = {row['num_first']}, {row['num_other']}"
     note_at_row(axes, place, n)
-
-
-def _label(row: dict[str, Any], several: bool, few: bool) -> str:
-    if row["scope"] == "all":
-        return "all tasks"
-    return task_label(row, several, few)

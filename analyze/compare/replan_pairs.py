@@ -57,13 +57,10 @@ def with_paired_replans(first: Tables, other: Tables, name: str) -> tuple[Tables
         )
     if "log2_ratio" not in first.cells.columns:
         return first, other
-    having = [table.cells.filter(_has_ratio()).select(_REPLAN) for table in (first, other)]
+    has_ratio = pl.col("log2_ratio").is_finite().fill_null(False)
+    having = [table.cells.filter(has_ratio).select(_REPLAN) for table in (first, other)]
     both = having[0].join(having[1], on=_REPLAN, how="inner").with_columns(pl.lit(True).alias("_both"))
     return _masked(first, both), _masked(other, both)
-
-
-def _has_ratio() -> pl.Expr:
-    return pl.col("log2_ratio").is_finite().fill_null(False)
 
 
 def _masked(table: Tables, both: pl.DataFrame) -> Tables:

@@ -7,7 +7,7 @@ torch and the like, which hardly affect them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -199,14 +199,14 @@ def check_comparable(runs: Sequence[Run], allowed: Sequence[str]) -> list[str]:
                 f"{run.question.site}): different softmaxes over different keys, whose masses cannot be compared; "
                 "choose a site that both have with --site."
             )
-    waived = {*allowed, *(("max_steps",) if "suite" in allowed and _several(run.suites for run in runs) else ())}
+    waived = {*allowed, *(("max_steps",) if "suite" in allowed and len({run.suites for run in runs}) > 1 else ())}
     notes = []
     for run in runs[1:]:
         differing = {name: _difference(name, first, run) for name in FIELDS}
-        found = {name: text for name, text in differing.items() if text}
-        refused = [name for name in found if name not in waived]
+        differences = {name: text for name, text in differing.items() if text}
+        refused = [name for name in differences if name not in waived]
         if refused:
-            named = "; ".join(f"{name}: {found[name]}" for name in refused)
+            named = "; ".join(f"{name}: {differences[name]}" for name in refused)
             # Allowing another suite allows its other number of steps.
             to_allow = [name for name in refused if name != "max_steps" or "suite" not in refused]
             flags = " ".join(f"--allow-mismatch {name}" for name in to_allow)
@@ -215,7 +215,9 @@ def check_comparable(runs: Sequence[Run], allowed: Sequence[str]) -> list[str]:
                 f"{_FIELDS[refused[0]][1]}; capture them alike{_selection_hint(refused)}, or compare all the same with "
                 f"{flags}."
             )
-        notes += [f"{first.name} and {run.name} differ in {name} ({text}), as allowed." for name, text in found.items()]
+        notes += [
+            f"{first.name} and {run.name} differ in {name} ({text}), as allowed." for name, text in differences.items()
+        ]
     return notes
 
 
@@ -278,10 +280,6 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 40 else text[:39] + "…"
 
 
-def _several(values: Iterable[Any]) -> bool:
-    return len(set(values)) > 1
-
-
 def _protocol(run: Run, name: str) -> tuple[int, ...]:
     return tuple(sorted({getattr(store.attributes.protocol, name) for store in run.stores}))
 
@@ -309,8 +307,8 @@ def _versions(run: Run, names: Sequence[str]) -> dict[str, str]:
 
 def _provenance(run: Run) -> dict[str, str]:
     """Software and machine of the run's episodes, which several jobs may have captured; the root has the first's."""
-    found: dict[str, dict[str, None]] = {}
+    values_by_name: dict[str, dict[str, None]] = {}
     for item in run.question.selected:
         for name, value in item.episode.attributes.provenance.items():
-            found.setdefault(name, {})[value] = None
-    return {name: listing(values) for name, values in found.items()}
+            values_by_name.setdefault(name, {})[value] = None
+    return {name: listing(values) for name, values in values_by_name.items()}

@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from typing import Any
+
 import polars as pl
 
 from vla_attention.analyze.compare.comparison import D_Z, HEDGES_G, LOG2_RATIO, SUCCESS, Comparison
 from vla_attention.analyze.measures.frames import LAYERS_AVG, layer_name
+from vla_attention.analyze.show.answer import Section
 from vla_attention.analyze.show.findings import few_families_note, findings
-from vla_attention.analyze.show.headings import (
-    WIDTH,
-    heading,
-    interval_note,
-    note_lines,
-    title,
-    untrained_warning,
-    wrap,
-)
-from vla_attention.analyze.show.numbers import (
-    format_interval,
-    format_number,
-    format_percent,
-    format_signed,
-    plural,
-    row_interval,
-)
+from vla_attention.analyze.show.headings import interval_note, note_lines, title, untrained_warning, wrap
+from vla_attention.analyze.show.numbers import format_number, plural, row_interval
 from vla_attention.analyze.show.plot_text import shortened
-from vla_attention.analyze.show.text_table import text_table
+from vla_attention.analyze.show.tables import (
+    Column,
+    Table,
+    count,
+    interval,
+    number,
+    percent,
+    signed,
+    signed_estimate,
+    texts,
+)
 from vla_attention.analyze.statistics.effect_sizes import FEWEST_EPISODES, FEWEST_TASKS
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Units
@@ -36,19 +35,18 @@ from vla_attention.schemas.stores.store_format import episode_name
 _SENTENCES = 2
 
 
-def comparison_text(comparison: Comparison) -> str:
-    """The whole text, at most 100 columns wide."""
+def comparison_sections(comparison: Comparison) -> list[Section]:
+    """The whole answer."""
     layer = comparison.overall_layer
-    parts = [_header(comparison, layer), _estimates_section(comparison, layer)]
+    sections = [_header(comparison, layer), _estimates_section(comparison, layer)]
     for name in comparison.names[1:]:
-        parts.append(_difference_section(comparison, name, layer))
+        sections.append(_difference_section(comparison, name, layer))
         if name in comparison.runs_with_common_tasks:
-            parts.append(_tasks_section(comparison, name, layer))
-    parts.append(_layers_section(comparison))
-    return "\n\n".join(part for part in parts if part) + "\n"
+            sections.append(_tasks_section(comparison, name, layer))
+    return [*sections, *_layers_section(comparison)]
 
 
-def _header(comparison: Comparison, layer: str) -> str:
+def _header(comparison: Comparison, layer: str) -> Section:
     lines = title("COMPARISON OF RUNS")
     if any(store.attributes.policy.untrained for run in comparison.runs for store in run.stores):
         lines += wrap(untrained_warning("a policy has"))
@@ -63,81 +61,80 @@ def _header(comparison: Comparison, layer: str) -> str:
     )
     of_suites = comparison.estimates.filter(pl.col("layer") == layer).unique(["run", "suite"], maintain_order=True)
     few = few_families_note(of_suites, "suite", comparison.units)
-    lines += note_lines([*comparison.notes, *([few] if few else [])])
-    return "\n".join(lines)
+    return Section([[*lines, *note_lines([*comparison.notes, *([few] if few else [])])]])
 
 
-def _estimates_section(comparison: Comparison, layer: str) -> str:
+def _estimates_section(comparison: Comparison, layer: str) -> Section:
     parts = comparison.estimates.filter(pl.col("layer") == layer).partition_by("run", "suite", maintain_order=True)
     estimates = [{row["quantity"]: row for row in part.iter_rows(named=True)} for part in parts]
     ratio = LOG2_RATIO in comparison.quantities
-    header = ["run", "suite", "episodes", "success"] + (["ratio", "interval", "uniform", "lift"] if ratio else [])
+    columns = [
+        texts("run", lambda of: of[SUCCESS]["run"][:24], left=True),
+        texts("suite", lambda of: of[SUCCESS]["suite"][:16], left=True),
+        count("episodes", lambda of: of[SUCCESS]["num_episodes"]),
+        percent("success", _value_of(SUCCESS), decimals=0),
+    ]
+    if ratio:
+        columns += [
+            number("ratio", _value_of("ratio")),
+            interval("", of=lambda of: of["ratio"]),
+            number("uniform", lambda of: of["ratio"]["uniform_ratio"]),
+            number("lift", _value_of("ratio_lift")),
+        ]
     fractions = [name for name in comparison.quantities if name.endswith("_fraction")][: 2 if ratio else 5]
-    header += [name.removesuffix("_fraction")[:14] for name in fractions]
-    body = []
-    for of in estimates:
-        row = of[SUCCESS]
-        cells = [row["run"][:24], row["suite"][:16], str(row["num_episodes"]), format_percent(row["value"], 0)]
-        if ratio:
-            row = of["ratio"]
-            cells += [format_number(row["value"]), format_interval(row["low"], row["high"])]
-            cells += [format_number(row["uniform_ratio"]), format_number(of["ratio_lift"]["value"])]
-        body.append(cells + [format_percent(of[name]["value"]) for name in fractions])
-    note = (
-        "ratio: geometric mean over tasks; uniform: what uniform attention gives; lift: ratio / uniform."
-        if ratio
-        else ""
-    )
-    lines = [heading("EACH RUN"), text_table(header, body, left=(0, 1)), *wrap(note)]
-    for row in (of["ratio"] for of in estimates) if ratio else ():
-        if row["num_nonfinite"] or row["episodes_without_ratio"]:
-            lines += wrap(
-                f"{row['run']}, {row['suite']}: {row['num_nonfinite']} replans have no finite ratio and are in no "
-                f"ratio; {row['episodes_without_ratio']} of {row['num_episodes']} episodes have none at all.",
-            )
-    return "\n".join(lines)
+    columns += [percent(name.removesuffix("_fraction")[:14], _value_of(name)) for name in fractions]
+    note = "ratio: geometric mean over tasks; uniform: what uniform attention gives; lift: ratio / uniform."
+    left_out = [
+        f"{row['run']}, {row['suite']}: {row['num_nonfinite']} replans have no finite ratio and are in no ratio; "
+        f"{row['episodes_without_ratio']} of {row['num_episodes']} episodes have none at all."
+        for row in (of["ratio"] for of in (estimates if ratio else ()))
+        if row["num_nonfinite"] or row["episodes_without_ratio"]
+    ]
+    return Section([Table(columns, estimates), note if ratio else "", *left_out], "EACH RUN")
 
 
-def _difference_section(comparison: Comparison, name: str, layer: str) -> str:
+def _value_of(quantity: str) -> Callable[[Mapping[str, Any]], float | None]:
+    def value(of: Mapping[str, Any]) -> float | None:
+        number: float | None = of[quantity]["value"]
+        return number
+
+    return value
+
+
+def _difference_section(comparison: Comparison, name: str, layer: str) -> Section:
     first = comparison.names[0]
-    rows = comparison.differences.filter(pl.col("run") == name, pl.col("scope") == "all", pl.col("layer") == layer)
-    lines = [heading(f"{name} AGAINST {first}")]
-    lines += _pairing(comparison, name, rows)
+    rows = comparison.differences.filter(pl.col("layer") == layer, run=name, scope="all")
     paired = bool(rows["paired"].any())
-    effect, effect_name = (D_Z, "d_z") if paired else (HEDGES_G, "g")
-    header = ["quantity", "n", first[:14], name[:14], "difference", "interval", "q", effect_name, "interval"]
-    body = []
-    for row in rows.iter_rows(named=True):
-        n = str(row["num_pairs"]) if row["paired"] else f"{row['num_first']}/{row['num_other']}"
-        body.append(
-            [
-                shortened(row["quantity"], 26),
-                n,
-                format_number(row["mean_first"]),
-                format_number(row["mean_other"]),
-                format_signed(row["difference"]),
-                format_interval(row["low"], row["high"]),
-                format_number(row["q"]),
-                format_signed(row[effect]),
-                row_interval(row, effect),
-            ]
-        )
-    lines.append(text_table(header, body, left=(0,)))
+    columns = [
+        texts("quantity", lambda row: shortened(row["quantity"], 26), left=True),
+        _num_pairs(),
+        number(first[:14], "mean_first"),
+        number(name[:14], "mean_other"),
+        signed("difference", "difference"),
+        interval(""),
+        number("q", "q"),
+        *(signed_estimate("d_z", D_Z) if paired else signed_estimate("g", HEDGES_G)),
+    ]
     named = findings(
         rows["q"].to_list(), rows["quantity"].to_list(), "quantity", "a difference", _num_sentences(comparison)
     )
-    lines += wrap(f"{_factor(comparison, name, rows)}{named}")
     meaning = (
         "d_z: mean / standard deviation of the paired differences (Cohen)"
         if paired
         else "g: Hedges' g, difference in standard deviations"
     )
-    lines += wrap(
+    note = (
         f"{meaning}, all weighing the same, corrected for small samples; none below {FEWEST_EPISODES} pairs or "
         f"episodes, or {_fewest_units(comparison.units)} are the units. q: p of no difference, adjusted for the number "
         "of quantities (Benjamini-Hochberg)."
     )
-    return "\n".join(lines)
+    said = f"{_factor(comparison, name, rows)}{named}"
+    pairing, table = _pairing(comparison, name, rows), Table(columns, rows.to_dicts())
+    return Section([pairing, table, said, note], f"{name} AGAINST {first}")
+
+
+def _num_pairs() -> Column:
+    return texts("n", lambda row: str(row["num_pairs"]) if row["paired"] else f"{row['num_first']}/{row['num_other']}")
 
 
 def _fewest_units(units: Units) -> str:
@@ -146,16 +143,16 @@ def _fewest_units(units: Units) -> str:
     return f"{FEWEST_FAMILIES} families of tasks where these"
 
 
-def _pairing(comparison: Comparison, name: str, rows: pl.DataFrame) -> list[str]:
+def _pairing(comparison: Comparison, name: str, rows: pl.DataFrame) -> str:
     first = comparison.names[0]
     alone = {
         run: comparison.unpaired.filter(pl.col("run") == run, pl.col("compared_with") == other)
         for run, other in ((first, name), (name, first))
     }
     if not rows["paired"].any():
-        return wrap(
+        return (
             f"NOT PAIRED: no episode of {name} has the {_pairing_keys(comparison)} of one of {first}, so this compares "
-            "means of independent episodes; differences between scenes are in it, and intervals are wider for that.",
+            "means of independent episodes; differences between scenes are in it, and intervals are wider for that."
         )
     pairs = comparison.pairs.filter(pl.col("run") == name).select("suite", "task_id", "episode_first").unique().height
     text = f"{plural(pairs, 'pair')} of episodes with the same {_pairing_keys(comparison)}."
@@ -167,7 +164,7 @@ def _pairing(comparison: Comparison, name: str, rows: pl.DataFrame) -> list[str]
         if table.height:
             names = [episode_name(row["task_id"], row["episode_index"]) for row in table.iter_rows(named=True)]
             text += f" Of {run}, {table.height} have no partner and are left out: {listing(names, 6)}."
-    return wrap(text)
+    return text
 
 
 def _num_sentences(comparison: Comparison) -> int:
@@ -189,59 +186,56 @@ def _factor(comparison: Comparison, name: str, rows: pl.DataFrame) -> str:
     return f"Ratio of {name} / ratio of {comparison.names[0]}: {factor} (2 to the difference). "
 
 
-def _tasks_section(comparison: Comparison, name: str, layer: str) -> str:
+def _tasks_section(comparison: Comparison, name: str, layer: str) -> Section:
     quantity = comparison.quantities[0]
     rows = comparison.differences.filter(
         pl.col("run") == name, pl.col("scope") != "all", pl.col("layer") == layer, pl.col("quantity") == quantity
     )
     several = rows["suite"].n_unique() > 1
-    header = ["task", "n", "difference", "interval", "q"]
-    body = [
-        [
-            f"{row['suite']} {'all' if row['task_id'] is None else row['task_id']}" if several else str(row["task_id"]),
-            str(row["num_pairs"]) if row["paired"] else f"{row['num_first']}/{row['num_other']}",
-            format_signed(row["difference"]),
-            format_interval(row["low"], row["high"]),
-            format_number(row["q"] if row["scope"] == "task" else None),
-        ]
-        for row in rows.iter_rows(named=True)
+
+    def task(row: Mapping[str, Any]) -> str:
+        number = "all" if row["task_id"] is None else row["task_id"]
+        return f"{row['suite']} {number}" if several else str(row["task_id"])
+
+    columns = [
+        texts("task", task, left=True),
+        _num_pairs(),
+        signed("difference", "difference"),
+        interval(""),
+        number("q", lambda row: row["q"] if row["scope"] == "task" else None),
+        texts("instruction", "instruction", running=True),
     ]
-    tasks = rows.filter(pl.col("scope") == "task")
-    labels = [
-        f"{row['suite']} {row['task_id']}" if several else f"task {row['task_id']}"
-        for row in tasks.iter_rows(named=True)
-    ]
-    named = findings(tasks["q"].to_list(), labels, "task", "a difference", _num_sentences(comparison))
-    said = wrap(f"{named} q: p of no difference, adjusted for the number of tasks (Benjamini-Hochberg).")
-    texts = [row["instruction"] or "" for row in rows.iter_rows(named=True)]
-    table = text_table(header, body, left=(0,), last="instruction", texts=texts, width=WIDTH)
-    return "\n".join([heading(f"PER TASK  {quantity}, {name} minus {comparison.names[0]}"), table, *said])
+    tasks = rows.filter(scope="task").to_dicts()
+    labels = [task(row) if several else f"task {task(row)}" for row in tasks]
+    named = findings([row["q"] for row in tasks], labels, "task", "a difference", _num_sentences(comparison))
+    said = f"{named} q: p of no difference, adjusted for the number of tasks (Benjamini-Hochberg)."
+    return Section([Table(columns, rows.to_dicts()), said], f"PER TASK  {quantity}, {name} minus {comparison.names[0]}")
 
 
-def _layers_section(comparison: Comparison) -> str:
-    rows = comparison.differences.filter(pl.col("scope") == "all", pl.col("quantity") == comparison.quantities[0])
+def _layers_section(comparison: Comparison) -> list[Section]:
+    rows = comparison.differences.filter(scope="all", quantity=comparison.quantities[0])
     layers = [layer for layer in rows["layer"].unique(maintain_order=True) if layer != LAYERS_AVG]
     if len(layers) < 2:
-        return ""
+        return []
     cells = {(row["run"], row["layer"]): row for row in rows.iter_rows(named=True)}
     others = comparison.names[1:4]
-    header = ["block"] + [text for name in others for text in (name[:20], "interval", "q")]
-    body = []
-    for layer in layers:
-        line = [layer]
-        for name in others:
-            row = cells.get((name, layer))
-            line += (
-                ["-", "-", "-"]
-                if row is None
-                else [format_signed(row["difference"]), row_interval(row), format_number(row["layers_q"])]
-            )
-        body.append(line)
+
+    def of_run(name: str) -> tuple[Column, ...]:
+        def row(layer: str) -> dict[str, Any]:
+            return cells.get((name, layer), {})
+
+        return (
+            signed(name[:20], lambda layer: row(layer).get("difference")),
+            interval("", of=row),
+            number("q", lambda layer: row(layer).get("layers_q")),
+        )
+
+    columns = [texts("block", str, left=True), *(column for name in others for column in of_run(name))]
     more = (
         f" (the first {len(others)} runs; the others are in the table)"
         if len(others) < len(comparison.names) - 1
         else ""
     )
-    per_layer = f"PER LAYER  {comparison.quantities[0]}, run minus {comparison.names[0]}{more}"
     note = "q: p of no difference, adjusted for the number of blocks (Benjamini-Hochberg)."
-    return "\n".join([heading(per_layer), text_table(header, body, left=(0,)), note])
+    title = f"PER LAYER  {comparison.quantities[0]}, run minus {comparison.names[0]}{more}"
+    return [Section([Table(columns, layers), note], title)]

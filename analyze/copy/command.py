@@ -59,7 +59,7 @@ def build_parser() -> argparse.ArgumentParser:
 def run(arguments: argparse.Namespace) -> int:
     """Copy the store, or print how large its parts are."""
     from vla_attention.analyze.copy.copying import check_parts, copy_store
-    from vla_attention.analyze.show.progress import progress_bar
+    from vla_attention.schemas.progress_bar import progress_bar
     from vla_attention.schemas.stores.reader import open_store
 
     store = open_store(arguments.store)
@@ -78,10 +78,10 @@ def run(arguments: argparse.Namespace) -> int:
         push = check_push(arguments.push)
     with progress_bar(len(store.episodes), "episodes") as advance:
         copied = copy_store(store, arguments.target, without, advance, packed=arguments.packed)
-    there = f" ({copied.present} were there already)" if copied.present else ""
+    already = f" ({copied.present} were there already)" if copied.present else ""
     left = f", {format_bytes(copied.left_bytes)} left behind: {', '.join(without)}" if without else ""
     added = plural(copied.added, "episode")
-    print(f"{arguments.target}: {added} added{there}, {format_bytes(copied.copied_bytes)}{left}.")
+    print(f"{arguments.target}: {added} added{already}, {format_bytes(copied.copied_bytes)}{left}.")
     if push is not None:
         from vla_attention.analyze.copy.pushing import push_store
 

@@ -22,9 +22,8 @@ from typing import Any
 from vla_attention.analyze.copy.packing import Packing
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 from vla_attention.schemas.stores.digest import run_digest, with_digest
-from vla_attention.schemas.stores.durable_files import publish
+from vla_attention.schemas.stores.durable_files import lock_for_writing, publish
 from vla_attention.schemas.stores.episode_files import files_of_no_array, refuse_links
-from vla_attention.schemas.stores.hub_address import HUB_PROTOCOL, MAIN, HubAddress
 from vla_attention.schemas.stores.partial_folders import partial_of, remove_dead_partials
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
@@ -36,9 +35,8 @@ from vla_attention.schemas.stores.store_format import (
     CorruptEpisode,
     RunMismatch,
 )
-from vla_attention.schemas.stores.store_lock import lock_for_writing
 from vla_attention.schemas.stores.store_place import check_place
-from vla_attention.schemas.stores.store_url import StoreUrl
+from vla_attention.schemas.stores.store_url import HUB_PROTOCOL, MAIN, HubAddress, StoreUrl
 
 
 @dataclass(frozen=True)
@@ -165,11 +163,11 @@ def _ensure_root(store: Store, target: Path, root: bytes, building: Path) -> Non
         (empty / EPISODES_DOCUMENT).write_bytes(_episodes_document(store))
         _rename_new(empty, target)
     if (target / "zarr.json").read_bytes() != root if (target / "zarr.json").is_file() else True:
-        there = open_store(target).attributes.provenance.get(FETCHED_FROM)  # raises when it is no store
+        source = open_store(target).attributes.provenance.get(FETCHED_FROM)  # raises when it is no store
         here = group_attributes(root)["provenance"].get(FETCHED_FROM)
-        if there and here and HubAddress.of(there).at(MAIN) == HubAddress.of(here).at(MAIN) and there != here:
+        if source and here and HubAddress.of(source).at(MAIN) == HubAddress.of(here).at(MAIN) and source != here:
             raise RunMismatch(
-                f"Cannot continue the copy {target}: it is of {there}, and the repository is at another commit now "
+                f"Cannot continue the copy {target}: it is of {source}, and the repository is at another commit now "
                 f"({here}). Give the first address to go on with it, or another name for a new copy."
             )
         raise RunMismatch(
@@ -185,13 +183,13 @@ def _refuse_others(store: Store, target: Path, present: Collection[str]) -> None
     """
     if not present:
         return
-    there = {episode.name: episode for episode in open_store(target).episodes}
+    copied = {episode.name: episode for episode in open_store(target).episodes}
     others = []
     for episode in store.episodes:
         if episode.name not in present:
             continue
         try:
-            captured = _captured(there[episode.name])
+            captured = _captured(copied[episode.name])
         except CorruptEpisode as error:
             raise CorruptEpisode(f"Cannot continue the copy {target}: {error}") from None
         if captured != _captured(episode):

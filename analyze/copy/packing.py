@@ -44,7 +44,7 @@ class Packing:
     A zip is on the disk before the index lists it, so that a crash of the machine leaves no entry without its zip.
 
     It is there before the first zip: a copy that ends early is a packed store of the episodes that it has. The caller
-    holds the lock of the store (`store_lock.py`), and calls `write_index` when it has ended.
+    holds the lock of the store (`lock_for_writing`), and calls `write_index` when it has ended.
     """
 
     def __init__(self, target: Path, run: str, building: Path) -> None:

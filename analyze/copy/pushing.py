@@ -10,11 +10,11 @@ from vla_attention.analyze.stores.contents import protocol_text
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, MissingDependency, listing
 from vla_attention.schemas.safe_text import visible
-from vla_attention.schemas.stores.hub_address import HUB_PROTOCOL, HubAddress
 from vla_attention.schemas.stores.packed_index import INDEX_FILE
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.remote_source import RemoteFailure
 from vla_attention.schemas.stores.store_format import EPISODES_GROUP, STORE_SUFFIX, StoreError
+from vla_attention.schemas.stores.store_url import HUB_PROTOCOL, HubAddress
 
 #: Files of one commit; the hub advises against thousands.
 _FILES_A_COMMIT = 200

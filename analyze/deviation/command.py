@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from vla_attention.analyze.arguments import (
     add_grouping,
@@ -11,11 +12,9 @@ from vla_attention.analyze.arguments import (
     add_selection,
     add_stores,
     output_folder,
-    settings_of,
-    stores_of,
+    question_of,
+    show,
 )
-from vla_attention.analyze.show.output_files import write_parquet
-from vla_attention.analyze.show.screen import fitted, write_whole
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
@@ -47,17 +46,15 @@ def build_parser() -> argparse.ArgumentParser:
 def run(arguments: argparse.Namespace) -> int:
     """Compare the actions; print the comparison, write the tables and the picture."""
     from vla_attention.analyze.deviation.deviation_study import study_deviation
-    from vla_attention.analyze.deviation.text import deviation_text
-    from vla_attention.analyze.measures.question import ask
+    from vla_attention.analyze.deviation.text import deviation_sections
+    from vla_attention.analyze.show.answer import Answer
 
-    study = study_deviation(ask(stores_of(arguments), settings_of(arguments)))
-    text = deviation_text(study)
-    folder = output_folder(arguments, "deviation")
-    files = write_parquet(folder, **study.tables())
-    files.append(write_whole(folder, text))
-    if not arguments.no_plots:
+    study = study_deviation(question_of(arguments))
+
+    def draw(folder: Path) -> list[Path]:
         from vla_attention.analyze.deviation.plot_deviation import plot_deviation
 
-        files += plot_deviation(study, folder)
-    print(fitted(text, folder, files))
-    return 0
+        return plot_deviation(study, folder)
+
+    answer = Answer(deviation_sections(study), study.tables(), draw)
+    return show(answer, output_folder(arguments, "deviation"), arguments)

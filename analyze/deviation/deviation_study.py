@@ -1,4 +1,8 @@
-"""The deviation of a policy's actions from a data set's: by dimension, task and phase, and beside attention."""
+"""The deviation of a policy's actions from a data set's: by dimension, task and phase, and beside attention.
+
+Dimensions of an action have different units. A deviation is therefore measured in the data set's own spread: 1 is the
+root mean square deviation of a policy that always answers with the data set's mean action.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +12,18 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.deviation.action_deviation import rank_correlation, root_mean_square, scaled_deviation
 from vla_attention.analyze.effects.action_changes import ActionSpread, action_spread
 from vla_attention.analyze.effects.paired_replans import ALL, PHASES
 from vla_attention.analyze.measures.aggregate import overall_layer, replans_of
-from vla_attention.analyze.measures.frames import EPISODE_ID, Tables, episode_id, float_values, long_table, replan_axis
+from vla_attention.analyze.measures.frames import (
+    EPISODE_ID,
+    Tables,
+    episode_id,
+    float_values,
+    long_table,
+    replan_axis,
+    rows_of_layer,
+)
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
@@ -26,6 +37,61 @@ from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import StoreError
 
 Array = NDArray[np.float64]
+
+#: Fewest replans with a value on either side of which a rank correlation is taken.
+FEWEST_REPLANS = 4
+
+
+def scaled_deviation(actions: Array, of_data: Array, counts: NDArray[np.integer], spread: Array) -> Array:
+    """(action - data set's action) / spread, over the steps that both have; NaN behind them.
+
+    Args:
+        actions: the policy's, (replan, step, dimension).
+        of_data: the data set's, (replan, step, dimension); other numbers of steps are allowed.
+        counts: (replan,) how many of the data set's steps there are.
+        spread: (dimension,) the units; NaN for dimensions that are not compared.
+
+    Returns:
+        (replan, step, dimension), with the smaller number of steps.
+    """
+    steps = min(actions.shape[1], of_data.shape[1])
+    scaled: Array = (actions[:, :steps] - of_data[:, :steps]) / spread
+    scaled[np.arange(steps)[None] >= np.asarray(counts)[:, None]] = np.nan
+    return scaled
+
+
+def root_mean_square(values: Array, axis: int | tuple[int, ...]) -> Array:
+    """Root mean square of the values that are there; NaN where none is."""
+    known = np.isfinite(values)
+    count = known.sum(axis=axis)
+    with np.errstate(invalid="ignore"):
+        root: Array = np.sqrt(
+            np.where(known, values, 0.0).__pow__(2).sum(axis=axis) / np.where(count > 0, count, np.nan)
+        )
+    return root
+
+
+def rank_correlation(first: Array, second: Array) -> float:
+    """Spearman's correlation of the places where both are finite; NaN where it is not defined.
+
+    Equal values share their mean rank. It is not defined for fewer than `FEWEST_REPLANS` places, or where one side is
+    the same everywhere.
+    """
+    both = np.isfinite(first) & np.isfinite(second)
+    if both.sum() < FEWEST_REPLANS:
+        return float("nan")
+    x, y = (_ranks(values[both]) for values in (first, second))
+    x, y = x - x.mean(), y - y.mean()
+    size = float(np.sqrt((x**2).sum() * (y**2).sum()))
+    return float((x * y).sum() / size) if size > 0 else float("nan")
+
+
+def _ranks(values: Array) -> Array:
+    _, place, count = np.unique(values, return_inverse=True, return_counts=True)
+    last = np.cumsum(count)
+    mean: Array = (last - (count - 1) / 2.0)[place]
+    return mean
+
 
 #: The two measures of a replan: of the first action, and of all steps of the chunk that the data set has too.
 MEASURES = ("first", "chunk")
@@ -108,9 +174,12 @@ def study_deviation(question: Question, replans: Tables | None = None) -> Deviat
         _check_has_both(item.store, item.episode)
     spread = _spread(question)
     units = np.where(spread.used, spread.spread, np.nan)
-    episodes = [_episode(item, units) for item in question.selected]
+    episodes = []
+    for item in question.selected:
+        actions = item.episode.read("actions").astype(np.float64)
+        episodes.append(_Episode(item, scaled_deviation(actions, *_data_actions(item.episode), units)))
     replans = replans_of(question) if replans is None else replans
-    layer = overall_layer(replans.cells)
+    layer = overall_layer(replans.parts[0].cells)
     return DeviationStudy(
         question=question,
         spread=spread,
@@ -118,7 +187,7 @@ def study_deviation(question: Question, replans: Tables | None = None) -> Deviat
         replans=pl.concat([_replan_rows(episode) for episode in episodes]),
         phases=_phase_table(episodes, question),
         dimensions=_dimension_table(episodes, question, spread),
-        correlations=_correlation_table(episodes, question, replans.filter(pl.col("layer") == layer).kept()),
+        correlations=_correlation_table(episodes, question, rows_of_layer(replans, layer)),
     )
 
 
@@ -167,12 +236,6 @@ def _spread(question: Question) -> ActionSpread:
     return spread
 
 
-def _episode(item: SelectedEpisode, units: Array) -> _Episode:
-    of_data, counts = _data_actions(item.episode)
-    actions = item.episode.read("actions").astype(np.float64)
-    return _Episode(item, scaled_deviation(actions, of_data, counts, units))
-
-
 def _replan_rows(episode: _Episode) -> pl.DataFrame:
     values = {"steps": np.isfinite(episode.scaled).any(axis=2).sum(axis=1).astype(np.int64)}
     measures = {name: episode.measures[:, i] for i, name in enumerate(MEASURES)}
@@ -190,8 +253,8 @@ def _phase_table(episodes: list[_Episode], question: Question) -> pl.DataFrame:
         suite, task, _ = episode_id(item)
         identity = {"suite": suite, "task_id": task, "instruction": visible(item.episode.attributes.instruction)}
         rows += [
-            identity | {"phase": phase} | dict(zip(MEASURES, found.tolist(), strict=True))
-            for phase, found in parts.items()
+            identity | {"phase": phase} | dict(zip(MEASURES, means.tolist(), strict=True))
+            for phase, means in parts.items()
         ]
     table = pl.DataFrame(rows).with_columns(pl.col(MEASURES).fill_nan(None))
     limits = dict.fromkeys(MEASURES, POSITIVE)

@@ -76,13 +76,13 @@ def _rows(axes: Axes, table: pl.DataFrame, labels: list[str], name: str) -> None
 
 
 def _correlations(axes: Axes, study: DeviationStudy, quantities: list[str]) -> None:
-    found = study.correlations.filter(pl.col("quantity").is_in(quantities), pl.col("correlation").is_not_null())
-    if found.is_empty():
+    correlations = study.correlations.filter(pl.col("quantity").is_in(quantities), pl.col("correlation").is_not_null())
+    if correlations.is_empty():
         explain(axes, "No episode has enough replans for a correlation.")
         return
     place = {name: i for i, name in enumerate(quantities)}
     for shift, measure in ((-0.14, MEASURES[0]), (0.14, MEASURES[1])):
-        part = found.filter(measure=measure)
+        part = correlations.filter(measure=measure)
         places = np.array([place[name] for name in part["quantity"]]) + shift
         values, low, high = (float_values(part[f"correlation{end}"]) for end in ("", "_low", "_high"))
         axes.hlines(places, low, high, color=_COLORS[measure], linewidth=1.0)

@@ -106,12 +106,15 @@ def noise_of(pairs: Sequence[tuple[Array, Array]], spread: Array) -> Noise:
     number = np.array([base.shape[0] * base.shape[1] for base, _ in pairs], dtype=np.float64)
     statistic = ratio_of_means_over_episodes(squares, np.broadcast_to(number, squares.shape))
     # The episodes are those of which the units are, whatever their tasks.
-    found = estimates([statistic], Units.of(np.zeros(len(pairs))))
+    spreads = estimates([statistic], Units.of(np.zeros(len(pairs))))
     # Several episodes that do not differ agree on the value; a single one says nothing of others.
     alike = (np.nan, np.nan) if len(pairs) < 2 else None
-    intervals = [(one.interval(), one.value) for one in found]
-    ends = np.array([(own.low, own.high) if own else alike or (value, value) for own, value in intervals], np.float64)
-    values = np.array([[one.value for one in found], *ends.T], dtype=np.float64)
+    intervals = [(one.interval(), one.value) for one in spreads]
+    ends = np.array(
+        [(interval.low, interval.high) if interval else alike or (value, value) for interval, value in intervals],
+        np.float64,
+    )
+    values = np.array([[one.value for one in spreads], *ends.T], dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         change, low, high = np.where(spread > 0, np.sqrt(values) / spread, np.nan)
     return Noise(change, low, high)

@@ -41,7 +41,8 @@ def answer_lines(study: EffectStudy) -> list[str]:
         where = "the same replans"
         if measured < every:
             where = f"all {every} episodes of the base, of which effects were measured in {measured}"
-        lines.append(f"Attention in {where}: {_uncapitalised(ratio_sentence(study.analysis.headline))}")
+        sentence = ratio_sentence(study.analysis.headline)
+        lines.append(f"Attention in {where}: {sentence[:1].lower()}{sentence[1:]}")
     lines.append(beyond(study, "minus_noise", "an effect beyond the noise"))
     return lines
 
@@ -67,17 +68,17 @@ def noise_sentence(study: EffectStudy) -> str:
 
 def for_whom(rows: Sequence[GroupRow]) -> str:
     """For whom the groups' keys were cut, and what that leaves; empty without a group."""
-    found = [readers for readers in readers_of(rows) if readers]
-    if not found:
+    readers_named = [readers for readers in readers_of(rows) if readers]
+    if not readers_named:
         return ""
-    if found == [_ACTION]:
+    if readers_named == [_ACTION]:
         return (
             f"Keys were cut for {_ACTION} alone: what other keys took over from them still reaches the action, and "
             f"does not where keys are cut for {_ALL} (--knockout-queries all)."
         )
-    if len(found) == 1:
-        return f"Keys were cut for {found[0]}{_REACH.get(found[0], '')}."
-    return f"Names say for whom keys were cut: for {'; for '.join(one + _REACH.get(one, '') for one in found)}."
+    if len(readers_named) == 1:
+        return f"Keys were cut for {readers_named[0]}{_REACH.get(readers_named[0], '')}."
+    return f"Names say for whom keys were cut: for {'; for '.join(one + _REACH.get(one, '') for one in readers_named)}."
 
 
 def side_sentence(row: GroupRow) -> str:
@@ -126,7 +127,3 @@ def beyond(study: EffectStudy, name: str, what: str) -> str:
 def _interval(row: dict[str, Any], name: str) -> str:
     bounds = row_interval(row, name)
     return "" if bounds == "-" else f" {bounds}"
-
-
-def _uncapitalised(text: str) -> str:
-    return text[:1].lower() + text[1:]

@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vla_attention.analyze.arguments import add_grouping, add_intervals, add_output, add_selection, settings_of
-from vla_attention.analyze.show.output_files import write_csv, write_parquet
-from vla_attention.analyze.show.screen import fitted, write_whole
+from vla_attention.analyze.arguments import add_grouping, add_intervals, add_output, add_selection, settings_of, show
 from vla_attention.schemas.command_line import command_parser
 from vla_attention.schemas.stores.store_url import store_place
 
@@ -55,21 +53,19 @@ def build_parser() -> argparse.ArgumentParser:
 def run(arguments: argparse.Namespace) -> int:
     """Print the effects; write tables and pictures."""
     from vla_attention.analyze.effects.effect_study import study_effects
-    from vla_attention.analyze.effects.text import effects_text
+    from vla_attention.analyze.effects.text import effects_sections
+    from vla_attention.analyze.show.answer import Answer
 
     study = study_effects(arguments.base, arguments.reruns, settings_of(arguments), arguments.dimensions)
-    text = effects_text(study)
-    folder = arguments.output or Path("results") / arguments.base.stem / "effects"
-    tables = {"effects": study.episodes, "effects_summary": study.summary} if study.conditions else {}
-    if study.given.rollouts:
-        tables |= {"rollouts": study.rollout_episodes, "rollouts_summary": study.rollouts}
-    files = [*write_parquet(folder, **tables), *write_csv(folder, **tables)]
-    files.append(write_whole(folder, text))
-    if not arguments.no_plots and study.conditions:
+
+    def draw(folder: Path) -> list[Path]:
         from vla_attention.analyze.effects.plot_attention_and_effect import plot_attention_and_effect
         from vla_attention.analyze.effects.plot_effects import plot_effects
 
-        files += plot_effects(study, folder)
-        files += plot_attention_and_effect(study, folder)
-    print(fitted(text, folder, files))
-    return 0
+        return [*plot_effects(study, folder), *plot_attention_and_effect(study, folder)]
+
+    tables = {"effects": study.episodes, "effects_summary": study.summary} if study.conditions else {}
+    if study.given.rollouts:
+        tables |= {"rollouts": study.rollout_episodes, "rollouts_summary": study.rollouts}
+    answer = Answer(effects_sections(study), tables, draw if study.conditions else None, csv=True)
+    return show(answer, arguments.output or Path("results") / arguments.base.stem / "effects", arguments)

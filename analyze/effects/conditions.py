@@ -88,8 +88,8 @@ class Condition:
 
     def _without_queries(self, name: str) -> str:
         for suffix in {queries_suffix(knockout.queries) for knockout in self.interventions.keys} - {""}:
-            stem, found, rest = name.rpartition(suffix)
-            if found and stem and (not rest or rest.startswith("_of_")):
+            stem, separator, rest = name.rpartition(suffix)
+            if separator and stem and (not rest or rest.startswith("_of_")):
                 return stem
         return name
 
@@ -123,7 +123,7 @@ def kind_of(interventions: Interventions) -> Kind:
         Kind.IMAGE: bool(interventions.images),
         Kind.NOISE: interventions.noise is not None,
     }
-    changed = [kind for kind, there in given.items() if there]
+    changed = [kind for kind, is_given in given.items() if is_given]
     if not interventions.keys:
         return Kind.NOTHING if not changed else changed[0] if len(changed) == 1 else Kind.SEVERAL
     kinds = {_kind_of_knockout(knockout) for knockout in interventions.keys}

@@ -187,18 +187,18 @@ def study_of(analysis: Analysis, opened: BaseAndReruns, dimensions: Sequence[int
 def _all_episodes(question: Question, base: Store) -> list[SelectedEpisode]:
     """All episodes of the base, selected or not; with `skip_corrupt`, damaged ones are left out."""
     known = {item.episode.name: item for item in question.selected}
-    found = []
+    selected = []
     for episode in base.episodes:
         try:
             if episode.name in known:
-                found.append(known[episode.name])
+                selected.append(known[episode.name])
                 continue
             episode.read("actions")
-            found += load_tokens([(base, episode)], question.site)
+            selected += load_tokens([(base, episode)], question.site)
         except CorruptEpisode:
             if not question.settings.skip_corrupt:
                 raise
-    return found
+    return selected
 
 
 def _left_out(pairings: Sequence[Pairing]) -> list[str]:
@@ -209,11 +209,11 @@ def _left_out(pairings: Sequence[Pairing]) -> list[str]:
         (elsewhere, "none of the selected episodes was run again."),
         (empty, "in the replans that are compared, the group has no key in the base."),
     )
-    return [f"{listing(names)} {_are(names)} left out: {reason}" for names, reason in reasons if names]
-
-
-def _are(names: Sequence[str]) -> str:
-    return "is" if len(names) == 1 else "are"
+    return [
+        f"{listing(names)} {'is' if len(names) == 1 else 'are'} left out: {reason}"
+        for names, reason in reasons
+        if names
+    ]
 
 
 def _spread(
@@ -243,11 +243,11 @@ def _spread(
         )
     pairs = []
     for condition in opened.reruns:
-        own = {episode.name: episode for episode in condition.store.episodes if condition.kind == Kind.NOISE}
+        repeated = {episode.name: episode for episode in condition.store.episodes if condition.kind == Kind.NOISE}
         for member in members:
             try:
-                if member.name in own:
-                    pairs.append((member.actions, actions_of(member, own[member.name], condition)))
+                if member.name in repeated:
+                    pairs.append((member.actions, actions_of(member, repeated[member.name], condition)))
             except CorruptEpisode:
                 if not settings.skip_corrupt:
                     raise
@@ -283,10 +283,10 @@ def _rows_of_pair(
     """The rows of one episode: of the base, its rerun, and the base's attention (replan, measure) to the group."""
     base, rerun, attention = given
     changes = changes_of(base, actions_of(base, rerun, condition), spread)
-    there = _has_keys(attention, len(changes), condition.kind)
-    if not there.any():
+    has_keys = _has_keys(attention, len(changes), condition.kind)
+    if not has_keys.any():
         return []
-    changes[~there] = np.nan
+    changes[~has_keys] = np.nan
     values = {name: changes[:, i] for i, name in enumerate(CHANGES)}
     if attention is not None:
         values |= {name: attention[:, i] for i, name in enumerate(MEASURES)}
@@ -297,7 +297,7 @@ def _rows_of_pair(
         "instruction": visible(attributes.instruction),
         "episode_index": attributes.episode_index,
         **fixed,
-        "num_replans": int(there.sum()),
+        "num_replans": int(has_keys.sum()),
     }
     return [{**named, **row} for row in mean_over_phases(base, values)]
 
@@ -327,15 +327,19 @@ def _notes(pairings: Sequence[Pairing], attention: dict[Any, GroupAttention]) ->
         kept = replace(pairing, missing=tuple(name for name in pairing.missing if name not in empty))
         if kept.gap:
             gaps.append(kept.gap)
-        held = (held_by_one(base.item.store, base.item.episode, condition.store, own) for base, own in pairing.pairs)
+        held = (
+            held_by_one(base.item.store, base.item.episode, condition.store, rerun) for base, rerun in pairing.pairs
+        )
         unknown = list(dict.fromkeys(name for one in held for name in one))
         if unknown:
             gaps.append(f"was not compared with the base in the {listing(unknown)}, which one of the two stores lacks")
         for gap in gaps:
             names.setdefault(gap, []).append(condition.name)
     return [
-        f"{found[0]} {gap}." if len(found) == 1 else f"Each of {len(found)} conditions ({listing(found, 3)}) {gap}."
-        for gap, found in names.items()
+        f"{conditions[0]} {gap}."
+        if len(conditions) == 1
+        else f"Each of {len(conditions)} conditions ({listing(conditions, 3)}) {gap}."
+        for gap, conditions in names.items()
     ]
 
 
@@ -346,8 +350,8 @@ def _drifts(pairings: Sequence[Pairing], spread: ActionSpread) -> list[str]:
         if pairing.condition.kind != Kind.NOTHING:
             continue
         largest, where = 0.0, ""
-        for base, own in pairing.pairs:
-            changes = changes_of(base, actions_of(base, own, pairing.condition), spread)
+        for base, rerun in pairing.pairs:
+            changes = changes_of(base, actions_of(base, rerun, pairing.condition), spread)
             chunks = changes[:, CHANGES.index("effect_chunk")]
             if chunks.max() > largest:
                 largest, where = float(chunks.max()), f"replan {int(chunks.argmax())} of {base.name}"
@@ -371,8 +375,8 @@ def with_floors(episodes: pl.DataFrame, conditions: Sequence[Condition]) -> pl.D
     controls = []
     for condition in conditions:
         names = [other.name for other in conditions if other.is_control_of(condition)]
-        own = episodes.filter(pl.col("condition").is_in(names)).group_by(place).agg(effect.alias("random"))
-        controls.append(own.with_columns(pl.lit(condition.name).alias("condition")))
+        controlled = episodes.filter(pl.col("condition").is_in(names)).group_by(place).agg(effect.alias("random"))
+        controls.append(controlled.with_columns(pl.lit(condition.name).alias("condition")))
     empty = pl.DataFrame(
         schema={name: episodes.schema[name] for name in place} | {"random": pl.Float64, "condition": pl.String}
     )

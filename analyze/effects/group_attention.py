@@ -55,7 +55,7 @@ def group_attention(
     """
     names = [site.name for site in question.stores[0].attributes.sites]
     others = [name for name in names if name != question.site]
-    found: dict[GroupOfKeys, GroupAttention] = {}
+    attention: dict[GroupOfKeys, GroupAttention] = {}
     known: set[GroupOfKeys] = set()
     left = list(dict.fromkeys(groups))
     for site in (question.site, *others):
@@ -64,26 +64,28 @@ def group_attention(
         try:
             here = _at_site(question, site, question.selected if everything is None else everything)
         except BadArgument as error:  # the chosen layers are none of that site's
-            found |= {group: GroupAttention(None, {}, str(error)) for group in left if group not in found}
+            attention |= {group: GroupAttention(None, {}, str(error)) for group in left if group not in attention}
             continue
         fitting, empty, notes = _fitting(here, left)
-        found |= {group: GroupAttention(None, {}, note) for group, note in notes.items() if group not in found}
+        attention |= {group: GroupAttention(None, {}, note) for group, note in notes.items() if group not in attention}
         if fitting and (site == question.site or question.settings.site is None):
-            found |= _measured(here, fitting)
+            attention |= _measured(here, fitting)
         known.update(empty)
         left = [group for group in left if group not in fitting]
     # A name that exists in the base, and has no key in the selected episodes: there, nothing was changed.
     nothing = {item.episode.name: _without_keys(item) for item in question.selected}
-    return found | {group: replace(found[group], values=nothing) for group in left if group in known}
+    return attention | {group: replace(attention[group], values=nothing) for group in left if group in known}
 
 
 def _at_site(question: Question, site: str, everything: Sequence[SelectedEpisode]) -> Question:
     if site == question.site:
         return replace(question, vocabulary=vocabulary_of(everything))
     selected = tuple(load_tokens(question.episodes, site))
-    there = load_tokens([(item.store, item.episode) for item in everything], site)
+    tokens_of_site = load_tokens([(item.store, item.episode) for item in everything], site)
     selection = select_again(question, site)
-    return replace(question, site=site, selected=selected, vocabulary=vocabulary_of(there), selection=selection)
+    return replace(
+        question, site=site, selected=selected, vocabulary=vocabulary_of(tokens_of_site), selection=selection
+    )
 
 
 def _without_keys(item: SelectedEpisode) -> Array:
@@ -166,10 +168,10 @@ def _of_group(
         )
     )
     keys = resolved.num_keys[:, number : number + 1]
-    found = group_measures(mass[:, None], valid, keys, uniform_mass[:, None], uniform_valid)
+    measures = group_measures(mass[:, None], valid, keys, uniform_mass[:, None], uniform_valid)
     columns = (
         mass,
-        found.lift[:, 0],
+        measures.lift[:, 0],
         np.full(replans, np.nan) if norm is None else norm,
         np.broadcast_to(keys[:, 0], replans),
     )

@@ -119,15 +119,15 @@ def pair_episodes(condition: Condition, base: Sequence[BaseEpisode], all_names: 
     Raises:
         BadArgument: the rerun holds none of the base's episodes, selected or not.
     """
-    own = {episode.name: episode for episode in condition.store.episodes}
-    pairs = tuple((one, own[one.name]) for one in base if one.name in own)
-    if not any(name in own for name in all_names):
+    reruns = {episode.name: episode for episode in condition.store.episodes}
+    pairs = tuple((one, reruns[one.name]) for one in base if one.name in reruns)
+    if not any(name in reruns for name in all_names):
         raise BadArgument(
             f"The rerun {condition.store.path} holds none of the {len(all_names)} episodes of its base "
-            f"({listing(all_names, 3)}); it holds {listing(own, 3)}: let vla-capture rerun finish."
+            f"({listing(all_names, 3)}); it holds {listing(reruns, 3)}: let vla-capture rerun finish."
         )
-    missing = tuple(one.name for one in base if one.name not in own)
-    return Pairing(condition, pairs, missing, tuple(name for name in own if name not in all_names))
+    missing = tuple(one.name for one in base if one.name not in reruns)
+    return Pairing(condition, pairs, missing, tuple(name for name in reruns if name not in all_names))
 
 
 def actions_of(base: BaseEpisode, rerun: StoredEpisode, condition: Condition) -> Array:

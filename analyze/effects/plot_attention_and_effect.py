@@ -116,15 +116,15 @@ def _name_points(axes: Axes, rows: list[GroupRow], measure: str) -> None:
         text = broken(name, 24)
         lines_of_name = text.split("\n")
         width, tall = _CHARACTER * max(map(len, lines_of_name)), _LINE * len(lines_of_name)
-        found: list[tuple[int, str, float, _Box]] = []
+        tried: list[tuple[int, str, float, _Box]] = []
         for align, lines in _PLACES:
             start, height = x + _GAP if align == "left" else x - _GAP - width, y + lines * _LINE
             box = (start, start + width, height - tall / 2, height + tall / 2)
             inside = box[0] >= 0 and box[1] <= 1 and box[2] >= 0 and box[3] <= 1
             if inside and not any(_overlap(box, other) for other in (*names, *points)):
-                found.append((sum(_overlap(box, bar) for bar in bars), align, height, box))
-        if found:
-            _, align, height, box = min(found, key=lambda place: place[0])
+                tried.append((sum(_overlap(box, bar) for bar in bars), align, height, box))
+        if tried:
+            _, align, height, box = min(tried, key=lambda place: place[0])
             axes.text(
                 box[0] if align == "left" else box[1],
                 height,
@@ -145,11 +145,11 @@ def _overlap(one: _Box, other: _Box) -> bool:
 
 def _table(rows: list[GroupRow]) -> pl.DataFrame:
     names = [f"{name}{end}" for name in ("mass", "lift", "norm", "effect") for end in ("", "_low", "_high")]
-    found = [
+    plotted = [
         {"group": row.label, "num_episodes": row.without["num_episodes"], "keys": row.without["keys"]}
         | {name: row.without[name] for name in names}
         for row in rows
         if row.without is not None
     ]
     schema: dict[str, Any] = {"group": pl.String, "num_episodes": pl.Int64}
-    return pl.DataFrame(found, schema=schema | dict.fromkeys(("keys", *names), pl.Float64))
+    return pl.DataFrame(plotted, schema=schema | dict.fromkeys(("keys", *names), pl.Float64))

@@ -183,14 +183,14 @@ def _table(rows: list[_Row], noise: list[dict[str, Any]]) -> pl.DataFrame:
     """What is drawn, one row per point."""
     columns = ("effect", "effect_low", "effect_high")
     lifts = ("mass", "lift", "lift_low", "lift_high")
-    found = [
+    plotted = [
         {"row": row.label, "point": kind, "condition": point["condition"], "num_episodes": point["num_episodes"]}
         | {name: point[name] for name in columns}
         | {name: None if row.lift is None else row.lift[name] for name in lifts}
         for row in rows
         for kind, point in row.points.items()
     ]
-    found += [
+    plotted += [
         {"row": "noise", "point": "noise", "condition": row["condition"], "num_episodes": row["num_episodes"]}
         | {name: row[name] for name in columns}
         for row in noise
@@ -201,4 +201,4 @@ def _table(rows: list[_Row], noise: list[dict[str, Any]]) -> pl.DataFrame:
         "num_episodes": pl.Int64,
         **dict.fromkeys((*columns, *lifts), pl.Float64),
     }
-    return pl.DataFrame(found, schema=schema)
+    return pl.DataFrame(plotted, schema=schema)

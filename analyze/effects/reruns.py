@@ -111,7 +111,7 @@ def _short(value: object) -> str:
 
 def _paths(given: Sequence[StorePlace]) -> list[tuple[StorePlace, bool]]:
     """Paths of stores, and whether each was named itself; the others are in a folder that was given."""
-    found: list[tuple[StorePlace, bool]] = []
+    paths: list[tuple[StorePlace, bool]] = []
     for path in given:
         if isinstance(path, Path) and path.is_dir() and not (path / "zarr.json").exists():
             inside = sorted(entry for entry in path.iterdir() if entry.suffix == STORE_SUFFIX and entry.is_dir())
@@ -120,10 +120,10 @@ def _paths(given: Sequence[StorePlace]) -> list[tuple[StorePlace, bool]]:
                     f"The folder {path} holds no store; expected those of vla-capture rerun --series --output-dir "
                     f"{path}, or the path of a NAME.zarr."
                 )
-            found += [(entry, False) for entry in inside]
+            paths += [(entry, False) for entry in inside]
         else:
-            found.append((path, True))
-    once = {path.resolve(): (path, named) for path, named in found}
+            paths.append((path, True))
+    once = {path.resolve(): (path, named) for path, named in paths}
     return list(once.values())
 
 

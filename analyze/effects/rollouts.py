@@ -42,8 +42,8 @@ def rollout_pairs(condition: Condition, question: Question) -> tuple[pl.DataFram
         BadArgument: no two rollouts begin alike.
     """
     base = _by_start([item.episode for item in question.selected])
-    own = _by_start(condition.store.episodes)
-    shared = [start for start in base if start in own]
+    changed = _by_start(condition.store.episodes)
+    shared = [start for start in base if start in changed]
     if not shared:
         raise BadArgument(
             f"No rollout of {condition.store.path} begins in the initial state of a selected episode of "
@@ -51,7 +51,7 @@ def rollout_pairs(condition: Condition, question: Question) -> tuple[pl.DataFram
         )
     suite, rows = question.stores[0].suite, []
     for start in shared:
-        first, other = base[start].attributes, own[start].attributes
+        first, other = base[start].attributes, changed[start].attributes
         success = [None if one.success is None else float(one.success) for one in (first, other)]
         # 0: not known.
         steps = [float(one.num_steps) if one.num_steps else None for one in (first, other)]
@@ -72,7 +72,7 @@ def rollout_pairs(condition: Condition, question: Question) -> tuple[pl.DataFram
             }
         )
     notes = []
-    missing = [base[start].name for start in base if start not in own]
+    missing = [base[start].name for start in base if start not in changed]
     if missing:
         notes.append(f"{condition.name} has no rollout from the initial states of {listing(missing, 6)}.")
     seeds = question.stores[0].attributes.protocol.seed, condition.store.attributes.protocol.seed
@@ -96,10 +96,10 @@ def rollout_summary(pairs: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
 
 def _by_start(episodes: Sequence[StoredEpisode]) -> dict[tuple[int, str, int], StoredEpisode]:
     """Episodes by task, initial state and how many of the same came before."""
-    found: dict[tuple[int, str, int], StoredEpisode] = {}
+    by_start: dict[tuple[int, str, int], StoredEpisode] = {}
     for episode in episodes:
         attributes, count = episode.attributes, 0
-        while (attributes.task_id, attributes.initial_state, count) in found:
+        while (attributes.task_id, attributes.initial_state, count) in by_start:
             count += 1
-        found[attributes.task_id, attributes.initial_state, count] = episode
-    return found
+        by_start[attributes.task_id, attributes.initial_state, count] = episode
+    return by_start

@@ -75,10 +75,10 @@ def check_same_calls(base: Store, episode: StoredEpisode, rerun: Store, own: Sto
             f"{base.path} of '{mine.task_name}' ('{visible(mine.instruction)}'): these are not the same episodes; make "
             "the rerun again."
         )
-    found = dict(_differing_inputs(episode, own, Changed.between(base, rerun)))
-    if found:
-        replan = min(int(np.argmax(differs)) for differs in found.values())
-        what = [name for name, differs in found.items() if differs[replan]]
+    differing = dict(_differing_inputs(episode, own, Changed.between(base, rerun)))
+    if differing:
+        replan = min(int(np.argmax(differs)) for differs in differing.values())
+        what = [name for name, differs in differing.items() if differs[replan]]
         raise StoreError(
             f"Replan {replan} of {where} was given {' and '.join(what)} than in its base {base.path}, which the "
             "condition does not change: the base was recorded again since, or the rerun is of another one; make the "

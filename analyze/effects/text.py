@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import polars as pl
 
 from vla_attention.analyze.effects.action_changes import MOSTLY_NOISE
 from vla_attention.analyze.effects.answer import answer_lines, beyond
@@ -13,11 +13,24 @@ from vla_attention.analyze.effects.conditions import FLOORS, Condition, Kind
 from vla_attention.analyze.effects.effect_study import EffectStudy
 from vla_attention.analyze.effects.group_rows import GroupRow, group_rows
 from vla_attention.analyze.effects.paired_replans import ALL, PHASES, stores_executed
+from vla_attention.analyze.show.answer import Section
 from vla_attention.analyze.show.findings import few_families_note
-from vla_attention.analyze.show.headings import heading, interval_note, note_lines, wrap
-from vla_attention.analyze.show.numbers import format_number, format_percent, format_signed, of_tasks, row_interval
+from vla_attention.analyze.show.headings import interval_note, note_lines, wrap
+from vla_attention.analyze.show.numbers import of_tasks
 from vla_attention.analyze.show.plot_text import broken
-from vla_attention.analyze.show.text_table import text_table
+from vla_attention.analyze.show.tables import (
+    INTERVAL,
+    Column,
+    Table,
+    count,
+    estimate,
+    interval,
+    number,
+    percent,
+    signed_estimate,
+    texts,
+    words,
+)
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 
 #: Conditions beside each other in the table of tasks.
@@ -33,154 +46,163 @@ def counted_actions(study: EffectStudy) -> str:
     return "executed" if stores_executed(study.given.base) else "chunk's"
 
 
-def effects_text(study: EffectStudy) -> str:
-    """The whole text."""
-    parts = [_header(study), _groups(study), _left_out(study), _others(study), _rollouts(study), _notes(study)]
+def effects_sections(study: EffectStudy) -> list[Section]:
+    """The whole answer."""
+    sections = [*_header(study), *_groups(study), *_left_out(study), *_others(study), *_rollouts(study), _notes(study)]
     if study.conditions:
-        parts += [
-            _floors(study),
-            _every(study),
-            _phases(study),
-            _tasks(study),
-            _dimensions(study),
-            _attention_notes(study),
-        ]
-    return "\n\n".join(part for part in parts if part) + "\n"
+        sections += [*_floors(study), _every(study), _phases(study), *_tasks(study)]
+        sections += [_dimensions(study), _attention_notes(study)]
+    return sections
 
 
-def _header(study: EffectStudy) -> str:
+def _header(study: EffectStudy) -> list[Section]:
     title = "EFFECTS: what the action does without what it could look at or read"
     lines = study.question.header(title, study.analysis.overall["layer"])
-    if study.conditions:
-        lines += wrap(f"Effects were measured in {of_tasks(*study.measured)}.")
-    return "\n".join([*lines, "", *(line for text in answer_lines(study) for line in wrap(text))])
+    measured = f"Effects were measured in {of_tasks(*study.measured)}." if study.conditions else ""
+    return [Section([lines, measured]), Section(answer_lines(study))]
 
 
-def _groups(study: EffectStudy) -> str:
-    """The answer: every group knocked out, and everything but it."""
+def group_table(study: EffectStudy, caption: str = "") -> Table:
+    """Every group knocked out, and everything but it, in a text and on the page."""
     rows = group_rows(study)
-    if not rows:
-        return ""
     with_norm = any(row.attention["norm"] is not None for row in rows)
-    header = ["group", "keys", "mass", "lift", *(["norm"] if with_norm else [])]
-    header += ["without", "interval", "x noise", "random", "only", "interval"]
-    body = [_group_cells(row, with_norm) for row in rows]
-    lines = [heading("WITHOUT IT, AND WITH IT ALONE  effect on the action"), text_table(header, body, left=(0,))]
-    lines += wrap(_EFFECT_NOTE.format(which=counted_actions(study)))
-    lines += wrap(interval_note(DEFAULT_LEVEL, study.question.units.words) + " Effects do not add up.")
-    return "\n".join(lines)
+
+    def attention(name: str) -> Callable[[GroupRow], float | None]:
+        return lambda row: row.attention[name]
+
+    def without(name: str) -> Callable[[GroupRow], float | None]:
+        return lambda row: (row.without or {}).get(name)
+
+    columns = [
+        texts("group", lambda row: broken(row.label, 24), left=True),
+        words(None, lambda row: row.label, "group"),
+        number("keys", attention("keys")),
+        number("mass", attention("mass")),
+        percent(None, attention("mass"), "mass"),
+        number("lift", attention("lift"), "lift"),
+        *([number("norm", attention("norm"))] if with_norm else []),
+        number("without", without("effect"), "without"),
+        interval("effect", INTERVAL, of=lambda row: row.without),
+        number("x noise", without("over_noise"), "times the noise"),
+        number("random", without("random"), "random keys"),
+        number("only", lambda row: (row.only or {}).get("effect"), "alone"),
+        interval("effect", INTERVAL, of=lambda row: row.only),
+    ]
+    return Table(columns, rows, caption)
 
 
-def _group_cells(row: GroupRow, with_norm: bool) -> list[str]:
-    known, without, only = row.attention, row.without, row.only
-    cells = [broken(row.label, 24), *(format_number(known[name]) for name in ("keys", "mass", "lift"))]
-    cells += [format_number(known["norm"])] if with_norm else []
-    return [*cells, *_effect(without), _of(without, "over_noise"), _of(without, "random"), *_effect(only)]
+def _groups(study: EffectStudy) -> list[Section]:
+    """The answer: every group knocked out, and everything but it."""
+    table = group_table(study)
+    note = _EFFECT_NOTE.format(which=counted_actions(study))
+    about = f"{interval_note(DEFAULT_LEVEL, study.question.units.words)} Effects do not add up."
+    return [Section([table, note, about], "WITHOUT IT, AND WITH IT ALONE  effect on the action")] if table.rows else []
 
 
-def _effect(row: dict[str, Any] | None) -> list[str]:
-    return ["-", "-"] if row is None else [format_number(row["effect"]), row_interval(row, "effect")]
+def _condition(width: int) -> Column:
+    return texts("condition", lambda row: broken(row["condition"], width), left=True)
 
 
-def _of(row: dict[str, Any] | None, name: str) -> str:
-    return "-" if row is None else format_number(row[name])
+_ANGLE_AND_GRIPPER = (number("angle", "angle"), percent("gripper", "gripper_flips"))
 
 
-def _others(study: EffectStudy) -> str:
+def _others(study: EffectStudy) -> list[Section]:
     """Every other change: noise, prompts, pictures, scaled attention."""
     shown = [
         condition for condition in study.conditions if condition.kind not in (Kind.WITHOUT, Kind.ONLY, Kind.RANDOM)
     ]
-    if not shown:
-        return ""
-    header = ["condition", "effect", "interval", "x noise", "angle", "gripper"]
-    rows = [study.of(condition) for condition in shown]
-    body = [
-        [
-            broken(row["condition"], 30),
-            *_effect(row),
-            _of(row, "over_noise"),
-            format_number(row["angle"]),
-            format_percent(row["gripper_flips"]),
-        ]
-        for row in rows
+    rows = [study.of(condition) | {"description": condition.description} for condition in shown]
+    columns = [
+        _condition(30),
+        *estimate("effect", "effect"),
+        number("x noise", "over_noise"),
+        *_ANGLE_AND_GRIPPER,
+        texts("what was changed", "description", running=True),
     ]
-    texts = [condition.description for condition in shown]
-    return "\n".join(
-        [heading("OTHER CHANGES"), text_table(header, body, left=(0,), last="what was changed", texts=texts)]
-    )
+    return [Section([Table(columns, rows)], "OTHER CHANGES")] if shown else []
 
 
-def _every(study: EffectStudy) -> str:
-    header = ["condition", "episodes", "effect", "interval", "x noise", "interval", "chunk", "angle", "gripper"]
-    body = []
-    for condition in study.conditions:
-        row = study.of(condition)
-        cells = [broken(condition.name, 24), str(row["num_episodes"]), *_effect(row)]
-        cells += [_of(row, "over_noise"), row_interval(row, "over_noise"), format_number(row["effect_chunk"])]
-        body.append([*cells, format_number(row["angle"]), format_percent(row["gripper_flips"])])
+def _every(study: EffectStudy) -> Section:
+    columns = [
+        _condition(24),
+        count("episodes", "num_episodes"),
+        *estimate("effect", "effect"),
+        *estimate("x noise", "over_noise"),
+        number("chunk", "effect_chunk"),
+        *_ANGLE_AND_GRIPPER,
+    ]
     note = (
         "chunk: effect over the whole chunk, not only its executed steps. angle: degrees between the first actions' "
         "translations. gripper: executed steps whose gripper command has the other sign; both of runs in vla-capture's "
         "own suites only, whose actions are known."
     )
-    lines = [heading("EVERY CONDITION"), text_table(header, body, left=(0,)), *wrap(note)]
-    lines += [part for one in study.conditions for part in wrap(f"{one.name}: {one.description}", rest="  ")]
-    return "\n".join(lines)
+    described = [part for one in study.conditions for part in wrap(f"{one.name}: {one.description}", rest="  ")]
+    return Section([Table(columns, [*map(study.of, study.conditions)]), note, described], "EVERY CONDITION")
 
 
-def _floors(study: EffectStudy) -> str:
+def _floors(study: EffectStudy) -> list[Section]:
     """Effects minus those of another noise seed and of random keys, in the same episodes."""
-    tested = [condition for condition in study.conditions if condition.kind not in FLOORS]
-    if not tested:
-        return ""
-    header = ["condition", "- noise", "interval", "q", "- random", "interval", "q"]
-    body = []
-    for condition in tested:
-        row = study.of(condition)
-        cells = [broken(condition.name, 24)]
-        for name in ("minus_noise", "minus_random"):
-            cells += [format_signed(row[name]), row_interval(row, name), format_number(row[f"{name}_q"])]
-        body.append(cells)
+    tested = [study.of(condition) for condition in study.conditions if condition.kind not in FLOORS]
+    columns = [
+        _condition(24),
+        *signed_estimate("- noise", "minus_noise"),
+        number("q", "minus_noise_q"),
+        *signed_estimate("- random", "minus_random"),
+        number("q", "minus_random_q"),
+    ]
     note = (
         "Effect minus that of another noise seed, and of random keys, in the same episode. q: p of no difference, "
         "adjusted for the number of conditions (Benjamini-Hochberg)."
     )
-    lines = [heading("ABOVE THE FLOORS"), text_table(header, body, left=(0,)), *wrap(note)]
-    lines += wrap(beyond(study, "minus_noise", "an effect beyond the noise"))
-    lines += wrap(beyond(study, "minus_random", "an effect beyond that of random keys"))
-    return "\n".join(lines)
-
-
-def _phases(study: EffectStudy) -> str:
-    of_phase = {
-        (row["condition"], row["phase"]): row
-        for row in study.summary.filter(pl.col("scope") == "all").iter_rows(named=True)
-    }
-    header = ["condition", *(text for phase in PHASES for text in (phase.removesuffix(" third"), "interval"))]
-    body = [
-        [broken(one.name, 24), *(cell for phase in PHASES for cell in _effect(of_phase.get((one.name, phase))))]
-        for one in study.conditions
+    exceeding = [
+        beyond(study, "minus_noise", "an effect beyond the noise"),
+        beyond(study, "minus_random", "an effect beyond that of random keys"),
     ]
-    return "\n".join([heading("THIRDS OF THE EPISODE  effect"), text_table(header, body, left=(0,))])
+    return [Section([Table(columns, tested), note, *exceeding], "ABOVE THE FLOORS")] if tested else []
 
 
-def _tasks(study: EffectStudy) -> str:
-    rows = study.summary.filter(pl.col("scope") == "task", pl.col("phase") == ALL)
+def _phases(study: EffectStudy) -> Section:
+    rows = study.summary.filter(scope="all").rows_by_key(["condition", "phase"], named=True, unique=True)
+
+    def of(phase: str) -> tuple[Column, Column]:
+        def row(condition: Condition) -> dict[str, Any]:
+            return rows.get((condition.name, phase), {})
+
+        effect = number(phase.removesuffix(" third"), lambda condition: row(condition).get("effect"))
+        return effect, interval("effect", of=row)
+
+    condition = texts("condition", lambda condition: broken(condition.name, 24), left=True)
+    columns = [condition, *(column for phase in PHASES for column in of(phase))]
+    return Section([Table(columns, study.conditions)], "THIRDS OF THE EPISODE  effect")
+
+
+def _tasks(study: EffectStudy) -> list[Section]:
+    rows = study.summary.filter(scope="task", phase=ALL)
     tasks = rows.select("task_id", "instruction").unique("task_id", keep="first").sort("task_id")
     if tasks.height < 2:
-        return ""
-    effect = {(row["task_id"], row["condition"]): row for row in rows.iter_rows(named=True)}
+        return []
+    by_task = rows.rows_by_key(["task_id", "condition"], named=True, unique=True)
     shown = _most_telling(study)
-    header = ["task", "n", *(broken(one.name, 14) for one in shown)]
-    body = []
-    for task in tasks["task_id"]:
-        found = [effect.get((task, one.name)) for one in shown]
-        n = max(row["num_episodes"] for row in found if row is not None) if any(found) else 0
-        body.append([str(task), str(n), *(_of(row, "effect") for row in found)])
-    more = f"; {len(study.conditions) - len(shown)} more conditions are in the tables" if shown else ""
-    title = heading(f"PER TASK  effect{more if len(shown) < len(study.conditions) else ''}")
-    return "\n".join([title, text_table(header, body, left=(0,), last="instruction", texts=list(tasks["instruction"]))])
+
+    def of(condition: Condition) -> Column:
+        def effect(task: dict[str, Any]) -> float | None:
+            return by_task.get((task["task_id"], condition.name), {}).get("effect")
+
+        return number(broken(condition.name, 14), effect)
+
+    def episodes(task: dict[str, Any]) -> int:
+        of_task = [by_task.get((task["task_id"], condition.name), {}) for condition in shown]
+        return max((row["num_episodes"] for row in of_task if row), default=0)
+
+    columns = [
+        count("task", "task_id", left=True),
+        count("n", episodes),
+        *map(of, shown),
+        texts("instruction", "instruction", running=True),
+    ]
+    more = len(study.conditions) - len(shown)
+    title = f"PER TASK  effect{f'; {more} more conditions are in the tables' if shown and more else ''}"
+    return [Section([Table(columns, tasks.to_dicts())], title)]
 
 
 def _most_telling(study: EffectStudy) -> list[Condition]:
@@ -191,76 +213,68 @@ def _most_telling(study: EffectStudy) -> list[Condition]:
     return [*first, *rest][:_MOST_IN_TASKS]
 
 
-def _rollouts(study: EffectStudy) -> str:
-    if not study.given.rollouts:
-        return ""
-    header = ["condition", "pairs", "base solves", "solves", "difference", "interval", "steps", "interval"]
-    body = [
-        [
-            broken(row["condition"], 30),
-            str(row["num_episodes"]),
-            format_percent(row["success_base"], 0),
-            format_percent(row["success"], 0),
-            format_signed(row["success_difference"]),
-            row_interval(row, "success_difference"),
-            format_signed(row["steps_difference"]),
-            row_interval(row, "steps_difference"),
-        ]
-        for row in study.rollouts.filter(pl.col("scope") == "all").iter_rows(named=True)
+def _rollouts(study: EffectStudy) -> list[Section]:
+    columns = [
+        _condition(30),
+        count("pairs", "num_episodes"),
+        percent("base solves", "success_base", decimals=0),
+        percent("solves", "success", decimals=0),
+        *signed_estimate("difference", "success_difference"),
+        *signed_estimate("steps", "steps_difference"),
     ]
     note = (
         "Rollouts under an intervention, paired with the base's by initial state; steps: rollout minus base (a failure "
         "is stopped at the most steps)."
     )
-    return "\n".join(
-        [heading("ROLLOUTS  success and number of steps"), text_table(header, body, left=(0,)), *wrap(note)]
-    )
+    if not study.given.rollouts:
+        return []
+    rows = study.rollouts.filter(scope="all").to_dicts()
+    return [Section([Table(columns, rows), note], "ROLLOUTS  success and number of steps")]
 
 
-def _dimensions(study: EffectStudy) -> str:
+def _dimensions(study: EffectStudy) -> Section:
     spread = study.spread
-    number = len(spread.spread)
-    noise = [(None, "-")] * number if spread.noise is None else [spread.noise.cells(i) for i in range(number)]
-    body = [
-        [str(i), format_number(float(spread.spread[i])), format_number(value), interval, spread.reasons[i] or "yes"]
-        for i, (value, interval) in enumerate(noise)
+    noise = [(None, "-") if spread.noise is None else spread.noise.cells(i) for i in range(len(spread.spread))]
+    columns = [
+        count("dimension", lambda i: i),
+        number("spread", lambda i: float(spread.spread[i])),
+        number("noise", lambda i: noise[i][0]),
+        texts("interval", lambda i: noise[i][1]),
+        texts("compared", lambda i: spread.reasons[i] or "yes", left=True),
     ]
-    table = text_table(["dimension", "spread", "noise", "interval", "compared"], body, left=(4,))
     note = (
         "spread: standard deviation of the base's actions. noise: root mean square change by another noise seed, in "
         f"spreads, with a {DEFAULT_LEVEL:.0%} interval over episodes; without --dimensions, those whose interval lies "
         "above 1 are left out, as they are more noise than movement (all are kept where all would be)."
     )
-    return "\n".join([heading("UNITS  dimensions of the action"), table, *wrap(note)])
+    return Section([Table(columns, range(len(noise))), note], "UNITS  dimensions of the action")
 
 
-def _left_out(study: EffectStudy) -> str:
+def _left_out(study: EffectStudy) -> list[Section]:
     """Which dimensions of the action are not compared."""
     named = [f"{i} ({reason})" for i, reason in enumerate(study.spread.reasons) if reason]
-    if not named:
-        return ""
     same = ""
     if any(reason == MOSTLY_NOISE for reason in study.spread.reasons):
         used = " ".join(str(i) for i in np.flatnonzero(study.spread.used))
         same = f" To compare with another policy, give both the same: --dimensions {used}."
-    return "\n".join(note_lines([f"not compared: dimensions {', '.join(named)} of the action.{same}"]))
+    said = note_lines([f"not compared: dimensions {', '.join(named)} of the action.{same}"])
+    return [Section([said])] if named else []
 
 
-def _notes(study: EffectStudy) -> str:
-    whole = study.summary.filter(pl.col("scope") == "all", pl.col("phase") == ALL)
-    few = few_families_note(whole, "condition", study.question.units)
-    return "\n".join(note_lines([*study.notes, *([few] if few else [])]))
+def _notes(study: EffectStudy) -> Section:
+    few = few_families_note(study.summary.filter(scope="all", phase=ALL), "condition", study.question.units)
+    return Section([note_lines([*study.notes, *([few] if few else [])])])
 
 
-def _attention_notes(study: EffectStudy) -> str:
+def _attention_notes(study: EffectStudy) -> Section:
     """Where attention is of another site, and why a group has none."""
     lines: list[str] = []
     told = [condition.group for condition in study.conditions]
-    for group, found in study.attention.items():
+    for group, attention in study.attention.items():
         if group not in told:
             continue
-        if found.site is None:
-            lines += note_lines([f"no attention beside '{group.text}': {found.note}"])
-        elif found.site != study.question.site:
-            lines += note_lines([f"attention to '{group.text}' is at site '{found.site}'."])
-    return "\n".join(lines)
+        if attention.site is None:
+            lines += note_lines([f"no attention beside '{group.text}': {attention.note}"])
+        elif attention.site != study.question.site:
+            lines += note_lines([f"attention to '{group.text}' is at site '{attention.site}'."])
+    return Section([lines])

@@ -5,17 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vla_attention.analyze.arguments import (
-    add_grouping,
-    add_intervals,
-    add_selection,
-    add_stores,
-    output_folder,
-    output_place,
-    settings_of,
-    stores_of,
-)
-from vla_attention.analyze.show.output_files import report_files
+from vla_attention.analyze.arguments import add_question, add_stores, output_folder, output_place, question_of
+from vla_attention.analyze.show.output_files import files_lines
 from vla_attention.schemas.command_line import command_parser
 from vla_attention.schemas.errors import BadArgument
 
@@ -55,9 +46,7 @@ def build_parser() -> argparse.ArgumentParser:
     kinds.add_argument(
         "--rows", action="store_true", help="with --netcdf: also the rows themselves; their size is printed first"
     )
-    add_grouping(parser)
-    selection = add_selection(parser)
-    add_intervals(parser)
+    selection = add_question(parser)
     selection.add_argument("--per-head", action="store_true", help="keep heads apart in the steps table")
     output = parser.add_argument_group("output")
     output.add_argument("--output", type=output_place, metavar="PATH", help="folder (default: results/STORE/export)")
@@ -74,10 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise BadArgument("--rows goes with --netcdf: rows do not fit into a table.")
     if arguments.table and not tables_wanted:
         raise BadArgument("--table goes with --csv or --parquet; --netcdf always holds masses.")
-    # Imported here, so that `--help` does not wait for polars and zarr.
-    from vla_attention.analyze.measures.question import ask
-
-    question = ask(stores_of(arguments), settings_of(arguments))
+    question = question_of(arguments)
     for line in question.remarks:
         print(line)
     folder = output_folder(arguments, "export")
@@ -90,11 +76,11 @@ def run(arguments: argparse.Namespace) -> int:
         written += write_tables(folder, chosen_tables(analyse(question), names), kinds)
     if arguments.netcdf:
         from vla_attention.analyze.export.labelled_arrays import rows_size, write_netcdf
-        from vla_attention.analyze.show.progress import progress_bar
+        from vla_attention.schemas.progress_bar import progress_bar
 
         if arguments.rows:
             print(f"rows: {rows_size(question)}, before compression")
         with progress_bar(len(question.selected) * (1 + arguments.rows), "episodes") as advance:
             written.append(write_netcdf(question, folder / "attention.nc", arguments.rows, advance))
-    report_files(folder, written)
+    print("\n".join(files_lines(folder, written)))
     return 0

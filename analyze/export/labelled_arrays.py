@@ -173,7 +173,7 @@ def _write_rows(file: Any, question: Question, progress: Callable[[int], object]
     samples, _, _, heads, keys = size.shape
     file.dimensions["key"] = keys
     for name, dimensions, values, attributes in _key_variables(question):
-        kind = values.dtype if values.dtype.kind != "U" else _text_type()
+        kind = values.dtype if values.dtype.kind != "U" else _needed("h5py").string_dtype()
         variable = file.create_variable(name, dimensions, kind)
         variable[...] = values if values.dtype.kind != "U" else values.astype(object)
         for key, value in attributes.items():
@@ -314,7 +314,3 @@ def _needed(module: str) -> Any:
         raise MissingDependency(
             f"Labelled arrays and NetCDF need {module}, which is not installed; pip install 'vla-attention[xarray]'."
         ) from None
-
-
-def _text_type() -> Any:
-    return _needed("h5py").string_dtype()

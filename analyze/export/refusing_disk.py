@@ -61,9 +61,9 @@ class UntoldFile(io.RawIOBase):
         """Read from here on; zeros where nothing could be written."""
         wanted = memoryview(buffer).cast("B")
         self._file.seek(self._position)
-        found = self._file.read(len(wanted)) or b""
-        wanted[: len(found)] = found
-        wanted[len(found) :] = bytes(len(wanted) - len(found))
+        content = self._file.read(len(wanted)) or b""
+        wanted[: len(content)] = content
+        wanted[len(content) :] = bytes(len(wanted) - len(content))
         self._position += len(wanted)
         return len(wanted)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from vla_attention.analyze.arguments import (
     add_episode,
@@ -12,10 +13,9 @@ from vla_attention.analyze.arguments import (
     add_stores,
     output_folder,
     output_place,
-    settings_of,
-    stores_of,
+    question_of,
+    show,
 )
-from vla_attention.analyze.show.output_files import report_files, write_parquet
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
@@ -52,20 +52,20 @@ def build_parser() -> argparse.ArgumentParser:
 def run(arguments: argparse.Namespace) -> int:
     """Print what the groups take; write tables and the picture."""
     from vla_attention.analyze.groups.group_preview import preview_groups
-    from vla_attention.analyze.groups.text import preview_text
-    from vla_attention.analyze.measures.question import ask
+    from vla_attention.analyze.groups.text import preview_sections
     from vla_attention.analyze.measures.selected import check_replan, find_episode
+    from vla_attention.analyze.show.answer import Answer
 
-    question = ask(stores_of(arguments), settings_of(arguments))
+    question = question_of(arguments)
     example = find_episode(question.selected, arguments.task, arguments.episode)
     replan = check_replan(example, arguments.replan)
     preview = preview_groups(question)
-    print(preview_text(question, preview))
-    folder = output_folder(arguments, "groups")
-    files = write_parquet(folder, groups=preview.groups, group_words=preview.words, group_overlaps=preview.overlaps)
-    if not arguments.no_plots:
+
+    def draw(folder: Path) -> list[Path]:
         from vla_attention.analyze.groups.plot_patches import plot_group_patches
 
-        files += plot_group_patches(example, question.grouping, replan, folder)
-    report_files(folder, files)
-    return 0
+        return plot_group_patches(example, question.grouping, replan, folder)
+
+    tables = {"groups": preview.groups, "group_words": preview.words, "group_overlaps": preview.overlaps}
+    answer = Answer(preview_sections(question, preview), tables, draw, whole=True)
+    return show(answer, output_folder(arguments, "groups"), arguments)

@@ -124,7 +124,7 @@ def _words_table(question: Question, names: Sequence[str], resolved: Sequence[Re
     episodes: dict[tuple[str, str, str, int], int] = {}
     for item, groups in zip(question.selected, resolved, strict=True):
         tokens = item.tokens
-        found: set[tuple[str, str, str, int]] = set()
+        instances: set[tuple[str, str, str, int]] = set()
         if not tokens.words or tokens.prompt_index is None:
             continue
         for which, (prompt, words) in enumerate(zip(tokens.prompts, tokens.words, strict=True)):
@@ -135,8 +135,8 @@ def _words_table(question: Question, names: Sequence[str], resolved: Sequence[Re
             for word in words:
                 pieces = pieces_of(word, prompt)
                 for i in np.flatnonzero(weights[list(word.keys)].max(axis=0, initial=0) > 0):
-                    found.add((names[int(i)], word.text.casefold(), "+".join(pieces).casefold(), len(pieces)))
-        for key in found:
+                    instances.add((names[int(i)], word.text.casefold(), "+".join(pieces).casefold(), len(pieces)))
+        for key in instances:
             episodes[key] = episodes.get(key, 0) + 1
     order = {name: i for i, name in enumerate(names)}
     rows = sorted(((*key, count) for key, count in episodes.items()), key=lambda row: (order[row[0]], -row[4], row[1]))

@@ -2,43 +2,35 @@
 
 from __future__ import annotations
 
-import polars as pl
-
 from vla_attention.analyze.groups.group_preview import UNTAKEN, GroupPreview
 from vla_attention.analyze.measures.baselines import baseline_notes
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.show.headings import wrap
+from vla_attention.analyze.show.answer import Section
 from vla_attention.analyze.show.numbers import format_number, of_tasks
-from vla_attention.analyze.show.text_table import text_table
+from vla_attention.analyze.show.tables import Table, texts
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
 
 
-def preview_text(question: Question, preview: GroupPreview) -> str:
-    """The preview as text: groups with their keys, words, what is shared and what is left over."""
+def preview_sections(question: Question, preview: GroupPreview) -> list[Section]:
+    """Groups with their keys, words, what is shared and what is left over."""
     grouping, tokens = question.grouping, question.selected[0].tokens
     sharing = "groups may overlap" if grouping.overlap else "no key in two groups"
-    lines = [
+    about = [
         f"Grouping '{grouping.name}': {len(grouping.names)} groups, {sharing}"
         + (f" ({grouping.description})" if grouping.description else ""),
         f"Site '{question.site}' with {tokens.layout.num_keys} keys; "
         f"{of_tasks(len(question.selected), question.num_tasks)}",
         *question.skipped,
-        "",
-        _groups_text(preview, grouping),
     ]
-    lines += ["", *_words_text(preview)] if preview.words.height else []
-    lines += ["", *_overlaps_text(preview)]
+    notes = _overlaps(preview)
     if grouping.ratio is not None and preview.uniform_ratio is not None:
         sides = " / ".join(" + ".join(side) for side in (grouping.ratio.numerator, grouping.ratio.denominator))
-        lines.append(f"Ratio {sides}: uniform attention alone gives {_range(*preview.uniform_ratio)}.")
-        lines += baseline_notes(question.stores)
-    return "\n".join(wrapped for line in lines for wrapped in _wrapped(line))
-
-
-def _wrapped(line: str) -> list[str]:
-    """Sentences are wrapped; tables, which are several lines already, are not."""
-    return [line] if "\n" in line or not line else wrap(line)
+        notes.append(f"Ratio {sides}: uniform attention alone gives {_range(*preview.uniform_ratio)}.")
+        notes += baseline_notes(question.stores)
+    words = [Section([_words_table(preview)])] if preview.words.height else []
+    keys = "keys: lowest..highest number over all replans; an object counts the area that it covers, in patches"
+    return [Section(about), Section([_groups_table(preview, grouping), [keys]]), *words, Section(notes)]
 
 
 def _range(low: float, high: float) -> str:
@@ -46,52 +38,50 @@ def _range(low: float, high: float) -> str:
     return first if first == last else f"{first}..{last}"
 
 
-def _groups_text(preview: GroupPreview, grouping: Grouping) -> str:
-    rows, texts = [], []
+def _groups_table(preview: GroupPreview, grouping: Grouping) -> Table:
+    rows = []
     for name in preview.groups["group"].unique(maintain_order=True):
-        parts = preview.groups.filter(pl.col("group") == name)
-        total = parts.row(0, named=True)
-        rows.append([name, _range(total["keys_min"], total["keys_max"])])
+        total, *parts = preview.groups.filter(group=name).to_dicts()
         taken = [
             f"{_range(part['keys_min'], part['keys_max'])} {part['role']} of {part['span']} ({part['span_keys']})"
-            for part in parts.slice(1).iter_rows(named=True)
+            for part in parts
         ]
         selectors = " | ".join(grouping.groups[name]) if name in grouping.groups else ""
-        texts.append(f"{', '.join(taken) or 'nothing'}{f'   <- {selectors}' if selectors else ''}")
-    table = text_table(["group", "keys"], rows, left=(0,), last="of which (keys of the span) <- selector", texts=texts)
-    return (
-        f"{table}\nkeys: lowest..highest number over all replans; an object counts the area that it covers, in patches"
-    )
+        which = f"{', '.join(taken) or 'nothing'}{f'   <- {selectors}' if selectors else ''}"
+        rows.append((name, _range(total["keys_min"], total["keys_max"]), which))
+    return _table(rows, "keys", "of which (keys of the span) <- selector")
 
 
-def _words_text(preview: GroupPreview) -> list[str]:
-    lines = []
-    rows, texts = [], []
+def _words_table(preview: GroupPreview) -> Table:
+    rows = []
     for name in preview.words["group"].unique(maintain_order=True):
-        words = preview.words.filter(pl.col("group") == name)
-        rows.append([name, str(words["word"].n_unique())])
+        words = preview.words.filter(group=name)
         shown = [
             row["word"] + (f" ({row['pieces']})" if row["num_pieces"] != 1 else "")
             for row in words.iter_rows(named=True)
         ]
-        texts.append(listing(shown, 40))
-    lines.append(
-        text_table(["group", "words"], rows, left=(0,), last="which (pieces, where a word has several)", texts=texts)
-    )
-    return lines
+        rows.append((name, str(words["word"].n_unique()), listing(shown, 40)))
+    return _table(rows, "words", "which (pieces, where a word has several)")
 
 
-def _overlaps_text(preview: GroupPreview) -> list[str]:
+def _table(rows: list[tuple[str, str, str]], number: str, running: str) -> Table:
+    columns = [
+        texts("group", lambda row: row[0], left=True),
+        texts(number, lambda row: row[1]),
+        texts(running, lambda row: row[2], running=True),
+    ]
+    return Table(columns, rows)
+
+
+def _overlaps(preview: GroupPreview) -> list[str]:
     lines = [
         f"Groups '{row['group']}' and '{row['other']}' share {_range(row['keys_min'], row['keys_max'])} keys."
         for row in preview.overlaps.iter_rows(named=True)
     ]
-    untaken = preview.groups.filter(pl.col("group") == UNTAKEN)
-    if untaken.height:
-        parts = [f"{row['role']} of {row['span']}" for row in untaken.slice(1).iter_rows(named=True)]
-        total = untaken.row(0, named=True)
-        lines.append(f"No group takes {_range(total['keys_min'], total['keys_max'])} keys: {listing(parts)}.")
-        lines.append("Their masses are in no fraction; add a group '*' to have them.")
-    else:
-        lines.append("Every key is in a group.")
-    return lines
+    untaken = preview.groups.filter(group=UNTAKEN)
+    if untaken.is_empty():
+        return [*lines, "Every key is in a group."]
+    total, *parts = untaken.to_dicts()
+    named = listing([f"{row['role']} of {row['span']}" for row in parts])
+    lines.append(f"No group takes {_range(total['keys_min'], total['keys_max'])} keys: {named}.")
+    return [*lines, "Their masses are in no fraction; add a group '*' to have them."]

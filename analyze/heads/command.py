@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from vla_attention.analyze.arguments import (
-    add_grouping,
-    add_intervals,
     add_output,
-    add_selection,
+    add_question,
     add_sink_rule,
     add_stores,
     output_folder,
-    settings_of,
+    question_of,
+    show,
     sink_rule,
 )
-from vla_attention.analyze.show.screen import fitted, write_whole
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
@@ -42,9 +41,7 @@ def build_parser() -> argparse.ArgumentParser:
         _EXAMPLES,
     )
     add_stores(parser)
-    add_grouping(parser)
-    add_selection(parser)
-    add_intervals(parser)
+    add_question(parser)
     rows = parser.add_argument_group("rows and heads")
     rows.add_argument("--top", type=int, default=5, metavar="N", help="heads listed on either end (default: 5)")
     rows.add_argument(
@@ -67,33 +64,30 @@ def run(arguments: argparse.Namespace) -> int:
     """Measure; print the text, write tables and pictures."""
     from vla_attention.analyze.heads.head_study import study_heads
     from vla_attention.analyze.heads.row_metrics import RowOptions
-    from vla_attention.analyze.heads.text import heads_text
-    from vla_attention.analyze.measures.question import ask
-    from vla_attention.analyze.show.output_files import write_parquet
+    from vla_attention.analyze.heads.text import heads_sections
+    from vla_attention.analyze.show.answer import Answer
     from vla_attention.schemas.errors import BadArgument
-    from vla_attention.schemas.stores.reader import open_store
 
     if arguments.top < 1:
         raise BadArgument(f"--top {arguments.top} lists no head; expected at least 1.")
     options = None if arguments.no_rows else RowOptions(tuple(arguments.top_k), sink_rule(arguments))
-    question = ask([open_store(path) for path in arguments.stores], settings_of(arguments))
-    study = study_heads(question, options)
-    folder = output_folder(arguments, "heads")
-    files = write_parquet(folder, **study.files())
-    text = heads_text(study, arguments.top)
-    files.append(write_whole(folder, text))
-    if not arguments.no_plots:
+    study = study_heads(question_of(arguments), options)
+
+    def draw(folder: Path) -> list[Path]:
         from vla_attention.analyze.heads.layer_time import layer_time_table
         from vla_attention.analyze.heads.plot_denoise_profile import plot_denoise_profile
         from vla_attention.analyze.heads.plot_head_grid import plot_head_grid
         from vla_attention.analyze.heads.plot_layer_time import plot_layer_time
         from vla_attention.analyze.ratios.plot_layer_profile import plot_layer_profile
 
-        grouping = question.grouping
-        files += plot_head_grid(study.heads, grouping, folder)
-        files += plot_layer_profile(study.tasks, grouping, folder)
+        grouping = study.question.grouping
         time = layer_time_table(study.replans, grouping, study.question.sampling)
-        files += plot_layer_time(time, study.replans, grouping, folder)
-        files += plot_denoise_profile(study.denoise, grouping, folder)
-    print(fitted(text, folder, files))
-    return 0
+        return [
+            *plot_head_grid(study.heads, grouping, folder),
+            *plot_layer_profile(study.tasks, grouping, folder),
+            *plot_layer_time(time, study.replans, grouping, folder),
+            *plot_denoise_profile(study.denoise, grouping, folder),
+        ]
+
+    answer = Answer(heads_sections(study, arguments.top), study.files(), draw)
+    return show(answer, output_folder(arguments, "heads"), arguments)

@@ -73,7 +73,8 @@ def depth_table(
 
 def _centres(table: pl.DataFrame, column: str, of: str) -> pl.DataFrame:
     """One row per (group, episode) with its centre, from one row per (episode, block, group)."""
-    once = table.unique([*EPISODE_ID, "block", "group"], keep="first", maintain_order=True)
+    cell = [*EPISODE_ID, "block", "group"]
+    once = table.select(*cell, column).unique(cell, keep="first", maintain_order=True)
     once = once.sort(*EPISODE_ID, "block", maintain_order=True)
     episodes = once.select(EPISODE_ID).unique(maintain_order=True)
     blocks = once["block"].unique().sort().to_numpy()

@@ -8,7 +8,16 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.frames import EPISODE_ID, Tables, float_values, head_axis, layer_axis, long_table
+from vla_attention.analyze.measures.frames import (
+    EPISODE_ID,
+    Tables,
+    cells_in_parts,
+    float_values,
+    groups_in_parts,
+    head_axis,
+    layer_axis,
+    long_table,
+)
 from vla_attention.analyze.measures.masses import finite_mean, group_measures, ratio, sides, uniform_ratio
 from vla_attention.analyze.measures.steps import MeasuredEpisode
 from vla_attention.analyze.statistics.episode_intervals import ABOUT_COLUMNS, Sampling, means_with_intervals
@@ -74,7 +83,7 @@ def dispersion(values: NDArray[np.float64], axis: int = -1) -> tuple[NDArray[np.
 
 
 def heads_tables(episodes: Tables, grouping: Grouping, sampling: Sampling) -> Tables:
-    """Every (layer, head), from `episode_heads` of all episodes: means over episodes with intervals.
+    """Every (layer, head), from `episode_heads` of all episodes in their order: means over episodes with intervals.
 
     X_low and X_high bound X, and X_episodes says how many episodes have a finite value.
 
@@ -85,24 +94,31 @@ def heads_tables(episodes: Tables, grouping: Grouping, sampling: Sampling) -> Ta
             mass) and `num_nonfinite`, the number of (episode, replan) left out of the logarithms.
         groups: layer, block, head, group, num_episodes, num_tasks, `ABOUT_COLUMNS`; bounded, `fraction` and `lift`.
     """
-    ordered = Tables(
-        episodes.cells.sort(*EPISODE_ID, maintain_order=True), episodes.groups.sort(*EPISODE_ID, maintain_order=True)
+    limits = {"fraction": SHARE, "lift": POSITIVE}
+    groups = pl.concat(
+        means_with_intervals(part, (*_HEAD, "group"), limits, sampling)
+        for part in groups_in_parts(episodes).by("layer")
     )
-    groups = means_with_intervals(ordered.groups, (*_HEAD, "group"), {"fraction": SHARE, "lift": POSITIVE}, sampling)
     if grouping.ratio is None:
         return Tables(
             groups.select(*_HEAD, "num_episodes", "num_tasks", *ABOUT_COLUMNS).unique(_HEAD, maintain_order=True),
             groups,
         )
+    cells = pl.concat(_cells_of_heads(part, sampling) for part in cells_in_parts(episodes).by("layer"))
+    return Tables(cells, groups)
+
+
+def _cells_of_heads(episodes: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
     bounded = {"log2_ratio": NO_LIMITS, "log2_lift": NO_LIMITS, "numerator_fraction": SHARE}
     above, below = pl.col("numerator_mass").mean(), pl.col("denominator_mass").mean()
-    plain = ordered.cells.group_by(_HEAD).agg(
+    plain = episodes.group_by(_HEAD).agg(
         pl.col("denominator_fraction").mean(),
         (above / below).fill_nan(None).alias("ratio_of_means"),
         pl.col("num_nonfinite").sum(),
     )
-    means = means_with_intervals(ordered.cells, _HEAD, bounded, sampling)
-    return Tables(means.join(plain, on=_HEAD, how="left", maintain_order="left"), groups)
+    return means_with_intervals(episodes, _HEAD, bounded, sampling).join(
+        plain, on=_HEAD, how="left", maintain_order="left"
+    )
 
 
 def dispersion_table(episodes: Tables, grouping: Grouping, sampling: Sampling) -> pl.DataFrame:
@@ -113,20 +129,20 @@ def dispersion_table(episodes: Tables, grouping: Grouping, sampling: Sampling) -
     `log2_ratio_std`, over the heads with a finite one. Further columns: layer, block, num_heads, num_episodes,
     num_tasks. Null with a single head.
     """
-    cells = episodes.cells
-    if grouping.ratio is None:
-        cells = cells.with_columns(
-            episodes.of_group(main_group(episodes, grouping))["fraction"].alias("numerator_fraction")
-        )
+    main = None if grouping.ratio is not None else main_group(episodes, grouping)
     measured = {"fraction": "numerator_fraction"} | ({"log2_ratio": "log2_ratio"} if grouping.ratio else {})
     by = (*EPISODE_ID, "layer", "block")
     rows = []
-    for key, part in cells.group_by(by, maintain_order=True):
-        row = dict(zip(by, key, strict=True)) | {"num_heads": part.height}
-        for name, column in measured.items():
-            std, cv = dispersion(float_values(part[column]))
-            row |= {f"{name}_std": float(std), f"{name}_cv": float(cv)}
-        rows.append(row)
+    for tables in episodes.parts:
+        cells = tables.cells
+        if main is not None:
+            cells = cells.with_columns(tables.of_group(main)["fraction"].alias("numerator_fraction"))
+        for key, part in cells.group_by(by, maintain_order=True):
+            row = dict(zip(by, key, strict=True)) | {"num_heads": part.height}
+            for name, column in measured.items():
+                std, cv = dispersion(float_values(part[column]))
+                row |= {f"{name}_std": float(std), f"{name}_cv": float(cv)}
+            rows.append(row)
     table = pl.DataFrame(rows).sort(*EPISODE_ID, maintain_order=True)
     values = {"fraction_std": POSITIVE, "fraction_cv": POSITIVE}
     values |= {"log2_ratio_std": POSITIVE} if grouping.ratio is not None else {}
@@ -161,5 +177,4 @@ def _descending(heads: pl.DataFrame) -> pl.DataFrame:
 
 def main_group(heads: Tables, grouping: Grouping) -> str:
     """The group by which heads are compared when the grouping has no ratio: the first that has any mass."""
-    having = set(heads.groups.filter(pl.col("fraction") > 0)["group"])
-    return next((name for name in grouping.names if name in having), grouping.names[0])
+    return next(iter(heads.groups_with("fraction")), grouping.names[0])

@@ -12,7 +12,6 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.heads.denoise import denoise_tables
 from vla_attention.analyze.heads.depth import contribution_norms, depth_table
 from vla_attention.analyze.heads.head_measures import dispersion_table, episode_heads, heads_tables
 from vla_attention.analyze.heads.row_metrics import (
@@ -22,9 +21,23 @@ from vla_attention.analyze.heads.row_metrics import (
     measure_all_rows,
     row_tables,
 )
-from vla_attention.analyze.measures.aggregate import episode_tables, replan_tables, task_tables
-from vla_attention.analyze.measures.frames import TableInParts, Tables, concat_tables, named_parts, named_tables
-from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked
+from vla_attention.analyze.measures.aggregate import (
+    episode_tables_of,
+    overall_layer,
+    overall_rows,
+    replan_tables,
+    task_tables,
+)
+from vla_attention.analyze.measures.frames import (
+    TableInParts,
+    Tables,
+    concat_tables,
+    episode_id,
+    named_parts,
+    named_tables,
+    tables_of_each,
+)
+from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_each
 from vla_attention.analyze.measures.sinks import KeyShares, SinkSearch, search_of
@@ -37,10 +50,12 @@ from vla_attention.analyze.measures.steps import (
     segment_weights,
     with_valid,
 )
-from vla_attention.analyze.show.progress import progress_bar
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.selection import Selection
+from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
+from vla_attention.schemas.progress_bar import progress_bar
 
 
 @dataclass(frozen=True)
@@ -122,7 +137,7 @@ def study_heads(question: Question, options: RowOptions | None = None) -> HeadSt
         else (of_episode.mass if is_cut else None for of_episode, is_cut in zip(measures, cut, strict=True))
     )
     measure = partial(_measure, apart=replace(selection, per_head=True), site=question.site)
-    of_heads: list[Tables] = []
+    of_heads: OnDisk[Tables] = OnDisk()
 
     def arrays_over_heads() -> Iterator[dict[str, NDArray[Any]]]:
         given = zip(question.selected, resolved, known, strict=True)
@@ -132,9 +147,13 @@ def study_heads(question: Question, options: RowOptions | None = None) -> HeadSt
                 yield measured.over_heads().arrays()
 
     over_heads = measured_on_disk(question.selected, replace(selection, per_head=False), arrays_over_heads())
-    heads = concat_tables(of_heads)
+    in_order = sorted(range(len(of_heads)), key=lambda i: episode_id(question.selected[i]))
+    heads = tables_of_each(in_order, of_heads.__getitem__)
     replans = replan_tables(over_heads, grouping)
-    episodes = episode_tables(replans, grouping)
+    episodes = episode_tables_of(over_heads, grouping)
+    tasks = task_tables(episodes, grouping, sampling)
+    depth = depth_table(episodes, contribution_norms(question, resolved), sampling)
+    del episodes  # what follows makes such tables again
     rows = search = None
     if options is not None and measures is not None:
         rows = row_tables(question.selected, measures, shown, selection, options)
@@ -144,11 +163,37 @@ def study_heads(question: Question, options: RowOptions | None = None) -> HeadSt
         question=question,
         options=options,
         replans=replans,
-        tasks=task_tables(episodes, grouping, sampling),
+        tasks=tasks,
         heads=heads_tables(heads, grouping, sampling),
         dispersion=dispersion_table(heads, grouping, sampling),
-        depth=depth_table(episodes, contribution_norms(question, resolved), sampling),
+        depth=depth,
         denoise=denoise_tables(over_heads, grouping, sampling),
         rows=rows,
         search=search,
     )
+
+
+def denoise_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping, sampling: Sampling) -> Tables:
+    """Every denoise step: the numbers over all tasks and layers of an analysis in which only this step is selected.
+
+    Returns:
+        `denoise_step`, `denoise_time` (mean over episodes) and the columns of `aggregate.task_tables`, in the order of
+        the steps.
+    """
+    selection = measured[0].selection
+    parts = []
+    for position in np.argsort(selection.denoise_steps, kind="stable").tolist():
+        of_step = MadeWhenAsked(partial(_at_denoise, measured, position), range(len(measured)))
+        episodes = episode_tables_of(of_step, grouping)
+        layer = overall_layer(episodes.cells)
+        whole = overall_rows(task_tables(episodes.filter(pl.col("layer") == layer), grouping, sampling))
+        times = [one.item.episode.read("denoise_time")[selection.denoise[position]] for one in measured]
+        time = pl.lit(float(np.mean(times)), dtype=pl.Float64).alias("denoise_time")
+        number = pl.lit(selection.denoise_steps[position], dtype=pl.Int64).alias("denoise_step")
+        cells, groups = (table.select(number, time, pl.all()) for table in (whole.cells, whole.groups))
+        parts.append(Tables(cells, groups))
+    return concat_tables(parts)
+
+
+def _at_denoise(measured: Sequence[MeasuredEpisode], position: int, episode: int) -> MeasuredEpisode:
+    return measured[episode].at_denoise(position)

@@ -17,7 +17,7 @@ from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.schemas.groupings.grouping import Grouping
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+    pass
 
 STEM = "layer_time"
 
@@ -55,7 +55,8 @@ def plot_layer_time(table: pl.DataFrame, replans: Tables, grouping: Grouping, fo
             axes.set_title(wrapped(quantity.removesuffix("_fraction"), 30, 1))
             bar.set_label("fraction")
         label_axis(axes, "y", layers)
-        _time_axis(axes, bins)
+        axes.set_xticks(np.linspace(-0.5, bins - 0.5, 6), [f"{share:.1f}" for share in np.linspace(0, 1, 6)])
+        axes.set_xlabel("episode time (0: first replan, 1: end)")
         if axes is shared[0]:
             axes.set_ylabel("layer")
     if dots:
@@ -68,9 +69,3 @@ def plot_layer_time(table: pl.DataFrame, replans: Tables, grouping: Grouping, fo
         about = f": {ratio_name(grouping.ratio)} {base}"
     title(figure, f"Layers over the episodes' time, {named(grouping)}{about}", note)
     return save_figure(figure, folder, STEM, table)
-
-
-def _time_axis(axes: Axes, bins: int) -> None:
-    positions = np.linspace(-0.5, bins - 0.5, 6)
-    axes.set_xticks(positions, [f"{share:.1f}" for share in np.linspace(0, 1, 6)])
-    axes.set_xlabel("episode time (0: first replan, 1: end)")

@@ -28,12 +28,12 @@ from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
 from vla_attention.analyze.measures.sinks import KeyShares, SinkRule, UniformShares
 from vla_attention.analyze.measures.steps import with_valid
-from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
+from vla_attention.schemas.progress_bar import progress_bar
 
 DEFAULT_TOP = (1, 5, 10)
 

@@ -35,12 +35,12 @@ from vla_attention.analyze.measures.frames import (
     LAYERS_AVG,
     LayerAxis,
     Tables,
-    concat_tables,
     float_values,
     long_table,
     replan_axis,
     tables_of_each,
 )
+from vla_attention.analyze.measures.masses import GROUP_MEASURES
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.steps import MeasuredEpisode, in_order_of_episodes, measure_episodes
 from vla_attention.analyze.statistics.episode_intervals import ABOUT_COLUMNS, Sampling, about_row
@@ -67,7 +67,7 @@ HEADLINE = "geometric_mean"
 
 def replans_of(question: Question) -> Tables:
     """Measure a question's episodes and average them per replan; see `replan_tables`."""
-    return concat_tables(replan_tables(measure_episodes(question), question.grouping).parts)
+    return replan_tables(measure_episodes(question), question.grouping)
 
 
 def replan_tables(measured: Sequence[MeasuredEpisode], grouping: Grouping) -> Tables:
@@ -127,7 +127,7 @@ def task_tables(
     # As arrays, once: there can be thousands of (task, layer) pairs. numpy has no null: NaN.
     columns = {name: float_values(cells[name]) for name in _columns_over_episodes(grouping)}
     units = sampling.units(cells)
-    values = {name: ordered.values(name) for name in ("mass", "keys", "density", "lift", "fraction")}
+    values = {name: ordered.values(name) for name in GROUP_MEASURES}
     rows, group_rows = [], []
     for scope, names, members in _scopes(cells):
         of_scope = {name: array[members] for name, array in columns.items()}
@@ -139,8 +139,9 @@ def task_tables(
     return Tables(_task_frame(rows, _cell_schema(grouping)), _task_frame(group_rows, _GROUP_SCHEMA))
 
 
-#: The columns of `task_tables(...).groups` with a fraction and its interval.
+#: The columns of `task_tables(...).groups` with a fraction and its interval, and those that are means alone.
 FRACTION_COLUMNS = ("fraction", "fraction_low", "fraction_high")
+_WITHOUT_BOUNDS = tuple(name for name in GROUP_MEASURES if name != "fraction")
 
 
 def layer_order(table: pl.DataFrame) -> list[str]:
@@ -239,7 +240,7 @@ def _task_rows(
     found = iter(estimates([*plain.values(), *bounded.values(), shares], units.decided()))
     layers = range(len(columns["success"]))
     of_plain, of_bounded = ({name: [next(found) for _ in layers] for name in which} for which in (plain, bounded))
-    means = {name: means_over_tasks(groups[name], units.tasks).tolist() for name in ("mass", "keys", "density", "lift")}
+    means = {name: means_over_tasks(groups[name], units.tasks).tolist() for name in _WITHOUT_BOUNDS}
     spreads = summarize_rows(columns["ratio_mean"]) if grouping.ratio else []
     rows, group_rows = [], []
     for i in layers:
@@ -255,16 +256,12 @@ def _task_rows(
         of_groups = []
         for j, name in enumerate(grouping.names):
             share = next(found)
-            values = {measure: _none_for_nan(of[i][j]) for measure, of in means.items()}
+            values = {measure: None if math.isnan(of[i][j]) else of[i][j] for measure, of in means.items()}
             of_groups.append(
                 {"group": name, **values, **named_interval("fraction", share.value, share.interval(level))}
             )
         group_rows.append(of_groups)
     return rows, group_rows
-
-
-def _none_for_nan(value: float) -> float | None:
-    return None if math.isnan(value) else value
 
 
 def baseline_logs(uniform: NDArray[np.float64], log_ratios: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -282,7 +279,7 @@ _NAMES: dict[str, type[pl.DataType]] = {
 _GROUP_SCHEMA: dict[str, type[pl.DataType]] = {
     **_NAMES,
     "group": pl.String,
-    **dict.fromkeys(("mass", "keys", "density", "lift", *FRACTION_COLUMNS), pl.Float64),
+    **dict.fromkeys((*_WITHOUT_BOUNDS, *FRACTION_COLUMNS), pl.Float64),
 }
 
 

@@ -23,6 +23,7 @@ from vla_attention.analyze.measures.frames import (
     float_values,
 )
 from vla_attention.analyze.measures.masses import (
+    GROUP_MEASURES,
     finite_mean,
     group_measures,
     ratio,
@@ -130,7 +131,7 @@ def episode_tables(replans: Tables, grouping: Grouping) -> Tables:
             ratio_lift          geometric mean over replans of ratio / uniform_ratio, finite positive ones
             geometric_mean      exp(log_ratio_mean)
         groups: suite, task_id, episode_index, layer, layer_number, block, group; mass, mass_std, fraction,
-            fraction_std, keys, density (means over replans), lift (over replans where it is finite).
+            fraction_std, keys, density, lift (means over the replans where it is finite).
     """
     return _joined([_of_table(part, grouping) for part in replans.parts])
 
@@ -193,7 +194,7 @@ def _of_table(part: Tables, grouping: Grouping) -> Tables:
     names = part.group_names()
     cells = {name: float_values(part.cells[name])[order] for name in _needed(grouping)}
     made = part.kept()
-    groups = {name: made.values(name)[order] for name in ("mass", "fraction", "keys", "density", "lift")}
+    groups = {name: made.values(name)[order] for name in GROUP_MEASURES}
     return _tables(
         found.drop("_row"),
         _cells_over(replans, cells, grouping),
@@ -251,15 +252,12 @@ def _geometric(replans: _Parts, values: Array) -> Array:
 
 def _groups_over(replans: _Parts, values: Mapping[str, Array]) -> dict[str, Array]:
     """Columns of groups from values (replan, ..., group) of all replans: (part, ..., group) each."""
-    return {
-        "mass": replans.mean(values["mass"]),
-        "mass_std": replans.std(values["mass"]),
-        "fraction": replans.mean(values["fraction"]),
-        "fraction_std": replans.std(values["fraction"]),
-        "keys": replans.mean(values["keys"]),
-        "density": replans.mean(values["density"]),
-        "lift": replans.mean(only_finite(values["lift"])),
-    }
+    found = {}
+    for name in GROUP_MEASURES:
+        found[name] = replans.mean(only_finite(values[name]))
+        if name in ("mass", "fraction"):
+            found[f"{name}_std"] = replans.std(values[name])
+    return found
 
 
 class _Parts:

@@ -30,6 +30,8 @@ LAYERS_AVG = "layers_avg"
 Measured = TypeVar("Measured")
 #: A few megabytes.
 _ROWS_OF_LARGER_PARTS = 20_000
+#: Each such part takes reading all episodes.
+_ROWS_OF_ALL_EPISODES = 40_000
 #: One axis: the columns that label it, each with a value per position.
 Axis = Mapping[str, Sequence[Any] | NDArray[Any] | pl.Series]
 
@@ -283,6 +285,10 @@ class TableInParts:
         """The parts, in order."""
         return iter(self.parts)
 
+    def __len__(self) -> int:
+        """Number of parts."""
+        return len(self.parts)
+
     @property
     def whole(self) -> pl.DataFrame:
         """The rows of all parts."""
@@ -290,7 +296,25 @@ class TableInParts:
 
     def filter(self, *conditions: pl.Expr, **values: Any) -> pl.DataFrame:
         """The rows of all parts for which conditions hold and columns have these values."""
-        return pl.concat([part.filter(*conditions, **values) for part in self.parts])
+        return pl.concat([_copied(part.filter(*conditions, **values)) for part in self.parts])
+
+    def select(self, columns: Sequence[str], *conditions: pl.Expr) -> pl.DataFrame:
+        """Some columns of the rows of all parts for which conditions hold."""
+        return pl.concat([_copied(part.filter(*conditions).select(columns)) for part in self.parts])
+
+    def by(self, column: str) -> Iterator[pl.DataFrame]:
+        """The rows in other parts, each with some values of a column that has the same ones in every episode."""
+        first = self.parts[0]
+        values = first[column].unique(maintain_order=True).to_list()
+        together = max(1, _ROWS_OF_ALL_EPISODES * len(values) // max(1, first.height * len(self.parts)))
+        for start in range(0, len(values), together):
+            chosen = pl.col(column).is_in(values[start : start + together])
+            yield pl.concat([_copied(part.filter(chosen)) for part in in_larger_parts(self.parts)])
+
+
+def _copied(rows: pl.DataFrame) -> pl.DataFrame:
+    """The same rows in memory of their own: `filter` gives a view of consecutive rows, with which the others stay."""
+    return rows[np.arange(rows.height)]
 
 
 def in_larger_parts(parts: Iterable[pl.DataFrame]) -> Iterator[pl.DataFrame]:
@@ -313,6 +337,12 @@ def cells_in_parts(level: Tables) -> TableInParts:
 def groups_in_parts(level: Tables) -> TableInParts:
     """The groups of a level."""
     return TableInParts(MadeWhenAsked(lambda i: level.parts[i].groups, range(len(level.parts))))
+
+
+def rows_of_layer(level: Tables, layer: str) -> Tables:
+    """The cells and groups of one layer, both kept."""
+    of_layer = pl.col("layer") == layer
+    return Tables(cells_in_parts(level).filter(of_layer), groups_in_parts(level).filter(of_layer))
 
 
 def named_parts(name: str, level: Tables) -> dict[str, TableInParts]:

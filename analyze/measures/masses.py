@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,17 +36,24 @@ def weighted_sums(values: NDArray[np.float32], weights: NDArray[np.float32]) -> 
 
 @dataclass(frozen=True)
 class GroupMeasures:
-    """The measures of every group, each of shape (replan, ..., group)."""
+    """The measures of every group, each of shape (replan, ..., group).
+
+    A field is a column of every table of groups; over replans, episodes and tasks its finite values are averaged.
+    """
 
     mass: NDArray[np.float64]
     fraction: NDArray[np.float64]
+    keys: NDArray[np.float64]
     density: NDArray[np.float64]
     lift: NDArray[np.float64]
-    keys: NDArray[np.float64]
 
     def columns(self) -> dict[str, NDArray[np.float64]]:
         """The measures by the names of their columns."""
-        return {name: getattr(self, name) for name in ("mass", "fraction", "keys", "density", "lift")}
+        return {name: getattr(self, name) for name in GROUP_MEASURES}
+
+
+#: The columns of groups, in the order of the tables.
+GROUP_MEASURES = tuple(field.name for field in fields(GroupMeasures))
 
 
 def group_measures(
@@ -79,7 +86,7 @@ def group_measures(
         fraction = mass / mass.sum(axis=-1, keepdims=True)
         density = np.where(keys > 0, mass / keys, np.nan)
         lift = np.where(uniform_mass > 0, mass / uniform_mass, np.nan) / (valid_mass / uniform_valid)[..., None]
-    return GroupMeasures(mass, fraction, density, lift, keys)
+    return GroupMeasures(mass, fraction, keys, density, lift)
 
 
 def ratio(numerator: NDArray[np.float64], denominator: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -14,7 +14,6 @@ from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
 from vla_attention.analyze.measures.task_families import relation_remarks, sampling_of, units_of
 from vla_attention.analyze.show.headings import run_header
-from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.units import Units
 from vla_attention.analyze.stores.checking import faults_of_each
@@ -31,6 +30,7 @@ from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.builtin_groupings import find_grouping
 from vla_attention.schemas.groupings.grouping import Grouping, parse_group_argument, parse_ratio_argument, with_groups
 from vla_attention.schemas.groupings.vocabulary import Vocabulary
+from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import RootAttributes, StoreError
 
@@ -92,7 +92,7 @@ class Question:
     @property
     def num_tasks(self) -> int:
         """Number of tasks of the selected episodes; equal numbers in different suites are different tasks."""
-        return len({(item.store.suite, item.episode.attributes.task_id) for item in self.selected})
+        return len({item.task for item in self.selected})
 
     @property
     def untrained(self) -> bool:

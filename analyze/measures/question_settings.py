@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypedDict
@@ -82,7 +82,18 @@ def settings_from_keywords(**keywords: Any) -> AnalysisSettings:
     return AnalysisSettings(**values)
 
 
-def _numbers(value: int | Sequence[int]) -> tuple[int, ...]:
+def check_name(what: str, given: str, known: Collection[str]) -> None:
+    """Raise `BadArgument` unless the name exists."""
+    if given not in known:
+        raise BadArgument(f"Unknown {what} '{given}'.{did_you_mean(given, known)} Existing: {listing(known)}.")
+
+
+def given_only(**options: int | None) -> dict[str, Any]:
+    """The options that were given."""
+    return {name: value for name, value in options.items() if value is not None}
+
+
+def _whole_numbers(value: int | Sequence[int]) -> tuple[int, ...]:
     items = [value] if isinstance(value, (int, str)) else list(value)
     try:
         return tuple(int(item) for item in items)
@@ -119,8 +130,8 @@ _CONVERT: dict[str, Any] = {
     "grouping": str,
     "groups": _groups,
     "ratio": _ratio,
-    "layers": _numbers,
-    "heads": _numbers,
-    "tasks": _numbers,
+    "layers": _whole_numbers,
+    "heads": _whole_numbers,
+    "tasks": _whole_numbers,
     "denoise": _steps,
 }

@@ -30,6 +30,11 @@ class SelectedEpisode:
     without: tuple[int, ...] = ()
 
     @property
+    def task(self) -> tuple[str, int]:
+        """Its suite and the number of its task."""
+        return self.store.suite, self.episode.attributes.task_id
+
+    @property
     def valid(self) -> NDArray[np.bool_]:
         """Keys that can hold information and were not taken out, shape (replan or 1, key)."""
         valid = self.tokens.valid.copy()
@@ -41,6 +46,14 @@ class SelectedEpisode:
         """Number of keys that can hold information and were not taken out, shape (replan or 1,)."""
         number: NDArray[np.int64] = self.valid.sum(axis=1)
         return number
+
+
+def positions_by_task(selected: Sequence[SelectedEpisode]) -> dict[tuple[str, int], list[int]]:
+    """Positions of each task's episodes, tasks in order of appearance."""
+    positions: dict[tuple[str, int], list[int]] = {}
+    for i, item in enumerate(selected):
+        positions.setdefault(item.task, []).append(i)
+    return positions
 
 
 def load_tokens(chosen: Sequence[tuple[Store, StoredEpisode]], site: str) -> list[SelectedEpisode]:

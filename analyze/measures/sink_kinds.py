@@ -67,7 +67,7 @@ def _value_ratio(question: Question, suite: str, task: int, key: int, blocks: li
     """None where the key shares its segment at a replan, or is valid at none."""
     sums = np.zeros(4)
     for item in question.selected:
-        if (item.store.suite, item.episode.attributes.task_id) == (suite, task):
+        if item.task == (suite, task):
             found = _lengths_and_masses(item, question, key, blocks)
             if found is None:
                 return None

@@ -40,16 +40,16 @@ from vla_attention.analyze.measures.baselines import uniform_keys
 from vla_attention.analyze.measures.kept import measured_once
 from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_episode
+from vla_attention.analyze.measures.selected import SelectedEpisode, positions_by_task, resolve_episode
 from vla_attention.analyze.measures.sink_kinds import value_ratios
 from vla_attention.analyze.show.numbers import plural
-from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.groupings.resolve import describe_key
 from vla_attention.schemas.layout import Role
+from vla_attention.schemas.progress_bar import progress_bar
 
 DEFAULT_FACTOR = 10.0
 DEFAULT_SHARE = 0.5
@@ -240,7 +240,7 @@ def search_of(question: Question, shares: Sequence[KeyShares], rule: SinkRule) -
     selection = question.selection
     once = layers_once(selection)
     frames, heads = [], []
-    for (suite, task), positions in _tasks(question).items():
+    for (suite, task), positions in sorted(positions_by_task(question.selected).items()):
         items = [question.selected[i] for i in positions]
         above, held, uniform = np.zeros((3, *shares[positions[0]].held.shape))
         for i in positions:
@@ -257,6 +257,7 @@ def search_of(question: Question, shares: Sequence[KeyShares], rule: SinkRule) -
         described = pl.DataFrame([_describe(int(key), items, valid) for key in keys], schema=_DESCRIPTION, orient="row")
         counted = np.zeros(held.shape[2], dtype=bool)
         counted[keys] = (described["role"] != Role.ACTION.label).to_numpy()
+        # Twice the uniform share: where a row has two or three valid keys, even attention exceeds the limit of mass.
         by_mass = counted & (held > np.maximum(rule.mass, 2.0 * uniform))
         # A share is a mean of quotients: rounding must not put one half below 0.5.
         is_sink = by_mass | (counted & (above >= rule.share - _ROUNDING))
@@ -335,18 +336,17 @@ def without_sinks(question: Question, sinks: pl.DataFrame, rule: SinkRule) -> Qu
     for suite, task, key in sinks.filter("widespread").select("suite", "task_id", "key").iter_rows():
         keys[suite, task] = (*keys.get((suite, task), ()), key)
     selected = tuple(
-        replace(item, without=tuple(sorted({*item.without, *keys.get(_task_of(item), ())})))
-        for item in question.selected
+        replace(item, without=tuple(sorted({*item.without, *keys.get(item.task, ())}))) for item in question.selected
     )
     for item in selected:
         if not item.valid.any():
             raise BadArgument(
-                f"Every valid key of task {_task_of(item)[1]} is a sink by this rule, so that nothing is left without "
+                f"Every valid key of task {item.task[1]} is a sink by this rule, so that nothing is left without "
                 "sinks; give a larger --sink-factor, --sink-mass or --sink-heads."
             )
     grouping = replace(question.grouping, name=f"{question.grouping.name}-without-sinks")
     num_valid = max(float(item.num_valid.mean()) for item in question.selected)
-    notes = (*question.notes, describe_sinks(sinks, len(_tasks(question)), rule, num_valid))
+    notes = (*question.notes, describe_sinks(sinks, question.num_tasks, rule, num_valid))
     return replace(question, selected=selected, grouping=grouping, notes=notes)
 
 
@@ -358,8 +358,9 @@ def sinks_of_sides(question: Question, sinks: pl.DataFrame) -> pl.DataFrame:
     names = question.grouping.names
     sides = [names.index(name) for name in (*ratio.numerator, *ratio.denominator)]
     counted: set[tuple[str, int, int]] = set()
+    of_task = positions_by_task(question.selected)
     for suite, task in sinks.select("suite", "task_id").unique().iter_rows():
-        for i in _tasks(question)[suite, task]:
+        for i in of_task[suite, task]:
             weights = resolve_episode(question.grouping, question.selected[i]).weights
             keys = np.flatnonzero((weights[:, :, sides] > 0).any(axis=(0, 2)))
             counted.update((suite, task, int(key)) for key in keys)
@@ -447,15 +448,3 @@ def _describe(
         return key, span.name, role, None, None, describe_key(key, tokens)
     row, column = divmod(key - span.start, span.grid.columns)
     return key, span.name, role, row, column, f"{describe_key(key, tokens)}, patch ({row}, {column})"
-
-
-def _task_of(item: SelectedEpisode) -> tuple[str, int]:
-    return item.store.suite, item.episode.attributes.task_id
-
-
-def _tasks(question: Question) -> dict[tuple[str, int], list[int]]:
-    """Positions of each task's episodes."""
-    tasks: dict[tuple[str, int], list[int]] = {}
-    for i, item in enumerate(question.selected):
-        tasks.setdefault(_task_of(item), []).append(i)
-    return dict(sorted(tasks.items()))

@@ -42,12 +42,12 @@ from vla_attention.analyze.measures.selected import (
     resolve_all,
     resolve_episode,
 )
-from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping, check_names, stack_over_keys
+from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.segments import segment_members, weights_on_segments
 
 #: The arrays of a `MeasuredEpisode`.
@@ -330,3 +330,19 @@ def _reduce(values: NDArray[np.float32], selection: Selection, axis: int = -1) -
     """Average over queries (the given axis) and, unless heads are kept apart, over heads (the axis before it)."""
     values = values.mean(axis=axis)
     return values if selection.per_head else values.mean(axis=axis, keepdims=True)
+
+
+def role_masses(question: Question) -> dict[str, float]:
+    """Mean mass of the keys of each role, by the role's name.
+
+    Means over replans, selected layers, denoise steps, heads and queries, then over episodes. They come from the stored
+    masses of segments, which are exact while stored rows are rounded. Their sum is the mean row sum (1).
+    """
+    selection = question.selection
+    totals: dict[str, float] = {}
+    for item in question.selected:
+        atoms = selected_cells(item.episode.read(f"{question.site}/atoms"), selection)
+        masses = atoms.reshape(-1, atoms.shape[-1]).mean(axis=0, dtype=np.float64)
+        for segment, mass in zip(item.episode.attributes.segments[question.site], masses.tolist(), strict=True):
+            totals[segment.role] = totals.get(segment.role, 0.0) + mass
+    return {role: total / len(question.selected) for role, total in totals.items()}

@@ -28,7 +28,7 @@ def sampling_of(estimand: Estimand, selected: Iterable[SelectedEpisode]) -> Samp
     """
     families: dict[TaskName, str] = {}
     for item in selected:
-        family, task = item.episode.attributes.task_family, _task_of(item)
+        family, task = item.episode.attributes.task_family, item.task
         known = families.setdefault(task, family) if family else ""
         if known != family and estimand == Estimand.TASKS_LIKE_THESE:
             raise MixedFamilies(
@@ -41,7 +41,7 @@ def sampling_of(estimand: Estimand, selected: Iterable[SelectedEpisode]) -> Samp
 
 def units_of(sampling: Sampling, selected: Sequence[SelectedEpisode]) -> Units:
     """The units of episodes, not decided (`Units.decided`)."""
-    tasks = [_task_of(item) for item in selected]
+    tasks = [item.task for item in selected]
     number = {task: i for i, task in enumerate(dict.fromkeys(tasks))}
     families = [sampling.families.get(task, "") for task in tasks]
     return Units.of(np.array([number[task] for task in tasks]), sampling.estimand, families)
@@ -55,7 +55,7 @@ def relation_remarks(sampling: Sampling, selected: Sequence[SelectedEpisode]) ->
 
 def family_notes(sampling: Sampling, selected: Sequence[SelectedEpisode]) -> tuple[str, ...]:
     """What intervals over these episodes' tasks are about where it is not what was asked, or assumes something."""
-    tasks = dict.fromkeys(_task_of(item) for item in selected)
+    tasks = dict.fromkeys(item.task for item in selected)
     families = dict.fromkeys(visible(sampling.families[task]) for task in tasks if task in sampling.families)
     if len(tasks) < 2:
         return ()
@@ -79,7 +79,7 @@ def unknown_families(sampling: Sampling, selected: Sequence[SelectedEpisode]) ->
     """That intervals count tasks that seem related as independent, because their families are not known; or nothing."""
     if sampling.estimand != Estimand.TASKS_LIKE_THESE:
         return ""
-    instructions = {_task_of(item): visible(item.episode.attributes.instruction) for item in selected}
+    instructions = {item.task: visible(item.episode.attributes.instruction) for item in selected}
     said = related_instructions([text for task, text in instructions.items() if task not in sampling.families])
     return f"{said} --intervals these-tasks does not count them so." if said else ""
 
@@ -129,7 +129,3 @@ def alike_instructions(instructions: Sequence[str]) -> AlikeInstructions | None:
     first = min(groups)
     examples = dict.fromkeys(instructions[number] for number in first[:2])
     return AlikeInstructions(len({number for group in groups for number in group}), tuple(examples))
-
-
-def _task_of(item: SelectedEpisode) -> TaskName:
-    return item.store.suite, item.episode.attributes.task_id

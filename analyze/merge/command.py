@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Merge the stores."""
     from vla_attention.analyze.merge.merging import merge_stores
     from vla_attention.analyze.show.numbers import plural
-    from vla_attention.analyze.show.progress import progress_bar
+    from vla_attention.schemas.progress_bar import progress_bar
     from vla_attention.schemas.stores.reader import open_store
 
     stores = [open_store(path) for path in arguments.stores]

@@ -17,15 +17,13 @@ from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.stores.checking import reports_of_store
 from vla_attention.schemas.errors import BadArgument, UserError, listing
-from vla_attention.schemas.stores.digest import with_digest
+from vla_attention.schemas.stores.digest import run_differences, with_digest
 from vla_attention.schemas.stores.durable_files import publish
 from vla_attention.schemas.stores.episode_files import refuse_links
-from vla_attention.schemas.stores.hub_address import HUB_PROTOCOL
 from vla_attention.schemas.stores.partial_folders import partial_of, remove_dead_partials
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.remote_source import source_of
 from vla_attention.schemas.stores.root import group_attributes, group_document
-from vla_attention.schemas.stores.run_differences import run_differences
 from vla_attention.schemas.stores.seal import SEAL_FILE
 from vla_attention.schemas.stores.store_format import (
     EPISODES_DOCUMENT,
@@ -35,7 +33,7 @@ from vla_attention.schemas.stores.store_format import (
     StoreExists,
 )
 from vla_attention.schemas.stores.store_place import check_place
-from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
+from vla_attention.schemas.stores.store_url import HUB_PROTOCOL, StorePlace, StoreUrl
 
 #: Differing fields that are named of two stores.
 _MOST_NAMED = 5
@@ -121,14 +119,14 @@ def _check_same_run(one: Store, other: Store) -> None:
             f"Cannot merge {one.path} and {other.path}: the one is of {versions[0]} and the other of {versions[1]} of "
             "the store format, and no store has episodes of both. Analyses take several stores: give them both."
         )
-    found = [
-        f"{where} is {_short(here)} in the one and {_short(there)} in the other"
-        for where, here, there in run_differences(one.attributes, other.attributes)
+    differences = [
+        f"{where} is {_short(here)} in the one and {_short(second)} in the other"
+        for where, here, second in run_differences(one.attributes, other.attributes)
     ]
     if one.run == other.run:
-        found = [f"the parts that copies left out are '{_left_out(one)}' and '{_left_out(other)}'"]
-    named = "; ".join(found[:_MOST_NAMED]) or "their zarr.json states the same in other numbers"
-    more = f"; and {len(found) - _MOST_NAMED} more fields differ" if len(found) > _MOST_NAMED else ""
+        differences = [f"the parts that copies left out are '{_left_out(one)}' and '{_left_out(other)}'"]
+    named = "; ".join(differences[:_MOST_NAMED]) or "their zarr.json states the same in other numbers"
+    more = f"; and {len(differences) - _MOST_NAMED} more fields differ" if len(differences) > _MOST_NAMED else ""
     raise RunMismatch(f"Cannot merge {one.path} and {other.path}, which are not of one run: {named}{more}.")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from vla_attention.analyze.arguments import (
     add_episode,
@@ -12,10 +13,9 @@ from vla_attention.analyze.arguments import (
     add_stores,
     output_folder,
     settings_of,
+    show,
     stores_of,
 )
-from vla_attention.analyze.show.output_files import write_parquet
-from vla_attention.analyze.show.screen import fitted, write_whole
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
@@ -75,30 +75,28 @@ def run(arguments: argparse.Namespace) -> int:
     """Measure the objects; print them, write tables and pictures."""
     from vla_attention.analyze.objects.object_settings import ObjectSettings
     from vla_attention.analyze.objects.object_study import study_objects
-    from vla_attention.analyze.objects.text import objects_text
+    from vla_attention.analyze.objects.text import objects_sections
+    from vla_attention.analyze.show.answer import Answer
 
-    object_settings = ObjectSettings(
-        percentiles=ObjectSettings.percentiles if arguments.percentiles is None else tuple(arguments.percentiles),
-        mask_coverage=arguments.mask_coverage,
-        tolerance=arguments.tolerance,
-        spatial=not arguments.no_iou,
-    )
     study = study_objects(
         stores_of(arguments),
         settings_of(arguments),
-        object_settings,
+        ObjectSettings(
+            percentiles=ObjectSettings.percentiles if arguments.percentiles is None else tuple(arguments.percentiles),
+            mask_coverage=arguments.mask_coverage,
+            tolerance=arguments.tolerance,
+            spatial=not arguments.no_iou,
+        ),
         keep_steps=arguments.save_steps,
         task=arguments.task,
         episode=arguments.episode,
     )
-    text, folder = objects_text(study), output_folder(arguments, "objects")
-    files = [*write_parquet(folder, **study.files()), write_whole(folder, text)]
-    if not arguments.no_plots:
+
+    def draw(folder: Path) -> list[Path]:
         from vla_attention.analyze.objects.plot_object_iou import plot_object_iou
         from vla_attention.analyze.objects.plot_object_shares import plot_object_shares
 
-        files += plot_object_shares(study, folder)
-        if object_settings.spatial:
-            files += plot_object_iou(study, folder)
-    print(fitted(text, folder, files))
-    return 0
+        return [*plot_object_shares(study, folder), *(plot_object_iou(study, folder) if not arguments.no_iou else [])]
+
+    answer = Answer(objects_sections(study), study.files(), draw)
+    return show(answer, output_folder(arguments, "objects"), arguments)

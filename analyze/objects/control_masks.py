@@ -25,13 +25,17 @@ area is the object's own place, and the control cannot tell following from a fix
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.measures.frames import Axis, long_table
 from vla_attention.analyze.measures.masses import finite_mean
+from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
+from vla_attention.analyze.measures.selected import SelectedEpisode, positions_by_task
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -218,3 +222,50 @@ def _spaced(count: int, most: int) -> NDArray[np.int64]:
 
 def _area(masks: NDArray[np.floating]) -> Array:
     return np.asarray(masks.sum(axis=1, dtype=np.float64))
+
+
+@dataclass(frozen=True)
+class ControlParts:
+    """What the control needs of an episode, by picture, and the axes and items of its table `objects`."""
+
+    sources: Mapping[str, ControlSource]
+    axes: Sequence[Axis]
+    items: Sequence[tuple[str, str, str]]
+
+
+def control_columns(episodes: Sequence[SelectedEpisode], parts: Sequence[ControlParts]) -> Sequence[pl.DataFrame]:
+    """The columns of the control, in the rows of each episode's `objects`; kept on disk."""
+    of_task = positions_by_task(episodes)
+    columns: OnDisk[pl.DataFrame] = OnDisk()
+    for members in of_task.values():
+        found = _controls(parts, members)
+        for i in members:
+            columns.append(_columns(episodes[i], parts[i], found[i]))
+    places = {i: place for place, i in enumerate(i for members in of_task.values() for i in members)}
+    return MadeWhenAsked(columns.__getitem__, [places[i] for i in range(len(episodes))])
+
+
+def _controls(parts: Sequence[ControlParts], members: Sequence[int]) -> dict[int, dict[str, Control]]:
+    """The controls of the episodes of one task, by picture."""
+    found: dict[int, dict[str, Control]] = {i: {} for i in members}
+    named = {i: (list(part.sources), [item[:2] for item in part.items]) for i in members for part in [parts[i]]}
+    # Episodes of a task have the same things; a thing that one lacks is out of its sight.
+    known = list(dict.fromkeys(item for _, items in named.values() for item in items))
+    places = {i: [known.index(item) for item in items] for i, (_, items) in named.items()}
+    # One picture at a time: the masks of all episodes of a task are in memory.
+    for picture in dict.fromkeys(picture for pictures, _ in named.values() for picture in pictures):
+        showing = [i for i in members if picture in named[i][0]]
+        sources = [parts[i].sources[picture].of_items(places[i], len(known)) for i in showing]
+        for i, control in zip(showing, controls(sources), strict=True):
+            found[i][picture] = control.of_items(places[i])
+    return found
+
+
+def _columns(item: SelectedEpisode, part: ControlParts, of_picture: Mapping[str, Control]) -> pl.DataFrame:
+    names = ("control_enrichment", "control_balanced", "control_overlap")
+    tables = []
+    for picture in part.sources:
+        control = of_picture[picture]
+        values = (control.enrichment, control.balanced, control.overlap[None, None])
+        tables.append(long_table(item, part.axes, dict(zip(names, values, strict=True))).select(names))
+    return pl.concat(tables)

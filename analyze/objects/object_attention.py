@@ -27,8 +27,7 @@ from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.objects.control_columns import ControlParts, control_columns, task_of
-from vla_attention.analyze.objects.control_masks import control_source
+from vla_attention.analyze.objects.control_masks import ControlParts, control_columns, control_source
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_views import (
     ALL_CAMERAS,
@@ -49,12 +48,12 @@ from vla_attention.analyze.objects.pointing_and_iou import (
     shifted_iou,
     shifted_masks,
 )
-from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import NO_COVERAGE
+from vla_attention.schemas.progress_bar import progress_bar
 
 Array = NDArray[np.float64]
 #: Maps of a replan that are compared with masks at once: of two denoise steps of 18 layers, or of as many heads.
@@ -121,7 +120,7 @@ def object_tables(question: Question, settings: ObjectSettings | None = None, ke
     if not any(cameras_of(item) for item in question.selected):
         raise BadArgument(f"Site '{question.site}': {NO_COVERAGE}.")
     showing = [item for item in question.selected if cameras_of(item)]
-    episodes_of = Counter(task_of(item) for item in showing)
+    episodes_of = Counter(item.task for item in showing)
     measure = partial(
         _measure_episode,
         selection=question.selection,
@@ -277,7 +276,7 @@ def _measure_episode(
         tables |= {"pointing": _pointing_part(episode), "iou": _iou_part(episode)}
     pictures = {ALL_CAMERAS: views, **{view.camera: [view] for view in views}}
     sources = {
-        name: control_source([(averaged[view.camera], view.area) for view in seen], episodes_of[task_of(item)] - 1)
+        name: control_source([(averaged[view.camera], view.area) for view in seen], episodes_of[item.task] - 1)
         for name, seen in pictures.items()
     }
     axes = [layers.columns, head_axis(selection), items]
@@ -431,13 +430,9 @@ def _over_steps(episode: _Episode, values: Array) -> Array:
 
 
 def _centres(view: View, measured: _Measured) -> dict[str, Array]:
-    row, column = measured.by_map["centre_row"], measured.by_map["centre_column"]
-    return {
-        "centre_row": row,
-        "centre_column": column,
-        "centre_row_share": row / view.grid.rows,
-        "centre_column_share": column / view.grid.columns,
-    }
+    sides = {"centre_row": view.grid.rows, "centre_column": view.grid.columns}
+    places = {name: measured.by_map[name] for name in sides}
+    return places | {f"{name}_share": places[name] / length for name, length in sides.items()}
 
 
 def _steps(episode: _Episode) -> _Steps:

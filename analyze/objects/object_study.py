@@ -49,42 +49,36 @@ class ObjectStudy:
         """The layer that the summaries are of."""
         return overall_layer(self.tables.objects.parts[0])
 
-    def _of_layer(self, table: TableInParts) -> pl.DataFrame:
-        return table.filter(pl.col("layer") == self.layer)
-
     @cached_property
     def summary(self) -> pl.DataFrame:
         """Shares, enrichment and control; see `objects_summary`."""
-        return objects_summary(self._of_layer(self.tables.objects), self.question.sampling)
+        return objects_summary(self.tables.objects, self.question.sampling)
 
     @cached_property
     def pointing_summary(self) -> pl.DataFrame | None:
         """Pointing game and distances; see `pointing_summary`."""
         if self.tables.pointing is None:
             return None
-        return pointing_summary(self._of_layer(self.tables.pointing), self.question.sampling)
+        return pointing_summary(self.tables.pointing, self.question.sampling)
 
     @cached_property
     def iou_summary(self) -> pl.DataFrame | None:
         """IoU by threshold; see `iou_summary`."""
         if self.tables.iou is None:
             return None
-        return iou_summary(self._of_layer(self.tables.iou), self.question.sampling)
+        return iou_summary(self.tables.iou, self.question.sampling)
 
-    @property
+    @cached_property
     def followed(self) -> list[NamedLeader]:
         """Which object is followed more than the others; see `followed_objects`."""
-        together = self.tables.objects.filter(pl.col("kind") == "object", pl.col("camera") == ALL_CAMERAS)
-        return followed_objects(together, self.question.sampling)
+        return followed_objects(self.tables.objects, self.question.sampling)
 
-    @property
+    @cached_property
     def finder(self) -> NamedLeader | None:
         """The layer and head that find the objects of interest; see `leading_finder`."""
         if self.tables.iou is None:
             return None
-        threshold = self.settings.shown_threshold
-        classes = self.tables.iou.filter(pl.col("kind") == "class", pl.col("threshold") == threshold)
-        return leading_finder(classes, threshold, self.question.sampling)
+        return leading_finder(self.tables.iou, self.settings.shown_threshold, self.question.sampling)
 
     def files(self) -> dict[str, pl.DataFrame | TableInParts]:
         """All tables by the names of their files."""
@@ -124,7 +118,7 @@ def study_objects(
     return ObjectStudy(question, chosen, example, object_tables(question, chosen, keep_steps))
 
 
-def objects_summary(objects: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
+def objects_summary(objects: TableInParts, sampling: Sampling) -> pl.DataFrame:
     """Means of every item over the episodes that have it, with intervals, of the layers' mean.
 
     From `object_tables`, `objects`. Classes in their order, then objects by enrichment; per camera, all cameras first.
@@ -149,48 +143,50 @@ def objects_summary(objects: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
     return _ordered(summary, "enrichment")
 
 
-def pointing_summary(pointing: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
+def pointing_summary(pointing: TableInParts, sampling: Sampling) -> pl.DataFrame:
     """Mean pointing game and distances of every item over the episodes in which it has a mask, with intervals.
 
     From `object_tables`, `pointing`; of "layers_avg" (means of the layers' values) or the only layer.
     """
     values = {"mask_patches": POSITIVE, "distance": POSITIVE, "distance_uniform": POSITIVE}
     values |= {"pointing": SHARE, "pointing_chance": SHARE}
-    return _ordered(_means(pointing.filter(pl.col("mask_replans") > 0), _ITEM, values, sampling), "pointing")
+    return _ordered(_means(pointing, _ITEM, values, sampling, where=pl.col("mask_replans") > 0), "pointing")
 
 
-def iou_summary(iou: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
+def iou_summary(iou: TableInParts, sampling: Sampling) -> pl.DataFrame:
     """Mean IoU of every item at every threshold, highest first, as in `pointing_summary`; from the table `iou`."""
     values = {"iou": SHARE, "iou_chance": SHARE}
-    return _ordered(_means(iou.drop_nulls("iou"), (*_ITEM, "threshold"), values, sampling), "iou")
+    known = pl.col("iou").is_not_null()
+    return _ordered(_means(iou, (*_ITEM, "threshold"), values, sampling, where=known), "iou")
 
 
-def followed_objects(objects: pl.DataFrame, sampling: Sampling) -> list[NamedLeader]:
+def followed_objects(objects: TableInParts, sampling: Sampling) -> list[NamedLeader]:
     """The object that exceeds its control by the largest factor over layers, and the (object, layer, head) that does.
 
     From `object_tables`, `objects`, all cameras together. Each with how surely it exceeds all the others
     (`many_looks.leader`). Left out are the background, items that cover hardly anything, and those of which the control
     cannot tell.
     """
-    candidates = objects.filter(
-        (pl.col("kind") == "object")
-        & (pl.col("camera") == ALL_CAMERAS)
-        & (pl.col("object_class") != CLASSES[3])
-        & (pl.col("area_share") >= _LEAST_AREA)
-        & pl.col("control_enrichment").is_not_null()
+    overall = overall_layer(objects.parts[0])
+    candidates = objects.select(
+        [*EPISODE_ID, "layer", "head", "item", "enrichment", "control_balanced", "control_overlap"],
+        pl.col("kind") == "object",
+        pl.col("camera") == ALL_CAMERAS,
+        pl.col("object_class") != CLASSES[3],
+        pl.col("area_share") >= _LEAST_AREA,
+        pl.col("control_enrichment").is_not_null(),
     )
     still = candidates.group_by("item").agg(pl.col("control_overlap").mean() >= STILL_OVERLAP)
     candidates = candidates.join(still.filter(~pl.col("control_overlap")).select("item"), on="item")
-    if candidates.is_empty():
-        return []
-    overall = candidates.filter(pl.col("layer") == overall_layer(objects))
     found = []
-    for part, item in ((overall, ("item",)), (_single_layers(candidates), ("item", "layer", "head"))):
-        means = part.group_by(*EPISODE_ID, *item, maintain_order=True).agg(
-            pl.col("enrichment").mean(), pl.col("control_balanced").mean()
+    for which, item in ((pl.col("layer") == overall, ("item",)), (_is_single(overall), ("item", "layer", "head"))):
+        means = (
+            candidates.filter(which)
+            .group_by(*EPISODE_ID, *item, maintain_order=True)
+            .agg(pl.col("enrichment").mean(), pl.col("control_balanced").mean())
         )
-        factors = [_linearised(of_item) for of_item in means.partition_by(item, maintain_order=True)]
-        leading = leader_of_table(pl.concat(factors), item, _OVER_CONTROL, sampling) if factors else None
+        factors = (_linearised(of_item) for of_item in means.partition_by(item, maintain_order=True))
+        leading = leader_of_table(factors, item, _OVER_CONTROL, sampling)
         found += [] if leading is None else [leading]
     return found
 
@@ -202,32 +198,38 @@ def _linearised(of_item: pl.DataFrame) -> pl.DataFrame:
     return of_item.with_columns(pl.Series(_OVER_CONTROL, values))
 
 
-def leading_finder(iou: pl.DataFrame, threshold: str, sampling: Sampling) -> NamedLeader | None:
+def leading_finder(iou: TableInParts, threshold: str, sampling: Sampling) -> NamedLeader | None:
     """The (camera, layer, head) whose maps have the highest IoU above chance with the objects of interest."""
-    of_interest = (pl.col("kind") == "class") & (pl.col("item") == CLASSES[0])
-    found = _single_layers(iou).filter(of_interest, pl.col("threshold") == threshold).drop_nulls("iou")
+    found = iou.select(
+        [*EPISODE_ID, "camera", "layer", "head", "iou", "iou_chance"],
+        pl.col("kind") == "class",
+        pl.col("item") == CLASSES[0],
+        pl.col("threshold") == threshold,
+        pl.col("iou").is_not_null(),
+        _is_single(overall_layer(iou.parts[0])),
+    )
     above = found.with_columns((pl.col("iou") - pl.col("iou_chance")).alias("above"))
-    return leader_of_table(above, ("camera", "layer", "head"), "above", sampling) if above.height else None
+    return leader_of_table([above], ("camera", "layer", "head"), "above", sampling)
 
 
-def _single_layers(table: pl.DataFrame) -> pl.DataFrame:
-    """The rows of single layers, without their mean."""
-    return table.filter((pl.col("layer") != LAYERS_AVG) | (overall_layer(table) != LAYERS_AVG))
+def _is_single(overall: str) -> pl.Expr:
+    """Rows of single layers, without their mean."""
+    return pl.col("layer").is_not_null() if overall != LAYERS_AVG else pl.col("layer") != LAYERS_AVG
 
 
 def _means(
-    table: pl.DataFrame,
+    table: TableInParts,
     item: Sequence[str],
     values: dict[str, tuple[float, float]],
     sampling: Sampling,
     quotients: dict[str, tuple[str, str]] | None = None,
     nulls: dict[str, float] | None = None,
+    where: pl.Expr | None = None,
 ) -> pl.DataFrame:
-    chosen = table.filter(pl.col("layer") == overall_layer(table))
-    names = {*values, *(name for sides in (quotients or {}).values() for name in sides)}
-    episodes = chosen.group_by(*EPISODE_ID, *item, maintain_order=True).agg(
-        *(pl.col(name).mean() for name in table.columns if name in names)
-    )
+    names = dict.fromkeys([*values, *(name for sides in (quotients or {}).values() for name in sides)])
+    conditions = [pl.col("layer") == overall_layer(table.parts[0]), *([] if where is None else [where])]
+    chosen = table.select([*EPISODE_ID, *item, *names], *conditions)
+    episodes = chosen.group_by(*EPISODE_ID, *item, maintain_order=True).agg(pl.col(name).mean() for name in names)
     return means_with_intervals(episodes, item, values, sampling, quotients=quotients, nulls=nulls)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import polars as pl
@@ -10,10 +11,23 @@ from vla_attention.analyze.objects.control_masks import STILL_OVERLAP
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_study import ObjectStudy
 from vla_attention.analyze.objects.object_views import ALL_CAMERAS, item_name
+from vla_attention.analyze.show.answer import Section
 from vla_attention.analyze.show.findings import apart_note, few_families_note
-from vla_attention.analyze.show.headings import interval_note, wrap
-from vla_attention.analyze.show.numbers import format_interval, format_number, plural, row_interval
-from vla_attention.analyze.show.text_table import episode_counts, text_table
+from vla_attention.analyze.show.headings import interval_note
+from vla_attention.analyze.show.numbers import format_number, plural, row_interval
+from vla_attention.analyze.show.tables import (
+    INTERVAL,
+    Column,
+    Table,
+    count,
+    episode_count,
+    estimate,
+    interval,
+    number,
+    percent,
+    texts,
+    words,
+)
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
 
@@ -32,27 +46,61 @@ _SHARES_NOTE = (
 )
 
 
-def objects_text(study: ObjectStudy) -> str:
+def objects_sections(study: ObjectStudy) -> list[Section]:
     """Shares and enrichment by camera; then, by camera, how well maps find the objects."""
-    lines = [*study.question.header("OBJECTS: which objects are looked at", study.layer), *_shares(study)]
-    if study.settings.spatial:
-        lines += _finding(study)
-    return "\n".join(lines)
-
-
-def _shares(study: ObjectStudy) -> list[str]:
-    several = study.question.num_tasks > 1
-    lines = ["", *wrap(followed_sentence(study))]
+    header, units = study.question.header("OBJECTS: which objects are looked at", study.layer), study.question.units
+    sections = [Section([header]), Section([followed_sentence(study)])]
     for camera in study.summary["camera"].unique(maintain_order=True):
-        part = _printed(study.summary.filter(pl.col("camera") == camera))
+        part = _printed(study.summary.filter(camera=camera))
         if camera == ALL_CAMERAS:
-            lines += ["", "all cameras", _shares_table(part.head(_MOST_ROWS), several), *_more(part)]
+            table = replace(share_table(study), rows=part.head(_MOST_ROWS).to_dicts())
+            sections.append(Section([["all cameras"], table, _more(part)]))
         else:
-            classes = part.filter(pl.col("kind") == "class")
-            lines += ["", f"camera {camera}", _shares_table(classes, several, shares=False)]
-    units = study.question.units
-    few = few_families_note(study.summary.filter(pl.col("camera") == study.summary["camera"][0]), "item", units)
-    return [*lines, "", *wrap(f"{_SHARES_NOTE} {interval_note(DEFAULT_LEVEL, units.words)} {few}".rstrip())]
+            classes = part.filter(kind="class").to_dicts()
+            sections.append(Section([[f"camera {camera}"], Table(_share_columns(study, shares=False), classes)]))
+    few = few_families_note(study.summary.filter(camera=study.summary["camera"][0]), "item", units)
+    note = f"{_SHARES_NOTE} {interval_note(DEFAULT_LEVEL, units.words)} {few}".rstrip()
+    return [*sections, Section([note]), *(_finding(study) if study.settings.spatial else [])]
+
+
+def share_table(study: ObjectStudy, caption: str = "") -> Table:
+    """Shares and enrichment over all cameras, in a text and on the page."""
+    return Table(_share_columns(study), over_all_cameras(study).to_dicts(), caption)
+
+
+def over_all_cameras(study: ObjectStudy) -> pl.DataFrame:
+    """The rows of the summary over all cameras; over the one, if there is one."""
+    cameras = study.summary["camera"]
+    return study.summary.filter(camera=ALL_CAMERAS if ALL_CAMERAS in cameras else cameras[0])
+
+
+def _share_columns(study: ObjectStudy, shares: bool = True) -> list[Column]:
+    over = "enrichment_over_control"
+    return [
+        texts("object", item_name, left=True),
+        words(None, "item", "object"),
+        words(None, "kind", "kind"),
+        episode_count(study.question.num_tasks > 1),
+        count(None, "num_episodes", "episodes"),
+        *([number("share", "share")] if shares else []),
+        percent(None, "share", "share"),
+        interval("share", INTERVAL, None, times=100),
+        number("area", "area_share"),
+        percent(None, "area_share", "area"),
+        *estimate("enrichment", "enrichment", "enrichment"),
+        texts("over control", lambda row: "cannot tell" if _still(row) else format_number(row[over])),
+        texts("interval", lambda row: "-" if _still(row) else row_interval(row, over)),
+        texts("q", lambda row: "-" if _still(row) else format_number(row[f"{over}_q"])),
+        number(None, over, "over control"),
+        interval(over, INTERVAL, None),
+        number(None, f"{over}_q", "q"),
+    ]
+
+
+def _still(row: dict[str, Any]) -> bool:
+    """Whether the object hardly moves, so that the control cannot tell."""
+    overlap = row["control_overlap"]
+    return overlap is not None and overlap >= STILL_OVERLAP
 
 
 def followed_sentence(study: ObjectStudy) -> str:
@@ -74,20 +122,38 @@ def followed_sentence(study: ObjectStudy) -> str:
     return f"No object, and no layer of an object, is shown to be followed more than all the others (about {about})."
 
 
-def _finding(study: ObjectStudy) -> list[str]:
-    iou, pointing = study.iou_summary, study.pointing_summary
+def _finding(study: ObjectStudy) -> list[Section]:
+    iou, pointing, shown = study.iou_summary, study.pointing_summary, study.settings.shown_threshold
     assert iou is not None
     assert pointing is not None
-    shown = study.settings.shown_threshold
-    lines: list[str] = []
+    sections = []
     for camera in iou["camera"].unique(maintain_order=True):
-        of_camera = pl.col("camera") == camera
-        part = _printed(iou.filter(of_camera, pl.col("threshold") == shown))
-        lines += ["", f"Finding the objects, camera {camera} (in brackets: chance)"]
-        otsu = iou.filter(of_camera, pl.col("threshold") == "otsu")
-        lines += [_finding_table(part.head(_MOST_ROWS), otsu, pointing.filter(of_camera), shown), *_more(part)]
-    lines += ["", *wrap(_finding_note(study.settings))]
-    return [*lines, *wrap(_found(study))]
+        part = _printed(iou.filter(camera=camera, threshold=shown))
+        otsu = iou.filter(camera=camera, threshold="otsu").rows_by_key(["kind", "item"], named=True)
+        pointed = pointing.filter(camera=camera).rows_by_key(["kind", "item"], named=True)
+        rows = [
+            row
+            | pointed[row["kind"], row["item"]][0]
+            | {"episodes": row["num_episodes"], "otsu": otsu[row["kind"], row["item"]][0]}
+            for row in part.head(_MOST_ROWS).iter_rows(named=True)
+        ]
+        columns = [
+            texts("object", item_name, left=True),
+            count("n", "episodes"),
+            number("patches", "mask_patches"),
+            texts(f"IoU {shown}", _iou),
+            interval("iou"),
+            texts("IoU otsu", lambda row: _iou(row["otsu"])),
+            texts("pointing", lambda row: f"{_short(row['pointing'])} ({_short(row['pointing_chance'])})"),
+            texts("distance", lambda row: f"{_short(row['distance'])} ({_short(row['distance_uniform'])})"),
+        ]
+        above = f"Finding the objects, camera {camera} (in brackets: chance)"
+        sections.append(Section([[above], Table(columns, rows), _more(part)]))
+    return [*sections, Section([_finding_note(study.settings), _found(study)])]
+
+
+def _iou(row: dict[str, Any]) -> str:
+    return f"{format_number(row['iou'])} ({format_number(row['iou_chance'])})"
 
 
 def _found(study: ObjectStudy) -> str:
@@ -125,58 +191,6 @@ def _printed(part: pl.DataFrame) -> pl.DataFrame:
 def _more(part: pl.DataFrame) -> list[str]:
     left = part.height - _MOST_ROWS
     return [f"and {plural(left, 'object')} more, in the tables"] if left > 0 else []
-
-
-def _shares_table(part: pl.DataFrame, several_tasks: bool, shares: bool = True) -> str:
-    rows = part.to_dicts()
-    heading, counts = episode_counts(rows, several_tasks)
-    body = [
-        [
-            item_name(row),
-            count,
-            *([format_number(row["share"])] if shares else []),
-            format_number(row["area_share"]),
-            format_number(row["enrichment"]),
-            format_interval(row["enrichment_low"], row["enrichment_high"]),
-            *_over_control(row),
-        ]
-        for row, count in zip(rows, counts, strict=True)
-    ]
-    header = ["object", heading, *(["share"] if shares else []), "area", "enrichment", "interval"]
-    header += ["over control", "interval", "q"]
-    return text_table(header, body, left=(0,))
-
-
-def _over_control(row: dict[str, Any]) -> tuple[str, str, str]:
-    overlap = row["control_overlap"]
-    if overlap is not None and overlap >= STILL_OVERLAP:
-        return "cannot tell", "-", "-"
-    name = "enrichment_over_control"
-    return format_number(row[name]), row_interval(row, name), format_number(row[f"{name}_q"])
-
-
-def _finding_table(part: pl.DataFrame, otsu: pl.DataFrame, pointing: pl.DataFrame, shown: str) -> str:
-    by_otsu, by_item = (
-        otsu.rows_by_key(["kind", "item"], named=True),
-        pointing.rows_by_key(["kind", "item"], named=True),
-    )
-    body = []
-    for row in part.iter_rows(named=True):
-        found, region = by_item[row["kind"], row["item"]][0], by_otsu[row["kind"], row["item"]][0]
-        body.append(
-            [
-                item_name(row),
-                str(row["num_episodes"]),
-                format_number(found["mask_patches"]),
-                f"{format_number(row['iou'])} ({format_number(row['iou_chance'])})",
-                format_interval(row["iou_low"], row["iou_high"]),
-                f"{format_number(region['iou'])} ({format_number(region['iou_chance'])})",
-                f"{_short(found['pointing'])} ({_short(found['pointing_chance'])})",
-                f"{_short(found['distance'])} ({_short(found['distance_uniform'])})",
-            ]
-        )
-    header = ["object", "n", "patches", f"IoU {shown}", "interval", "IoU otsu", "pointing", "distance"]
-    return text_table(header, body, left=(0,))
 
 
 def _short(value: float | None) -> str:

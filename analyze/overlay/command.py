@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from vla_attention.analyze.arguments import (
     add_episode,
@@ -16,12 +15,9 @@ from vla_attention.analyze.arguments import (
     settings_of,
     stores_of,
 )
-from vla_attention.analyze.show.output_files import report_files, write_csv, writing
+from vla_attention.analyze.show.output_files import write_csv, writing
 from vla_attention.schemas.command_line import command_parser
 from vla_attention.schemas.errors import BadArgument
-
-if TYPE_CHECKING:
-    from vla_attention.analyze.overlay.overlay_study import OverlayStudy
 
 _EXAMPLES = """examples:
   vla-analyze overlay runs/libero_10.zarr
@@ -71,8 +67,9 @@ def build_parser() -> argparse.ArgumentParser:
 def run(arguments: argparse.Namespace) -> int:
     """Draw one episode."""
     from vla_attention.analyze.overlay.overlay_study import study_overlay
-    from vla_attention.analyze.overlay.text import overlay_text
+    from vla_attention.analyze.overlay.text import overlay_sections
     from vla_attention.analyze.overlay.video import check_video
+    from vla_attention.analyze.show.answer import Answer
 
     if arguments.video:
         if arguments.no_plots:
@@ -87,28 +84,24 @@ def run(arguments: argparse.Namespace) -> int:
         replans=arguments.replans,
         most_replans=_STRIP_REPLANS,
     )
-    print(overlay_text(study))
-    folder = output_folder(arguments, "overlay")
-    with writing("pictures", folder):
-        files = _write(arguments, study, folder)
-    report_files(folder, files)
-    return 0
 
+    def draw(folder: Path) -> list[Path]:
+        """The strip, the video and the numbers, as far as they were asked for."""
+        files: list[Path] = []
+        with writing("pictures", folder):
+            if not arguments.no_plots:
+                from vla_attention.analyze.overlay.plot_strip import plot_overlay_strip
 
-def _write(arguments: argparse.Namespace, study: OverlayStudy, folder: Path) -> list[Path]:
-    """The strip, the video and the numbers, as far as they were asked for."""
-    files: list[Path] = []
-    if not arguments.no_plots:
-        from vla_attention.analyze.overlay.plot_strip import plot_overlay_strip
+                files += plot_overlay_strip(study, folder, measure=arguments.measure, smooth=arguments.smooth)
+            if arguments.video:
+                from vla_attention.analyze.overlay.plot_video_frames import write_overlay_video
 
-        files += plot_overlay_strip(study, folder, measure=arguments.measure, smooth=arguments.smooth)
-    if arguments.video:
-        from vla_attention.analyze.overlay.plot_video_frames import write_overlay_video
+                path = folder / f"{study.stem}.{arguments.video}"
+                look = {"measure": arguments.measure, "smooth": arguments.smooth}
+                files.append(write_overlay_video(study, path, arguments.fps, **look))
+            if arguments.no_plots or arguments.video:
+                files += write_csv(folder, **{f"{study.stem}_all": study.whole_table})
+        return files
 
-        path = folder / f"{study.stem}.{arguments.video}"
-        files.append(
-            write_overlay_video(study, path, arguments.fps, measure=arguments.measure, smooth=arguments.smooth)
-        )
-    if arguments.no_plots or arguments.video:
-        files += write_csv(folder, **{f"{study.stem}_all": study.whole_table})
-    return files
+    answer = Answer(overlay_sections(study), draw=draw, whole=True)
+    return answer.show(output_folder(arguments, "overlay"), pictures=True)

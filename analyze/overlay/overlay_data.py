@@ -154,8 +154,8 @@ def episode_overlay(
         views[camera] = by_name.get(camera, PolicyCameraView(camera, camera, True, False))
     ratio = uniform = None
     if question.grouping.ratio is not None:
-        own = rows_of_episode(replans, item)
-        rows = own.filter(pl.col("layer") == overall_layer(own)).sort("replan")
+        of_episode = rows_of_episode(replans, item)
+        rows = of_episode.filter(pl.col("layer") == overall_layer(of_episode)).sort("replan")
         ratio = rows["ratio"].fill_null(float("nan")).to_numpy()
         uniform = rows["uniform_ratio"].fill_null(float("nan")).to_numpy()
     return EpisodeOverlay(
@@ -178,15 +178,15 @@ def _outlines(
     if groups is None:
         return {}
     weights = resolve(groups, item.tokens).weights
-    found: dict[str, dict[str, NDArray[np.bool_]]] = {}
+    outlines: dict[str, dict[str, NDArray[np.bool_]]] = {}
     for i, name in enumerate(groups.names):
-        found[name] = {}
+        outlines[name] = {}
         for camera in cameras:
             span = item.tokens.layout.camera_span(camera)
             assert span.grid is not None
             taken = weights[:, span.start : span.stop, i] >= OUTLINE_WEIGHT
-            found[name][camera] = taken.reshape(-1, span.grid.rows, span.grid.columns)
-    return found
+            outlines[name][camera] = taken.reshape(-1, span.grid.rows, span.grid.columns)
+    return outlines
 
 
 def check_outlines(question: Question, groups: Grouping | None) -> None:

@@ -43,7 +43,10 @@ def plot_overlay_strip(
     side = _SIDE if columns > 3 else 2.1
     figure = new_figure(width, 1.55 + len(blocks) * (0.42 + len(cameras) * side))
     outcome = outcome_word(attributes.success)
-    shown = f"replan{'s' if len(replans) > 1 else ''} {_numbers(replans)} of {overlay.num_replans}"
+    named = ", ".join(map(str, replans))
+    if len(replans) > 12:
+        named = f"{replans[0]} to {replans[-1]}, {len(replans)} of them,"
+    shown = f"replan{'s' if len(replans) > 1 else ''} {named} of {overlay.num_replans}"
     note = f"{'; '.join(part for part in (outcome, shown, study.averaged_over) if part)}. {orientation_note(overlay)}"
     title(figure, episode_heading(overlay), note)
     bar_height = 0.24 / side
@@ -70,14 +73,6 @@ def episode_heading(overlay: EpisodeOverlay) -> str:
     """Suite, task, episode and instruction, for a title."""
     suite, episode = overlay.item.store.suite, overlay.item.episode.attributes
     return f"{suite} task {episode.task_id}, episode {episode.episode_index}: {episode.instruction}"
-
-
-def _numbers(replans: Sequence[int]) -> str:
-    return (
-        ", ".join(map(str, replans))
-        if len(replans) <= 12
-        else f"{replans[0]} to {replans[-1]}, {len(replans)} of them,"
-    )
 
 
 def _above(overlay: EpisodeOverlay, grouping: Grouping, replan: int) -> str:

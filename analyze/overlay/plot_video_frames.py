@@ -20,8 +20,8 @@ from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, legend_above, r
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure
 from vla_attention.analyze.show.plot_text import explain, ratio_name, title, wrapped
-from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.schemas.groupings.grouping import Grouping
+from vla_attention.schemas.progress_bar import progress_bar
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from vla_attention.analyze.overlay.overlay_data import orientation_note
 from vla_attention.analyze.overlay.overlay_study import OverlayStudy
-from vla_attention.analyze.show.headings import wrap, wrap_all
-from vla_attention.analyze.show.numbers import format_number
+from vla_attention.analyze.show.answer import Section
 from vla_attention.analyze.show.patch_pictures import upright
-from vla_attention.analyze.show.text_table import text_table
+from vla_attention.analyze.show.tables import Column, Table, count, number, texts
 from vla_attention.schemas.safe_text import visible
 
 _LEGEND = (
@@ -16,33 +15,45 @@ _LEGEND = (
 )
 
 
-def overlay_text(study: OverlayStudy) -> str:
+def overlay_sections(study: OverlayStudy) -> list[Section]:
     """A line per shown replan: ratio, each camera's share and brightest patch; and how the pictures were turned."""
-    overlay = study.overlay
-    header = ["replan", "step", *(["ratio"] if overlay.ratio is not None else [])]
-    for camera in overlay.maps:
-        header += [f"{camera} %", "most", "at"]
-    lift, rows = overlay.values("lift"), []
-    for replan in study.replans:
-        cells = [str(replan), str(overlay.env_step[replan])]
-        if overlay.ratio is not None:
-            cells.append(format_number(float(overlay.ratio[replan])))
-        for camera, mass in overlay.maps.items():
-            shown = upright(lift[camera][replan], overlay.views[camera])
-            row, column = divmod(int(shown.argmax()), shown.shape[1])
-            image_mass = overlay.image_mass[replan]
-            share = 100 * mass[replan].sum() / image_mass if image_mass else float("nan")
-            cells += [format_number(float(share)), format_number(float(shown.max())), f"{row},{column}"]
-        rows.append(cells)
-    item = overlay.item
-    several = overlay.ratio is not None and len(study.question.selection.layers) > 1
-    legend = f"ratio: geometric mean of the layers. {_LEGEND}" if several else _LEGEND
-    lines = [
-        *wrap_all(study.question.remarks),
-        *wrap(f"{item.store.suite} {item.episode.name}: {visible(item.episode.attributes.instruction)}"),
-        text_table(header, rows),
-        *wrap(legend),
-        "",
-        *wrap(orientation_note(overlay)),
+    overlay, lift, ratio = study.overlay, study.overlay.values("lift"), study.overlay.ratio
+
+    def of_camera(camera: str) -> tuple[Column, ...]:
+        shown = {replan: upright(lift[camera][replan], overlay.views[camera]) for replan in study.replans}
+
+        def share(replan: int) -> float:
+            of_image = overlay.image_mass[replan]
+            return float(100 * overlay.maps[camera][replan].sum() / of_image) if of_image else float("nan")
+
+        def place(replan: int) -> str:
+            row, column = divmod(int(shown[replan].argmax()), shown[replan].shape[1])
+            return f"{row},{column}"
+
+        return (
+            number(f"{camera} %", share),
+            number("most", lambda replan: float(shown[replan].max())),
+            texts("at", place),
+        )
+
+    columns = [
+        count("replan", int),
+        count("step", lambda replan: overlay.env_step[replan]),
+        *([] if ratio is None else [number("ratio", lambda replan: float(ratio[replan]))]),
+        *(column for camera in overlay.maps for column in of_camera(camera)),
     ]
-    return "\n".join(lines)
+    item = overlay.item
+    several = ratio is not None and len(study.question.selection.layers) > 1
+    note = orientation_note(overlay)
+    return [
+        Section(
+            [
+                *study.question.remarks,
+                f"{item.store.suite} {item.episode.name}: {visible(item.episode.attributes.instruction)}",
+                Table(columns, study.replans),
+                f"ratio: geometric mean of the layers. {_LEGEND}" if several else _LEGEND,
+                [] if note else [""],  # what follows stands apart
+            ]
+        ),
+        Section([note]),
+    ]

@@ -73,8 +73,8 @@ def run(arguments: argparse.Namespace) -> int:
     from vla_attention.analyze.published.results_reader import find_results, read_results_file
     from vla_attention.analyze.published.results_tables import labels_of, results_tables
     from vla_attention.analyze.show.output_files import write_text, writing
-    from vla_attention.analyze.show.progress import progress_bar
     from vla_attention.schemas.errors import BadArgument
+    from vla_attention.schemas.progress_bar import progress_bar
 
     paths = find_results(arguments.results)
     if arguments.plot_comparison and len(paths) < 2:

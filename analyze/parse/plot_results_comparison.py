@@ -15,6 +15,7 @@ from vla_attention.analyze.published.results_tables import ResultsTables
 from vla_attention.analyze.show.numbers import interval_name, plural
 from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, note_at_row, ratio_axis, scattered, share_ticks
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, FIXED_COLORS, NOTE_COLOR, SERIES_COLORS
+from vla_attention.analyze.show.plot_rows import MANY_ROWS, draw_estimate, draw_uniform
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import title, wrapped
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
@@ -63,7 +64,7 @@ def fractions_table(tables: Sequence[ResultsTables], labels: Sequence[str]) -> p
 def plot_results_comparison(tables: Sequence[ResultsTables], labels: Sequence[str], folder: Path) -> list[Path]:
     """Draw one row per results file; returns the paths of png, pdf and csv. A row without a finite ratio says so."""
     data = comparison_table(tables, labels)
-    few = data.height <= 24
+    few = data.height <= MANY_ROWS
     kinds = data["kind"].unique(maintain_order=True).to_list()
     figure = new_figure(10, 1.9 + (0.42 if few else 0.22) * (data.height + 0.5) + 0.16 * len(kinds))
     note = (
@@ -145,15 +146,11 @@ def _ratios(axes: Axes, data: pl.DataFrame, tables: Sequence[ResultsTables], kin
             text = "no finite ratio" if row["geometric_mean"] is None else "mean ratio 0"
             note_at_row(axes, position, text, x=0.01)
         else:
-            if row["geometric_mean_low"] is not None:
-                ends = [max(row["geometric_mean_low"], low), row["geometric_mean_high"]]
-                axes.plot(ends, [position, position], color=color, linewidth=2.0, zorder=3)
-            axes.plot(
-                row["geometric_mean"], position, marker, color=color, markersize=6.5, markeredgecolor="white", zorder=4
-            )
+            first, last = row["geometric_mean_low"], row["geometric_mean_high"]
+            ends = (first if first is None else max(first, low), last)
+            draw_estimate(axes, position, row["geometric_mean"], ends, color, marker)
         if row["uniform_ratio"]:
-            ends = [position - 0.42, position + 0.42]
-            axes.plot([row["uniform_ratio"]] * 2, ends, "--", color=BASELINE_COLOR, linewidth=1.2, zorder=1)
+            draw_uniform(axes, position, row["uniform_ratio"])
         text = f"n = {row['num_episodes']}"
         if row["episodes_without_ratio"]:
             text += f" ({row['episodes_without_ratio']} without)"

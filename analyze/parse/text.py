@@ -22,7 +22,7 @@ from vla_attention.analyze.published.results_tables import (
 from vla_attention.analyze.ratios.verdict import LINGUISTIC_BELOW, VISUAL_ABOVE, verdict
 from vla_attention.analyze.show.headings import WIDTH, wrap
 from vla_attention.analyze.show.numbers import format_interval, format_number, format_percent, interval_name, plural
-from vla_attention.analyze.show.text_table import text_table
+from vla_attention.analyze.show.tables import Table, count, number, percent, texts
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.results import ResultsError
@@ -62,8 +62,8 @@ def summary_of_files(title: str, files: Sequence[ResultsFile], tables: ResultsTa
     lines += _over_episodes(tables, layer)
     lines += ["", f"Attention Fractions ({_named(layer)}):", *_fractions(rows)]
     if len(_layers(files)) > 1:
-        lines += ["", "Per layer", *_per_layer(files)]
-    lines += ["", f"Per task ({_named(layer)})", *_per_task(episodes, files, layer)]
+        lines += ["", "Per layer", str(_per_layer(files))]
+    lines += ["", f"Per task ({_named(layer)})", str(_per_task(episodes, files, layer))]
     known = rows.select(uniform_ratios().is_not_null().all()).item()
     notes = [
         *([_FRAMES_CAVEAT] if files[0].kind.frames else [] if known else [_CAVEAT]),
@@ -105,16 +105,16 @@ def _paragraph(text: str) -> str:
 
 def _layers(files: Sequence[ResultsFile]) -> list[str]:
     """Layers of all files by number, "layers_avg" last."""
-    found = dict.fromkeys(layer for file in files for layer in layers_of(file))
-    return sorted(found, key=lambda layer: (layer == LAYERS_AVG, int(layer) if layer != LAYERS_AVG else 0))
+    layers = dict.fromkeys(layer for file in files for layer in layers_of(file))
+    return sorted(layers, key=lambda layer: (layer == LAYERS_AVG, int(layer) if layer != LAYERS_AVG else 0))
 
 
 def _rows_of(files: Sequence[ResultsFile], layer: str) -> list[pl.DataFrame]:
     """Steps of that layer; of a pooled file without this layer, those of its overall layer."""
     parts = []
     for i, file in enumerate(files):
-        own = layer if layer in layers_of(file) else overall_layer(file.steps)
-        parts.append(file.steps.filter(pl.col("layer") == own).with_columns(pl.lit(i).alias("file")))
+        shown = layer if layer in layers_of(file) else overall_layer(file.steps)
+        parts.append(file.steps.filter(pl.col("layer") == shown).with_columns(pl.lit(i).alias("file")))
     return parts
 
 
@@ -213,49 +213,57 @@ def _fractions(rows: pl.DataFrame) -> list[str]:
     return lines
 
 
-def _per_layer(files: Sequence[ResultsFile]) -> list[str]:
-    body = []
+def _per_layer(files: Sequence[ResultsFile]) -> Table:
+    rows = []
     for layer in _layers(files):
-        rows = pl.concat([file.steps.filter(pl.col("layer") == layer) for file in files])
-        spread = spread_of(rows["ratio"])
-        body.append(
-            [
-                layer,
-                str(spread.num_replans),
-                _mean_std(spread),
-                *(format_number(value) for value in (spread.median, spread.min, spread.max)),
-                str(spread.num_infinite),
-                str(spread.num_undefined),
-                *(
-                    format_percent(_float(rows[f"{name}_fraction"].cast(pl.Float64).mean()))
-                    for name in ("visual", "linguistic")
-                ),
-            ]
+        steps = pl.concat([file.steps.filter(pl.col("layer") == layer) for file in files])
+        shares = {name: _float(steps[f"{name}_fraction"].cast(pl.Float64).mean()) for name in ("visual", "linguistic")}
+        rows.append({"layer": layer, "spread": spread_of(steps["ratio"]), **shares})
+    columns = [
+        texts("layer", "layer", left=True),
+        count("replans", lambda row: row["spread"].num_replans),
+        texts("mean ± std", lambda row: _mean_std(row["spread"])),
+        number("median", lambda row: row["spread"].median),
+        number("min", lambda row: row["spread"].min),
+        number("max", lambda row: row["spread"].max),
+        count("infinite", lambda row: row["spread"].num_infinite),
+        count("undefined", lambda row: row["spread"].num_undefined),
+        percent("visual", "visual"),
+        percent("linguistic", "linguistic"),
+    ]
+    return Table(columns, rows)
+
+
+def _per_task(episodes: pl.DataFrame, files: Sequence[ResultsFile], layer: str) -> Table:
+    steps, rows = pl.concat(_rows_of(files, layer)), []
+    for (file, task), part in episodes.partition_by("file", "task_id", as_dict=True, maintain_order=True).items():
+        steps_of_task = steps.filter((pl.col("file") == file) & pl.col("episode").is_in(part["episode"].implode()))
+        rows.append(
+            {
+                "task": str(task) if len(files) == 1 else f"{files[int(str(file))].suite} {task}",
+                "episodes": part.height,
+                "spread": spread_of(steps_of_task["ratio"]),
+                "success": _float(part["success"].cast(pl.Float64).mean()),
+                "instruction": str(part["instruction"][0]),
+            }
         )
-    header = ["layer", "replans", "mean ± std", "median", "min", "max", "infinite", "undefined", "visual", "linguistic"]
-    return text_table(header, body, left=(0,), width=WIDTH).split("\n")
-
-
-def _per_task(episodes: pl.DataFrame, files: Sequence[ResultsFile], layer: str) -> list[str]:
-    rows = pl.concat(_rows_of(files, layer))
-    body, texts = [], []
-    for (number, task), part in episodes.partition_by("file", "task_id", as_dict=True, maintain_order=True).items():
-        own = rows.filter((pl.col("file") == number) & pl.col("episode").is_in(part["episode"].implode()))
-        spread = spread_of(own["ratio"])
-        name = str(task) if len(files) == 1 else f"{files[int(str(number))].suite} {task}"
-        success = format_percent(_float(part["success"].cast(pl.Float64).mean()))
-        body.append([name, str(part.height), str(spread.num_replans), success, _mean_std(spread)])
-        texts.append(str(part["instruction"][0]))
-    header = ["task", "n", "replans", "success", "mean ± std"]
-    return text_table(header, body, left=(0,), last="instruction", texts=texts, width=WIDTH).split("\n")
+    columns = [
+        texts("task", "task", left=True),
+        count("n", "episodes"),
+        count("replans", lambda row: row["spread"].num_replans),
+        percent("success", "success"),
+        texts("mean ± std", lambda row: _mean_std(row["spread"])),
+        texts("instruction", "instruction", running=True),
+    ]
+    return Table(columns, rows)
 
 
 def _notes(file: ResultsFile, layer: str, named: bool) -> list[str]:
     of = f"{file.path}: " if named else ""
     notes = []
     if layer not in layers_of(file) or (layer != LAYERS_AVG and not named and len(layers_of(file)) > 1):
-        own = overall_layer(file.steps)
-        notes.append(f"{of}There is no {LAYERS_AVG}; layer {own} is used instead, as in the published parser.")
+        shown = overall_layer(file.steps)
+        notes.append(f"{of}There is no {LAYERS_AVG}; layer {shown} is used instead, as in the published parser.")
     lacking = (
         file.episodes.filter(pl.col("num_replans") > 0).height
         - file.steps.filter(layer=overall_layer(file.steps))["episode"].n_unique()
@@ -275,11 +283,11 @@ def _notes(file: ResultsFile, layer: str, named: bool) -> list[str]:
             f"{of}{file.zeros} ratios of 0 stand for 'no ratio' (nothing on either side, or no layer with a finite "
             "ratio) and are read as undefined; the published parser counts them as 0."
         )
-    found = disagreements(file)
-    for reason in sorted({item.reason for item in found if item.reason}):
-        count = sum(item.reason == reason for item in found)
+    disagreeing = disagreements(file)
+    for reason in sorted({item.reason for item in disagreeing if item.reason}):
+        count = sum(item.reason == reason for item in disagreeing)
         notes.append(f"{of}Differs from the file's own summary in {plural(count, 'number')}: {reason}.")
-    unexplained = [item for item in found if not item.reason]
+    unexplained = [item for item in disagreeing if not item.reason]
     if unexplained:
         first = unexplained[0]
         episode = file.episodes.row(first.stated.episode, named=True)

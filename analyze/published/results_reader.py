@@ -146,20 +146,19 @@ def find_results(given: Sequence[str]) -> list[Path]:
 
 
 def _found(given: Sequence[str]) -> list[Path]:
-    found: dict[Path, Path] = {}
+    by_real_path: dict[Path, Path] = {}
     for text in given:
         path = Path(text).expanduser()
         matches = [path] if path.exists() else [Path(match) for match in sorted(glob.glob(str(path), recursive=True))]
-        files = [file for match in matches for file in (_files_of_folder(match) if match.is_dir() else [match])]
+        files = []
+        for match in matches:
+            inside = sorted(match.glob(f"{RESULTS_PREFIX}*.json")) or sorted(match.glob("*.json"))
+            files += inside if match.is_dir() else [match]
         if not files:
             raise ResultsNotFound(_nothing_found(text, path, matches))
         for file in files:
-            found.setdefault(file.resolve(), file)
-    return list(found.values())
-
-
-def _files_of_folder(folder: Path) -> list[Path]:
-    return sorted(folder.glob(f"{RESULTS_PREFIX}*.json")) or sorted(folder.glob("*.json"))
+            by_real_path.setdefault(file.resolve(), file)
+    return list(by_real_path.values())
 
 
 def _nothing_found(text: str, path: Path, matches: Sequence[Path]) -> str:

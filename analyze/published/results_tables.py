@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.aggregate import episode_tables, layer_order, task_tables
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables, float_values
+from vla_attention.analyze.measures.masses import GROUP_MEASURES
 from vla_attention.analyze.published.results_reader import ResultsFile, ResultsKind, SummaryNumber
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.summaries import SampleSummary, summarize
@@ -154,7 +155,7 @@ def _replans(rows: pl.DataFrame, grouping: Grouping) -> Tables:
             pl.col(f"{name}_mass").cast(pl.Float64).alias("mass"),
             pl.col(f"{name}_fraction").cast(pl.Float64).alias("fraction"),
             (pl.col(f"{name}_keys") if f"{name}_keys" in table.columns else _UNKNOWN).alias("keys"),
-            *(_UNKNOWN.alias(unknown) for unknown in ("density", "lift")),
+            *(_UNKNOWN.alias(name) for name in GROUP_MEASURES if name not in ("mass", "fraction", "keys")),
             pl.int_range(pl.len()).alias("_cell"),
         )
         for name in grouping.names
@@ -196,7 +197,7 @@ def disagreements(file: ResultsFile) -> list[Disagreement]:
         for (episode, layer), rows in file.steps.partition_by("episode", "layer", as_dict=True).items()
     }
     known: dict[tuple[int, str, str], tuple[NDArray[np.float64], SampleSummary]] = {}
-    found = []
+    disagreeing = []
     for stated in file.summary_numbers:
         column = "ratio" if stated.measure == "visual_linguistic_ratio" else stated.measure
         if column not in file.steps.columns or stated.statistic not in _STATISTICS:
@@ -209,8 +210,8 @@ def disagreements(file: ResultsFile) -> list[Disagreement]:
         values, summary = known[key]
         computed = getattr(summary, stated.statistic)
         if not _agrees(stated.value, computed):
-            found.append(Disagreement(stated, computed, _reason(stated, values)))
-    return found
+            disagreeing.append(Disagreement(stated, computed, _reason(stated, values)))
+    return disagreeing
 
 
 def _agrees(stated: float | None, computed: float | None) -> bool:
@@ -236,12 +237,14 @@ def labels_of(files: Sequence[ResultsFile]) -> list[str]:
 def _label(number: int, files: Sequence[ResultsFile]) -> str:
     file = files[number]
     same = [(*other.path.resolve().parent.parts[1:], other.path.stem) for other in files if other.suite == file.suite]
-    own = (*file.path.resolve().parent.parts[1:], file.path.stem)
+    parts = (*file.path.resolve().parent.parts[1:], file.path.stem)
     if len(same) == 1:
         return file.suite
     # x.json and attention_ratio_results_x.json are about one suite: their file names tell them apart, else folders do.
-    depth = next(depth for depth in range(1, len(own) + 1) if sum(path[-depth:] == own[-depth:] for path in same) == 1)
-    return file.path.stem if depth == 1 else "/".join((*own[-depth:-1], file.suite))
+    depth = next(
+        depth for depth in range(1, len(parts) + 1) if sum(path[-depth:] == parts[-depth:] for path in same) == 1
+    )
+    return file.path.stem if depth == 1 else "/".join((*parts[-depth:-1], file.suite))
 
 
 def by_kind(files: Sequence[ResultsFile]) -> dict[ResultsKind, list[ResultsFile]]:

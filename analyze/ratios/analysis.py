@@ -34,8 +34,7 @@ from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.analyze.measures.sinks import SinkRule, search_sinks
 from vla_attention.analyze.measures.sinks import without_sinks as question_without_sinks
 from vla_attention.analyze.measures.steps import MeasuredEpisode, measure_episodes, step_tables
-from vla_attention.analyze.published.frame_proxy import frame_proxy
-from vla_attention.analyze.published.results_writer import write_results_of_suites
+from vla_attention.analyze.published.results_writer import frame_proxy, write_results_of_suites
 from vla_attention.analyze.ratios.answer import (
     HEADLINE_NAME,
     Headline,
@@ -45,11 +44,12 @@ from vla_attention.analyze.ratios.answer import (
     run_sentence,
 )
 from vla_attention.analyze.ratios.contribution_text import (
-    contributions_section,
-    group_contributions_section,
+    contribution_sections,
+    group_contribution_sections,
     same_sides,
 )
-from vla_attention.analyze.ratios.summary_text import AnalysedRun, ratio_definition, summary_text
+from vla_attention.analyze.ratios.summary_text import AnalysedRun, ratio_definition, summary_sections
+from vla_attention.analyze.show.answer import text_of
 from vla_attention.analyze.show.numbers import solved_text
 from vla_attention.analyze.show.output_files import write_parquet, write_text, writing
 from vla_attention.analyze.show.plot_text import shortened
@@ -166,10 +166,10 @@ class Analysis:
         suites = sorted(self.episodes.cells["suite"].unique())
         layers, steps = len(set(question.selection.blocks)), question.selection.denoise_steps
         solved = solved_text(item.episode.attributes.success for item in question.selected)
-        found = [run_sentence(name, row, solved, suites, layers, steps, question.site)]
+        sentences = [run_sentence(name, row, solved, suites, layers, steps, question.site)]
         if headline is not None:
-            found.append(ratio_sentence(headline))
-        return [*found, conclusion(headline, untrained, row["num_tasks"], row["num_episodes"])]
+            sentences.append(ratio_sentence(headline))
+        return [*sentences, conclusion(headline, untrained, row["num_tasks"], row["num_episodes"])]
 
     @property
     def notes(self) -> list[str]:
@@ -196,15 +196,15 @@ class Analysis:
     def summary(self) -> str:
         """The whole text: `summary_text`, then the section on contributions where these were recorded."""
         question = self.question
-        parts = [summary_text(_described(self), self.grouping, self.episodes, self.tasks)]
+        sections = summary_sections(_described(self), self.grouping, self.episodes, self.tasks)
         if all(store.attributes.recording.contributions for store in question.stores):
             tables, sampling = self.group_contributions, question.sampling
-            if self.contributions is not None and not same_sides(self.contributions, tables):
+            both = self.contributions is not None and not same_sides(self.contributions, tables)
+            if both:
                 assert self.contribution_rows is not None
-                parts.append(contributions_section(self.contribution_rows))
-            first = len(parts) == 1
-            parts.append(group_contributions_section(tables, self.grouping, question.site, sampling, first))
-        return "\n".join(parts)
+                sections += contribution_sections(self.contribution_rows)
+            sections += group_contribution_sections(tables, self.grouping, question.site, sampling, not both)
+        return f"{text_of(sections)}\n"
 
 
 def analyse(question: Question, without_sinks: SinkRule | None = None) -> Analysis:

@@ -5,10 +5,8 @@ from __future__ import annotations
 import argparse
 
 from vla_attention.analyze.arguments import (
-    add_grouping,
-    add_intervals,
     add_output,
-    add_selection,
+    add_question,
     add_sink_rule,
     add_stores,
     output_folder,
@@ -49,9 +47,7 @@ def build_parser(prog: str = "vla-analyze") -> argparse.ArgumentParser:
     parser.add_argument(
         "--list", action="store_true", help="print what the stores hold (layout, words, objects) and stop"
     )
-    add_grouping(parser)
-    selection = add_selection(parser)
-    add_intervals(parser)
+    selection = add_question(parser)
     selection.add_argument("--per-head", action="store_true", help="keep heads apart in the steps table")
     sinks = parser.add_argument_group("sinks")
     sinks.add_argument(

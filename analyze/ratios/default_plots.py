@@ -16,8 +16,8 @@ from vla_attention.analyze.ratios.plot_ratio_distribution import COLUMNS, plot_r
 from vla_attention.analyze.ratios.plot_ratio_evolution import plot_all_evolutions
 from vla_attention.analyze.ratios.plot_ratio_per_task import plot_ratio_per_task
 from vla_attention.analyze.show.picture_formats import picture_formats, pictures_saved_as
-from vla_attention.analyze.show.progress import progress_bar
 from vla_attention.schemas.groupings.grouping import Grouping
+from vla_attention.schemas.progress_bar import progress_bar
 
 if TYPE_CHECKING:
     from vla_attention.analyze.ratios.analysis import Analysis
@@ -54,19 +54,18 @@ class PlottedTables:
         note = f"Mean over {analysis.denoise}."
         if analysis.question.untrained:
             note += " UNTRAINED weights."
+        replans = None
+        if analysis.grouping.ratio is not None:
+            replans = pl.concat([part.cells.select(COLUMNS) for part in analysis.replans.parts])
         return cls(
             grouping=analysis.grouping,
-            replans=None if analysis.grouping.ratio is None else _drawn_of(analysis.replans),
+            replans=replans,
             episodes=analysis.episodes.cells,
             tasks=analysis.tasks.kept(),
             note=note,
             about=f"{note} Intervals over tasks: about {analysis.question.units.words}.",
             formats=picture_formats(),
         )
-
-
-def _drawn_of(replans: Tables) -> pl.DataFrame:
-    return pl.concat([part.cells.select(COLUMNS) for part in replans.parts])
 
 
 def write_plots(tables: PlottedTables, folder: Path) -> list[Path]:

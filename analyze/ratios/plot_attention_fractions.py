@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -61,6 +60,7 @@ def plot_attention_fractions(
     title(figure, f"Attention fractions, {about or named(grouping)}", f"{counts} {note}")
     axes = figure.subplots()
     styles = group_styles(grouping.names)
+    plain = {"edgecolor": "none", "pad": 1.0}  # below a number on a hatched bar
     bottom = np.zeros(len(layers))
     for i, name in enumerate(grouping.names):
         if name not in with_keys:
@@ -77,7 +77,7 @@ def plot_attention_fractions(
             if share >= 0.045:
                 axes.text(
                     position, start + share / 2, f"{100 * share:.0f}", ha="center", va="center", size=7,
-                    color=_ink(style["color"]), bbox=_patch(style) if style["hatch"] else None,
+                    color=_ink(style["color"]), bbox={"facecolor": style["color"], **plain} if style["hatch"] else None,
                 )  # fmt: skip
         bottom += fractions[:, i]
     if not fractions.any():
@@ -100,8 +100,3 @@ def _ink(color: str) -> str:
     """Black or white, whichever is easier to read on a colour (relative luminance)."""
     red, green, blue = (int(color[i : i + 2], 16) / 255 for i in (1, 3, 5))
     return "white" if 0.299 * red + 0.587 * green + 0.114 * blue < 0.55 else "black"
-
-
-def _patch(style: dict[str, str]) -> dict[str, Any]:
-    """A plain background for a number on a hatched bar."""
-    return {"facecolor": style["color"], "edgecolor": "none", "pad": 1.0}

@@ -73,7 +73,8 @@ def _ratio_panel(axes: Axes, rows: pl.DataFrame, grouping: Grouping, level: floa
     # The line breaks where there is no ratio.
     shown = np.where(drawn, mean, np.nan)
     axes.plot(at, shown, "o-", color=DATA_COLOR, markersize=4.5, label="geometric mean", zorder=3)
-    axes.vlines(at, low, high, color=DATA_COLOR, linewidth=2.2, alpha=0.55, zorder=2, label=_interval(low, level))
+    bars = interval_name(level) if np.isfinite(low).any() else "no interval"
+    axes.vlines(at, low, high, color=DATA_COLOR, linewidth=2.2, alpha=0.55, zorder=2, label=bars)
     axes.plot(at, uniform, "--", color=BASELINE_COLOR, linewidth=1.2, label=BASELINE_LABEL)
     if len(at) == 1 and np.isfinite(uniform[0]):
         axes.plot([-0.4, 0.4], [uniform[0]] * 2, "--", color=BASELINE_COLOR, linewidth=1.2)
@@ -113,7 +114,3 @@ def _fraction_panel(axes: Axes, tables: Tables, grouping: Grouping) -> None:
 def _positions(axes: Axes, labels: Sequence[str]) -> None:
     label_positions(axes.xaxis, labels, _MOST_LABELS)
     axes.set_xlim(-0.6, len(labels) - 0.4)
-
-
-def _interval(low: np.ndarray, level: float) -> str:
-    return interval_name(level) if np.isfinite(low).any() else "no interval"

@@ -11,8 +11,16 @@ import polars as pl
 from vla_attention.analyze.measures.aggregate import overall_layer
 from vla_attention.analyze.measures.frames import LAYERS_AVG, layer_name
 from vla_attention.analyze.show.numbers import interval_name, of_tasks
-from vla_attention.analyze.show.plot_axes import BASELINE_LABEL, legend_above, note_at_row, ratio_axis, scattered
-from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, DOT_COLOR, STRIPE_COLOR
+from vla_attention.analyze.show.plot_axes import note_at_row, ratio_axis
+from vla_attention.analyze.show.plot_colours import STRIPE_COLOR
+from vla_attention.analyze.show.plot_rows import (
+    MANY_ROWS,
+    draw_dots,
+    draw_estimate,
+    draw_uniform,
+    label_rows,
+    legend_of_rows,
+)
 from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, named, ratio_name, task_label, title
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
@@ -30,8 +38,6 @@ _COLUMNS = (
     "episodes_without_ratio",
     "num_nonfinite",
 )
-#: From this many tasks on, a row is one line high.
-_MANY = 24
 
 
 @drawn_in_our_style
@@ -72,7 +78,7 @@ def plot_ratio_per_task(
     data = pl.concat([rows, overall]).select(*identity, *_COLUMNS)
     # With one task, the row over all tasks would repeat it.
     shown = pl.concat([rows, overall]) if rows.height > 1 else rows
-    few = rows.height <= _MANY
+    few = rows.height <= MANY_ROWS
     figure = new_figure(9, 1.6 + (0.46 if few else 0.2) * (shown.height + 0.5))
     name = layer_name(layer, LAYERS_AVG)
     title(figure, f"Ratio per task, {name}, {about or named(grouping)}", f"{_counts(rows, dots)} {note}")
@@ -90,17 +96,11 @@ def plot_ratio_per_task(
     ratio_axis(axes.xaxis, np.concatenate(values))
     _draw_rows(axes, shown, dots, few)
     several = rows["suite"].n_unique() > 1
-    axes.set_yticks(range(shown.height), [_label(row, several, few) for row in shown.iter_rows(named=True)])
-    axes.set_ylim(shown.height - 0.4, -0.6)
-    axes.tick_params(axis="y", length=0)
-    axes.grid(axis="x")
+    label_rows(axes, [_label(row, several, few) for row in shown.iter_rows(named=True)])
     axes.set_xlabel(f"ratio of masses, {ratio_name(grouping.ratio)} (logarithmic)")
-    _legend(
-        axes,
-        level,
-        with_interval=shown["geometric_mean_low"].is_not_null().any(),
-        with_baseline=shown["uniform_ratio"].is_not_null().any(),
-    )
+    interval = interval_name(level) if shown["geometric_mean_low"].is_not_null().any() else ""
+    uniform = bool(shown["uniform_ratio"].is_not_null().any())
+    legend_of_rows(axes, 4, "geometric mean", interval, "single episode", uniform)
     return save_figure(figure, folder, stem, data)
 
 
@@ -111,37 +111,18 @@ def _draw_rows(axes: Axes, shown: pl.DataFrame, dots: pl.DataFrame, few: bool) -
         if total:
             axes.axhspan(position - 0.5, position + 0.5, color=STRIPE_COLOR, linewidth=0, zorder=0)
         else:
-            own = dots.filter((pl.col("suite") == row["suite"]) & (pl.col("task_id") == row["task_id"]))
-            values = own["geometric_mean"].drop_nulls().to_numpy()
+            of_task = dots.filter((pl.col("suite") == row["suite"]) & (pl.col("task_id") == row["task_id"]))
+            values = of_task["geometric_mean"].drop_nulls().to_numpy()
             values = values[values > 0]
-            places = scattered(generator, position, len(values))
-            axes.scatter(values, places, s=14 if few else 8, color=DOT_COLOR, alpha=0.8, linewidths=0, zorder=2)
+            draw_dots(axes, position, values, generator, few)
         mean, low, high = row["geometric_mean"], row["geometric_mean_low"], row["geometric_mean_high"]
         if mean is not None and mean > 0:
-            if low is not None and high is not None:
-                axes.plot([low, high], [position, position], color=DATA_COLOR, linewidth=2.0 if few else 1.4, zorder=3)
-            size = 6.5 if few else 4.5
-            axes.plot(
-                mean,
-                position,
-                "D" if total else "o",
-                color=DATA_COLOR,
-                markersize=size,
-                zorder=4,
-                markeredgecolor="white",
-            )
+            draw_estimate(axes, position, mean, (low, high), marker="D" if total else "o", few=few)
         else:
             note_at_row(axes, position, "no finite ratio", x=0.01)
         uniform = row["uniform_ratio"]
         if uniform is not None and uniform > 0:
-            axes.plot(
-                [uniform, uniform],
-                [position - 0.42, position + 0.42],
-                "--",
-                color=BASELINE_COLOR,
-                linewidth=1.2,
-                zorder=1,
-            )
+            draw_uniform(axes, position, uniform)
         left_out = f" ({row['episodes_without_ratio']} without)" if row["episodes_without_ratio"] else ""
         text = f"n = {row['num_episodes']}{left_out}"
         note_at_row(axes, position, text)
@@ -153,16 +134,6 @@ def _label(row: dict[str, Any], several: bool, few: bool) -> str:
     if row["scope"] == "all":
         return f"all tasks of {row['suite']}"
     return task_label(row, several, few)
-
-
-def _legend(axes: Axes, level: float, with_interval: bool, with_baseline: bool) -> None:
-    axes.plot([], [], "o", color=DATA_COLOR, markersize=6, label="geometric mean")
-    if with_interval:
-        axes.plot([], [], color=DATA_COLOR, linewidth=2, label=interval_name(level))
-    axes.scatter([], [], s=14, color=DOT_COLOR, linewidths=0, label="single episode")
-    if with_baseline:
-        axes.plot([], [], "--", color=BASELINE_COLOR, linewidth=1.2, label=BASELINE_LABEL)
-    legend_above(axes, 4, handlelength=1.5)
 
 
 def _counts(rows: pl.DataFrame, dots: pl.DataFrame) -> str:

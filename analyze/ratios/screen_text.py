@@ -12,25 +12,18 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from math import ceil
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 
 from vla_attention.analyze.measures.aggregate import HEADLINE, layer_order, overall_layer, overall_rows
-from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables
+from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.ratios.analysis import Analysis
+from vla_attention.analyze.ratios.summary_text import ratio_columns
+from vla_attention.analyze.show.answer import SCREEN_LINES, WHOLE_TEXT
 from vla_attention.analyze.show.headings import WIDTH, wrap, wrap_all
-from vla_attention.analyze.show.numbers import (
-    format_number,
-    format_percent,
-    format_percent_interval,
-    interval_name,
-    row_interval,
-)
+from vla_attention.analyze.show.numbers import format_number, format_percent, row_interval
 from vla_attention.analyze.show.plot_text import shortened
-from vla_attention.analyze.show.screen import SCREEN_LINES, WHOLE_TEXT
-from vla_attention.analyze.show.text_table import text_table
-from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
+from vla_attention.analyze.show.tables import INTERVAL, Table, count, number, percent, percent_interval, texts
 
 #: Rows of groups, and blocks of layers beside each other, before "in summary.txt" stands for the rest.
 _MOST_GROUPS, _MOST_BLOCKS = 6, 2
@@ -133,21 +126,17 @@ def _beside_each_other(name: str, columns: Sequence[str], rows: Mapping[str, Seq
 
 def _groups(analysis: Analysis, most: int) -> list[str]:
     """The groups that get attention, at most so many, over all tasks and layers."""
-    found = [(name, analysis.overall_groups[name]) for name in analysis.present_groups]
-    found = [(name, row) for name, row in found if row["mass"]]
-    rows = [
-        (
-            shortened(name, 40),
-            format_number(row["keys"]),
-            format_percent(row["fraction"]),
-            format_percent_interval(row["fraction_low"], row["fraction_high"]),
-            format_number(row["lift"]),
-        )
-        for name, row in found[:most]
+    rows = [{"name": name} | analysis.overall_groups[name] for name in analysis.present_groups]
+    rows = [row for row in rows if row["mass"]]
+    columns = [
+        texts("GROUPS", lambda row: shortened(row["name"], 40), left=True),
+        number("keys", "keys"),
+        percent("fraction", "fraction"),
+        percent_interval("fraction", INTERVAL),
+        number("lift", "lift"),
     ]
-    table = _table(("GROUPS", "keys", "fraction", interval_name(DEFAULT_LEVEL), "lift"), rows)
-    more = len(found) - len(rows)
-    return [*table, f"{more} more groups {_REST}"] if more else table
+    table, more = _without_rule(Table(columns, rows[:most])), len(rows) - most
+    return [*table, f"{more} more groups {_REST}"] if more > 0 else table
 
 
 def _tasks(analysis: Analysis, room: int) -> list[str]:
@@ -157,49 +146,32 @@ def _tasks(analysis: Analysis, room: int) -> list[str]:
     level = tasks.filter(pl.col("scope") == ("all" if several else "task"))
     noun, cells = ("suite" if several else "task"), list(level.cells.iter_rows(named=True))
     fits = len(cells) if len(cells) < room else max(room - 2, 0)
-    values = _ratio_cells if analysis.grouping.ratio is not None else _fraction_cells
-    header, rows = values(analysis, level, cells[:fits])
-    names = [row["suite"] if several else str(row["task_id"]) for row in cells[:fits]]
+    groups = () if analysis.grouping.ratio is not None else analysis.present_groups[:_MOST_FRACTIONS]
+    of_group = level.by_group("suite", "task_id")
     rows = [
-        (name, str(row["num_episodes"]), format_percent(row["success_rate"], 0), *more)
-        for name, row, more in zip(names, cells[:fits], rows, strict=True)
+        row | {f"fraction {name}": of_group[row["suite"], row["task_id"], name]["fraction"] for name in groups}
+        for row in cells[:fits]
     ]
-    texts = None if several else [row["instruction"] or "" for row in cells[:fits]]
-    table = _table((f"{noun.upper()}S", "n", "solved", *header), rows, texts)
+    columns = [
+        texts(f"{noun.upper()}S", lambda row: row["suite"] if several else str(row["task_id"]), left=True),
+        count("n", "num_episodes"),
+        percent("solved", "success_rate", decimals=0),
+        *(ratio_columns()[:4] if analysis.grouping.ratio is not None else []),
+        *(percent(shortened(name, 14), f"fraction {name}") for name in groups),
+    ]
+    head, *lines = _without_rule(Table(columns, rows))
+    if not several:
+        # What is left of the width, on one line each.
+        width = max(map(len, [head, *lines]))
+        room = WIDTH - width - 2
+        said = [
+            textwrap.shorten(row["instruction"] or "", room, placeholder=" ...") if room > 0 else "" for row in rows
+        ]
+        lines = [f"{line:<{width}}  {text}".rstrip() for line, text in zip(lines, said, strict=True)]
     left = len(cells) - fits
-    return [*table, f"{left} more {noun}s {_REST}"] if left else table
+    return [head, *lines, *([f"{left} more {noun}s {_REST}"] if left else [])]
 
 
-def _ratio_cells(
-    analysis: Analysis, level: Tables, rows: Sequence[dict[str, Any]]
-) -> tuple[list[str], list[Sequence[str]]]:
-    header = ["ratio", interval_name(DEFAULT_LEVEL), "uniform", "lift"]
-    return header, [
-        (
-            format_number(row[HEADLINE]),
-            row_interval(row, HEADLINE),
-            format_number(row["uniform_ratio"]),
-            format_number(row["ratio_lift"]),
-        )
-        for row in rows
-    ]
-
-
-def _fraction_cells(
-    analysis: Analysis, level: Tables, rows: Sequence[dict[str, Any]]
-) -> tuple[list[str], list[Sequence[str]]]:
-    names, of_group = analysis.present_groups[:_MOST_FRACTIONS], level.by_group("suite", "task_id")
-    return [shortened(name, 14) for name in names], [
-        [format_percent(of_group[row["suite"], row["task_id"], name]["fraction"]) for name in names] for row in rows
-    ]
-
-
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]], texts: Sequence[str] | None = None) -> list[str]:
-    """A table without a rule, one line per row; `texts` stand in what is left of the width, cut where they are long."""
-    lines = [line for line in text_table(header, rows, left=(0,)).splitlines() if not line.startswith("·")]
-    if texts is None:
-        return lines
-    width = max(map(len, lines))
-    room = WIDTH - width - 2
-    cut = [textwrap.shorten(text, room, placeholder=" ...") if room > 0 else "" for text in texts]
-    return [lines[0], *(f"{line:<{width}}  {text}".rstrip() for line, text in zip(lines[1:], cut, strict=True))]
+def _without_rule(table: Table) -> list[str]:
+    head, rows = table.laid_out()
+    return [*head, *(line for row in rows for line in row)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,25 +11,23 @@ import polars as pl
 from vla_attention.analyze.measures.aggregate import layer_order, overall_layer, overall_rows
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables, layer_name
 from vla_attention.analyze.ratios.verdict import LINGUISTIC_BELOW, VISUAL_ABOVE, meanings, reading, verdict
+from vla_attention.analyze.show.answer import Section
 from vla_attention.analyze.show.findings import few_families_note
-from vla_attention.analyze.show.headings import (
-    WIDTH,
-    heading,
-    title,
-    untrained_warning,
-    wrap,
-    wrap_all,
-)
-from vla_attention.analyze.show.numbers import (
-    format_number,
-    format_percent,
-    interval_name,
-    plural,
-    row_interval,
-    solved_text,
-)
+from vla_attention.analyze.show.headings import WIDTH, title, untrained_warning, wrap, wrap_all
+from vla_attention.analyze.show.numbers import format_number, format_percent, plural, solved_text
 from vla_attention.analyze.show.plot_text import shortened
-from vla_attention.analyze.show.text_table import text_table
+from vla_attention.analyze.show.tables import (
+    INTERVAL,
+    Cell,
+    Column,
+    Table,
+    count,
+    interval,
+    number,
+    percent,
+    texts,
+    words,
+)
 from vla_attention.analyze.statistics.units import Units
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
@@ -51,7 +49,6 @@ class AnalysedRun:
         denoise_steps: denoise steps that were averaged over.
         units: what the intervals over all tasks are about.
         heads: how heads were averaged, as text.
-        level: level of the intervals in `tasks_table`.
         notes: further lines, for instance about translated layer numbers.
         answer: the sentences that stand first.
     """
@@ -62,27 +59,26 @@ class AnalysedRun:
     denoise_steps: Sequence[int]
     units: Units
     heads: str = "mean over all heads"
-    level: float = 0.95
     notes: Sequence[str] = field(default_factory=tuple)
     answer: Sequence[str] = ()
 
 
-def summary_text(run: AnalysedRun, grouping: Grouping, episodes: Tables, tasks: Tables) -> str:
-    """The whole summary, at most 100 columns wide, from `aggregate.episode_tables` and `aggregate.task_tables`."""
-    parts = [_header(run, grouping, episodes)]
+def summary_sections(run: AnalysedRun, grouping: Grouping, episodes: Tables, tasks: Tables) -> list[Section]:
+    """The summary, from `aggregate.episode_tables` and `aggregate.task_tables`."""
+    sections = _header(run, grouping, episodes)
     if grouping.ratio:
-        parts += [_ratio_section(run, grouping, tasks), _nonfinite_section(overall_rows(tasks).cells)]
-    parts += [_groups_section(grouping, tasks, "fraction"), _groups_section(grouping, tasks, "lift")]
+        sections += [*_ratio_sections(run, grouping, tasks), *_nonfinite_section(overall_rows(tasks).cells)]
+    sections += [*_group_sections(grouping, tasks, "fraction"), *_group_sections(grouping, tasks, "lift")]
     suites = tasks.cells["suite"].drop_nulls().unique().sort().to_list()
     if len(suites) > 1:
-        parts.append(_across_section(run, grouping, tasks, "all"))
+        sections.append(_across_section(run, grouping, tasks, "all"))
     for suite in suites:
         of = f" OF {suite}" if len(suites) > 1 else ""
-        parts.append(_across_section(run, grouping, tasks.filter(pl.col("suite") == suite), "task", of))
-    return "\n\n".join(part for part in parts if part) + "\n"
+        sections.append(_across_section(run, grouping, tasks.filter(pl.col("suite") == suite), "task", of))
+    return sections
 
 
-def _header(run: AnalysedRun, grouping: Grouping, episodes: Tables) -> str:
+def _header(run: AnalysedRun, grouping: Grouping, episodes: Tables) -> list[Section]:
     of_layer = episodes.filter(pl.col("layer") == overall_layer(episodes.cells))
     overall = of_layer.cells
     num_tasks = overall.select("suite", "task_id").n_unique()
@@ -95,7 +91,8 @@ def _header(run: AnalysedRun, grouping: Grouping, episodes: Tables) -> str:
     layers = [layer for layer in layer_order(episodes.cells) if layer != LAYERS_AVG]
     blocks = dict(episodes.cells.select("layer", "block").unique().iter_rows())
     translated = [f"{layer} = block {blocks[layer]}" for layer in layers if str(blocks[layer]) != layer]
-    lines = [*title("ATTENTION SUMMARY"), *wrap_all(run.answer), *([""] if run.answer else [])]
+    above = [*title("ATTENTION SUMMARY"), *wrap_all(run.answer)]
+    lines: list[str] = [] if run.answer else above
     if run.untrained:
         lines += ["!" * WIDTH, *wrap(untrained_warning()), "!" * WIDTH]
     lines += _labelled("store", ", ".join(run.stores))
@@ -116,42 +113,58 @@ def _header(run: AnalysedRun, grouping: Grouping, episodes: Tables) -> str:
         lines += _labelled("ratio", ratio_definition(grouping))
     for note in run.notes:
         lines += _labelled("note", note)
-    return "\n".join(lines)
+    return [*([Section([above])] if run.answer else []), Section([lines])]
 
 
-def _ratio_section(run: AnalysedRun, grouping: Grouping, tasks: Tables) -> str:
-    level = overall_rows(tasks)
-    rows = level.cells
-    header = ["layer", "ratio", interval_name(run.level), "uniform", "lift", "of means", "mean ± std", "median"]
-    header += ["verdict"] * grouping.compares_modalities
-    body = [
-        [
-            row["layer"],
-            format_number(row["geometric_mean"]),
-            row_interval(row, "geometric_mean"),
-            *(format_number(row[column]) for column in ("uniform_ratio", "ratio_lift", "ratio_of_means")),
-            _mean_and_spread(row),
-            format_number(row["ratio_median"]),
-            *[reading(row, run.untrained)] * grouping.compares_modalities,
-        ]
-        for row in _by_layer(rows)
+def ratio_columns(bounds_of_lift: bool = False) -> list[Column]:
+    """The ratio of a row of `aggregate.task_tables`, what uniform attention gives, and the lift over it."""
+    return [
+        number("ratio", "geometric_mean", "ratio"),
+        interval("geometric_mean", INTERVAL, INTERVAL),
+        number("uniform", "uniform_ratio", "uniform"),
+        number("lift", "ratio_lift", "lift"),
+        *([interval("ratio_lift", INTERVAL)] if bounds_of_lift else []),
+        number("of means", "ratio_of_means", "of means"),
     ]
-    overall = rows.filter(pl.col("layer") == overall_layer(rows)).row(0, named=True)
-    words = meanings([reading(row, run.untrained) for row in _by_layer(rows)]) if grouping.compares_modalities else ""
+
+
+def _layer() -> Column:
+    def cell(row: Mapping[str, Any]) -> Cell:
+        block = "" if row["block"] is None or str(row["block"]) == row["layer"] else f" (block {row['block']})"
+        return Cell(f"{row['layer']}{block}", row["layer_number"])
+
+    return Column("layer", lambda row: str(row["layer"]), cell, "layer", left=True)
+
+
+def layer_table(grouping: Grouping, tasks: Tables, untrained: bool) -> Table:
+    """The ratio over all tasks in every layer, in a text and on the page."""
+    columns = [
+        _layer(),
+        *ratio_columns(),
+        texts("mean ± std", _mean_and_spread),
+        number(None, "ratio_mean", "mean"),
+        number("median", "ratio_median", "median"),
+        count(None, "num_nonfinite", "not finite"),
+    ]
+    if grouping.compares_modalities:
+        columns.append(texts("verdict", lambda row: reading(row, untrained), left=True))
+    return Table(columns, _by_layer(overall_rows(tasks).cells), "Ratio per layer")
+
+
+def _ratio_sections(run: AnalysedRun, grouping: Grouping, tasks: Tables) -> list[Section]:
+    level, table = overall_rows(tasks), layer_table(grouping, tasks, run.untrained)
+    overall = level.cells.filter(pl.col("layer") == overall_layer(level.cells)).row(0, named=True)
+    compares = grouping.compares_modalities
     legend = (
         "ratio, uniform, lift: geometric means; uniform: what uniform attention gives, lift: ratio / uniform. of "
         "means: mean numerator mass / mean denominator mass. mean, std, median: of the episodes' mean ratios "
-        f"(n = {overall['num_episodes']}). {_interval_note(run, overall)} {words}".strip()
+        f"(n = {overall['num_episodes']}). {_interval_note(run, overall)} "
+        f"{meanings([reading(row, run.untrained) for row in table.rows]) if compares else ''}".strip()
     )
-    return "\n".join(
-        [
-            heading(f"RATIO  {ratio_definition(grouping)}"),
-            text_table(header, body, left=(0, 8) if grouping.compares_modalities else (0,)),
-            "",
-            *wrap(legend),
-            *wrap(_baseline_sentence(grouping, overall["uniform_ratio"], level)),
-        ]
-    )
+    return [
+        Section([table], f"RATIO  {ratio_definition(grouping)}"),
+        Section([legend, _baseline_sentence(grouping, overall["uniform_ratio"], level)]),
+    ]
 
 
 def _interval_note(run: AnalysedRun, overall: dict[str, object]) -> str:
@@ -187,7 +200,7 @@ def _baseline_sentence(grouping: Grouping, uniform: float | None, level: Tables)
     )
 
 
-def _nonfinite_section(rows: pl.DataFrame) -> str:
+def _nonfinite_section(rows: pl.DataFrame) -> list[Section]:
     lines = []
     for row in _by_layer(rows):
         of = layer_name(row["layer"], LAYERS_AVG)
@@ -202,95 +215,112 @@ def _nonfinite_section(rows: pl.DataFrame) -> str:
             lines.append(f"{of}: {zeros} ratios are 0 and left out of the geometric mean")
         if row["layer"] == LAYERS_AVG and row["nonfinite_layers"]:
             lines.append(f"{of}: {row['nonfinite_layers']} (replan, layer) ratios left out of the average over layers")
-    if not lines:
-        return ""
     explanation = (
         "Infinite (no denominator mass) or undefined (no mass on either side). Left out of mean, median and geometric "
         "mean; the ratio of means and the fractions include these replans."
     )
-    return "\n".join([heading("RATIOS THAT ARE NOT FINITE"), *wrap(explanation), *lines])
+    return [Section([explanation, lines], "RATIOS THAT ARE NOT FINITE")] if lines else []
 
 
-def _groups_section(grouping: Grouping, tasks: Tables, kind: str) -> str:
+def layer_groups_table(level: Tables, groups: Sequence[str]) -> Table:
+    """Fractions, then lifts of groups in every layer; a text has them in tables of their own, the page in one."""
+    of_group = level.by_group("layer")
+    cells = {row["layer"]: row for row in level.cells.iter_rows(named=True)}
+    rows = [
+        {name: cells[layer][name] for name in ("layer", "layer_number", "block")}
+        | {f"{kind} {group}": of_group[layer, group][kind] for kind in ("fraction", "lift") for group in groups}
+        for layer in layer_order(level.cells)
+    ]
+    fractions = [percent(shortened(group, 24), f"fraction {group}", group) for group in groups]
+    lifts = [number(shortened(group, 24), f"lift {group}", f"{group} lift") for group in groups]
+    caption = (
+        "Groups per layer. Per cent: fraction of the groups' summed mass; lift: mass over what uniform attention gives"
+    )
+    return Table([_layer(), *fractions, *lifts], rows, caption)
+
+
+def _group_sections(grouping: Grouping, tasks: Tables, kind: str) -> list[Section]:
     """Layers by groups that have keys; in blocks of as many groups as the width allows."""
     level = overall_rows(tasks)
     groups = level.groups_with_keys()
-    names = [shortened(name, 24) for name in groups]
-    layers, of_group = layer_order(level.cells), level.by_group("layer")
-    show = format_percent if kind == "fraction" else format_number
-    cells = {group: [show(of_group[layer, group][kind]) for layer in layers] for group in groups}
-    room = WIDTH - max(map(len, [*layers, "layer"]))
-    blocks: list[list[int]] = [[]]
-    used = 0
-    for i, group in enumerate(groups):
-        width = 2 + max(map(len, [names[i], *cells[group]]))
+    table = layer_groups_table(level, groups)
+    layer, columns = table.columns[0], table.columns[1:][: len(groups)]
+    if kind == "lift":
+        columns = table.columns[1:][len(groups) :]
+
+    def width_of(column: Column) -> int:
+        return max(len(text) for text in (str(column.header), *map(column.text, table.rows)))
+
+    blocks: list[list[Column]] = [[]]
+    used, room = 0, WIDTH - width_of(layer)
+    for column in columns:
+        width = 2 + width_of(column)
         if used + width > room and blocks[-1]:
             blocks.append([])
             used = 0
-        blocks[-1].append(i)
+        blocks[-1].append(column)
         used += width
-    tables = [
-        text_table(
-            ["layer", *(names[i] for i in block)],
-            [[layer, *(cells[groups[i]][j] for i in block)] for j, layer in enumerate(layers)],
-            left=(0,),
-        )
-        for block in blocks
+    heading = "FRACTION of the summed masses of all groups" + (" (groups overlap)" if grouping.overlap else "")
+    note = ""
+    if kind == "lift":
+        heading = "LIFT  mass, against what uniform attention gives"
+        note = "Mean over replans of mass / mass of attention that is uniform at each query, which has 1."
+    tables = [Table([layer, *block], table.rows) for block in blocks]
+    last = len(tables) - 1
+    return [Section([one, note if i == last else ""], "" if i else heading) for i, one in enumerate(tables)]
+
+
+def across_table(
+    grouping: Grouping, level: Tables, scope: str = "task", several_suites: bool = False, on_page: Sequence[str] = ()
+) -> Table:
+    """A row per task (scope "task") or per suite (scope "all"), in a text and on the page.
+
+    Args:
+        grouping: whose ratio, or without one whose first groups, are shown.
+        level: the rows.
+        scope: of the rows.
+        several_suites: whether the page names the suites.
+        on_page: groups that the page shows.
+    """
+    of_group = level.by_group("suite", "task_id")
+    rows = [
+        row
+        | {f"fraction {group}": of_group[row["suite"], row["task_id"], group]["fraction"] for group in grouping.names}
+        for row in level.cells.iter_rows(named=True)
     ]
-    if kind == "fraction":
-        of_groups = "FRACTION of the summed masses of all groups" + (" (groups overlap)" if grouping.overlap else "")
-        note = ""
-    else:
-        of_groups = "LIFT  mass, against what uniform attention gives"
-        note = "\nMean over replans of mass / mass of attention that is uniform at each query, which has 1."
-    return "\n".join([heading(of_groups), "\n\n".join(tables)]) + note
+    by_suite = scope == "all"
+    columns = [
+        words("suite", "suite") if by_suite else count("task", "task_id", "task", left=True),
+        *([words(None, "suite", "suite")] if several_suites else []),
+        *([] if by_suite else [words("instruction", "instruction", "instruction", running=True)]),
+        count("n", "num_episodes", "episodes"),
+        percent("success", "success_rate", "solved"),
+        *([*ratio_columns(), number("mean", "ratio_mean", "mean")] if grouping.ratio else []),
+        *([count(None, "num_nonfinite", "not finite")] if grouping.ratio else []),
+        *(
+            percent(shortened(group, 12), f"fraction {group}")
+            for group in (() if grouping.ratio else grouping.names[:5])
+        ),
+        *(percent(None, f"fraction {group}", group) for group in on_page),
+    ]
+    return Table(columns, rows)
 
 
-def _across_section(run: AnalysedRun, grouping: Grouping, tasks: Tables, scope: str, of: str = "") -> str:
-    """A row per task (scope "task") or per suite (scope "all"), of `overall_layer`."""
+def _across_section(run: AnalysedRun, grouping: Grouping, tasks: Tables, scope: str, of: str = "") -> Section:
     layer = overall_layer(tasks.cells)
     level = tasks.filter((pl.col("scope") == scope) & (pl.col("layer") == layer))
-    rows, of_group = level.cells, level.by_group("suite", "task_id")
-    name = "suite" if scope == "all" else "task"
-    header = [name, "n", "success"]
-    if grouping.ratio:
-        header += ["ratio", interval_name(run.level), "uniform", "lift", "of means", "mean"]
-    else:
-        header += [shortened(group, 12) for group in grouping.names[:5]]
-    body = []
-    for row in rows.iter_rows(named=True):
-        cells = [
-            row["suite"] if scope == "all" else str(row["task_id"]),
-            str(row["num_episodes"]),
-            format_percent(row["success_rate"]),
-        ]
-        if grouping.ratio:
-            cells += [
-                format_number(row["geometric_mean"]),
-                row_interval(row, "geometric_mean"),
-                *(format_number(row[c]) for c in ("uniform_ratio", "ratio_lift", "ratio_of_means", "ratio_mean")),
-            ]
-        else:
-            cells += [
-                format_percent(of_group[row["suite"], row["task_id"], group]["fraction"])
-                for group in grouping.names[:5]
-            ]
-        body.append(cells)
-    last = "" if scope == "all" else "instruction"
-    texts = [row["instruction"] or "" for row in rows.iter_rows(named=True)]
-    shown = layer_name(layer, LAYERS_AVG)
     what = "ratio" if grouping.ratio else f"fractions of {listing(grouping.names[:5])}"
-    table = text_table(header, body, left=(0,), last=last, texts=texts if last else None, width=WIDTH)
-    fewest = rows["num_episodes"].min()
+    fewest, warning = level.cells["num_episodes"].min(), ""
     if grouping.ratio and scope == "task" and isinstance(fewest, int) and 1 < fewest < FEW_EPISODES:
         warning = (
             "The interval of a task with n episodes rests on n - 1 degrees of freedom. With fewer than "
             f"{FEW_EPISODES} episodes its width varies much by chance: a narrow one is no sign of certainty."
         )
-        table = "\n".join([table, *wrap(warning)])
     if scope == "all":
-        table = "\n".join([table, *wrap(few_families_note(rows, "suite", run.units))])
-    return "\n".join([heading(f"PER {name.upper()}{of}  {what}, {shown}"), table])
+        warning = few_families_note(level.cells, "suite", run.units)
+    name = "SUITE" if scope == "all" else "TASK"
+    heading = f"PER {name}{of}  {what}, {layer_name(layer, LAYERS_AVG)}"
+    return Section([across_table(grouping, level, scope), warning], heading)
 
 
 def _by_layer(rows: pl.DataFrame) -> list[dict[str, Any]]:

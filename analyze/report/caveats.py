@@ -58,7 +58,7 @@ def caveats(analysis: Analysis, masses: Mapping[str, float], sinks: pl.DataFrame
         sinks: `SinkSearch.sinks`; None when nobody looked for sinks.
     """
     question = analysis.question
-    found = [
+    given = [
         *_weights(question),
         *_dependence(question),
         *_baseline(analysis),
@@ -79,7 +79,7 @@ def caveats(analysis: Analysis, masses: Mapping[str, float], sinks: pl.DataFrame
         *_related_tasks(question),
         *(Caveat("Chosen part", line) for line in question.notes),
     ]
-    return sorted(found, key=lambda caveat: not caveat.grave)
+    return sorted(given, key=lambda caveat: not caveat.grave)
 
 
 def _related_tasks(question: Question) -> list[Caveat]:
@@ -153,7 +153,7 @@ def _episodes(analysis: Analysis) -> list[Caveat]:
     if sum(counts) == 1:
         sentence = "A single episode does not show how much episodes differ: there are no intervals."
         return [Caveat("One episode", sentence, True)]
-    found = []
+    given = []
     if min(counts) < FEW_EPISODES:
         low, high = min(counts), max(counts)
         several = plural(high, "episode") if low == high else f"{low} to {high} episodes"
@@ -161,10 +161,10 @@ def _episodes(analysis: Analysis) -> list[Caveat]:
             f"Tasks have {several} each: the interval of a task with fewer than {FEW_EPISODES} episodes is wide, and "
             "relies on ratios that are normal on a logarithmic scale."
         )
-        found.append(Caveat("Few episodes", sentence))
+        given.append(Caveat("Few episodes", sentence))
     if len(counts) == 1:
-        found.append(Caveat("One task", "The intervals are about more episodes of this task, not about other tasks."))
-    return found
+        given.append(Caveat("One task", "The intervals are about more episodes of this task, not about other tasks."))
+    return given
 
 
 def _sites(question: Question) -> list[Caveat]:
@@ -265,18 +265,18 @@ def _queries(question: Question) -> list[Caveat]:
 def _parts_of_the_model(question: Question) -> list[Caveat]:
     policy, selection = question.stores[0].attributes.policy, question.selection
     blocks, heads, steps = len(set(selection.blocks)), len(selection.heads), selection.denoise_steps
-    found = []
+    given = []
     num_layers, num_heads = question.stores[0].attributes.size_of(question.site)
     if blocks < num_layers or heads < num_heads:
         sentence = f"These numbers are of {blocks} of {num_layers} layers and {heads} of {num_heads} heads."
-        found.append(Caveat("Part of the model", sentence))
+        given.append(Caveat("Part of the model", sentence))
     if len(steps) < policy.num_denoise_steps and not question.notes:
         which = "step" if len(steps) == 1 else "steps"
         sentence = f"Means over denoise {which} {listing(steps)} of {policy.num_denoise_steps}."
-        found.append(Caveat("Denoise steps", sentence))
+        given.append(Caveat("Denoise steps", sentence))
     if selection.note:
-        found.append(Caveat("Layer numbers", selection.note))
-    return found
+        given.append(Caveat("Layer numbers", selection.note))
+    return given
 
 
 def _compute_type(question: Question) -> list[Caveat]:

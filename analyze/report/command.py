@@ -4,14 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from vla_attention.analyze.arguments import (
-    add_grouping,
-    add_intervals,
-    add_selection,
-    add_stores,
-    output_place,
-    settings_of,
-)
+from vla_attention.analyze.arguments import add_question, add_stores, output_place, question_of
 from vla_attention.analyze.report.report_settings import ReportSettings
 from vla_attention.schemas.command_line import command_parser
 
@@ -37,9 +30,7 @@ def build_parser() -> argparse.ArgumentParser:
         _EXAMPLES,
     )
     add_stores(parser)
-    add_grouping(parser)
-    add_selection(parser)
-    add_intervals(parser)
+    add_question(parser)
     content, defaults = parser.add_argument_group("content"), ReportSettings()
     content.add_argument(
         "--episodes",
@@ -79,15 +70,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Analyse and write the page."""
     from pathlib import Path
 
-    from vla_attention.analyze.measures.question import ask
     from vla_attention.analyze.report.page import report_file, write_report
     from vla_attention.analyze.show.browser import open_page
     from vla_attention.analyze.show.numbers import plural
-    from vla_attention.schemas.stores.reader import open_store
 
     settings = ReportSettings(arguments.episodes, arguments.replans, not arguments.quick, tuple(arguments.effects))
     path = report_file(arguments.output or Path("results") / arguments.stores[0].stem)
-    question = ask([open_store(store) for store in arguments.stores], settings_of(arguments))
+    question = question_of(arguments)
     write_report(question, path, settings)
     for line in question.skipped:
         print(line)

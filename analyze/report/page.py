@@ -4,34 +4,50 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
+from typing import ClassVar
 
 import jinja2
 
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.role_masses import role_masses
 from vla_attention.analyze.measures.sinks import SinkSearch, search_sinks
+from vla_attention.analyze.measures.steps import role_masses
 from vla_attention.analyze.ratios.analysis import Analysis, analyse
 from vla_attention.analyze.report.caveats import Caveat, caveat_section, caveats
-from vla_attention.analyze.report.deviation_section import deviation_section
-from vla_attention.analyze.report.effect_section import effect_section
 from vla_attention.analyze.report.headline import headline_section
-from vla_attention.analyze.report.methods import method_section
 from vla_attention.analyze.report.overlay_section import overlay_section
-from vla_attention.analyze.report.question_sections import object_section, sink_section, time_section, word_section
+from vla_attention.analyze.report.question_sections import (
+    deviation_section,
+    effect_section,
+    object_section,
+    sink_section,
+    time_section,
+    word_section,
+)
 from vla_attention.analyze.report.ratio_sections import contribution_section, layer_section, task_section
 from vla_attention.analyze.report.report_settings import ReportSettings
 from vla_attention.analyze.report.run_section import run_section
 from vla_attention.analyze.report.section_parts import Section
 from vla_attention.analyze.show.numbers import of_tasks
 from vla_attention.analyze.show.output_files import write_text, writing
-from vla_attention.analyze.show.progress import progress_bar
+from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.safe_text import visible
 
 #: Endings of a file's name that make it a page.
 _ENDINGS = (".html", ".htm")
+
+
+@dataclass(frozen=True)
+class Methods:
+    """How everything on the page is computed. `level`: of all intervals; `about`: what they are about."""
+
+    template: ClassVar[str] = "methods.html"
+    level: str
+    about: str
 
 
 def report_file(path: Path) -> Path:
@@ -61,7 +77,7 @@ def report_html(analysis: Analysis, settings: ReportSettings) -> str:
     question = analysis.question
     search = search_sinks(question) if settings.rows else None
     notes = caveats(analysis, role_masses(question), None if search is None else search.sinks)
-    found = []
+    sections = []
     with tempfile.TemporaryDirectory() as folder:
         makers = _section_makers(analysis, notes, search, Path(folder), settings)
         with progress_bar(len(makers), "sections") as advance:
@@ -69,8 +85,8 @@ def report_html(analysis: Analysis, settings: ReportSettings) -> str:
                 section = make()
                 advance(1)
                 if section is not None:
-                    found.append(section)
-    return render(analysis, found)
+                    sections.append(section)
+    return render(analysis, sections)
 
 
 def _section_makers(
@@ -102,7 +118,7 @@ def _section_makers(
         lambda: contribution_section(analysis),
         lambda: overlay_section(question, analysis.replans.cells, settings),
         lambda: run_section(analysis),
-        lambda: method_section(analysis.question.units),
+        lambda: Section("methods", "How it is computed", [Methods(f"{100 * DEFAULT_LEVEL:g}%", question.units.words)]),
     ]
 
 

@@ -2,37 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 
 from vla_attention.analyze.heads.layer_time import layer_time_table
 from vla_attention.analyze.heads.plot_layer_time import plot_layer_time
-from vla_attention.analyze.measures.aggregate import layer_order, overall_rows
+from vla_attention.analyze.measures.aggregate import overall_rows
 from vla_attention.analyze.measures.frames import layer_name
 from vla_attention.analyze.ratios.analysis import Analysis
+from vla_attention.analyze.ratios.contribution_text import contributions_table
 from vla_attention.analyze.ratios.plot_attention_fractions import plot_attention_fractions
 from vla_attention.analyze.ratios.plot_layer_profile import plot_layer_profile
 from vla_attention.analyze.ratios.plot_ratio_distribution import plot_ratio_distribution
 from vla_attention.analyze.ratios.plot_ratio_per_task import plot_ratio_per_task
+from vla_attention.analyze.ratios.summary_text import across_table, layer_groups_table, layer_table
 from vla_attention.analyze.report.pictures import Diagram, drawn
-from vla_attention.analyze.report.section_parts import (
-    Cell,
-    Paragraph,
-    Part,
-    Section,
-    Table,
-    count_cell,
-    interval_cell,
-    number_cell,
-    percent_cell,
-    text_cell,
-)
-from vla_attention.analyze.show.numbers import format_number, format_percent, interval_name
-from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
+from vla_attention.analyze.report.section_parts import PageTable, Paragraph, Part, Section
+from vla_attention.analyze.show.numbers import format_number, format_percent
 
-_INTERVAL = interval_name(DEFAULT_LEVEL)
 #: Groups with a column of their own in the table of tasks: beside a ratio, and alone.
 _GROUPS_BESIDE_RATIO, _GROUPS_ALONE = 2, 6
 
@@ -41,36 +30,17 @@ def task_section(analysis: Analysis, folder: Path) -> Section:
     """A row per task, and the picture of ratios per task."""
     ratio, layer = analysis.grouping.ratio, analysis.overall["layer"]
     chosen = analysis.tasks.filter((pl.col("scope") == "task") & (pl.col("layer") == layer))
-    of_group = chosen.by_group("suite", "task_id")
     several = chosen.cells["suite"].n_unique() > 1
     groups = analysis.present_groups[: _GROUPS_ALONE if ratio is None else _GROUPS_BESIDE_RATIO]
-    header = ["task", *(["suite"] if several else []), "instruction", "episodes", "solved %"]
-    if ratio is not None:
-        header += ["ratio", _INTERVAL, "uniform", "lift", "of means", "mean", "not finite"]
-    header += [f"{group} %" for group in groups]
-    body = []
-    for row in chosen.cells.iter_rows(named=True):
-        cells = [count_cell(row["task_id"]), *([text_cell(row["suite"])] if several else [])]
-        cells += [text_cell(row["instruction"]), count_cell(row["num_episodes"]), percent_cell(row["success_rate"])]
-        if ratio is not None:
-            cells += _ratio_cells(row, "uniform_ratio", "ratio_lift", "ratio_of_means", "ratio_mean")
-        cells += [percent_cell(of_group[row["suite"], row["task_id"], group]["fraction"]) for group in groups]
-        body.append(cells)
+    table = across_table(analysis.grouping, chosen, several_suites=several, on_page=groups)
     caption = (
         f"Tasks ({layer_name(layer)}). Per cent of a group: its fraction of all attention. The interval's column sorts "
         "by width."
     )
-    parts: list[Part] = [Table(caption, header, body)]
+    parts: list[Part] = [PageTable(replace(table, caption=caption))]
     if ratio is not None:
         parts.insert(0, _tasks_diagram(analysis, chosen.cells, folder))
     return Section("tasks", "Tasks", parts)
-
-
-def _ratio_cells(row: dict[str, Any], *columns: str) -> list[Cell]:
-    """The geometric mean ratio with its interval, further columns, and how many replans have no finite ratio."""
-    interval = interval_cell(row["geometric_mean_low"], row["geometric_mean_high"])
-    numbers = [number_cell(row[column]) for column in columns]
-    return [number_cell(row["geometric_mean"]), interval, *numbers, count_cell(row["num_nonfinite"])]
 
 
 def _tasks_diagram(analysis: Analysis, tasks: pl.DataFrame, folder: Path) -> Diagram:
@@ -113,7 +83,11 @@ def layer_section(analysis: Analysis, folder: Path) -> Section:
             "Fractions of all groups per layer, means over episodes.",
         )
     )
-    return Section("layers", "Layers and groups", [*parts, *_layer_tables(analysis)])
+    # Two tables, because one would be too wide.
+    if grouping.ratio is not None:
+        parts.append(PageTable(layer_table(grouping, analysis.tasks, analysis.question.untrained)))
+    parts.append(PageTable(layer_groups_table(overall_rows(analysis.tasks), analysis.present_groups)))
+    return Section("layers", "Layers and groups", parts)
 
 
 def _layer_diagrams(analysis: Analysis, folder: Path) -> list[Diagram]:
@@ -141,31 +115,6 @@ def _layer_diagrams(analysis: Analysis, folder: Path) -> list[Diagram]:
     ]
 
 
-def _layer_tables(analysis: Analysis) -> list[Table]:
-    """Ratios of the layers, then fractions and lifts of the groups: two tables, because one would be too wide."""
-    over_all, groups = overall_rows(analysis.tasks), analysis.present_groups
-    of_group = over_all.by_group("layer")
-    rows = {row["layer"]: row for row in over_all.cells.iter_rows(named=True)}
-    ratios, shares = [], []
-    for layer in layer_order(over_all.cells):
-        row = rows[layer]
-        block = "" if row["block"] is None or str(row["block"]) == layer else f" (block {row['block']})"
-        name = Cell(f"{layer}{block}", row["layer_number"])
-        if analysis.grouping.ratio is not None:
-            columns = ("uniform_ratio", "ratio_lift", "ratio_of_means", "ratio_mean", "ratio_median")
-            ratios.append([name, *_ratio_cells(row, *columns)])
-        fractions = [percent_cell(of_group[layer, group]["fraction"]) for group in groups]
-        shares.append([name, *fractions, *(number_cell(of_group[layer, group]["lift"]) for group in groups)])
-    caption = (
-        "Groups per layer. Per cent: fraction of the groups' summed mass; lift: mass over what uniform attention gives"
-    )
-    tables = [Table(caption, ["layer", *(f"{g} %" for g in groups), *(f"{g} lift" for g in groups)], shares)]
-    if ratios:
-        header = ["layer", "ratio", _INTERVAL, "uniform", "lift", "of means", "mean", "median", "not finite"]
-        tables.insert(0, Table("Ratio per layer", header, ratios))
-    return tables
-
-
 def contribution_section(analysis: Analysis) -> Section | None:
     """What the image keys and the text keys add to the residual stream; None when it was not recorded."""
     if analysis.contribution_rows is None:
@@ -176,23 +125,6 @@ def contribution_section(analysis: Analysis) -> Section | None:
         "replans and denoise steps). A sink has a large mass and may have a small norm. Unlike masses, norms of "
         "different sites may be divided by each other."
     )
-    rows = [
-        [
-            Cell(row["layer"], row["layer_number"]),
-            number_cell(row["visual_norm"]),
-            number_cell(row["linguistic_norm"]),
-            number_cell(row["geometric_mean"]),
-            interval_cell(row["geometric_mean_low"], row["geometric_mean_high"]),
-            *(number_cell(row[name]) for name in ("uniform_ratio", "ratio_lift")),
-            interval_cell(row["ratio_lift_low"], row["ratio_lift_high"]),
-            *(number_cell(row[name]) for name in ("ratio_of_means", "ratio_mean")),
-        ]
-        for row in analysis.contribution_rows.iter_rows(named=True)
-    ]
-    caption = (
-        "Norms of contributions. Ratio, uniform, lift: geometric means. Uniform: the ratio that the same values would "
-        "give if attention were shared out between the segments as uniform attention is; lift: ratio / uniform"
+    return Section(
+        "contributions", "Contributions", [Paragraph(note), PageTable(contributions_table(analysis.contribution_rows))]
     )
-    header = ["layer", "visual norm", "linguistic norm", "ratio", _INTERVAL, "uniform", "lift", _INTERVAL]
-    table = Table(caption, [*header, "of means", "mean"], rows)
-    return Section("contributions", "Contributions", [Paragraph(note), table])

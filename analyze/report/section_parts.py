@@ -5,12 +5,11 @@ The templates escape every text, so nothing from a store can become markup.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
-from vla_attention.analyze.show.numbers import format_interval, format_number
+from vla_attention.analyze.show.tables import Cell, Table
 
 
 class Part(Protocol):
@@ -57,56 +56,30 @@ class Definitions:
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One cell of a table. `sort_key` orders the rows; None sorts last in either direction."""
-
-    text: str
-    sort_key: float | str | None
-    kind: str = "number"
-
-
-@dataclass(frozen=True)
-class Table:
+class PageTable:
     """A table whose columns sort by a click on their headers. The first cell of a row is its name."""
 
     template: ClassVar[str] = "table.html"
-    caption: str
-    header: Sequence[str]
-    rows: Sequence[Sequence[Cell]]
+    table: Table
+
+    @property
+    def caption(self) -> str:
+        """What stands above it."""
+        return self.table.caption
+
+    @property
+    def header(self) -> list[str]:
+        """The columns' names."""
+        return [column.page for column in self.table.columns if column.page is not None]
+
+    @property
+    def rows(self) -> list[list[Cell]]:
+        """The cells of every row."""
+        columns = [column for column in self.table.columns if column.page is not None]
+        return [[column.cell(row) for column in columns] for row in self.table.rows]
 
     @property
     def kinds(self) -> list[str]:
         """The kind of cells in every column: headers are aligned as their cells are."""
-        return [cell.kind for cell in self.rows[0]] if self.rows else ["number"] * len(self.header)
-
-
-def number_cell(value: float | None) -> Cell:
-    """A number; - for none."""
-    return Cell(format_number(value), _known(value))
-
-
-def count_cell(value: int) -> Cell:
-    """A whole number."""
-    return Cell(str(value), value)
-
-
-def percent_cell(share: float | None) -> Cell:
-    """A share in per cent, without the sign: that is in the header."""
-    known = _known(share)
-    return Cell("-" if known is None else f"{100 * known:.1f}", known)
-
-
-def interval_cell(low: float | None, high: float | None, times: float = 1.0) -> Cell:
-    """An interval, both ends multiplied by `times`. It sorts by its width."""
-    if low is None or high is None:
-        return Cell(format_interval(None, None), None)
-    return Cell(format_interval(times * low, times * high), times * (high - low))
-
-
-def text_cell(text: str) -> Cell:
-    """Words."""
-    return Cell(text, text, "words")
-
-
-def _known(value: float | None) -> float | None:
-    return None if value is None or math.isnan(value) else value
+        rows = self.rows
+        return [cell.kind for cell in rows[0]] if rows else ["number"] * len(self.header)

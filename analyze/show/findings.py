@@ -29,13 +29,13 @@ def findings(
     tested = [q for q in q_values if q is not None]
     if not tested:
         return f"None of {plural(len(names), kind)} can be tested."
-    found = [name for name, q in zip(names, q_values, strict=True) if q is not None and q <= level]
+    named = [name for name, q in zip(names, q_values, strict=True) if q is not None and q <= level]
     shared = f": {NAMED_AT:g} shared by {num_sentences} sentences" if num_sentences > 1 else ""
     bound = f"(q <= {level:g}{shared})"
-    if not found:
+    if not named:
         return f"Of {plural(len(tested), kind)}, none shows {what} {bound}."
-    verb = "shows" if len(found) == 1 else "show"
-    return f"Of {plural(len(tested), kind)}, {len(found)} {verb} {what} {bound}: {listing(found, 8)}."
+    verb = "shows" if len(named) == 1 else "show"
+    return f"Of {plural(len(tested), kind)}, {len(named)} {verb} {what} {bound}: {listing(named, 8)}."
 
 
 def apart_note(leaders: Sequence[NamedLeader], column: str) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from vla_attention.schemas.command_line import format_bytes as format_bytes  # shared with capture
-from vla_attention.schemas.plurals import plural as plural
+from vla_attention.schemas.errors import plural as plural
 
 
 def format_number(value: float | None) -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import math
+import operator
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -62,9 +64,9 @@ def _refusal_in(error: BaseException, file: Path) -> OSError | None:
         return error
     if isinstance(error, (UserError, KeyboardInterrupt)) or not isinstance(error, Exception):
         return None
-    found = _NUMBER_OF_OS_ERROR.search(str(error))
-    if found is not None:
-        return OSError(int(found[1]), os.strerror(int(found[1])))
+    number = _NUMBER_OF_OS_ERROR.search(str(error))
+    if number is not None:
+        return OSError(int(number[1]), os.strerror(int(number[1])))
     if isinstance(error, OSError) or not file.exists():
         return None
     try:  # polars says "transport error" where the end of a Parquet file is refused
@@ -123,20 +125,23 @@ def write_csv(folder: Path, **tables: pl.DataFrame | Iterable[pl.DataFrame]) -> 
     return _write(folder, "csv", tables, lambda table, path: table.write_csv(path), _write_csv_parts)
 
 
-def _write_csv_parts(parts: Iterator[pl.DataFrame], path: Path) -> None:
+def _write_csv_parts(parts: Iterable[pl.DataFrame], path: Path) -> None:
     with path.open("wb") as file:
         for number, part in enumerate(parts):
             part.write_csv(file, include_header=number == 0)
 
 
-#: Rows that a Parquet file holds together; the writer keeps as many in memory.
+#: Fewest rows that a Parquet file holds together. The writer keeps as many in memory, some 400 bytes each, and 75 kB of
+#: each such group until the file ends: for a table of N rows the sum is least with the square root of 190 N.
 _ROWS_TOGETHER = 30_000
 
 
-def _write_parquet_parts(parts: Iterator[pl.DataFrame], path: Path, metadata: Mapping[str, str]) -> None:
+def _write_parquet_parts(table: Iterable[pl.DataFrame], path: Path, metadata: Mapping[str, str]) -> None:
     from polars.io.plugins import register_io_source
 
+    parts = iter(table)
     first = next(parts)
+    together = max(_ROWS_TOGETHER, math.isqrt(190 * first.height * operator.length_hint(table)))
     failed: list[BaseException] = []
 
     def source(
@@ -149,9 +154,11 @@ def _write_parquet_parts(parts: Iterator[pl.DataFrame], path: Path, metadata: Ma
             failed.append(error)
             raise
 
-    table = register_io_source(source, schema=first.schema)
+    rows = register_io_source(source, schema=first.schema)
     try:
-        table.sink_parquet(path, metadata=dict(metadata), row_group_size=_ROWS_TOGETHER, engine="streaming")
+        # Given a path, a thread of polars makes the file, at times after an error of a part has been raised.
+        with path.open("wb") as file:
+            rows.sink_parquet(file, metadata=dict(metadata), row_group_size=together, engine="streaming")
     except Exception:
         if failed:
             raise failed[0] from None
@@ -163,7 +170,7 @@ def _write(
     ending: str,
     tables: Mapping[str, pl.DataFrame | Iterable[pl.DataFrame]],
     write: Callable[[pl.DataFrame, Path], object],
-    write_parts: Callable[[Iterator[pl.DataFrame], Path], object],
+    write_parts: Callable[[Iterable[pl.DataFrame], Path], object],
 ) -> list[Path]:
     import polars as pl
 
@@ -178,14 +185,9 @@ def _write(
                 if isinstance(table, pl.DataFrame):
                     write(table, temporary)
                 else:
-                    write_parts(iter(table), temporary)
+                    write_parts(table, temporary)
             written.append(path)
     return written
-
-
-def report_files(folder: Path, files: Sequence[Path]) -> None:
-    """Print which files were written into a folder, see `files_lines`."""
-    print("\n".join(files_lines(folder, files)))
 
 
 def files_lines(folder: Path, files: Sequence[Path]) -> list[str]:

@@ -73,6 +73,15 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
+def find_places(figure: Figure) -> None:
+    """Find them once, for every format. While a figure has a layout engine, matplotlib draws all of it twice."""
+    engine = figure.get_layout_engine()
+    if engine is not None:
+        figure.set_dpi(DPI)
+        engine.execute(figure)
+        figure.set_layout_engine(None)
+
+
 def save_figure(
     figure: Figure,
     folder: Path,
@@ -86,12 +95,7 @@ def save_figure(
     `picture_formats`, PNG and PDF unless a command line says otherwise.
     """
     paths = []
-    engine = figure.get_layout_engine()
-    if engine is not None:
-        # Places are found once, for every format. While a figure has an engine, matplotlib draws all of it twice.
-        figure.set_dpi(DPI)
-        engine.execute(figure)
-        figure.set_layout_engine(None)
+    find_places(figure)
     for kind in formats or picture_formats():
         path = folder / f"{stem}.{kind}"
         # Without a creation date the same data give the same file.

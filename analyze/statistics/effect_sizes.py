@@ -243,8 +243,8 @@ class _Classes:
         else:
             squares, sizes = (np.concatenate([getattr(side, name) for side in sides]) for name in ("squares", "size"))
             divisors = np.repeat([float(side.num_tasks) for side in sides], [len(side.size) for side in sides])
-            found, freedom = strata_error(squares, sizes, divisors)
-            variance, degrees = float(found), math.floor(freedom) if np.isfinite(freedom) else 0
+            squared_error, freedom = strata_error(squares, sizes, divisors)
+            variance, degrees = float(squared_error), math.floor(freedom) if np.isfinite(freedom) else 0
         largest = max(float(np.abs(side.means).max()) for side in sides)
         # The variance is not a number with too few clusters, and where a stratum has a single episode.
         if not variance > (ROUNDING * largest) ** 2 or degrees < 1:

@@ -89,8 +89,9 @@ def means_with_intervals(
     """
     nulls = nulls or {}
     rows = []
+    needed = dict.fromkeys([*by, *values, *(name for pair in (quotients or {}).values() for name in pair)])
     whole = sampling.units(table)
-    numbered = table.with_columns(pl.Series(_TASK, whole.tasks))
+    numbered = table.select(*needed, pl.Series(_TASK, whole.tasks))
     for key, part in numbered.group_by(by, maintain_order=True):
         given = whole.of_tasks(part[_TASK].to_numpy())
         units = given.decided()

@@ -185,10 +185,12 @@ def estimates(statistics: Sequence[EpisodeStatistic], units: Units) -> list[Esti
     task_of = units.tasks
     member = (task_of[:, None] == np.arange(len(units.clusters))).astype(np.float64)  # (episode, task)
     used, above, below = (
-        np.concatenate([part.reshape(-1, len(task_of)) for part in parts]).astype(np.float64)  # (statistic, episode)
+        np.concatenate([part.reshape(-1, len(task_of)) for part in parts]).astype(np.float64, copy=False)
         for parts in zip(*((one.used, one.numerator, one.denominator) for one in statistics), strict=True)
     )
-    above, below = above * used, below * used
+    # (statistic, episode) each, and there can be thousands of both: what can be is done in place.
+    above *= used
+    below *= used
     size = used @ member  # (statistic, task)
     num_tasks = (size > 0).sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -196,15 +198,21 @@ def estimates(statistics: Sequence[EpisodeStatistic], units: Units) -> list[Esti
         mean_above, mean_below = (part.sum(axis=1) / num_tasks for part in (task_above, task_below))
         quotient = mean_above / mean_below
         # One episode's, and one task's, share in the deviation of the quotient from its truth, to first order.
-        by_episode = (above - quotient[:, None] * below) / mean_below[:, None]
         by_task = (task_above - quotient[:, None] * task_below) / mean_below[:, None]
-        squares = ((by_episode - by_task[:, task_of]) ** 2 * used) @ member
-        scale = np.where(mean_below == 0, 0.0, np.abs(above).max(axis=1, initial=0.0) / mean_below)
+        largest = np.maximum(above.max(axis=1, initial=0.0), -above.min(axis=1, initial=0.0))
+        scale = np.where(mean_below == 0, 0.0, largest / mean_below)
+        below *= quotient[:, None]
+        above -= below
+        above /= mean_below[:, None]
+        above -= by_task[:, task_of]
+        above *= above
+        above *= used
+        squares = above @ member
     variance, degrees = strata_error(squares, size, num_tasks[:, None])
     degrees = np.floor(degrees)
     if units.estimand.of_other_tasks:
         between, of_clusters = family_error(by_task, size > 0, units.clusters, units.fewest_clusters)
-        # A single task of none: an interval over its episodes.
+        # A single task whose family nobody knows: an interval over its episodes, as nothing says how tasks differ.
         clusters = (num_tasks > 1) | (units.families is not None)
         variance, degrees = np.where(clusters, between, variance), np.where(clusters, of_clusters, degrees)
     kinds = [statistic for statistic in statistics for _ in range(statistic.used.size // len(task_of))]
@@ -245,13 +253,13 @@ def strata_error(
     Returns:
         NaN where a stratum has a single episode.
     """
-    there, degrees = size > 0, np.maximum(size - 1, 0.0)
+    has_episodes, degrees = size > 0, np.maximum(size - 1, 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        own = squares / (size - 1)
+        of_its_own = squares / (size - 1)
         freedom = degrees.sum(axis=-1, keepdims=True)
-        pooled = _SMALL_STRATUM * np.where(there, squares, 0.0).sum(axis=-1, keepdims=True) / freedom
-        small = there & (size < _FEW) & (size < size.max(axis=-1, keepdims=True) / 2) & (own < pooled)
-        of_stratum = np.where(there, np.where(small, pooled, own) / size, 0.0) / num_tasks**2
+        pooled = _SMALL_STRATUM * np.where(has_episodes, squares, 0.0).sum(axis=-1, keepdims=True) / freedom
+        small = has_episodes & (size < _FEW) & (size < size.max(axis=-1, keepdims=True) / 2) & (of_its_own < pooled)
+        of_stratum = np.where(has_episodes, np.where(small, pooled, of_its_own) / size, 0.0) / num_tasks**2
     variance: NDArray[np.float64] = of_stratum.sum(axis=-1)
     return variance, welch_degrees(of_stratum, np.where(small, freedom, degrees))
 

@@ -9,7 +9,7 @@ names above the level (Gutmann & Maymin 1987, "Is the selected population the be
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +26,8 @@ from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Units
 EPISODE_COLUMNS = ("suite", "task_id", "episode_index")
 #: A name is printed when its p-value is at most this, divided by the number of names that a text could print.
 NAMED_AT = 0.05
+#: Their estimates take ten times the memory of the values: a few of thousands of words and heads at a time.
+_ITEMS_TOGETHER = 64
 
 
 def adjusted_p_values(p_values: Sequence[float | None]) -> list[float | None]:
@@ -39,10 +41,10 @@ def adjusted_p_values(p_values: Sequence[float | None]) -> list[float | None]:
     order = np.argsort(p, kind="stable")
     scaled = p[order] * len(p) / np.arange(1, len(p) + 1)
     adjusted = np.minimum(np.minimum.accumulate(scaled[::-1])[::-1], 1.0)
-    found: list[float | None] = [None] * len(p_values)
+    by_place: list[float | None] = [None] * len(p_values)
     for place, q in zip(order, adjusted, strict=True):
-        found[known[place]] = float(q)
-    return found
+        by_place[known[place]] = float(q)
+    return by_place
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ def leader(values: ArrayLike, units: Units) -> Leader | None:
         None without two items that have a mean.
     """
     table = np.asarray(values, dtype=np.float64)
-    means = [one.value for one in estimates([mean_over_episodes(column) for column in table.T], units)]
+    means = [one.value for one in _estimates(table, range(table.shape[1]), units)]
     fewest, cluster_of = fewest_clusters(units), units.clusters[units.tasks]
     clusters_of_items = [len(np.unique(cluster_of[np.isfinite(column)])) for column in table.T]
     known = [i for i, mean in enumerate(means) if mean is not None and clusters_of_items[i] >= fewest]
@@ -92,11 +94,9 @@ def leader(values: ArrayLike, units: Units) -> Leader | None:
     highest = np.array([means[i] if i in known else np.nan for i in range(len(means))], dtype=np.float64)
     first = int(np.nanargmax(highest))
     others = [i for i in known if i != first]
-    gaps = table[:, [first]] - table[:, others]
-    paired = estimates([mean_over_episodes(gap) for gap in gaps.T], units)
     p_values, apart = [], []
-    for column, gap, other in zip(gaps.T, paired, others, strict=True):
-        shared = len(np.unique(cluster_of[np.isfinite(column)]))
+    for gap, other in zip(_estimates(table, others, units, table[:, first]), others, strict=True):
+        shared = len(np.unique(cluster_of[np.isfinite(table[:, first] - table[:, other])]))
         if shared < min(fewest, units.fewest_clusters):
             gap = _between_episodes(table[:, first], table[:, other], units)
             apart.append(other)
@@ -104,6 +104,15 @@ def leader(values: ArrayLike, units: Units) -> Leader | None:
     missing = any(p is None for p in p_values)
     p_value = None if missing else max(p for p in p_values if p is not None)
     return Leader(first, float(highest[first]), p_value, len(known), tuple(apart))
+
+
+def _estimates(
+    table: NDArray[np.float64], items: Sequence[int], units: Units, first: NDArray[np.float64] | None = None
+) -> Iterator[Estimate]:
+    """Of the mean of each item, or of `first` - the item where this is given."""
+    for start in range(0, len(items), _ITEMS_TOGETHER):
+        values = table[:, items[start : start + _ITEMS_TOGETHER]]
+        yield from estimates([mean_over_episodes((values if first is None else first[:, None] - values).T)], units)
 
 
 @dataclass(frozen=True)
@@ -123,27 +132,43 @@ class NamedLeader:
     units: Units
 
 
-def leader_of_table(table: pl.DataFrame, item: Sequence[str], value: str, sampling: Sampling) -> NamedLeader | None:
-    """`leader` of a table with one row per (episode, item), whose columns `item` name the items."""
-    names = table.select(item).unique(maintain_order=True)
-    episodes = table.select(EPISODE_COLUMNS).unique(maintain_order=True)
-    place = names.with_row_index("_item")
-    wide = np.full((episodes.height, names.height), np.nan)
-    numbered = table.join(place, on=list(item), nulls_equal=True).join(
-        episodes.with_row_index("_episode"), on=list(EPISODE_COLUMNS)
-    )
-    wide[numbered["_episode"].to_numpy(), numbered["_item"].to_numpy()] = (
-        numbered[value].cast(pl.Float64).fill_null(np.nan).to_numpy()
-    )
-    units = sampling.units(episodes).decided()
-    found = leader(wide, units)
-    if found is None and units.families is not None:
-        units = units.about_these_tasks()
-        found = leader(wide, units)
-    if found is None:
+def leader_of_table(
+    table: Iterable[pl.DataFrame], item: Sequence[str], value: str, sampling: Sampling
+) -> NamedLeader | None:
+    """`leader` of a table in parts with one row per (episode, item), whose columns `item` name the items."""
+    episodes: dict[tuple[Any, ...], int] = {}
+    names: dict[tuple[Any, ...], int] = {}
+    values = [
+        (
+            _numbers(part.select(EPISODE_COLUMNS), episodes),
+            _numbers(part.select(item), names),
+            part[value].cast(pl.Float64).fill_null(np.nan).to_numpy(),
+        )
+        for part in table
+    ]
+    if not names:
         return None
-    apart = tuple(names.row(i, named=True) for i in found.apart)
-    return NamedLeader(names.row(found.item, named=True), found, apart, units)
+    wide = np.full((len(episodes), len(names)), np.nan)
+    for of_episode, of_item, numbers in values:
+        wide[of_episode, of_item] = numbers
+    units = sampling.units(pl.DataFrame(list(episodes), schema=EPISODE_COLUMNS, orient="row")).decided()
+    leading = leader(wide, units)
+    if leading is None and units.families is not None:
+        units = units.about_these_tasks()
+        leading = leader(wide, units)
+    if leading is None:
+        return None
+    first, *apart = (dict(zip(item, list(names)[i], strict=True)) for i in (leading.item, *leading.apart))
+    return NamedLeader(first, leading, tuple(apart), units)
+
+
+def _numbers(rows: pl.DataFrame, known: dict[tuple[Any, ...], int]) -> NDArray[np.int32]:
+    """The number of every row among all different ones, in order of first appearance; new ones are added."""
+    different = rows.unique(maintain_order=True)
+    numbers = pl.Series("number", [known.setdefault(row, len(known)) for row in different.rows()], dtype=pl.Int32)
+    numbered = different.with_columns(numbers.alias("_number"))
+    joined = rows.join(numbered, on=rows.columns, how="left", nulls_equal=True, maintain_order="left")
+    return joined["_number"].to_numpy()
 
 
 def fewest_clusters(units: Units) -> int:

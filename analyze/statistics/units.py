@@ -72,8 +72,8 @@ class Units:
 
     def of_tasks(self, tasks: NDArray[np.intp]) -> Units:
         """The units of other episodes of the same tasks, numbers as in `tasks`; tasks without an episode drop out."""
-        there, numbers = np.unique(tasks, return_inverse=True)
-        families = None if self.families is None else self.families[there]
+        task_ids, numbers = np.unique(tasks, return_inverse=True)
+        families = None if self.families is None else self.families[task_ids]
         known = families is not None and bool((families >= 0).any())
         return replace(self, tasks=numbers, families=families if known else None)
 

@@ -104,8 +104,8 @@ def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
     yield f"  run        suite {protocol.suite}, protocol {protocol_text(protocol)}"
     if root.data_set is not None:
         yield f"  data set   {root.data_set.describe()}"
-    found = _Found.of(root, episodes)
-    yield f"  episodes   {len(episodes)} ({solved_text(found.success)}), tasks {listing(store.task_ids, 100)}"
+    summary = _EpisodeSummary.of(root, episodes)
+    yield f"  episodes   {len(episodes)} ({solved_text(summary.success)}), tasks {listing(store.task_ids, 100)}"
     labels = [
         f"{label} (block {block})" if label != block else str(block)
         for label, block in zip(
@@ -120,16 +120,16 @@ def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
     error = "exact" if exact else f"masses within {mass_error_bound(recording.mantissa_bits):.1e} (relative)"
     yield f"  precision  {recording.mantissa_bits} mantissa bits: {error}"
     for site in root.sites:
-        own = f" ({own_parts(root, site.name)})" if site.layers or site.heads or site.num_action_queries else ""
-        yield f"Site '{site.name}'{own}: {site.num_keys} keys; span, keys, roles (number of keys, of the first replan)"
+        note = f" ({own_parts(root, site.name)})" if site.layers or site.heads or site.num_action_queries else ""
+        yield f"Site '{site.name}'{note}: {site.num_keys} keys; span, keys, roles (number of keys, of the first replan)"
         for span in site.spans:
-            yield f"  {_describe_span(span, found.first[site.name])}"
-        vocabulary = found.names[site.name].vocabulary()
+            yield f"  {_describe_span(span, summary.first[site.name])}"
+        vocabulary = summary.names[site.name].vocabulary()
         yield f"  words      {listing(vocabulary.words, 200)}"
         yield f"  objects    {listing(vocabulary.objects, 200)}"
     yield "Tasks"
-    for task, (instruction, interest) in found.tasks.items():
-        held = f"({found.num_episodes[task]} episodes; objects of interest: {interest})"
+    for task, (instruction, interest) in summary.tasks.items():
+        held = f"({summary.num_episodes[task]} episodes; objects of interest: {interest})"
         yield f"  {task:>3}  {instruction}  {held}"
     yield "Selectors"
     for name, kind in SELECTOR_KINDS.items():
@@ -137,7 +137,7 @@ def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
 
 
 @dataclass
-class _Found:
+class _EpisodeSummary:
     """What `_lines` says of episodes, read one after the other.
 
     Attributes:
@@ -155,24 +155,24 @@ class _Found:
     names: dict[str, Names] = field(default_factory=lambda: defaultdict(Names))
 
     @classmethod
-    def of(cls, root: RootAttributes, episodes: Iterable[StoredEpisode]) -> _Found:
-        found = cls()
+    def of(cls, root: RootAttributes, episodes: Iterable[StoredEpisode]) -> _EpisodeSummary:
+        summary = cls()
         for episode in read_one_by_one(episodes):
             attributes = episode.attributes
-            found.success.append(attributes.success)
-            found.num_episodes[attributes.task_id] += 1
-            if attributes.task_id not in found.tasks:
+            summary.success.append(attributes.success)
+            summary.num_episodes[attributes.task_id] += 1
+            if attributes.task_id not in summary.tasks:
                 interest = listing([thing.name for thing in attributes.objects if thing.of_interest])
-                found.tasks[attributes.task_id] = visible(attributes.instruction), interest
+                summary.tasks[attributes.task_id] = visible(attributes.instruction), interest
             for site in root.sites:
-                if site.name not in found.first:
-                    found.first[site.name] = episode.tokens(root, site.name)
+                if site.name not in summary.first:
+                    summary.first[site.name] = episode.tokens(root, site.name)
                 # Words and objects are in the attributes: no array of the other episodes is read.
-                names = found.names[site.name]
+                names = summary.names[site.name]
                 names.add_words(words_of(prompt) for prompt in episode.prompts(root, site.name))
                 if episode.coverage(root, site.name):
                     names.add_objects(attributes.objects)
-        return found
+        return summary
 
 
 def _describe_span(span: Span, tokens: EpisodeTokens) -> str:

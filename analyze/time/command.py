@@ -3,23 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+from pathlib import Path
 
-from vla_attention.analyze.arguments import (
-    add_grouping,
-    add_intervals,
-    add_output,
-    add_selection,
-    add_stores,
-    output_folder,
-    settings_of,
-    stores_of,
-)
-from vla_attention.analyze.show.screen import fitted, write_whole
+from vla_attention.analyze.arguments import add_output, add_question, add_stores, output_folder, question_of, show
 from vla_attention.schemas.command_line import command_parser
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 _EXAMPLES = """examples:
   vla-analyze time runs/libero_10.zarr
@@ -47,37 +34,32 @@ def build_parser() -> argparse.ArgumentParser:
     time.add_argument(
         "--window", type=int, default=8, metavar="N", help="replans shown before and after the closing (default: 8)"
     )
-    add_grouping(parser)
-    add_selection(parser)
-    add_intervals(parser)
+    add_question(parser)
     add_output(parser, "results/STORE/time")
     return parser
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the findings; write tables and pictures."""
-    from vla_attention.analyze.measures.question import ask
-    from vla_attention.analyze.show.output_files import write_parquet
-    from vla_attention.analyze.time.text import time_text
+    from vla_attention.analyze.show.answer import Answer
+    from vla_attention.analyze.time.text import time_sections
     from vla_attention.analyze.time.time_courses import TimeSettings, time_courses
 
     settings = TimeSettings(arguments.bins, arguments.window)
-    question = ask(stores_of(arguments), settings_of(arguments))
+    question = question_of(arguments)
     courses = time_courses(question, settings)
-    text = time_text(question, courses, settings)
-    folder: Path = output_folder(arguments, "time")
-    files = write_parquet(
-        folder,
-        time_course=courses.course,
-        gripper_closing=courses.closing,
-        gripper_change=courses.change,
-        success_against_failure=courses.outcomes,
-        autocorrelation=courses.autocorrelation,
-    )
-    files.append(write_whole(folder, text))
-    if not arguments.no_plots:
+
+    def draw(folder: Path) -> list[Path]:
         from vla_attention.analyze.time.plot_time_course import plot_time_courses
 
-        files += plot_time_courses(courses, question.grouping, folder)
-    print(fitted(text, folder, files))
-    return 0
+        return plot_time_courses(courses, question.grouping, folder)
+
+    tables = {
+        "time_course": courses.course,
+        "gripper_closing": courses.closing,
+        "gripper_change": courses.change,
+        "success_against_failure": courses.outcomes,
+        "autocorrelation": courses.autocorrelation,
+    }
+    answer = Answer(time_sections(question, courses, settings), tables, draw)
+    return show(answer, output_folder(arguments, "time"), arguments)

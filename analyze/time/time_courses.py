@@ -17,9 +17,17 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.aggregate import overall_layer, replans_of
-from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, Tables, episode_id, float_values
+from vla_attention.analyze.measures.frames import (
+    EPISODE_ID,
+    EPISODE_KEYS,
+    Tables,
+    episode_id,
+    float_values,
+    rows_of_layer,
+)
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.statistics.autocorrelation import autocorrelation_table
 from vla_attention.analyze.statistics.effect_sizes import contrast, contrast_row
 from vla_attention.analyze.statistics.episode_intervals import ABOUT_COLUMNS, Sampling, about_row
 from vla_attention.analyze.statistics.intervals import (
@@ -43,8 +51,8 @@ from vla_attention.analyze.time.alignment import (
     episode_timing,
     on_episode_time,
 )
-from vla_attention.analyze.time.effective_replans import effective_replans_table
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.groupings.grouping import Grouping
 
 RATIO = "ratio"
 #: The two alignments of a time course.
@@ -131,10 +139,10 @@ def time_courses(
         replans: the question's replans when they are known already (`aggregate.replans_of`).
     """
     settings = settings or TimeSettings()
-    replans = replans_of(question) if replans is None else replans
     grouping = question.grouping
-    layer = overall_layer(replans.cells)
-    of_layer = replans.filter(pl.col("layer") == layer).kept()
+    replans = replans_of(question) if replans is None else replans
+    layer = overall_layer(replans.parts[0].cells)
+    of_layer = rows_of_layer(replans, layer)
     rows, groups = of_layer.cells, of_layer.groups_with_mass()
     quantities = ((RATIO,) if grouping.ratio else ()) + groups
     # What closes a gripper is known of our suites only.
@@ -227,15 +235,15 @@ def _course(
         decided = units.decided()
         timed = np.stack(aligned)
         statistics = _statistics(timed, quantities)
-        found = estimates(statistics, decided)
+        means = estimates(statistics, decided)
         # Bonferroni over the points of one curve: all of it lies within, at the level of a single point.
         together = 1.0 - (1.0 - DEFAULT_LEVEL) / len(places)
         known = np.array([episode.uniform for episode in episodes])
-        for number, (statistic, one) in enumerate(zip(statistics, found, strict=True)):
+        for number, (statistic, one) in enumerate(zip(statistics, means, strict=True)):
             quantity, position = quantities[number // len(places)], number % len(places)
-            there = np.isfinite(timed[:, position]).any(axis=1)
+            measured = np.isfinite(timed[:, position]).any(axis=1)
             # The baseline of the episodes that the point is of, also where none of their ratios is finite.
-            of = statistic.used if statistic.used.any() else there & np.isfinite(known)
+            of = statistic.used if statistic.used.any() else measured & np.isfinite(known)
             baseline = estimates([geometric_mean_over_episodes(known[of])], units.part(of))[0] if of.any() else UNKNOWN
             uniform = baseline.value if quantity == RATIO else None
             num_tasks = units.part(statistic.used).num_tasks
@@ -260,12 +268,14 @@ def _units(episodes: Sequence[_Episode], sampling: Sampling) -> Units:
 
 
 def _closing_table(episodes: Sequence[_Episode], rows: pl.DataFrame) -> pl.DataFrame:
-    found = [
+    closings = [
         (*e.identity, e.closing, None if e.closing is None else float(e.starts[e.closing] / e.num_steps))
         for e in episodes
     ]
     kinds = {key: rows.schema[key] for key in EPISODE_KEYS}
-    return pl.DataFrame(found, schema={**kinds, "closing_replan": pl.Int64, "closing_time": pl.Float64}, orient="row")
+    return pl.DataFrame(
+        closings, schema={**kinds, "closing_replan": pl.Int64, "closing_time": pl.Float64}, orient="row"
+    )
 
 
 _CHANGE_SCHEMA: dict[str, Any] = {
@@ -293,14 +303,14 @@ def _change_table(
         ]
 
     statistics = means(changes)
-    found, placebo, beyond = (
+    change, placebo, beyond = (
         estimates(of, units.decided()) for of in (statistics, means(placebos), means(changes - placebos))
     )
     nulls = [1.0 if quantity == RATIO else 0.0 for quantity in quantities]
-    q_values = adjusted_p_values([_larger_p(*of) for of in zip(found, beyond, nulls, strict=True)])
+    q_values = adjusted_p_values([_larger_p(*of) for of in zip(change, beyond, nulls, strict=True)])
     rows = []
     for i, (quantity, statistic) in enumerate(zip(quantities, statistics, strict=True)):
-        numbers = (found[i].value, *ends(found[i].interval()), placebo[i].value, beyond[i].value)
+        numbers = (change[i].value, *ends(change[i].interval()), placebo[i].value, beyond[i].value)
         counts = int(statistic.used.sum()), units.part(statistic.used).num_tasks, *about_row(units).values()
         rows.append((quantity, *numbers, *ends(beyond[i].interval()), q_values[i], *counts))
     return pl.DataFrame(rows, schema=_CHANGE_SCHEMA, orient="row")
@@ -333,17 +343,31 @@ def _outcomes_table(episodes: Sequence[_Episode], quantities: Sequence[str], sam
     solved = np.array([episode.success is True for episode in episodes])
     means = np.array([[summarize(column).mean for column in episode.values.T] for episode in episodes], np.float64)
     means[[episode.success is None for episode in episodes]] = np.nan  # in neither class
-    names, found = [], []
+    names, contrasts = [], []
     for i, quantity in enumerate(quantities):
         values = means[:, i] / np.log(2.0) if quantity == RATIO else means[:, i]
         names.append("log2_ratio" if quantity == RATIO else f"{quantity}_fraction")
-        found.append(contrast(values, solved, units))
-    looks = {name: adjusted_p_values([getattr(one, name).p_value(0.0) for one in found]) for name in _ADJUSTED}
+        contrasts.append(contrast(values, solved, units))
+    looks = {name: adjusted_p_values([getattr(one, name).p_value(0.0) for one in contrasts]) for name in _ADJUSTED}
     rows = [
         {"quantity": name, **contrast_row(one, SUCCESS, FAILURE), **{f"{of}_q": looks[of][i] for of in _ADJUSTED}}
-        for i, (name, one) in enumerate(zip(names, found, strict=True))
+        for i, (name, one) in enumerate(zip(names, contrasts, strict=True))
     ]
     texts = {"quantity": pl.String, "note": pl.String}
     return pl.DataFrame(rows, schema_overrides=texts, infer_schema_length=None).with_columns(
         pl.col(pl.Null).cast(pl.Float64)
     )
+
+
+def effective_replans_table(replans: Tables, grouping: Grouping) -> pl.DataFrame:
+    """`autocorrelation_table` of every (episode, layer) of `aggregate.replan_tables`.
+
+    The series is log2_ratio, or the first group's fraction when the grouping has no ratio.
+    """
+    keys = [*EPISODE_KEYS, "layer", "layer_number"]
+    if grouping.ratio:
+        name, values = "log2_ratio", replans.cells["log2_ratio"]
+    else:
+        name, values = f"{grouping.names[0]}_fraction", replans.of_group(grouping.names[0])["fraction"]
+    table = replans.cells.select(*keys, "replan", values.alias(name)).sort("replan", maintain_order=True)
+    return autocorrelation_table(table, keys, name).sort(*EPISODE_ID, "layer_number", nulls_last=True)

@@ -93,7 +93,8 @@ class ViewerServer(ThreadingHTTPServer):
         if not 0 <= port < 2**16:
             raise BadArgument(f"Cannot use --port {port}; expected a number from 1 to 65535, or 0 for any free port.")
         self.stores = tuple(stores)
-        self.page = _page()
+        folder = files("vla_attention.analyze.view") / "bundle"
+        self.page = {name: (folder / name).read_bytes() for name in PAGE_FILES}
         self.sent: dict[str, int] = {}
         try:
             super().__init__((LOOPBACK, port), _Handler)
@@ -162,11 +163,6 @@ class ViewerServer(ThreadingHTTPServer):
         for piece in pieces:
             self.sent[name] = self.sent.get(name, 0) + len(piece)
             yield piece
-
-
-def _page() -> dict[str, bytes]:
-    folder = files("vla_attention.analyze.view") / "bundle"
-    return {name: (folder / name).read_bytes() for name in PAGE_FILES}
 
 
 def _json(document: dict[str, Any]) -> Answer:

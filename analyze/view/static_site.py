@@ -11,12 +11,11 @@ from vla_attention.analyze.show.output_files import write_text, writing
 from vla_attention.analyze.view.paths import PAGE_FILES, STORES_DOCUMENT
 from vla_attention.analyze.view.served_stores import ServedStore, stores_document
 from vla_attention.schemas.errors import BadArgument, listing
-from vla_attention.schemas.stores.foreign_files import beyond_the_format
-from vla_attention.schemas.stores.hub_address import HubAddress
+from vla_attention.schemas.stores.episode_files import beyond_the_format
 from vla_attention.schemas.stores.reader import Store
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX
 from vla_attention.schemas.stores.store_place import refuse_in_store
-from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
+from vla_attention.schemas.stores.store_url import HubAddress, StorePlace, StoreUrl
 
 #: Where browsers of others find the hub.
 HUB = "https://huggingface.co"

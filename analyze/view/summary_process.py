@@ -83,11 +83,11 @@ def _measured(store: Store, batch: Sequence[StoredEpisode]) -> dict[str, Any]:
     question = ask([replace(store, episodes=tuple(batch))], AnalysisSettings())
     cells = episode_tables_of(measure_episodes(question, progress=lambda _: None), question.grouping).cells
     cells = cells.filter(pl.col("layer") == overall_layer(cells))
-    found = {(row["task_id"], row["episode_index"]): row for row in cells.iter_rows(named=True)}
+    by_episode = {(row["task_id"], row["episode_index"]): row for row in cells.iter_rows(named=True)}
     rows = []
     for episode in batch:
         row = _described(episode)
-        numbers = found[row["task"], row["episode"]]
+        numbers = by_episode[row["task"], row["episode"]]
         rows.append(row | {"ratio": _finite(numbers.get(HEADLINE)), "lift": _finite(numbers.get("ratio_lift"))})
     return {"episodes": rows, **_about(question)}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from vla_attention.analyze.arguments import (
     add_intervals,
@@ -11,10 +12,9 @@ from vla_attention.analyze.arguments import (
     add_stores,
     output_folder,
     settings_of,
+    show,
     stores_of,
 )
-from vla_attention.analyze.show.output_files import write_parquet
-from vla_attention.analyze.show.screen import fitted, write_whole
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
@@ -50,17 +50,16 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure the words; print them, write the table and the picture."""
-    from vla_attention.analyze.words.text import words_text
+    from vla_attention.analyze.show.answer import Answer
+    from vla_attention.analyze.words.text import words_sections
     from vla_attention.analyze.words.word_study import study_words
 
     study = study_words(stores_of(arguments), settings_of(arguments), arguments.task)
-    text = words_text(study)
-    folder = output_folder(arguments, "words" if arguments.task is None else f"words_task{arguments.task:03d}")
-    files = write_parquet(folder, words=study.episodes, words_summary=study.summary)
-    files.append(write_whole(folder, text))
-    if not arguments.no_plots:
+
+    def draw(folder: Path) -> list[Path]:
         from vla_attention.analyze.words.plot_word_bars import plot_word_bars
 
-        files += plot_word_bars(study.summary, folder, study.layer, study.instruction)
-    print(fitted(text, folder, files))
-    return 0
+        return plot_word_bars(study.summary, folder, study.layer, study.instruction)
+
+    folder = output_folder(arguments, "words" if arguments.task is None else f"words_task{arguments.task:03d}")
+    return show(Answer(words_sections(study), study.files(), draw), folder, arguments)

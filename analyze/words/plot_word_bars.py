@@ -31,7 +31,7 @@ _MOST = 60
 def plot_word_bars(
     summary: pl.DataFrame, folder: Path, layer: str, instruction: str | None = None, stem: str = STEM
 ) -> list[Path]:
-    """Draw from `word_reading.words_summary`; returns the paths of png, pdf and csv.
+    """Draw from `word_study.words_summary`; returns the paths of png, pdf and csv.
 
     Words are in the summary's order (sorted by lift; with `instruction`, of one task, in reading order). A bar starts
     at 1, the value of uniform attention, on a logarithmic axis: bars of twice and of half as much are equally long.

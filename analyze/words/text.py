@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
-import polars as pl
-
+from vla_attention.analyze.show.answer import Section
 from vla_attention.analyze.show.findings import apart_note, few_families_note
-from vla_attention.analyze.show.headings import interval_note, wrap
-from vla_attention.analyze.show.numbers import format_interval, format_number
-from vla_attention.analyze.show.text_table import episode_counts, text_table
+from vla_attention.analyze.show.headings import interval_note
+from vla_attention.analyze.show.numbers import format_number
+from vla_attention.analyze.show.tables import (
+    INTERVAL,
+    Table,
+    count,
+    episode_count,
+    interval,
+    number,
+    percent,
+    texts,
+    words,
+)
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
 from vla_attention.analyze.statistics.many_looks import NAMED_AT, fewest_clusters
 from vla_attention.analyze.words.word_study import WordStudy
@@ -20,25 +30,39 @@ _NOTE = (
 )
 
 
-def words_text(study: WordStudy) -> str:
+def words_sections(study: WordStudy) -> list[Section]:
     """The words with their numbers, what stands beside them for scale, and who reads most."""
-    several = study.question.num_tasks > 1
-    lines = [
-        *study.question.header("WORDS: which words of the instruction are read", study.layer),
-        *([f"Instruction: {study.instruction}"] if study.instruction else []),
-        "",
-        *wrap(leading_sentence(study)),
-        "",
-        _table(study.summary.filter(pl.col("kind") == "word"), several),
-        "",
-        "for scale",
-        _table(study.summary.filter(pl.col("kind") == "scale"), several),
-        "",
-        *wrap(_NOTE),
+    scale = replace(summary_table(study), rows=study.summary.filter(kind="scale").to_dicts())
+    header = study.question.header("WORDS: which words of the instruction are read", study.layer)
+    units = study.question.units
+    return [
+        Section([header, *([[f"Instruction: {study.instruction}"]] if study.instruction else [])]),
+        Section([leading_sentence(study)]),
+        Section([summary_table(study)]),
+        Section([["for scale"], scale]),
+        Section([_NOTE, interval_note(DEFAULT_LEVEL, units.words), few_families_note(study.summary, "item", units)]),
     ]
-    lines += wrap(interval_note(DEFAULT_LEVEL, study.question.units.words))
-    lines += wrap(few_families_note(study.summary, "item", study.question.units))
-    return "\n".join(lines)
+
+
+def summary_table(study: WordStudy) -> Table:
+    """The words, in a text and on the page."""
+    columns = [
+        words("word", "item", "word"),
+        texts("class", "word_class", left=True),
+        words(None, lambda row: row["word_class"] or "-", "class"),
+        number("pieces", "pieces"),
+        episode_count(study.question.num_tasks > 1),
+        count(None, "num_episodes", "episodes"),
+        number("mass", "mass"),
+        number("lift", "lift", "lift"),
+        interval("lift", INTERVAL),
+        number("q", "lift_q", "q"),
+        percent(None, "mass", "mass"),
+        number("share", "share"),
+        percent(None, "share", "of the text"),
+    ]
+    caption = "Words of the instructions. q: p of lift 1, adjusted for the number of words (Benjamini-Hochberg)"
+    return Table(columns, study.summary.filter(kind="word").to_dicts(), caption)
 
 
 def leading_sentence(study: WordStudy) -> str:
@@ -64,27 +88,6 @@ def leading_sentence(study: WordStudy) -> str:
         f"No word, and no layer of a word, is shown to be read more than all the others{some} (about {about}"
         f"{'; --intervals these-tasks compares all' if some else ''})."
     )
-
-
-def _table(summary: pl.DataFrame, several_tasks: bool) -> str:
-    rows = summary.to_dicts()
-    heading, counts = episode_counts(rows, several_tasks)
-    header = ["word", "class", "pieces", heading, "mass", "lift", "interval", "q", "share"]
-    body = [
-        [
-            row["item"],
-            row["word_class"] or "",
-            format_number(row["pieces"]),
-            count,
-            format_number(row["mass"]),
-            format_number(row["lift"]),
-            format_interval(row["lift_low"], row["lift_high"]),
-            format_number(row["lift_q"]),
-            format_number(row["share"]),
-        ]
-        for row, count in zip(rows, counts, strict=True)
-    ]
-    return text_table(header, body, left=(0, 1))
 
 
 def _cell(row: dict[str, Any]) -> str:

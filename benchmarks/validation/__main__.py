@@ -5,7 +5,7 @@
     python -m benchmarks.validation POLICIES --work DIR --reduced          two tasks and few calls: about a minute
     python -m benchmarks.validation --checkpoint PATH --suite libero_10 --work DIR --task-id 0 1 2      your own
 
-POLICIES has one folder per trained policy (`python -m vla_attention.capture.small_policy export`). What is in DIR
+POLICIES has one folder per trained policy (`python -m examples.cubes_policy export`). What is in DIR
 already is not made again: a killed run goes on. DIR/results.json has all numbers, DIR/tables.md the tables.
 """
 

@@ -11,7 +11,7 @@ from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.reader import Store, open_store
 
-#: The suite in which each control was trained (`capture/small_policy/dataset.py`).
+#: The suite in which each control was trained (`examples/cubes_policy/dataset.py`).
 SUITES = {"words": "cubes", "redundant": "cubes_marked", "mark": "cubes_mark_only", "no-wrist": "cubes"}
 #: In place of a control: the policy of questions 2 and 3, which was trained longer and on more tasks.
 SHIPPED = "shipped"
@@ -38,7 +38,7 @@ class KnownPolicy:
 
 
 def read_policies(folder: Path) -> list[KnownPolicy]:
-    """The checkpoints in a folder: sub-folders that `small_policy export` wrote, by control and seed."""
+    """The checkpoints in a folder: sub-folders that `examples.cubes_policy export` wrote, by control and seed."""
     found = []
     for card in sorted(folder.glob("*/card.json")):
         facts = json.loads(card.read_text(encoding="utf-8"))
@@ -47,7 +47,7 @@ def read_policies(folder: Path) -> list[KnownPolicy]:
     if not found:
         raise BadArgument(
             f"The folder {folder} holds no checkpoint with a card.json; expected folders of `python -m "
-            "vla_attention.capture.small_policy export`."
+            "examples.cubes_policy export`."
         )
     return sorted(found, key=lambda policy: (list(SUITES).index(policy.control), policy.seed))
 
@@ -72,7 +72,7 @@ def load_policy(store: Path) -> Any:
     """The policy of a store, rebuilt as `vla-capture rerun` does it."""
     import argparse
 
-    from vla_attention.capture.device import load_torch
+    from vla_attention.capture.machine.device import load_torch
     from vla_attention.capture.rerun.arguments import add_rerun_arguments
 
     parser = argparse.ArgumentParser()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import shutil
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -12,32 +11,33 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vla_attention.capture.command_line import check_writable
 from vla_attention.capture.doctor.acceptance import find_published_rate, judge, share_of_tasks
-from vla_attention.capture.doctor.findings import Finding, something_missing
 from vla_attention.capture.doctor.machine import (
+    Finding,
     checked,
     find_drawing,
     find_gpu,
     find_memory,
     find_precision,
     find_processor,
+    find_simulator,
+    something_missing,
 )
-from vla_attention.capture.doctor.simulators import find_simulator
-from vla_attention.capture.environments.suites import find_suite
+from vla_attention.capture.environments.suites import check_installed, find_suite
 from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.jobs.termination import Termination
-from vla_attention.capture.run_settings import RecordingSettings, RunSettings, run_settings
+from vla_attention.capture.rollout.recording_plan import RecordingSettings
+from vla_attention.capture.run.run_settings import RunSettings, run_settings
 from vla_attention.schemas.command_line import format_bytes
-from vla_attention.schemas.errors import BadArgument, UserError
-from vla_attention.schemas.installing import INSTALL_CAPTURE
+from vla_attention.schemas.errors import INSTALL_CAPTURE, BadArgument, UserError, plural
 from vla_attention.schemas.safe_text import print_line
+from vla_attention.schemas.stores.store_place import check_writable
 from vla_attention.schemas.threads import use_threads
 
 if TYPE_CHECKING:
+    from vla_attention.capture.budget.trial import Trial
     from vla_attention.capture.policies.policy import Policy
-    from vla_attention.capture.trial import Trial
-    from vla_attention.schemas.stores.store_format import RootAttributes
+    from vla_attention.schemas.stores.store_format import Recording, RootAttributes
 
 
 def run_doctor(arguments: argparse.Namespace, termination: Termination) -> int:
@@ -72,7 +72,7 @@ def _findings(arguments: argparse.Namespace, settings: RunSettings, termination:
     try:
         import torch
 
-        from vla_attention.capture.device import load_torch
+        from vla_attention.capture.machine.device import load_torch
     except ImportError as error:
         yield Finding("torch", "missing", f"torch cannot be loaded ({error}).", f"Install it: {INSTALL_CAPTURE}.")
         return
@@ -147,20 +147,22 @@ def _find_place(settings: RunSettings) -> Finding:
     """Return whether the store can be written where the run would write it, and the room there."""
 
     def look() -> str:
+        from vla_attention.capture.store.disk_estimate import free_bytes
         from vla_attention.capture.store.store_root import read_existing_root
-        from vla_attention.capture.store.store_writer import refuse_existing
+        from vla_attention.schemas.stores.root import episode_folders
 
         if settings.store.exists():
-            refuse_existing(settings.store) if settings.mode == "new" else read_existing_root(settings.store)
+            read_existing_root(settings.store)
+            held.append(len(episode_folders(settings.store)))
         check_writable(settings.store.parent, "--store")
-        return f"{format_bytes(_free(settings.store))} free for {settings.store}."
+        return f"{format_bytes(free_bytes(settings.store))} free for {settings.store}."
 
-    return checked("store", look)
-
-
-def _free(path: Path) -> int:
-    existing = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
-    return shutil.disk_usage(existing).free
+    held: list[int] = []
+    finding = checked("store", look)
+    if finding.status == "ok" and any(held) and settings.mode == "new":
+        to_do = "A run there needs --resume, which adds what is missing, or --overwrite, which begins again."
+        return Finding("store", "note", f"{settings.store} holds {plural(held[0], 'episode')} already.", to_do)
+    return finding
 
 
 @dataclass(frozen=True)
@@ -172,10 +174,9 @@ class _PlannedRun:
 
 def _try(settings: RunSettings, policy: Policy, device: str, termination: Termination) -> Iterator[Finding]:
     """Run the first replans of a task, or with a budget of as many as the run; yield time and size of that run."""
-    from vla_attention.capture.budget import choose_recording, recordings_by_size
+    from vla_attention.capture.budget.budget import choose_recording, recordings_by_size
     from vla_attention.capture.rollout.episode import max_replans
-    from vla_attention.capture.store.measured_size import mean_size
-    from vla_attention.schemas.stores.store_format import Recording
+    from vla_attention.capture.store.disk_estimate import free_bytes, mean_size
 
     try:
         planned = _plan(settings, policy, device, termination)
@@ -201,7 +202,7 @@ def _try(settings: RunSettings, policy: Policy, device: str, termination: Termin
     except UserError as error:
         yield Finding("size", "missing", str(error))
         return
-    estimate, free = choice.estimate, _free(settings.store)
+    estimate, free = choice.estimate, free_bytes(settings.store)
     text = (
         f"At most {format_bytes(estimate.total_bytes)}: {episodes} episodes, up to {replans} replans each, "
         f"{format_bytes(estimate.bytes_per_replan)} a replan and {format_bytes(estimate.episode_overhead)} an episode; "
@@ -219,33 +220,16 @@ def _try(settings: RunSettings, policy: Policy, device: str, termination: Termin
 
 def _plan(settings: RunSettings, policy: Policy, device: str, termination: Termination) -> _PlannedRun:
     """Plan the run as `run_capture` does, check that it can continue its store, and try its first replans."""
-    from vla_attention.capture.budget import recordings_by_size
-    from vla_attention.capture.budgeted_recording import TRIED_TASKS
-    from vla_attention.capture.capture_run import plan_changes, plan_protocol, plan_recording
+    from vla_attention.capture.budget.budget import recordings_by_size
+    from vla_attention.capture.budget.budgeted_recording import TRIED_TASKS
+    from vla_attention.capture.budget.trial import run_trial, spread
     from vla_attention.capture.environments.base import EnvironmentSettings
-    from vla_attention.capture.environments.suites import list_tasks
-    from vla_attention.capture.provenance import describe_machine
-    from vla_attention.capture.rollout.episode import check_protocol
+    from vla_attention.capture.machine.provenance import describe_machine
+    from vla_attention.capture.run.capture_run import plan_run
     from vla_attention.capture.store.store_root import check_same_run, read_existing_root
-    from vla_attention.capture.trial import run_trial, spread
-    from vla_attention.schemas.stores.store_format import FORMAT_NAME, STORE_VERSION, Recording, RootAttributes
 
-    evaluation = settings.protocol or policy.default_protocol
-    protocol = plan_protocol(settings, evaluation, policy)
-    check_protocol(protocol, policy)
-    tasks = list_tasks(settings.suite)
-    wanted = tasks if settings.task_ids is None else tuple(tasks[number] for number in settings.task_ids)
-    changes = plan_changes(settings, policy, tasks)
-    attributes = RootAttributes(
-        format=FORMAT_NAME,
-        store_version=STORE_VERSION,
-        policy=policy.identity(),
-        protocol=protocol,
-        recording=plan_recording(settings.recording, policy)[0],
-        sites=policy.sites,
-        provenance=describe_machine(device),
-        interventions=changes.interventions,
-    )
+    plan = plan_run(settings, policy, describe_machine(device))
+    attributes = plan.attributes
     candidates: tuple[Recording, ...] = (attributes.recording,)
     if settings.budget is not None:
         candidates = recordings_by_size(attributes.recording, policy.num_denoise_steps, settings.fixed)
@@ -254,16 +238,16 @@ def _plan(settings: RunSettings, policy: Policy, device: str, termination: Termi
         existing = read_existing_root(settings.store)
         same = existing.recording if existing.recording in candidates else attributes.recording
         check_same_run(settings.store, existing, replace(attributes, recording=same))
-    environment = EnvironmentSettings(evaluation, settings.libero_assets)
+    environment = EnvironmentSettings(plan.evaluation, settings.libero_assets)
     trials = [
-        run_trial(policy, tried, task, environment, changes, termination.check)
-        for task in spread(wanted, TRIED_TASKS if settings.budget is not None else 1)
+        run_trial(policy, tried, task, environment, plan.changes, termination.check)
+        for task in spread(plan.wanted, TRIED_TASKS if settings.budget is not None else 1)
     ]
-    return _PlannedRun(attributes, len(wanted), trials)
+    return _PlannedRun(attributes, len(plan.wanted), trials)
 
 
 def _time(settings: RunSettings, trial: Trial, replans: int, replan_steps: int, episodes: int) -> Finding:
-    from vla_attention.capture.rollout.pipeline import default_num_envs
+    from vla_attention.capture.run.run_settings import default_num_envs
 
     num_envs = min(settings.num_envs or default_num_envs(), episodes)
     seconds = trial.seconds_of(replans, replan_steps, num_envs) * episodes
@@ -317,13 +301,14 @@ def _accept(arguments: argparse.Namespace, termination: Termination) -> int:
         arguments.num_episodes = episodes
     settings = run_settings(arguments)
 
-    from vla_attention.capture.capture_run import run_capture
-    from vla_attention.capture.device import load_torch
-    from vla_attention.capture.trial import spread
+    from vla_attention.capture.budget.trial import spread
+    from vla_attention.capture.machine.device import load_torch
+    from vla_attention.capture.run.capture_run import run_capture
 
     chosen = spread(range(settings.suite.num_tasks), tasks)
     device = load_torch(arguments.device, threads.number)
     policy = arguments.family.build(arguments, device)
+    check_installed(settings.suite, settings.libero_assets)
     with ExitStack() as stack:
         settings = replace(settings, task_ids=tuple(chosen))
         if arguments.store is None:

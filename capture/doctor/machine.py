@@ -1,4 +1,4 @@
-"""What the machine has: processor and threads, GPU, precision, memory, drawing without a display."""
+"""What the machine has: processor and threads, GPU, precision, memory, drawing without a display, simulators."""
 
 from __future__ import annotations
 
@@ -7,16 +7,45 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from vla_attention.capture.doctor.findings import Finding
-from vla_attention.capture.memory import memory_limits
+from vla_attention.capture.environments.base import Suite
+from vla_attention.capture.environments.libero_installation import find_assets, package_folder
+from vla_attention.capture.environments.robosuite_installation import find_robosuite
+from vla_attention.capture.environments.suites import list_tasks
+from vla_attention.capture.machine.memory import memory_limits
 from vla_attention.schemas.command_line import format_bytes
-from vla_attention.schemas.errors import UserError
-from vla_attention.schemas.installing import INSTALL_CAPTURE
+from vla_attention.schemas.errors import INSTALL_CAPTURE, UserError
 from vla_attention.schemas.threads import Threads
+
+#: `ok`: as it should be. `note`: works, but could be better, or is not needed. `missing`: the run needs it.
+Status = Literal["ok", "note", "missing"]
+_SHOWN: dict[Status, str] = {"ok": "ok", "note": "note", "missing": "MISSING"}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line: what was looked at, how it stands, and what to do where something is missing or could be better."""
+
+    what: str
+    status: Status
+    text: str
+    to_do: str = ""
+
+    def describe(self) -> str:
+        """Return the line for the terminal."""
+        text = f"{self.text} {self.to_do}".strip()
+        return f"{_SHOWN[self.status]:<8} {self.what:<11} {text}"
+
+
+def something_missing(findings: Iterable[Finding]) -> bool:
+    """Whether the run cannot be made as it is described."""
+    return any(finding.status == "missing" for finding in findings)
+
 
 #: Seconds after which a check of drawing counts as hanging; the first picture of a GPU's driver can take half a minute.
 _DRAWING_TIMEOUT_S = 120
@@ -173,3 +202,28 @@ def checked(what: str, check: Callable[[], str]) -> Finding:
         return Finding(what, "ok", check())
     except UserError as error:
         return Finding(what, "missing", str(error))
+
+
+def find_simulator(suite: Suite, libero_assets: Path | None) -> list[Finding]:
+    """Return the lines about robosuite, LIBERO and its assets; the last two are notes where the suite needs neither."""
+    findings = [checked("robosuite", _robosuite)]
+    if suite.kind == "libero":
+        return [
+            *findings,
+            checked("LIBERO", lambda: f"{len(list_tasks(suite))} tasks of {suite.name} in {package_folder()}."),
+            checked("assets", lambda: f"{find_assets(libero_assets)}."),
+        ]
+    return [*findings, _not_needed("LIBERO", suite, libero_assets)]
+
+
+def _robosuite() -> str:
+    find_robosuite()
+    return f"robosuite {version('robosuite')}, MuJoCo {version('mujoco')}."
+
+
+def _not_needed(what: str, suite: Suite, libero_assets: Path | None) -> Finding:
+    try:
+        text = f"installed in {package_folder()}, assets in {find_assets(libero_assets)}"
+    except UserError as error:
+        return Finding(what, "note", f"Not needed for the suite {suite.name}. Before its own suites: {error}")
+    return Finding(what, "ok", f"Not needed for the suite {suite.name}; {text}.")

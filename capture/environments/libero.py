@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,18 +14,13 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import ROBOT, EnvironmentSettings, Task
 from vla_attention.capture.environments.libero_installation import find_assets, load_libero, package_folder
-from vla_attention.capture.environments.libero_task_file import UnusableTask, check_task_file
 from vla_attention.capture.environments.simulator import SimulatedEnvironment
-from vla_attention.capture.foreign_files.regular_files import check_regular
+from vla_attention.capture.foreign_files.checked_files import check_regular
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 
 #: Bytes of a file of initial states; 50 states of LIBERO have 30 kB.
 MAX_STATES_BYTES = 64_000_000
-
-
-class UnusableInitialStates(UserError, ValueError):
-    """The file with the initial states of a task is missing, damaged, or something else."""
 
 
 def load_initial_states(path: Path) -> NDArray[np.float64]:
@@ -34,7 +30,7 @@ def load_initial_states(path: Path) -> NDArray[np.float64]:
     numpy functions that rebuild an array are allowed, by their names in numpy 1. No other code in a file can run.
 
     Raises:
-        UnusableInitialStates: the file is missing, damaged, or holds anything else.
+        UnusableTask: the file is missing, damaged, or holds anything else.
     """
     from vla_attention.capture.foreign_files.pickles import ARRAYS, PickleRefused
     from vla_attention.capture.foreign_files.torch_files import load_torch
@@ -49,25 +45,23 @@ def load_initial_states(path: Path) -> NDArray[np.float64]:
     ]
     install_again = "install LIBERO again with 'make setup'"
     try:
-        size = check_regular(path, UnusableInitialStates)
+        size = check_regular(path, UnusableTask)
         if size > MAX_STATES_BYTES:
-            raise UnusableInitialStates(
-                f"'{path}' has {size} bytes; initial states of {MAX_STATES_BYTES} at most are read."
-            )
+            raise UnusableTask(f"'{path}' has {size} bytes; initial states of {MAX_STATES_BYTES} at most are read.")
         states = np.asarray(load_torch(path, ARRAYS, allowed), dtype=np.float64)
     except FileNotFoundError:
-        raise UnusableInitialStates(f"There are no initial states at '{path}'; {install_again}.") from None
+        raise UnusableTask(f"There are no initial states at '{path}'; {install_again}.") from None
     except PickleRefused as error:
-        raise UnusableInitialStates(
+        raise UnusableTask(
             f"The initial states in '{path}' were refused: the file {error}; nothing of it was executed. To get them "
             f"anew, {install_again}."
         ) from error
     except (TypeError, ValueError, OSError) as error:
         if isinstance(error, UserError):
             raise
-        raise UnusableInitialStates(f"'{path}' holds no initial states ({error}); {install_again}.") from error
+        raise UnusableTask(f"'{path}' holds no initial states ({error}); {install_again}.") from error
     if states.ndim != 2 or not np.isfinite(states).all():
-        raise UnusableInitialStates(
+        raise UnusableTask(
             f"'{path}' holds numbers of shape {states.shape}, or NaN; expected (state, number), all finite: "
             f"{install_again}."
         )
@@ -218,3 +212,49 @@ class LiberoEnvironment(SimulatedEnvironment):
         ]
         roots = {name: [thing.root_body] for name, thing in (movable | fixed).items()}
         return self._with_robot_and_background(described), roots | {ROBOT: self._robot_bodies()}
+
+
+#: Bytes of a task file; LIBERO's have up to 3,300.
+_MAX_TASK_FILE_BYTES = 1_000_000
+#: Parentheses in one another; LIBERO's have eight. Its parser compares and prints what it reads by recursion.
+_MAX_TASK_FILE_DEPTH = 64
+#: The attribute that is evaluated. Nothing but numbers may stand beside it.
+_EVALUATED = ":yaw_rotation"
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?")
+
+
+class UnusableTask(UserError, ValueError):
+    """A task's files in LIBERO, or its assets, make no scene."""
+
+
+def check_task_file(path: Path) -> None:
+    """Raise `UnusableTask` unless a task file is small, balanced, and evaluates numbers only."""
+    try:
+        size = check_regular(path, UnusableTask)
+        if size > _MAX_TASK_FILE_BYTES:
+            raise UnusableTask(f"'{path}' has {size} bytes; a task file of {_MAX_TASK_FILE_BYTES} at most is read.")
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise UnusableTask(f"There is no task file at '{path}'; install LIBERO again with 'make setup'.") from None
+    except (OSError, UnicodeError) as error:
+        raise UnusableTask(f"The task file '{path}' cannot be read ({error}).") from error
+    # As the parser does it: comments, case, words.
+    words = re.findall(r"[()]|[^\s()]+", re.sub(r";.*$", "", text, flags=re.MULTILINE).lower())
+    # For each open parenthesis whether it, or one around it, has the attribute.
+    evaluated = [False]
+    for word in words:
+        if word == "(":
+            evaluated.append(evaluated[-1])
+        elif word == ")":
+            evaluated.pop()
+        elif word == _EVALUATED:
+            evaluated[-1] = True
+        elif evaluated[-1] and not _NUMBER.fullmatch(word):
+            raise UnusableTask(
+                f"The task file '{path}' has '{word}' as an angle ({_EVALUATED}), which LIBERO would execute; expected "
+                "numbers. Nothing of it was executed."
+            )
+        if not 1 <= len(evaluated) <= _MAX_TASK_FILE_DEPTH:
+            raise UnusableTask(
+                f"The task file '{path}' has unbalanced parentheses, or more than {_MAX_TASK_FILE_DEPTH} deep."
+            )

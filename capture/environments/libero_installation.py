@@ -24,9 +24,8 @@ from typing import Any
 from vla_attention.capture.environments.base import Suite, Task
 from vla_attention.capture.environments.robosuite_installation import import_robosuite, readable_device_choice
 from vla_attention.capture.environments.task_families import sentence_template
-from vla_attention.capture.foreign_files.regular_files import check_folder
-from vla_attention.schemas.errors import MissingDependency, UserError
-from vla_attention.schemas.installing import INSTALL_LIBERO
+from vla_attention.capture.foreign_files.checked_files import check_folder
+from vla_attention.schemas.errors import INSTALL_LIBERO, MissingDependency, UserError
 
 ASSETS_VARIABLE = "VLA_LIBERO_ASSETS"
 #: The dataset on the Hugging Face hub that the package itself (hf-libero) downloads.
@@ -111,7 +110,8 @@ def find_assets(configured: Path | None) -> Path:
                     f"The LIBERO asset folder '{folder}' ({origin}) {problem}; give the folder that holds "
                     f"{', '.join(ASSET_SUBFOLDERS)}, for example a copy of the hub dataset {ASSETS_SOURCE}."
                 )
-            _check_assets(folder.resolve())
+            # MuJoCo opens pipes and devices among them by itself.
+            check_folder(folder.resolve(), LiberoAssetsMissing, inside=False)
             return folder.resolve()
     own_places = (package_folder() / "assets", Path.home() / ".cache" / "libero" / "assets")
     for folder in own_places:
@@ -124,11 +124,6 @@ def find_assets(configured: Path | None) -> Path:
 
 
 @functools.cache
-def _check_assets(folder: Path) -> None:
-    """Raise `LiberoAssetsMissing` for pipes and devices among the assets, which MuJoCo opens by itself."""
-    check_folder(folder, LiberoAssetsMissing, inside=False)
-
-
 def load_libero(assets: Path) -> dict[str, Any]:
     """Import LIBERO's environments with these assets; return its environment classes by lower-case problem name."""
     import_robosuite()

@@ -9,23 +9,28 @@ import sys
 from collections.abc import Iterator
 from typing import Any
 
-from vla_attention.schemas.errors import MissingDependency
-from vla_attention.schemas.installing import INSTALL_CAPTURE
+from vla_attention.schemas.errors import INSTALL_CAPTURE, MissingDependency
+
+
+def find_robosuite() -> str:
+    """Return robosuite's folder without importing it; raise `MissingDependency` if it is not installed."""
+    spec = importlib.util.find_spec("robosuite")
+    if spec is None or not spec.submodule_search_locations:
+        raise MissingDependency(f"robosuite is not installed, and simulations need it: {INSTALL_CAPTURE}.")
+    return next(iter(spec.submodule_search_locations))
 
 
 def import_robosuite() -> None:
     """Import robosuite without its log file and advice; raise `MissingDependency` if it is not installed."""
     if "robosuite" in sys.modules:
         return
-    spec = importlib.util.find_spec("robosuite")
-    if spec is None or not spec.submodule_search_locations:
-        raise MissingDependency(f"robosuite is not installed, and simulations need it: {INSTALL_CAPTURE}.")
+    folder = find_robosuite()
     if sys.platform == "linux":
         os.environ.setdefault("MUJOCO_GL", "egl")  # must precede the first import of MuJoCo, which reads it
     # robosuite reads its settings during its import. By default it opens a log file with a fixed name in the common
     # temporary folder. On a shared node that file belongs to its first user, and the import fails for everyone else.
     # The settings module imports nothing, so it can be loaded before the package and changed.
-    location = os.path.join(next(iter(spec.submodule_search_locations)), "macros.py")
+    location = os.path.join(folder, "macros.py")
     macros_spec = importlib.util.spec_from_file_location("robosuite.macros", location)
     assert macros_spec is not None
     assert macros_spec.loader is not None

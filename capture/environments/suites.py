@@ -6,8 +6,11 @@ A new suite of an existing simulator is one line in `SUITES`. A new simulator is
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Suite, Task, check_task_id
 from vla_attention.capture.environments.cubes.tasks import list_cube_tasks
+from vla_attention.capture.environments.robosuite_installation import find_robosuite
 from vla_attention.schemas.errors import BadArgument, unknown_name
 
 #: Every suite. The numbers of steps are openpi's (see `episode_protocol.py`).
@@ -49,6 +52,21 @@ def list_tasks(suite: Suite) -> tuple[Task, ...]:
     from vla_attention.capture.environments.robosuite_tasks import list_robosuite_tasks
 
     return list_robosuite_tasks(suite)
+
+
+def check_installed(suite: Suite, libero_assets: Path | None) -> None:
+    """Raise what the first episode would raise where the suite's simulator or its files are not there; loads neither.
+
+    Raises:
+        MissingDependency: robosuite or LIBERO is not installed.
+        LiberoAssetsMissing: no folder has all of LIBERO's assets.
+    """
+    find_robosuite()
+    if suite.kind == "libero":
+        from vla_attention.capture.environments.libero_installation import find_assets
+
+        list_tasks(suite)
+        find_assets(libero_assets)
 
 
 def make_environment(suite: Suite, task_id: int, settings: EnvironmentSettings) -> Environment:

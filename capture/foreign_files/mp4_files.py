@@ -125,20 +125,20 @@ def _samples_of(handle: int, kind: bytes, begins: int, ends: int, size: int, mos
     if kind == b"trun":
         count, given = given, 0
         bits = 32 * sum(bool(version_and_flags & bit) for bit in (0x100, 0x200, 0x400, 0x800))
-        own = 8 + 4 * sum(bool(version_and_flags & bit) for bit in (0x1, 0x4))
+        head_bytes = 8 + 4 * sum(bool(version_and_flags & bit) for bit in (0x1, 0x4))
     else:
-        own = 12
+        head_bytes = 12
         if kind == b"stz2" or not given:
             bits, given = given & 255 or 32, 0
     if count > most:
         raise Mp4Refused(
             f"says that it has {count:,} pictures; expected at most {most:,}, for the frames of its data set"
         )
-    if count * bits > 8 * (ends - begins - own):
+    if count * bits > 8 * (ends - begins - head_bytes):
         raise Mp4Refused(f"is damaged: its list '{kind.decode()}' of {count:,} samples has {ends - begins:,} bytes")
     total = given * count
     if kind == b"stsz" and not given:
-        total = int(np.frombuffer(os.pread(handle, 4 * count, begins + own), ">u4").sum(dtype=np.int64))
+        total = int(np.frombuffer(os.pread(handle, 4 * count, begins + head_bytes), ">u4").sum(dtype=np.int64))
     if total > size:
         raise Mp4Refused(f"is damaged: it has {size:,} bytes, and pictures of {total:,} bytes")
     return int(count)

@@ -125,12 +125,12 @@ class ParquetFile:
         try:
             for leaf, chunk in self._chosen(columns, groups):
                 try:
-                    found, unpacked = _check_pages(handle, self.size, leaf, chunk)
+                    num_pages, unpacked = _check_pages(handle, self.size, leaf, chunk)
                 except (DamagedThrift, IndexError) as error:
                     raise ParquetRefused(f"is damaged in its column '{leaf.column}' ({_reason(error)})") from None
                 claimed[leaf.column] += unpacked + chunk.values * leaf.width
                 stored += chunk.packed
-                pages += found
+                pages += num_pages
                 if pages > TABLE_PAGES:
                     raise ParquetRefused(f"has more than {TABLE_PAGES:,} pages")
         finally:
@@ -145,12 +145,12 @@ class ParquetFile:
 
     def _groups_of(self, first: int, count: int) -> range:
         """The groups that hold these rows."""
-        begins, found = 0, []
+        begins, groups = 0, []
         for number, rows in enumerate(self.groups):
             if begins < first + count and begins + rows > first:
-                found.append(number)
+                groups.append(number)
             begins += rows
-        return range(found[0], found[-1] + 1) if found else range(0)
+        return range(groups[0], groups[-1] + 1) if groups else range(0)
 
     def _chosen(self, columns: Collection[str], groups: range) -> Iterator[tuple[_Leaf, _Chunk]]:
         for position, leaf in enumerate(self._leaves):
@@ -199,9 +199,9 @@ def _read_footer(data: bytes) -> tuple[list[_Leaf], list[list[_Chunk]], list[int
             if of != STRUCT:
                 raise DamagedThrift("its groups of rows are none")
             for _ in range(count):
-                stated, found, at = _read_group(data, at, leaves)
+                stated, group, at = _read_group(data, at, leaves)
                 rows.append(stated)
-                chunks.append(found)
+                chunks.append(group)
             groups = []
         else:
             at = skip_value(data, at, kind)

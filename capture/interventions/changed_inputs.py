@@ -1,4 +1,8 @@
-"""What a policy call is given, with the prompt and the pictures that interventions change."""
+"""What a policy call is given, with the prompt and the pictures that interventions change.
+
+Pictures are (height, width, 3) uint8, as the model sees them. Masks are (height, width) bool, True where a pixel is
+replaced.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +13,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.interventions import images
 from vla_attention.capture.interventions.prompts import changed_instruction
 from vla_attention.capture.policies.policy import GivenInputs, camera_grid
 from vla_attention.schemas.errors import BadArgument, unknown_name
 from vla_attention.schemas.groupings.resolve import EmptyGroup
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import ImageChange, Interventions
-from vla_attention.schemas.layout import SiteLayout
+from vla_attention.schemas.layout import PatchGrid, SiteLayout
 from vla_attention.schemas.stores.store_format import episode_name
 
 
@@ -82,15 +85,15 @@ def changed_picture(
 ) -> NDArray[np.uint8]:
     """Return a camera's other picture, (height, width, 3) uint8 as the model sees it; errors as `changed_inputs`."""
     if change.kind == "blank":
-        return images.blank(picture)
+        return blank(picture)
     if change.kind == "noise":
         place = (context.task_id, context.episode_index, context.replan, zlib.crc32(change.camera.encode()))
-        return images.noise(picture, np.random.default_rng((change.seed, *place)))
+        return noise(picture, np.random.default_rng((change.seed, *place)))
     if change.kind == "rotated":
-        return images.rotated(picture)
+        return rotated(picture)
     grid = camera_grid(sites, change.camera)
     if change.kind == "shifted":
-        return images.shifted(picture, grid, change.rows, change.columns)
+        return shifted(picture, grid, change.rows, change.columns)
     patches = object_patches(change, context, known=allow_empty)
     if not patches.any() and not allow_empty:
         raise EmptyGroup(
@@ -98,8 +101,8 @@ def changed_picture(
             f"{episode_name(context.task_id, context.episode_index)}; add --allow-empty to leave such pictures as they "
             "are."
         )
-    mask = images.patch_pixels(patches, grid, picture.shape)
-    return images.masked(picture, mask) if change.kind == "masked" else images.filled(picture, mask)
+    mask = patch_pixels(patches, grid, picture.shape)
+    return masked(picture, mask) if change.kind == "masked" else filled(picture, mask)
 
 
 def object_patches(change: ImageChange, context: CallContext, *, known: bool = False) -> NDArray[np.bool_]:
@@ -119,3 +122,103 @@ def object_patches(change: ImageChange, context: CallContext, *, known: bool = F
         raise unknown_name("object", change.object, names)
     patches: NDArray[np.bool_] = covered[:, names.index(change.object)] > 0
     return patches
+
+
+Picture = NDArray[np.uint8]
+
+#: Grey levels of a blank picture: the middle of the model's range, and what a camera without light gives.
+GREY, BLACK = 128, 0
+#: Rounds of averaging neighbours that smooth a filled region.
+_SMOOTHING_ROUNDS = 60
+
+
+def blank(picture: Picture, level: int = GREY) -> Picture:
+    """Return an even picture of one grey level, 0 to 255."""
+    return np.full_like(picture, level)
+
+
+def noise(picture: Picture, generator: np.random.Generator) -> Picture:
+    """Return even noise: every number 0 to 255, independently."""
+    return generator.integers(0, 256, picture.shape, dtype=np.uint8)
+
+
+def rotated(picture: Picture) -> Picture:
+    """Return the picture turned by 180 degrees."""
+    return np.ascontiguousarray(picture[::-1, ::-1])
+
+
+def shifted(picture: Picture, grid: PatchGrid, rows: int, columns: int) -> Picture:
+    """Return the picture moved by whole patches, down and to the right; the edge's pixels fill what becomes free.
+
+    Raises:
+        BadArgument: nothing of the picture would be left.
+    """
+    if abs(rows) >= grid.rows or abs(columns) >= grid.columns:
+        raise BadArgument(
+            f"A shift by {rows} rows and {columns} columns of patches leaves nothing of a picture of {grid.rows} x "
+            f"{grid.columns} patches."
+        )
+    height, width = picture.shape[:2]
+    down, right = round(rows * height / grid.rows), round(columns * width / grid.columns)
+    row = np.clip(np.arange(height) - down, 0, height - 1)
+    column = np.clip(np.arange(width) - right, 0, width - 1)
+    return np.ascontiguousarray(picture[row[:, None], column[None, :]])
+
+
+def patch_pixels(patches: NDArray[np.bool_], grid: PatchGrid, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return the mask of the pixels that belong to the chosen patches (patch,), row by row from the top left."""
+    row = np.arange(shape[0]) * grid.rows // shape[0]
+    column = np.arange(shape[1]) * grid.columns // shape[1]
+    mask: NDArray[np.bool_] = patches.reshape(grid.rows, grid.columns)[row[:, None], column[None, :]]
+    return mask
+
+
+def masked(picture: Picture, mask: NDArray[np.bool_]) -> Picture:
+    """Return the picture with the mean colour of the pixels outside of the mask inside of it; grey if there are none.
+
+    A picture without a pixel in the mask is returned as it is.
+    """
+    if not mask.any():
+        return picture
+    result = picture.copy()
+    result[mask] = GREY if mask.all() else np.rint(picture[~mask].mean(axis=0)).astype(np.uint8)
+    return result
+
+
+def filled(picture: Picture, mask: NDArray[np.bool_]) -> Picture:
+    """Return the picture with the mask filled from its surroundings by push and pull, then smoothed.
+
+    Pull: pictures of half, a quarter ... of the size, each pixel the mean of the known ones among its four. Push: from
+    the coarsest to the finest, unknown pixels take the colour of the coarser one. Then every pixel of the mask becomes
+    the mean of its four neighbours, some sixty times. The method of Gortler and others, The Lumigraph (1996), section
+    3.4.3, with weights 0 and 1. A mask over everything gives a grey picture.
+    """
+    if not mask.any():
+        return picture
+    if mask.all():
+        return blank(picture)
+    colour = np.where(mask[..., None], 0.0, picture.astype(np.float64))
+    smooth = _push_pull(colour, ~mask)
+    for _ in range(_SMOOTHING_ROUNDS):
+        framed = np.pad(smooth, ((1, 1), (1, 1), (0, 0)), mode="edge")
+        mean = (framed[:-2, 1:-1] + framed[2:, 1:-1] + framed[1:-1, :-2] + framed[1:-1, 2:]) / 4
+        smooth[mask] = mean[mask]
+    result = picture.copy()
+    result[mask] = np.rint(smooth[mask]).clip(0, 255).astype(np.uint8)
+    return result
+
+
+def _push_pull(colour: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return (height, width, 3) with the unknown pixels filled; at least one pixel is known."""
+    if known.all():
+        return colour
+    height, width = known.shape
+    even = ((0, height % 2), (0, width % 2))
+    weight = np.pad(known.astype(np.float64), even)
+    weighted = np.pad(colour * known[..., None], (*even, (0, 0)))
+    quarter = (weight.shape[0] // 2, 2, weight.shape[1] // 2, 2)
+    count = weight.reshape(quarter).sum(axis=(1, 3))
+    total = weighted.reshape(*quarter, 3).sum(axis=(1, 3))
+    coarse = _push_pull(total / np.maximum(count, 1)[..., None], count > 0)
+    enlarged = coarse.repeat(2, axis=0).repeat(2, axis=1)[:height, :width]
+    return np.where(known[..., None], colour, enlarged)

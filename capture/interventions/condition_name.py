@@ -6,6 +6,7 @@ import hashlib
 import re
 from collections.abc import Sequence
 
+from vla_attention.schemas.errors import runs_of
 from vla_attention.schemas.interventions import (
     AttentionScale,
     AttentionUniform,
@@ -93,15 +94,9 @@ def _of_seed(seed: int) -> str:
 
 def _of_places(*places: tuple[int, ...] | None) -> str:
     named = zip(("layers", "heads", "steps"), places, strict=True)
-    return "".join(f"_{name}_{_numbers(chosen)}" for name, chosen in named if chosen is not None)
+    return "".join(f"_{name}_{_in_runs(chosen)}" for name, chosen in named if chosen is not None)
 
 
-def _numbers(chosen: Sequence[int]) -> str:
+def _in_runs(chosen: Sequence[int]) -> str:
     """Return numbers in ascending order as text; three and more that follow each other are `first_to_last`."""
-    runs: list[list[int]] = []
-    for number in chosen:
-        if runs and number == runs[-1][-1] + 1:
-            runs[-1].append(number)
-        else:
-            runs.append([number])
-    return "_".join(f"{run[0]}_to_{run[-1]}" if len(run) > 2 else "_".join(map(str, run)) for run in runs)
+    return "_".join(f"{run[0]}_to_{run[-1]}" if len(run) > 2 else "_".join(map(str, run)) for run in runs_of(chosen))

@@ -8,15 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from vla_attention.schemas.documents import decode_json, decode_toml
-from vla_attention.schemas.errors import BadArgument, UserError, listing
+from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.groupings.words import split_words
 from vla_attention.schemas.interventions import PromptChange
 from vla_attention.schemas.limits import WRITTEN_FILE_BYTES
 from vla_attention.schemas.regular_files import read_regular
-
-
-class SynonymsUnreadable(UserError, ValueError):
-    """A file that is no table of words and their synonyms."""
 
 
 def changed_instruction(
@@ -91,10 +87,10 @@ def read_synonyms(path: Path) -> dict[str, str]:
         content = decode_toml(given.decode()) if path.suffix == ".toml" else decode_json(given)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
-        raise SynonymsUnreadable(f"Cannot read the synonyms '{path}' ({reason}); expected JSON or TOML.") from None
+        raise BadArgument(f"Cannot read the synonyms '{path}' ({reason}); expected JSON or TOML.") from None
     if not isinstance(content, dict) or not content or not all(isinstance(value, str) for value in content.values()):
-        raise SynonymsUnreadable(f'The synonyms \'{path}\' are no table; expected for instance {{"bowl": "dish"}}.')
+        raise BadArgument(f'The synonyms \'{path}\' are no table; expected for instance {{"bowl": "dish"}}.')
     several = [word for word in content if len(split_words(word)) != 1]
     if several:
-        raise SynonymsUnreadable(f"The synonyms '{path}' give one for '{several[0]}', which is not a single word.")
+        raise BadArgument(f"The synonyms '{path}' give one for '{several[0]}', which is not a single word.")
     return dict(content)

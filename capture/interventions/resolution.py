@@ -169,24 +169,29 @@ def empty_replans(
     for selector in selectors_of(interventions):
         weights = selector_weights(selector, tokens, vocabularies)
         # Keys that are masked, such as those of a camera that the suite has not, are none.
-        counts = [np.broadcast_to((there * tokens[site].valid).sum(axis=1), replans) for site, there in weights.items()]
+        counts = [
+            np.broadcast_to((weight * tokens[site].valid).sum(axis=1), replans) for site, weight in weights.items()
+        ]
         empty[selector] = np.asarray(sum(counts) == 0)
     return empty
 
 
-def check_not_empty(
+def has_empty_group(
     interventions: Interventions,
     tokens: Mapping[str, EpisodeTokens],
     vocabularies: Mapping[str, Vocabulary],
     place: ReplanPlace,
-) -> None:
-    """Raise `EmptyGroup` for the first selector whose group has no key in one replan."""
-    for selector, empty in empty_replans(interventions, tokens, vocabularies).items():
-        if empty.any():
-            raise EmptyGroup(
-                f"The group '{selector}' of an intervention has no key at {place}: an object may be out of view, or "
-                "the instruction lacks the word; add --allow-empty to leave such replans unchanged."
-            )
+    *,
+    allow_empty: bool = False,
+) -> bool:
+    """Return whether the group of some selector has no key in one replan; raise `EmptyGroup` unless `allow_empty`."""
+    empty = [selector for selector, empty in empty_replans(interventions, tokens, vocabularies).items() if empty.any()]
+    if empty and not allow_empty:
+        raise EmptyGroup(
+            f"The group '{empty[0]}' of an intervention has no key at {place}: an object may be out of view, or the "
+            "instruction lacks the word; add --allow-empty to leave such replans unchanged."
+        )
+    return bool(empty)
 
 
 def make_editors(

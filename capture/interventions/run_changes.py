@@ -12,10 +12,10 @@ from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.interventions.prompts import changed_instruction
 from vla_attention.capture.interventions.resolution import (
     ReplanPlace,
-    check_not_empty,
     check_selectors,
     empty_replans,
     episode_vocabularies,
+    has_empty_group,
     make_editors,
     run_vocabularies,
     selectors_of,
@@ -79,10 +79,7 @@ class RunChanges:
         # Where empty groups are allowed, an object may also be one of another task's scene.
         known = [*objects, *self._named_objects()] if self.allow_empty else objects
         vocabularies = self._vocabularies(sites, known, policy_input.prompt.instruction_text)
-        if not self.allow_empty:
-            check_not_empty(self.interventions, tokens, vocabularies, place)
-        elif any(empty.any() for empty in empty_replans(self.interventions, tokens, vocabularies).values()):
-            self.num_empty += 1
+        self.num_empty += has_empty_group(self.interventions, tokens, vocabularies, place, allow_empty=self.allow_empty)
         return make_editors(self.interventions, tokens, vocabularies, place) or None
 
     def describe_empty(self) -> str | None:
@@ -126,8 +123,8 @@ def check_stored_replans(interventions: Interventions, store: Store, *, allow_em
     first: dict[str, str] = {}
     counts: dict[str, int] = {}
     any_empty = total = 0
-    for name, there in tokens.items():
-        empty = empty_replans(interventions, there, vocabularies)
+    for name, tokens_of_episode in tokens.items():
+        empty = empty_replans(interventions, tokens_of_episode, vocabularies)
         for selector, replans in empty.items():
             counts[selector] = counts.get(selector, 0) + int(replans.sum())
             if replans.any():

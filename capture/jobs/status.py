@@ -11,9 +11,8 @@ from pathlib import Path
 from vla_attention.capture.environments.suites import SUITES
 from vla_attention.capture.jobs.worker_records import REASON_CHARACTERS, WorkerRecord, planned_tasks, read_records
 from vla_attention.schemas.command_line import format_bytes
-from vla_attention.schemas.errors import BadArgument, listing, shortened
+from vla_attention.schemas.errors import BadArgument, listing, plural, shortened
 from vla_attention.schemas.jsonable import to_json
-from vla_attention.schemas.plurals import plural
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.claims import Holder, holders
 from vla_attention.schemas.stores.damaged_episodes import DamagedEpisode, look_at
@@ -154,24 +153,27 @@ def store_status(path: Path, expected: int | None = None, verify: bool = False) 
         ids |= set(range(next((suite.num_tasks for suite in SUITES if suite.name == root.protocol.suite), 0)))
     tasks = []
     for task_id in sorted(ids):
-        found = episodes.get(task_id, [])
-        wanted = expected if expected is not None else plan[task_id].episodes if task_id in plan else None
+        committed = episodes.get(task_id, [])
+        planned = plan[task_id].wanted if task_id in plan else None
+        wanted = planned if expected is None else set(range(expected))
         faulty = damaged.get(task_id, [])
-        present = {parse_episode_name(episode.name)[1] for episode in faulty} | {episode.episode for episode in found}
-        last = max(found, key=lambda episode: episode.at, default=None)
+        present = {parse_episode_name(episode.name)[1] for episode in faulty} | {
+            episode.episode for episode in committed
+        }
+        last = max(committed, key=lambda episode: episode.at, default=None)
         tasks.append(
             TaskStatus(
                 task_id=task_id,
                 instruction=instructions.get(task_id, ""),
-                committed=len(found),
-                expected=wanted,
-                success=sum(episode.success is True for episode in found),
-                bytes=sum(episode.bytes for episode in found),
+                committed=len(committed),
+                expected=None if wanted is None else len(wanted),
+                success=sum(episode.success is True for episode in committed),
+                bytes=sum(episode.bytes for episode in committed),
                 last_at=last.at if last else "",
                 last_by=last.by if last else "",
-                missing=tuple(sorted(set(range(wanted or 0)) - present)),
+                missing=tuple(sorted((wanted or set()) - present)),
                 damaged=tuple(faulty),
-                unknown=sum(episode.success is None for episode in found),
+                unknown=sum(episode.success is None for episode in committed),
                 dropped=tuple(dropped.get(task_id, ())),
             )
         )
@@ -184,12 +186,12 @@ def print_status(stores: Sequence[Path], expected: int | None, as_json: bool, ch
     Returns:
         The exit code: 1 if `check` is set and an expected episode is missing or one is damaged, else 0.
     """
-    found = [store_status(store, expected, verify) for store in stores]
+    statuses = [store_status(store, expected, verify) for store in stores]
     if as_json:
-        print(json.dumps([to_json(status) | {"complete": status.complete} for status in found], indent=1))
+        print(json.dumps([to_json(status) | {"complete": status.complete} for status in statuses], indent=1))
     else:
-        print("\n\n".join(_text(status) for status in found))
-    return 1 if check and any(status.complete is False for status in found) else 0
+        print("\n\n".join(_text(status) for status in statuses))
+    return 1 if check and any(status.complete is False for status in statuses) else 0
 
 
 def _dropped(records: Sequence[WorkerRecord], present: Set[str]) -> dict[int, list[DroppedEpisode]]:

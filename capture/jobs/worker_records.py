@@ -10,19 +10,18 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import warnings
+from collections.abc import Set
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
 from vla_attention.schemas.documents import decode_json
-from vla_attention.schemas.errors import Note, listing, shortened
+from vla_attention.schemas.errors import Note, listing, plural, shortened
 from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
 from vla_attention.schemas.limit_checks import check_at_most
 from vla_attention.schemas.limits import DOCUMENT_BYTES, PLANNED_EPISODES, RECORDS_BYTES
-from vla_attention.schemas.plurals import plural
 from vla_attention.schemas.regular_files import read_regular
 from vla_attention.schemas.stores.claims import JOBS_SUFFIX, job_files, jobs_folder
 from vla_attention.schemas.stores.partial_folders import no_link
@@ -36,16 +35,36 @@ REASON_CHARACTERS = 1000
 
 @dataclass(frozen=True)
 class PlannedTask:
-    """A task and its planned number of episodes: those with the indices 0 to `episodes` - 1."""
+    """A task and its planned episodes: so many, with these `indices`, or from 0 on where none are given."""
 
     task_id: int
     name: str
     instruction: str
     episodes: int
+    indices: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         """Check the number, by which missing episodes are counted."""
         check_at_most(f"The number of episodes of task {self.task_id}", self.episodes, PLANNED_EPISODES)
+        if self.indices and len(self.indices) != self.episodes:
+            raise ValueError(f"task {self.task_id} has {len(self.indices)} indices for {self.episodes} episodes")
+
+    @classmethod
+    def of_episodes(cls, task_id: int, name: str, instruction: str, indices: Set[int]) -> PlannedTask:
+        """Plan the episodes with these indices."""
+        counted = indices == set(range(len(indices)))
+        return cls(task_id, name, instruction, len(indices), () if counted else tuple(sorted(indices)))
+
+    @property
+    def wanted(self) -> Set[int]:
+        """The indices of the planned episodes."""
+        return set(self.indices or range(self.episodes))
+
+    def with_those_of(self, other: PlannedTask) -> PlannedTask:
+        """Return the task with the episodes of both plans; they are of one task."""
+        if not self.indices and not other.indices:  # without counting, however many they are
+            return max(self, other, key=lambda task: task.episodes)
+        return PlannedTask.of_episodes(self.task_id, self.name, self.instruction, self.wanted | other.wanted)
 
 
 @dataclass(frozen=True)
@@ -85,12 +104,18 @@ class WorkerRecord:
 
 
 class RecordWriter:
-    """Writes the record of this worker after every change."""
+    """Writes the record of this worker after every change, from the first on at which the store exists."""
 
     def __init__(self, store: Path, worker: Worker, plan: tuple[PlannedTask, ...], threads: int = 0) -> None:
         self.file = records_folder(store) / f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{worker.tag}.json"
-        self.record = WorkerRecord(store_identity(store), worker, plan, now(), "running", threads=threads)
+        self._store = store
+        self.record = WorkerRecord("", worker, plan, now(), "running", threads=threads)
         self._write()
+
+    @property
+    def worker(self) -> Worker:
+        """The process of the record."""
+        return self.record.worker
 
     def add_commit(self, episode: str) -> None:
         """Record that the worker has committed an episode."""
@@ -110,6 +135,11 @@ class RecordWriter:
         self._write()
 
     def _write(self) -> None:
+        if not self.record.store:
+            try:
+                self.record = replace(self.record, store=store_identity(self._store))
+            except FileNotFoundError:  # `va.record` makes a store with its first episode
+                return
         self.file.parent.mkdir(parents=True, exist_ok=True)
         temporary = self.file.with_name(f".{self.file.name}.partial")
         temporary.write_text(json.dumps(to_json(self.record), indent=1), encoding="utf-8")
@@ -161,27 +191,20 @@ def read_records(store: Path) -> list[WorkerRecord]:
 
 
 def planned_tasks(records: list[WorkerRecord]) -> dict[int, PlannedTask]:
-    """Return every planned task by its id, with the largest number of episodes that a worker planned.
+    """Return every planned task by its id, with all episodes that workers planned.
 
     Raises:
         StoreError: together they have more episodes than are counted one by one.
     """
     plan: dict[int, PlannedTask] = {}
     for task in (task for record in records for task in record.plan):
-        known = plan.get(task.task_id)
-        if known is None or task.episodes > known.episodes:
-            plan[task.task_id] = task
+        plan[task.task_id] = plan[task.task_id].with_those_of(task) if task.task_id in plan else task
     if (planned := sum(task.episodes for task in plan.values())) > PLANNED_EPISODES:
         raise StoreError(
             f"The workers' records plan {planned:,} episodes; expected at most {PLANNED_EPISODES:,}. Delete "
             f"NAME{JOBS_SUFFIX} beside the store when no capture runs; no reader of the store needs it."
         )
     return plan
-
-
-def delete_jobs_folder(store: Path) -> None:
-    """Delete all records and claims of a store that will be replaced."""
-    shutil.rmtree(jobs_folder(store), ignore_errors=True)
 
 
 def store_identity(store: Path) -> str:

@@ -7,8 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from vla_attention.capture.foreign_files.json_objects import read_object
-from vla_attention.capture.foreign_files.regular_files import check_regular
+from vla_attention.capture.foreign_files.checked_files import check_regular, read_object
 from vla_attention.schemas.errors import UserError
 
 #: Size of an axis, or a number of parts, that a checkpoint states. The largest of the models here is a vocabulary of

@@ -43,12 +43,12 @@ def in_hub_cache(repository: str, file: str) -> Path | None:
     commits.
     """
     snapshots = snapshots_folder(repository)
-    found = {path.relative_to(snapshots).parts[0]: path for path in sorted(snapshots.glob(f"*/{file}"))}
+    by_commit = {path.relative_to(snapshots).parts[0]: path for path in sorted(snapshots.glob(f"*/{file}"))}
     try:
         newest = (snapshots.parent / "refs" / "main").read_text(encoding="ascii").strip()
     except (OSError, ValueError):
         newest = ""
-    return found.get(newest) or next(iter(found.values()), None)
+    return by_commit.get(newest) or next(iter(by_commit.values()), None)
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,14 @@ import argparse
 from pathlib import Path
 
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.threads import add_threads
 
 #: The two untrained policies that come with the program: a small one, and a smaller one for tests.
 UNTRAINED = "untrained"
 UNTRAINED_TINY = "untrained-tiny"
 UNTRAINED_POLICIES = (UNTRAINED, UNTRAINED_TINY)
+#: What `--threads` says of the policy.
+POLICY_THREADS = "processor threads of the policy (default: OMP_NUM_THREADS, else the cores that this process may use)"
 #: Their names in stores that were made before they said what the policies are.
 FORMER_NAMES = {"embedded": UNTRAINED, "dummy": UNTRAINED_TINY}
 
@@ -47,15 +50,5 @@ def add_model_arguments(
     group.add_argument("--config-name", metavar="NAME", help=config_name)
     group.add_argument("--dtype", metavar="NAME", help=f"float32 or bfloat16 (default: {dtype_default})")
     group.add_argument("--device", default="auto", help="auto (default: a GPU if there is one), cpu, cuda, cuda:1 ...")
-    add_threads(group)
+    add_threads(group, POLICY_THREADS)
     return group
-
-
-def add_threads(group: argparse._ActionsContainer) -> None:
-    """Add `--threads`; `schemas.threads.use_threads` takes its value."""
-    group.add_argument(
-        "--threads",
-        type=int,
-        metavar="N",
-        help="processor threads of the policy (default: OMP_NUM_THREADS, else the cores that this process may use)",
-    )

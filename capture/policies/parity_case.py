@@ -10,7 +10,7 @@ from zipfile import ZipFile
 
 import numpy as np
 
-from vla_attention.capture.foreign_files.regular_files import check_regular
+from vla_attention.capture.foreign_files.checked_files import check_regular
 from vla_attention.capture.policies.checkpoints import read_json_object
 from vla_attention.schemas.errors import UserError, listing
 from vla_attention.schemas.safe_text import visible
@@ -45,8 +45,8 @@ def read_case_file(folder: Path) -> dict[str, Any]:
     if not folder.is_dir():
         raise UnusableCase(f"There is no case folder at '{folder}'.")
     if not (folder / CASE_FILE).is_file():
-        found = listing(sorted(path.name for path in folder.iterdir()))
-        raise UnusableCase(f"'{folder}' is no case: it has no {CASE_FILE}, but {found}.")
+        names = listing(sorted(path.name for path in folder.iterdir()))
+        raise UnusableCase(f"'{folder}' is no case: it has no {CASE_FILE}, but {names}.")
     return read_json_object(folder / CASE_FILE)
 
 

@@ -82,7 +82,7 @@ class RobotData:
             if given not in short and given not in short.values():
                 raise unknown_name("camera of the policy", given, short.values())
         chosen = {name: self.chosen_cameras.get(name, self.chosen_cameras.get(short[name])) for name in policy_cameras}
-        found: dict[str, str] = {}
+        columns: dict[str, str] = {}
         for camera in policy_cameras:
             column = chosen[camera]
             if column is None:
@@ -96,13 +96,13 @@ class RobotData:
                     f"{short[camera]}={NONE} to leave it black and masked."
                 )
             if column != NONE:
-                found[camera] = self.camera_column(column)
-        if not found:
+                columns[camera] = self.camera_column(column)
+        if not columns:
             raise BadArgument(
                 f"None of the policy's cameras {listing(short.values())} has pictures in the data set '{self.name}', "
                 f"whose cameras are {listing(self.cameras)}; give --camera POLICY=DATASET."
             )
-        return found
+        return columns
 
     def state_columns(self) -> tuple[str, ...]:
         """Return the columns that make up the state."""

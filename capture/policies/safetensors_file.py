@@ -46,8 +46,8 @@ class SafetensorsFile:
 
     def check_floats(self, names: Iterable[str]) -> None:
         """Raise `CheckpointMismatch` for weights that are no floating point numbers of at least 16 bits."""
-        found = {name: str(self.stored.get_slice(name).get_dtype()) for name in names}
-        wrong = [f"{name} ({kind})" for name, kind in found.items() if kind not in _FLOATS]
+        kinds = {name: str(self.stored.get_slice(name).get_dtype()) for name in names}
+        wrong = [f"{name} ({kind})" for name, kind in kinds.items() if kind not in _FLOATS]
         if wrong:
             raise CheckpointMismatch(
                 f"'{self.path}' has weights that are no floating point numbers of 16 bits or more: {listing(wrong)}; "

@@ -8,21 +8,13 @@ from pathlib import Path
 
 import sentencepiece
 
-from vla_attention.capture.foreign_files.regular_files import check_regular
-from vla_attention.schemas.errors import UserError
+from vla_attention.capture.foreign_files.checked_files import check_regular
+from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
 
 #: Bytes of a model. PaliGemma's, of 257,152 pieces, has 4.3 MB.
 MAX_MODEL_BYTES = 64_000_000
 #: The small model of the untrained policies that come with this package.
 EMBEDDED_TOKENIZER = Path(__file__).parent / "embedded" / "tokenizer.model"
-
-
-class TokenizerNotFound(UserError, FileNotFoundError):
-    """There is no tokenizer file."""
-
-
-class UnreadableTokenizer(UserError, ValueError):
-    """The file is no sentencepiece model, or not one for the policy."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +33,11 @@ class SentencepieceModel:
     def __init__(self, path: str | Path, needed: str):
         path = Path(path)
         try:
-            size = check_regular(path, UnreadableTokenizer)
+            size = check_regular(path, UnreadableCheckpoint)
         except FileNotFoundError:
-            raise TokenizerNotFound(f"There is no tokenizer file at '{path}'; {needed}.") from None
+            raise CheckpointNotFound(f"There is no tokenizer file at '{path}'; {needed}.") from None
         if size > MAX_MODEL_BYTES:
-            raise UnreadableTokenizer(
+            raise UnreadableCheckpoint(
                 f"'{path}' has {size} bytes; a sentencepiece model of {MAX_MODEL_BYTES} at most is read."
             )
         content = path.read_bytes()
@@ -56,7 +48,7 @@ class SentencepieceModel:
         try:
             self._processor.LoadFromSerializedProto(content)
         except (RuntimeError, OSError) as error:
-            raise UnreadableTokenizer(f"'{path}' is not a sentencepiece model, or it is damaged.") from error
+            raise UnreadableCheckpoint(f"'{path}' is not a sentencepiece model, or it is damaged.") from error
 
     @property
     def vocab_size(self) -> int:
@@ -77,8 +69,8 @@ class SentencepieceModel:
         """Encode a text, without tokens for its begin and end; offsets count characters."""
         # sentencepiece 0.2.3 replaced its proto objects; the new ones need the protobuf package.
         if hasattr(self._processor, "EncodeAsOffsetMapping"):
-            found = self._processor.EncodeAsOffsetMapping(text)
-            parts = zip(found["ids"], found["pieces"], found["offsets"], strict=True)
+            encoded = self._processor.EncodeAsOffsetMapping(text)
+            parts = zip(encoded["ids"], encoded["pieces"], encoded["offsets"], strict=True)
             return [Token(int(id_), piece, start, stop) for id_, piece, (start, stop) in parts]
         encode = getattr(self._processor, "EncodeAsImmutableProto")  # noqa: B009 - newer type stubs lack it
         return [Token(p.id, p.piece, p.begin, p.end) for p in encode(text).pieces]

@@ -10,25 +10,26 @@ from __future__ import annotations
 import argparse
 import copy
 import os
+import shlex
 import shutil
 import socket
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vla_attention.capture.analysis_process import run_analysis
-from vla_attention.capture.command_line import check_writable, run_capture_command
+from vla_attention.capture.commands.command_line import run_capture_command
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
+from vla_attention.capture.run.command import run_analysis
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.layers import select_layers
 from vla_attention.schemas.threads import Threads, use_threads
 
 if TYPE_CHECKING:
-    from vla_attention.capture.run_settings import RunSettings
+    from vla_attention.capture.run.run_settings import RunSettings
 
 _FROM_ENVIRONMENT = "--from-environment"
 
@@ -49,7 +50,7 @@ def _main(program: str, argv: Sequence[str] | None) -> int:
     requeues = [0]
 
     def command(termination: Termination) -> int:
-        from vla_attention.capture.arguments import build_evaluate_parser
+        from vla_attention.capture.commands.arguments import build_evaluate_parser
 
         arguments = build_evaluate_parser(family, script).parse_args(_with_environment(given, family))
         requeues[0] = arguments.max_requeues
@@ -69,8 +70,6 @@ def _with_environment(given: Sequence[str], family: PolicyFamily) -> list[str]:
     """Return the arguments, with those of the batch scripts' variables in place of `--from-environment`."""
     if _FROM_ENVIRONMENT not in given:
         return list(given)
-    from vla_attention.capture.published.environment_variables import arguments_from_environment, describe_job
-
     line = describe_job(os.environ, socket.gethostname())
     if line:
         print(line, flush=True)
@@ -90,6 +89,9 @@ class _Job:
 
 def _evaluate(arguments: argparse.Namespace, script: PublishedScript, termination: Termination) -> int:
     threads = use_threads(arguments.threads)
+
+    from vla_attention.schemas.stores.store_place import check_writable
+
     jobs = _jobs(arguments)
     stage = arguments.stage or ("both" if arguments.array_index is None else "capture")
     if stage != "capture":
@@ -106,7 +108,7 @@ def _evaluate(arguments: argparse.Namespace, script: PublishedScript, terminatio
 def _jobs(arguments: argparse.Namespace) -> list[_Job]:
     from vla_attention.capture.environments.suites import ALL_SUITES, STANDARD_SUITES, SUITES
     from vla_attention.capture.jobs.slurm import array_task_ids
-    from vla_attention.capture.run_settings import run_settings
+    from vla_attention.capture.run.run_settings import run_settings
 
     existing = [*(suite.name for suite in SUITES), ALL_SUITES]
     if arguments.task_suite not in existing:
@@ -178,13 +180,15 @@ def _place(index: int, suites: Sequence[str]) -> tuple[str, int] | None:
 
 
 def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], threads: Threads, termination: Termination) -> None:
+    from vla_attention.schemas.stores.store_place import check_writable
+
     for job in jobs:
         check_writable(job.settings.store.parent, "--output-dir" if arguments.store is None else "--store")
 
-    from vla_attention.capture.capture_run import run_capture
-    from vla_attention.capture.device import load_torch
+    from vla_attention.capture.machine.device import load_torch
     from vla_attention.capture.rollout.episode_faults import EpisodesMissing
     from vla_attention.capture.rollout.progress import say
+    from vla_attention.capture.run.capture_run import run_capture
     from vla_attention.schemas.stores.damaged_episodes import DamagedEpisodesLeft
 
     say(threads.describe())
@@ -253,3 +257,102 @@ def _publish(source: Path, target: Path) -> None:
         temporary = place.with_name(f".{place.name}.{os.getpid()}.partial")
         shutil.copyfile(file, temporary)
         temporary.replace(place)
+
+
+#: Variable -> option, for variables that are passed on unchanged.
+_OPTIONS = {
+    "CONFIG_NAME": "--config-name",
+    "TASK_SUITE": "--task-suite",
+    "OUTPUT_DIR": "--output-dir",
+    "STORE": "--store",
+    "STAGE": "--stage",
+}
+_WHOLE_NUMBERS = {
+    "NUM_EPISODES": "--num-episodes",
+    "SEED": "--seed",
+    "REPLAN_STEPS": "--replan-steps",
+    "MAX_REQUEUES": "--max-requeues",
+}
+#: Variable, option, and what is expected.
+_SEVERAL_NUMBERS = (
+    ("TASK_ID", "--task-id", "a whole number, or several separated by spaces"),
+    ("LAYERS", "--layers", 'layer numbers separated by spaces, as in LAYERS="25 26 27"'),
+)
+_SWITCH = {"1": True, "true": True, "yes": True, "": False, "0": False, "false": False, "no": False}
+
+
+def arguments_from_environment(environment: Mapping[str, str], family: PolicyFamily) -> list[str]:
+    """Return the arguments for the batch scripts' variables. An empty variable counts as not set.
+
+    The heads of the scripts, `scripts/run_attention_ratio*.sh`, document the variables. Those of a single policy family
+    are in its `PublishedScript`.
+
+    Raises:
+        BadArgument: a variable has a value that it cannot have, or belongs to another family's script.
+    """
+    given = {name: value.strip() for name, value in environment.items()}
+    get = given.get
+    arguments: list[str] = []
+    for name, option in _OPTIONS.items():
+        if get(name):
+            arguments += [option, given[name]]
+    for name, option in _WHOLE_NUMBERS.items():
+        if get(name):
+            if not given[name].isdecimal():
+                raise BadArgument(f"{name} is '{given[name]}'; expected a whole number.")
+            arguments += [option, given[name]]
+    for name, option, described in _SEVERAL_NUMBERS:
+        numbers = given.get(name, "").split()
+        if not all(number.isdecimal() for number in numbers):
+            raise BadArgument(f"{name} is '{given[name]}'; expected {described}.")
+        if numbers:
+            arguments += [option, *numbers]
+    arguments += _family_arguments(given, family)
+    save_viz = _SWITCH.get(get("SAVE_VIZ", "").lower())
+    if save_viz is None:
+        raise BadArgument(f"SAVE_VIZ is '{given['SAVE_VIZ']}'; expected 1 or 0.")
+    if save_viz:
+        arguments += ["--save-viz"]
+    checkpoint = _checkpoint(given)
+    if checkpoint:
+        arguments += ["--checkpoint", checkpoint]
+    in_slurm, stage = bool(get("SLURM_JOB_ID")), get("STAGE")
+    if get("SLURM_ARRAY_TASK_ID") and stage != "analyze":
+        arguments += ["--array-index", given["SLURM_ARRAY_TASK_ID"]]
+    if get("DEVICE"):
+        arguments += ["--device", given["DEVICE"]]
+    elif in_slurm and stage != "analyze" and (not checkpoint or checkpoint not in family.built_in):
+        # A job without a GPU fails at once, instead of running on the CPU until its time is over.
+        arguments += ["--device", "cuda"]
+    try:
+        return [*arguments, *shlex.split(get("ARGS", ""))]
+    except ValueError as error:
+        raise BadArgument(f"ARGS is '{given['ARGS']}', which cannot be read as arguments: {error}.") from None
+
+
+def describe_job(environment: Mapping[str, str], host: str) -> str:
+    """Return the first line of a SLURM job's log; empty without SLURM."""
+    job = environment.get("SLURM_JOB_ID")
+    if not job:
+        return ""
+    array, index = environment.get("SLURM_ARRAY_JOB_ID"), environment.get("SLURM_ARRAY_TASK_ID")
+    name = f"{array}_{index}" if array and index else job
+    restarts = environment.get("SLURM_RESTART_COUNT", "0")
+    return f"Job {name} on {host}" + (f", requeued {restarts} times." if restarts != "0" else ".")
+
+
+def _family_arguments(given: Mapping[str, str], family: PolicyFamily) -> list[str]:
+    """Return the options of the family's own variables; `BadArgument` for a variable of another family."""
+    options = family.published.variables if family.published else {}
+    for other in policy_families():
+        for name in other.published.variables if other.published else {}:
+            if given.get(name) and name not in options:
+                raise BadArgument(f"{name} is for {other.title}, and means nothing to {family.title}; unset it.")
+    return [word for name, option in options.items() if given.get(name) for word in (option, given[name])]
+
+
+def _checkpoint(given: Mapping[str, str]) -> str:
+    one, other = given.get("CHECKPOINT", ""), given.get("CKPT_PATH", "")
+    if one and other and one != other:
+        raise BadArgument(f"CHECKPOINT is '{one}' and CKPT_PATH is '{other}'; give one of them.")
+    return one or other

@@ -1,4 +1,4 @@
-"""The attention function of all policies. It can pass its rows to a recorder.
+"""The attention function of all policies. It can pass its rows to a recorder, or to one for each call of a batch.
 
 A row is the post-softmax probability of one query over all keys of its site. Rows leave `attend` in float32, before the
 cast to the compute precision: probabilities rounded to bfloat16 sum to 1 only within 0.2 %.
@@ -7,6 +7,7 @@ cast to the compute precision: probabilities rounded to bfloat16 sum to 1 only w
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
@@ -162,3 +163,56 @@ class AttentionEditor(Protocol):
         tokens: the keys of the site that these tokens are at the denoise steps, (token,) int64.
         """
         ...
+
+
+@dataclass(frozen=True)
+class BatchCollector(RowCollector):
+    """Gives every member of a batch the rows and updates of its own call, as a batch of 1.
+
+    each: one collector per member, in the order of the batch. The projection is the same for all: its gate depends on
+    the denoise step only.
+    """
+
+    each: Sequence[RowCollector]
+
+    def begin_block(self, layer: int, denoise_step: int) -> None:
+        """Tell every member."""
+        for collector in self.each:
+            collector.begin_block(layer, denoise_step)
+
+    def sink(self, layer: int, denoise_step: int, action_queries: slice) -> RowSink | None:
+        """Return the function that shares out the rows of this call, or None if no member wants them."""
+        sinks = [collector.sink(layer, denoise_step, action_queries) for collector in self.each]
+        if all(sink is None for sink in sinks):
+            return None
+
+        def take(rows: Tensor) -> None:
+            for member, sink in enumerate(sinks):
+                if sink is not None:
+                    sink(rows[member : member + 1])
+
+        return take
+
+    def update_sink(self, layer: int, denoise_step: int, action_queries: slice) -> UpdateSink | None:
+        """Return the function that shares out the update of this call, or None if no member wants it."""
+        sinks = [collector.update_sink(layer, denoise_step, action_queries) for collector in self.each]
+        if all(sink is None for sink in sinks):
+            return None
+
+        def take(values: Tensor, project: Projection, update: Tensor) -> None:
+            for member, sink in enumerate(sinks):
+                if sink is not None:
+                    of_member = slice(member, member + 1)
+                    sink(values[of_member], project, update[of_member])
+
+        return take
+
+
+def split_heads(x: Tensor, head_dim: int) -> Tensor:
+    """Split (batch, token, head · dim) into (batch, head, token, dim)."""
+    return torch.unflatten(x, -1, (-1, head_dim)).transpose(1, 2)
+
+
+def join_heads(x: Tensor) -> Tensor:
+    """Join (batch, head, token, dim) into (batch, token, head · dim)."""
+    return x.transpose(1, 2).flatten(2)

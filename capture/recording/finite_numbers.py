@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from vla_attention.capture.recording.attention import RowCollector, RowSink
-from vla_attention.capture.store.recorded_rows import RecordedRows
+from vla_attention.capture.store.replan_records import RecordedRows
 from vla_attention.schemas.errors import UserError
 
 

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vla_attention.capture.recording.attention import PieceSink, RowCollector, RowSink, UpdateSink
-from vla_attention.capture.recording.call_contributions import CallContributions, Cell
+from vla_attention.capture.recording.call_contributions import CallContributions, Cell, KeyFacts
 from vla_attention.capture.recording.contributions import Projection
-from vla_attention.capture.recording.shared_contributions import KeyFacts
-from vla_attention.capture.store.recorded_rows import RecordedRows
+from vla_attention.capture.store.replan_records import RecordedRows
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.segments import segment_members, segments_of
@@ -278,8 +277,7 @@ class AttentionRecorder(RowCollector):
             moved = [array.numpy() for array in to_processor(self.on_device())]
         axes = (len(self.plan.layers), len(self.plan.denoise_steps))
         rows, *grams = (array.reshape(*axes, *array.shape[1:]) for array in moved)
-        sums = rows.sum(axis=-1, dtype=np.float64).astype(np.float32)
-        return RecordedRows(rows, sums, grams[0] if grams else None)
+        return RecordedRows.summed(rows, grams[0] if grams else None)
 
     def on_device(self) -> list[Tensor]:
         """Return the rows (cell, head, query, key) and, if recorded, the Gram matrices, where the model made them.
@@ -355,14 +353,14 @@ def _of_queries(tensor: Tensor, axis: int, queries: slice) -> Tensor:
 
 def to_processor(tensors: Sequence[Tensor]) -> list[Tensor]:
     """Return the tensors in the processor's memory: all that are on a GPU in one copy, through pinned memory."""
-    there = [tensor for tensor in tensors if tensor.device.type == "cuda"]
-    if not there:
+    on_gpu = [tensor for tensor in tensors if tensor.device.type == "cuda"]
+    if not on_gpu:
         return list(tensors)
-    packed = torch.cat([tensor.reshape(-1) for tensor in there])
+    packed = torch.cat([tensor.reshape(-1) for tensor in on_gpu])
     pinned = torch.empty(packed.shape, dtype=packed.dtype, pin_memory=True)
     pinned.copy_(packed, non_blocking=True)
     torch.cuda.current_stream(packed.device).synchronize()
-    moved = iter(torch.split(pinned, [tensor.numel() for tensor in there]))
+    moved = iter(torch.split(pinned, [tensor.numel() for tensor in on_gpu]))
     return [next(moved).view(tensor.shape) if tensor.device.type == "cuda" else tensor for tensor in tensors]
 
 
@@ -379,8 +377,8 @@ def make_recorders(
     """
     recorders: dict[str, AttentionRecorder] = {}
     for site in sites:
-        own = recording.of_site(site)
-        plan = RecordingPlan(own.layers, own.denoise_steps, own.heads, own.queries, site.name)
+        of_site = recording.of_site(site)
+        plan = RecordingPlan(of_site.layers, of_site.denoise_steps, of_site.heads, of_site.queries, site.name)
         roles = key_role[site.name]
         parts = segment_members(site, roles[None], segments_of(site, roles))[0] if recording.contributions else None
         recorders[site.name] = AttentionRecorder(plan, site.num_keys, parts, pools)

@@ -10,11 +10,11 @@ from vla_attention.capture.interventions.arguments import add_intervention_argum
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.policies.family import PolicyFamily
-from vla_attention.capture.policies.model_arguments import add_threads
+from vla_attention.capture.policies.model_arguments import POLICY_THREADS
 from vla_attention.capture.policies.robot import NONE
-from vla_attention.capture.recording_arguments import add_recording_arguments
+from vla_attention.capture.rollout.recording_arguments import add_recording_arguments
 from vla_attention.schemas.errors import BadArgument, listing
-from vla_attention.schemas.threads import use_threads
+from vla_attention.schemas.threads import add_threads, use_threads
 
 REPLAY_EXAMPLES = """\
   vla-capture replay data/so101_pick --checkpoint my/pi05_so101 --every 15 --episodes 0 1 2-5
@@ -41,7 +41,7 @@ def add_replay_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) 
     if of_file:
         group = parser.add_argument_group("model")
         group.add_argument("--device", default="auto", help="auto (default: a GPU if there is one), cpu, cuda ...")
-        add_threads(group)
+        add_threads(group, POLICY_THREADS)
     else:
         family.add_arguments(parser)
         parser.set_defaults(family=family)

@@ -20,8 +20,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.capture.replay.data_set_errors import DamagedDataSet, DataSetError, DataSetNotFound
-from vla_attention.capture.replay.data_tables import DataTable
+from vla_attention.capture.replay.data_tables import DamagedDataSet, DataSetError, DataSetNotFound, DataTable
 from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.limit_checks import TooLarge, check_at_most
@@ -350,7 +349,7 @@ def episodes_of_tables(folder: Path, paths: Paths) -> Episodes:
         _checked(path, parts["episode_index"][-1], parts["length"][-1])
         for names in _lists_of_texts(path, rows["tasks"]):
             tasks.add(names)
-    numbers = {name: np.concatenate(found) for name, found in parts.items()}
+    numbers = {name: np.concatenate(arrays) for name, arrays in parts.items()}
 
     def files_of(place: int) -> tuple[str, dict[str, VideoPlace]]:
         def path_of(what: str, video: str | None) -> str:

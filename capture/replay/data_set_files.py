@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vla_attention.capture.foreign_files.json_objects import read_object
+from vla_attention.capture.foreign_files.checked_files import read_object
 from vla_attention.capture.replay.data_set_episodes import (
     Episodes,
     Paths,
@@ -21,12 +21,7 @@ from vla_attention.capture.replay.data_set_episodes import (
     tasks_of_lines,
     tasks_of_table,
 )
-from vla_attention.capture.replay.data_set_errors import (
-    DamagedDataSet,
-    DataSetError,
-    DataSetNotFound,
-    UnsupportedDataSet,
-)
+from vla_attention.capture.replay.data_tables import DamagedDataSet, DataSetError, DataSetNotFound
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.limits import (
     ARRAY_AXES,
@@ -36,6 +31,15 @@ from vla_attention.schemas.limits import (
     PICTURE_PIXELS,
     PICTURE_SIDE,
 )
+
+
+class UnsupportedDataSet(DataSetError):
+    """A data set of another kind or version."""
+
+
+class UndecodableVideo(DataSetError):
+    """A video whose pictures cannot be decoded."""
+
 
 INFO = "meta/info.json"
 #: Versions with one file per episode, and those with several episodes per file.

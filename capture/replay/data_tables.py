@@ -15,9 +15,21 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.capture.foreign_files.parquet_files import ParquetFile, ParquetRefused
-from vla_attention.capture.replay.data_set_errors import DamagedDataSet, DataSetNotFound
-from vla_attention.schemas.errors import listing
+from vla_attention.schemas.errors import UserError, listing
 from vla_attention.schemas.regular_files import NotRegular
+
+
+class DataSetError(UserError, ValueError):
+    """A data set that cannot be used as it is."""
+
+
+class DataSetNotFound(DataSetError, FileNotFoundError):
+    """There is no data set, or a file of it is missing."""
+
+
+class DamagedDataSet(DataSetError):
+    """A file of a data set that cannot be read, or that contradicts the others."""
+
 
 #: The descriptor of stderr belongs to the whole process.
 _STDERR = threading.Lock()

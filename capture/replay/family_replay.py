@@ -3,24 +3,116 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import math
-from typing import cast
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Protocol, cast
 
-from vla_attention.capture.capture_run import plan_recording
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.capture.machine.provenance import describe_machine
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.identity import downloads_of
-from vla_attention.capture.policies.policy import camera_grid
-from vla_attention.capture.provenance import describe_machine
-from vla_attention.capture.replay.lerobot_dataset import LeRobotDataset
-from vla_attention.capture.replay.replay_episodes import Replay, replay_episode
-from vla_attention.capture.replay.replay_plan import ReplayPlan, announce, columns_of, record_episodes
-from vla_attention.capture.replay.robot_policy import RobotPolicy
+from vla_attention.capture.policies.policy import Policy, PolicyInput, camera_grid
+from vla_attention.capture.policies.robot import Robot
+from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, DataSetFrame, LeRobotDataset
+from vla_attention.capture.replay.replay_plan import (
+    BeforeCall,
+    ReplayPlan,
+    announce,
+    columns_of,
+    joined,
+    record_episodes,
+    success_of,
+)
 from vla_attention.capture.replay.video import decoder_version
+from vla_attention.capture.rollout.episode_loop import EpisodeJob, episode_start
+from vla_attention.capture.rollout.policy_call import record_call, replan_record
 from vla_attention.capture.rollout.progress import say
-from vla_attention.capture.run_settings import recording_settings
-from vla_attention.capture.store.store_writer import open_run
+from vla_attention.capture.rollout.recording_plan import plan_recording, recording_settings, root_attributes
+from vla_attention.capture.store.episode_writer import EpisodeWriter
+from vla_attention.capture.store.store_writer import RunStore, open_run
 from vla_attention.schemas.errors import listing
-from vla_attention.schemas.stores.store_format import FORMAT_NAME, STORE_VERSION, RootAttributes
+
+
+class RobotPolicy(Policy, Protocol):
+    """A policy of a family that reads data sets, built for the robot of one."""
+
+    @property
+    def robot(self) -> Robot:
+        """The columns that the policy reads."""
+
+    def prepare_robot(
+        self, pictures: Mapping[str, NDArray[np.uint8]], state: NDArray[np.float64], instruction: str
+    ) -> PolicyInput:
+        """Turn a frame into the model's input; pictures: column -> (height, width, 3) uint8."""
+
+
+@dataclass(frozen=True)
+class Replay:
+    """A policy on a data set.
+
+    every: a call at frame 0, every, 2 · every ... instruction: what the policy reads instead of the tasks; None: the
+    tasks. machine: provenance of this process.
+    """
+
+    policy: RobotPolicy
+    store: RunStore
+    every: int
+    seed: int
+    instruction: str | None
+    machine: Mapping[str, str]
+
+
+def replay_episode(replay: Replay, job: EpisodeJob, episode: DataSetEpisode, before_call: BeforeCall) -> Path:
+    """Make the policy calls of one episode, and commit them; returns its folder in the store.
+
+    The step of a replan is the number of its frame. The recorded actions of a replan are those from its frame on, as
+    many as the policy gives, fewer at the end of the episode. Whether the task was solved is not known unless the data
+    set has a column `next.success`.
+    """
+    policy, recording = replay.policy, replay.store.attributes.recording
+    state = joined(episode, policy.robot.state)
+    actions = joined(episode, policy.robot.actions) if policy.robot.actions else None
+    digest = hashlib.sha256(np.ascontiguousarray(state[0]).tobytes()).hexdigest()
+    start = episode_start(job.task, job.episode_index, replay.machine, state_digest=digest, objects=())
+    denoise_times = policy.denoise_times()[list(recording.denoise_steps)]
+    with replay.store.episode(start, np.asarray(denoise_times), job.size) as writer:
+        cameras = tuple(policy.robot.cameras.values())
+        for frame in episode.frames(replay.every, cameras):
+            before_call(len(writer.records))
+            _append_call(replay, writer, frame, job.task.task_id, state[frame.index], actions)
+        return writer.commit(success_of(episode), episode.length)
+
+
+def _append_call(
+    replay: Replay,
+    writer: EpisodeWriter,
+    frame: DataSetFrame,
+    task_id: int,
+    state: NDArray[np.float64],
+    actions: NDArray[np.float64] | None,
+) -> None:
+    policy, recording = replay.policy, replay.store.attributes.recording
+    instruction = frame.instruction if replay.instruction is None else replay.instruction
+    policy_input = policy.prepare_robot(frame.images, state, instruction)
+    seed = policy.replan_noise_seed(replay.seed, task_id, frame.episode, len(writer.records))
+    where = f"replan {len(writer.records)} (frame {frame.index}) of {writer.what}"
+    call = record_call(policy, policy_input, seed, recording, where)
+    writer.append(
+        replan_record(
+            policy_input,
+            call,
+            recording,
+            env_step=frame.index,
+            noise_seed=seed,
+            dataset_actions=None if actions is None else actions[frame.index : frame.index + policy.action_horizon],
+        )
+    )
 
 
 def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: str) -> int:
@@ -34,14 +126,12 @@ def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: 
     if note:
         say(note)
     every = plan.every or policy.default_replan_steps
-    attributes = RootAttributes(
-        format=FORMAT_NAME,
-        store_version=STORE_VERSION,
-        policy=policy.identity(),
-        protocol=plan.protocol(every),
-        recording=recording,
-        sites=policy.sites,
-        provenance=describe_machine(device) | downloads_of(policy) | plan.data.downloads | decoder_version(),
+    attributes = root_attributes(
+        policy.identity(),
+        policy.sites,
+        plan.protocol(every),
+        recording,
+        describe_machine(device) | downloads_of(policy) | plan.data.downloads | decoder_version(),
         data_set=plan.source(columns_of(robot.cameras, robot.state, robot.actions)),
     )
     store = open_run(plan.store, attributes, plan.mode)
@@ -50,7 +140,7 @@ def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: 
     if masked:
         say(f"Black and masked: {listing(masked)}.")
     replay = Replay(policy, store, every, plan.seed, plan.instruction, attributes.provenance)
-    return record_episodes(plan, todo, every, lambda episode, before: replay_episode(replay, episode, before))
+    return len(record_episodes(plan, store, todo, every, partial(replay_episode, replay)))
 
 
 def _picture_sizes(data: LeRobotDataset, policy: RobotPolicy) -> list[int]:

@@ -14,11 +14,20 @@ from vla_attention.capture.policies.policy import camera_grid
 from vla_attention.capture.policies.robot import NONE, RobotData
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode
 from vla_attention.capture.replay.policy_file import ReplayPolicy
-from vla_attention.capture.replay.replay_episodes import BeforeCall, joined, success_of, task_name, task_of
-from vla_attention.capture.replay.replay_plan import ReplayPlan, announce, columns_of, record_episodes
+from vla_attention.capture.replay.replay_plan import (
+    BeforeCall,
+    ReplayPlan,
+    announce,
+    columns_of,
+    joined,
+    record_episodes,
+    success_of,
+)
 from vla_attention.capture.replay.video import decoder_version
+from vla_attention.capture.rollout.episode_loop import EpisodeJob
 from vla_attention.capture.rollout.progress import say
-from vla_attention.capture.run_settings import recording_settings
+from vla_attention.capture.rollout.recording_plan import recording_settings
+from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.session import RecordedRun
 from vla_attention.schemas.errors import BadArgument
@@ -40,25 +49,23 @@ class FileReplay:
     state: tuple[str, ...]
     actions: tuple[str, ...]
 
-    def replay_episode(self, episode: DataSetEpisode, before_call: BeforeCall) -> None:
-        """Make the policy calls of one episode, and commit them."""
-        own = self.plan.instruction
-        instruction = episode.instructions[0] if own is None else own
+    def replay_episode(self, job: EpisodeJob, episode: DataSetEpisode, before_call: BeforeCall) -> Path:
+        """Make the policy calls of one episode, and commit them; returns its folder in the store."""
+        instruction, task = self.plan.instruction, job.task
         state = joined(episode, self.state) if self.state else None
         actions = joined(episode, self.actions) if self.actions else None
-        task = task_of(episode)
         # What the policy reads is not known of every policy: with no camera in the layout, all columns are decoded.
         columns = tuple(self.cameras.values()) or None
         with self.run.episode(
-            task_id=task,
-            episode_index=episode.index,
-            instruction=instruction,
-            task_name=task_name(instruction, task),
+            task_id=task.task_id,
+            episode_index=job.episode_index,
+            instruction=task.instruction,
+            task_name=task.name,
         ) as recorded:
             for number, frame in enumerate(episode.frames(self.every, columns)):
                 before_call(number)
-                frame = frame if own is None else replace(frame, instruction=own)
-                seed = noise_seed(self.seed, task, episode.index, number)
+                frame = frame if instruction is None else replace(frame, instruction=instruction)
+                seed = noise_seed(self.seed, task.task_id, episode.index, number)
                 torch.manual_seed(seed)
                 # With no number in the layout, as many recorded actions are kept as the policy gives.
                 last = frame.index + (self.given.layout.action_horizon or episode.length)
@@ -73,6 +80,8 @@ class FileReplay:
                     replan.actions = self.given.act(frame)
             recorded.success = success_of(episode)
             recorded.num_steps = episode.length
+        assert recorded.folder is not None  # an episode without a recorded call is an error
+        return recorded.folder
 
 
 def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: ReplayPolicy) -> int:
@@ -97,7 +106,7 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
         tokenizer=given.tokenizer,
         untrained=given.untrained,
         layers=settings.layers,
-        denoise_steps=[int(word) if word.isdigit() else word for word in settings.denoise_steps],
+        denoise_steps=settings.denoise_steps,
         heads=settings.heads,
         queries="mean" if settings.queries == "mean" else "all",
         bits=settings.mantissa_bits,
@@ -124,7 +133,8 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
         todo = announce(plan, run.attributes, layout.action_horizon, sizes)
         seed = plan.seed if interventions.noise is None else interventions.noise.seed
         replay = FileReplay(given, run, plan, every, seed, cameras, state, actions)
-        added = record_episodes(plan, todo, every, replay.replay_episode)
+        store = RunStore(plan.store, run.attributes)
+        added = len(record_episodes(plan, store, todo, every, replay.replay_episode))
     if run.num_dropped:
         say(f"In {run.num_dropped} policy calls no attention ran; they are not in the store.")
     if added:

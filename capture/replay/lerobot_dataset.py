@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.foreign_files.pictures import PictureRefused, decode_picture
 from vla_attention.capture.replay.data_set_episodes import EpisodeEntry
-from vla_attention.capture.replay.data_set_errors import DamagedDataSet, DataSetNotFound
 from vla_attention.capture.replay.data_set_files import INFO, META_FILES, DataSetInfo, Feature, read_info
-from vla_attention.capture.replay.data_tables import DataTable, stacked
+from vla_attention.capture.replay.data_tables import DamagedDataSet, DataSetNotFound, DataTable, stacked
 from vla_attention.capture.replay.video import VideoFile
 from vla_attention.schemas.errors import BadArgument, UnknownName, listing, unknown_name
 from vla_attention.schemas.limits import (

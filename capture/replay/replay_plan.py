@@ -4,42 +4,54 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from vla_attention.capture.command_line import check_writable
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.identity import announcement
 from vla_attention.capture.policies.robot import RobotData
-from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
-from vla_attention.capture.replay.chosen_episodes import chosen_episodes
 from vla_attention.capture.replay.data_set_files import INDEX_COLUMNS
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, LeRobotDataset, open_dataset
-from vla_attention.capture.replay.replay_episodes import EpisodeReplay, num_calls, task_of
 from vla_attention.capture.replay.video import import_av
-from vla_attention.capture.rerun.progress import RerunProgress
 from vla_attention.capture.rollout.episode_faults import Faults
+from vla_attention.capture.rollout.episode_loop import (
+    EpisodeJob,
+    EpisodeResult,
+    EpisodeSource,
+    OneByOneLoop,
+    StepReport,
+    plan_of,
+)
 from vla_attention.capture.rollout.progress import say
 from vla_attention.capture.store.disk_estimate import describe, estimate_disk
-from vla_attention.capture.store.episode_writer import ReplanRefused
-from vla_attention.capture.store.store_writer import WriteMode, refuse_existing
-from vla_attention.schemas.errors import BadArgument, listing
-from vla_attention.schemas.plurals import plural
+from vla_attention.capture.store.store_writer import RunStore, WriteMode, refuse_recorded
+from vla_attention.schemas.errors import BadArgument, listing, plural
+from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.damaged_episodes import find_damaged
 from vla_attention.schemas.stores.root import episode_folders
 from vla_attention.schemas.stores.store_format import (
-    EPISODES_GROUP,
     STORE_SUFFIX,
     DataSetSource,
     Protocol,
     RootAttributes,
-    StoreExists,
-    episode_name,
     parse_episode_name,
 )
-from vla_attention.schemas.stores.store_place import check_place
+from vla_attention.schemas.stores.store_place import check_place, check_writable
+
+#: The column that says of every frame whether the task is solved, where a data set has it.
+SUCCESS_COLUMN = "next.success"
+
+#: Called before every policy call with the number of calls done; an exception that it raises drops the episode.
+BeforeCall = Callable[[int], None]
+#: Makes the policy calls of an episode and commits them; returns its folder.
+EpisodeReplay = Callable[[EpisodeJob, DataSetEpisode, BeforeCall], Path]
 
 
 @dataclass(frozen=True)
@@ -79,6 +91,15 @@ class ReplayPlan:
         info = self.data.info
         return DataSetSource(self.data.name, info.version, info.fps, info.robot_type, self.data.digest, dict(columns))
 
+    def job(self, index: int, every: int) -> EpisodeJob:
+        """Return what is to be recorded of an episode. Its task is that of its first frame."""
+        episode = self.data.episode(index)
+        task_id = int(episode.task_indices[0])
+        instruction = self.data.tasks[task_id] if self.instruction is None else self.instruction
+        name = re.sub(r"\W+", "_", instruction.strip()).strip("_")[:60] or f"task_{task_id}"
+        task = Task(suite_of(self.data), task_id, name, instruction, num_initial_states=0)
+        return EpisodeJob(task, index, self.calls(index, every), f"episode {index}")
+
     def calls(self, index: int, every: int) -> int:
         """Return the number of policy calls of an episode."""
         return num_calls(self.data.entry(index).length, every)
@@ -104,8 +125,8 @@ def plan_replay(arguments: argparse.Namespace, termination: Termination) -> Repl
     check_place(store, "write a store at")
     mode: WriteMode = "overwrite" if arguments.overwrite else "resume" if arguments.resume else "new"
     # An existing store or an unwritable place is an error now, before the minutes for loading a model.
-    if mode == "new" and store.exists():
-        refuse_existing(store)
+    if mode == "new":
+        refuse_recorded(store)
     check_writable(store.parent, "--store")
     return ReplayPlan(
         data=data,
@@ -202,49 +223,90 @@ def announce(
     return todo
 
 
-def record_episodes(plan: ReplayPlan, todo: Sequence[int], every: int, replay: EpisodeReplay) -> int:
-    """Make the calls of the episodes; returns how many were added. One with a fault is left out, and noted in the plan.
+@dataclass(frozen=True)
+class FramesSource(EpisodeSource):
+    """The policy's calls on the frames of a data set. replay: makes those of an episode, and commits them."""
+
+    plan: ReplayPlan
+    every: int
+    replay: EpisodeReplay
+
+    def record(self, job: EpisodeJob, report: StepReport) -> EpisodeResult:
+        """Make the policy calls of an episode and commit them."""
+        episode = self.plan.data.episode(job.episode_index)
+
+        def before_call(done: int) -> None:
+            self.plan.termination.check()
+            report(done, done)
+
+        folder = self.replay(job, episode, before_call)
+        return EpisodeResult(job.task.task_id, job.episode_index, success_of(episode), episode.length, job.size, folder)
+
+
+def record_episodes(
+    plan: ReplayPlan, store: RunStore, todo: Sequence[int], every: int, replay: EpisodeReplay
+) -> list[EpisodeResult]:
+    """Make the calls of the episodes; returns those that were added. The plan notes those that a fault left out.
 
     Raises:
         Terminated: SIGTERM was received; the episode in progress was dropped.
     """
-    progress = RerunProgress(len(todo), sum(plan.calls(index, every) for index in todo))
-    added = 0
-    try:
+    if not todo:
+        return []
+    jobs = []
+    with progress_bar(len(todo), "episodes") as advance:
         for index in todo:
-            plan.termination.check()
-            episode = plan.data.episode(index)
-            # Another process may run the same command, and have committed the episode meanwhile.
-            if (plan.store / EPISODES_GROUP / episode_name(task_of(episode), index)).is_dir():
-                continue
-            progress.begin(f"episode {index}")
-            again = True
-            while again:
-                again = False
-                try:
-                    with plan.termination.only_at_checks():
-                        added += _record_one(plan, episode, every, replay, progress)
-                except (NumbersNotFinite, ReplanRefused) as error:
-                    again = plan.faults.note(episode_name(task_of(episode), index), error)
-                    what_next = "It begins again." if again else "It is left out."
-                    progress.say(f"episode {index}: {error} {what_next}")
-            progress.end(plan.calls(index, every))
-    finally:
-        progress.close()
-    return added
+            jobs.append(plan.job(index, every))
+            advance(1)
+    loop = OneByOneLoop(store, plan_of(jobs), plan.termination, "call", FramesSource(plan, every, replay))
+    results = loop.record_all(jobs)
+    plan.faults.dropped.update(loop.faults.dropped)
+    return results
 
 
-def _record_one(
-    plan: ReplayPlan, episode: DataSetEpisode, every: int, replay: EpisodeReplay, progress: RerunProgress
-) -> int:
-    calls = plan.calls(episode.index, every)
+def chosen_episodes(data: LeRobotDataset, words: Sequence[str] | None, limit: int | None) -> tuple[int, ...]:
+    """Return the numbers of episodes, in their order.
 
-    def before_call(done: int) -> None:
-        plan.termination.check()
-        progress.update(done, calls)
+    Args:
+        data: the data set.
+        words: numbers and ranges (`3-7`, both ends included); None for all.
+        limit: so many at most, the first ones; None for all.
 
-    try:
-        replay(episode, before_call)
-    except StoreExists:
-        return 0
-    return 1
+    Raises:
+        UnknownName: an episode does not exist.
+        BadArgument: a word is no number and no range, or nothing is left.
+    """
+    chosen: set[int] = set()
+    for word in words if words is not None else ():
+        match = re.fullmatch(r"(\d+)(?:-(\d+))?", word)
+        if match is None or int(match[2] or match[1]) < int(match[1]):
+            raise BadArgument(f"Cannot use --episodes {word}; expected a number, or a range as 3-7.")
+        first, last = int(match[1]), int(match[2] or match[1])
+        data.entry(first)
+        data.entry(last)  # before a long range is counted
+        chosen.update(range(first, last + 1))
+    if words is None:
+        chosen = set(data.info.episodes)
+    if limit is not None and limit < 1:
+        raise BadArgument(f"Cannot use --num-episodes {limit}; expected at least 1.")
+    numbers = tuple(data.entry(index).index for index in sorted(chosen)[:limit])
+    if not numbers:
+        raise BadArgument(f"The data set '{data.name}' has no episodes.")
+    return numbers
+
+
+def num_calls(length: int, every: int) -> int:
+    """Return the number of policy calls of an episode of so many frames."""
+    return -(-length // every)
+
+
+def joined(episode: DataSetEpisode, columns: tuple[str, ...]) -> NDArray[np.float64]:
+    """Return columns of numbers side by side, (frame, number)."""
+    return np.concatenate([episode.column(name) for name in columns], axis=1)
+
+
+def success_of(episode: DataSetEpisode) -> bool | None:
+    """Return whether the task was solved at some frame; None if the data set has no such column."""
+    if SUCCESS_COLUMN not in episode.dataset.features:
+        return None
+    return bool(episode.column(SUCCESS_COLUMN).any())

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.foreign_files.mp4_files import Mp4Refused, check_mp4
-from vla_attention.capture.replay.data_set_errors import DamagedDataSet, DataSetNotFound, UndecodableVideo
+from vla_attention.capture.replay.data_set_files import UndecodableVideo
+from vla_attention.capture.replay.data_tables import DamagedDataSet, DataSetNotFound
 from vla_attention.schemas.errors import MissingDependency
 from vla_attention.schemas.limits import PICTURE_PIXELS, PICTURE_SIDE, VIDEO_EARLIER_KEYS, VIDEO_FRAMES
 

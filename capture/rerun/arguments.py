@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from vla_attention.capture.interventions.arguments import add_intervention_arguments
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import family_of_kind
-from vla_attention.capture.recording_arguments import add_recording_arguments
+from vla_attention.capture.rollout.recording_arguments import add_recording_arguments
 from vla_attention.schemas.errors import BadArgument, UnknownName, UserError
 from vla_attention.schemas.threads import use_threads
 

@@ -1,18 +1,26 @@
-"""The store whose policy calls are made again: which of its episodes, and what forbids it."""
+"""The store whose policy calls are made again: which of its episodes, by which policy, and what forbids it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
+from vla_attention.capture.machine.provenance import POLICY_BATCH
 from vla_attention.capture.rerun.stored_calls import StoreWithoutInputs
-from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.errors import BadArgument, UserError, listing
 from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.stores.damaged_episodes import look_at
 from vla_attention.schemas.stores.reader import Store, open_store
-from vla_attention.schemas.stores.store_format import CorruptEpisode, StoreError, parse_episode_name
+from vla_attention.schemas.stores.store_format import (
+    CorruptEpisode,
+    PolicyIdentity,
+    RootAttributes,
+    StoreError,
+    parse_episode_name,
+)
 
 
 def open_base(path: Path, task_ids: Sequence[int] | None = None, num_episodes: int | None = None) -> Store:
@@ -62,23 +70,75 @@ def instructions_of(store: Store) -> dict[int, str]:
     Also of tasks that `open_base` was not asked for: the prompt of another task is one. Of those, damaged episodes are
     left out, which are not run again.
     """
-    found = {episode.attributes.task_id: episode.attributes.instruction for episode in store.episodes}
+    instructions = {episode.attributes.task_id: episode.attributes.instruction for episode in store.episodes}
     for episode in open_store(store.path).episodes:
         task_id, _ = parse_episode_name(episode.name)
-        if task_id not in found:
+        if task_id not in instructions:
             with suppress(CorruptEpisode):
-                found[task_id] = episode.attributes.instruction
-    return found
+                instructions[task_id] = episode.attributes.instruction
+    return instructions
 
 
 def check_may_change(store: Store, interventions: Interventions) -> None:
     """Raise `StoreError` for interventions on a store whose own run had some already."""
-    own = store.attributes.interventions
-    if own.is_none or interventions.is_none:
+    stored = store.attributes.interventions
+    if stored.is_none or interventions.is_none:
         return
     source = store.attributes.rerun_of
     base = f"; its base is {source.name}" if source is not None else ""
     raise StoreError(
         f"Cannot change the policy calls of {store.path} once more: its run had interventions already "
-        f"({own.describe()}){base}; give a store without interventions."
+        f"({stored.describe()}){base}; give a store without interventions."
     )
+
+
+#: Fields of a policy's identity that name places, or where a configuration came from; they decide no number.
+_PLACES = ("name", "checkpoint", "config.configuration", "config.text_encoder")
+
+
+class OtherPolicy(UserError, ValueError):
+    """The policy is another one than that of the store."""
+
+
+def check_same_policy(store: Store, identity: PolicyIdentity, sites: object) -> None:
+    """Raise `OtherPolicy` unless weights, configuration and layout are those of the store.
+
+    Facts that a later version of this program added to the configuration are not in the store, and are not compared.
+    """
+    root: RootAttributes = store.attributes
+    stored = root.policy
+    if identity.digest != stored.digest:
+        raise OtherPolicy(
+            f"Cannot rerun {store.path}: its weights have the digest {stored.digest[:12]} ({stored.name}: "
+            f"{stored.checkpoint}), and those of '{identity.checkpoint}' have {identity.digest[:12]}; give the "
+            "--checkpoint that was captured."
+        )
+    difference = _first_difference(to_json(stored), to_json(identity), "")
+    if difference is None and to_json(root.sites) != to_json(sites):
+        difference = "sites", "the one", "another"
+    if difference is not None:
+        where, old, new = difference
+        raise OtherPolicy(
+            f"Cannot rerun {store.path}: its policy has the {where} {old!r}, and this one has {new!r}; give the model "
+            "options of the capture."
+        )
+
+
+def _first_difference(old: object, new: object, where: str) -> tuple[str, object, object] | None:
+    if where in _PLACES:
+        return None
+    if isinstance(old, Mapping) and isinstance(new, Mapping):
+        for key, value in old.items():
+            difference = _first_difference(value, new.get(key), f"{where}.{key}".lstrip("."))
+            if difference:
+                return difference
+        return None
+    return None if old == new else (where, old, new)
+
+
+def machine_differences(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """Return what differs between the machine of an episode and this one, as `torch 2.9 then, 2.10 now`."""
+    single = {POLICY_BATCH: "1"}
+    then, now = single | dict(then), single | dict(now)
+    facts = [name for name in then if name in now and then[name] != now[name]]
+    return [f"{name} {then[name]} then, {now[name]} now" for name in facts]

@@ -5,29 +5,26 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vla_attention.capture.capture_run import plan_recording
-from vla_attention.capture.command_line import check_writable
-from vla_attention.capture.device import load_torch
 from vla_attention.capture.interventions.resolution import check_not_compiled, check_places, interventions_for
 from vla_attention.capture.jobs.termination import Termination
+from vla_attention.capture.machine.device import load_torch
+from vla_attention.capture.machine.provenance import describe_machine
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.identity import downloads_of
-from vla_attention.capture.provenance import describe_machine
-from vla_attention.capture.rerun.base_store import check_may_change, open_base
+from vla_attention.capture.rerun.base_store import check_may_change, check_same_policy, open_base
 from vla_attention.capture.rerun.interventions_of_rerun import check_on_store, rerun_interventions
 from vla_attention.capture.rerun.rerun_store import Rerun
-from vla_attention.capture.rerun.same_policy import check_same_policy
-from vla_attention.capture.rerun.series_run import SeriesRun
+from vla_attention.capture.rerun.series import SeriesRun
 from vla_attention.capture.rerun.stored_calls import check_has_inputs
 from vla_attention.capture.rollout.progress import say
-from vla_attention.capture.run_settings import recording_settings
-from vla_attention.capture.store.store_writer import WriteMode, refuse_existing
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.capture.rollout.recording_plan import plan_recording, recording_settings
+from vla_attention.capture.store.store_writer import WriteMode, refuse_recorded
+from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.interventions import Interventions
-from vla_attention.schemas.plurals import plural
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.reader import Store
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX
+from vla_attention.schemas.stores.store_place import check_writable
 from vla_attention.schemas.stores.store_url import local_path
 from vla_attention.schemas.threads import Threads
 
@@ -56,8 +53,8 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
     target = _target(arguments, base, interventions)
     mode: WriteMode = "overwrite" if arguments.overwrite else "resume" if arguments.resume else "new"
     if target is not None:
-        if mode == "new" and target.exists():
-            refuse_existing(target)
+        if mode == "new":
+            refuse_recorded(target)
         check_writable(target.parent, "--store")
     for line in nothing_changes:
         say(line)

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.policies.policy import PolicyInput
-from vla_attention.capture.rerun.calls import Repeater
-from vla_attention.capture.rerun.same_policy import machine_differences
-from vla_attention.capture.rerun.stored_calls import StoredCalls
+from vla_attention.capture.rerun.base_store import machine_differences
+from vla_attention.capture.rerun.stored_calls import Repeater, StoredCalls
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, round_mantissa
 from vla_attention.schemas.stores.store_format import Recording, StoreError

@@ -1,36 +1,132 @@
-"""One rerun of a store: the policy is loaded, and the stored calls are made again into other stores."""
+"""One rerun of a store: the policy is loaded, and the stored calls are made again into stores like any other."""
 
 from __future__ import annotations
 
-import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
+from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.policy import Policy, stored_picture_sizes
 from vla_attention.capture.rerun.base_store import instructions_of
-from vla_attention.capture.rerun.calls import Repeater
 from vla_attention.capture.rerun.fidelity import check_fidelity
-from vla_attention.capture.rerun.progress import RerunProgress
-from vla_attention.capture.rerun.rerun_episodes import rerun_episodes
-from vla_attention.capture.rerun.stored_calls import read_calls
+from vla_attention.capture.rerun.stored_calls import Repeater, read_calls
 from vla_attention.capture.rollout.episode_faults import Faults
-from vla_attention.capture.rollout.progress import say
+from vla_attention.capture.rollout.episode_loop import (
+    EpisodeJob,
+    EpisodeResult,
+    EpisodeSource,
+    OneByOneLoop,
+    StepReport,
+    episode_start,
+    plan_of,
+)
+from vla_attention.capture.rollout.policy_call import replan_record
+from vla_attention.capture.rollout.progress import Progress, say
+from vla_attention.capture.rollout.recording_plan import root_attributes
 from vla_attention.capture.store.disk_estimate import describe, estimate_disk
-from vla_attention.capture.store.store_writer import WriteMode, open_run
-from vla_attention.schemas.errors import UserError
+from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run, remove_without_episodes
 from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import (
-    FORMAT_NAME,
-    STORE_VERSION,
+    CorruptEpisode,
     Recording,
     RootAttributes,
-    parse_episode_name,
+    StoreError,
 )
+
+
+class BaseDamaged(StoreError):
+    """An episode of the store whose calls are made again is damaged: another attempt would find the same."""
+
+
+def job_of(base: Store, episode: StoredEpisode) -> EpisodeJob:
+    """Return what is to be recorded of a stored episode."""
+    attributes = episode.attributes
+    task = Task(
+        suite=base.attributes.protocol.suite,
+        task_id=attributes.task_id,
+        name=attributes.task_name,
+        instruction=attributes.instruction,
+        num_initial_states=0,
+        task_family=attributes.task_family,
+    )
+    return EpisodeJob(task, attributes.episode_index, attributes.num_replans, episode.name)
+
+
+@dataclass(frozen=True)
+class StoredCallsSource(EpisodeSource):
+    """The policy calls of a store's episodes, made again.
+
+    episodes: by their names. machine: provenance that is stored with every episode.
+    """
+
+    repeater: Repeater
+    store: RunStore
+    episodes: Mapping[str, StoredEpisode]
+    machine: Mapping[str, str]
+    termination: Termination
+
+    def record(self, job: EpisodeJob, report: StepReport) -> EpisodeResult:
+        """Rerun an episode and commit it.
+
+        Outcome, number of steps, environment steps and object coverage are those of the stored episode: nothing is
+        executed. With interventions the stored actions are kept beside the changed ones, to know the base by them.
+        """
+        with _reading_the_base():
+            calls = read_calls(self.episodes[job.name])
+        attributes, recording, repeater = calls.attributes, self.store.attributes.recording, self.repeater
+        start = episode_start(
+            job.task,
+            job.episode_index,
+            self.machine,
+            state_digest=attributes.initial_state_digest,
+            objects=attributes.objects,
+            state_index=attributes.initial_state_index,
+        )
+        denoise_times = repeater.policy.denoise_times()[list(recording.denoise_steps)]
+        with self.store.episode(start, np.asarray(denoise_times), calls.num_replans) as writer:
+            for replan in range(calls.num_replans):
+                self.termination.check()
+                with _reading_the_base():
+                    policy_input = repeater.prepare(calls, replan)
+                writer.append(
+                    replan_record(
+                        policy_input,
+                        repeater.call(calls, replan, policy_input),
+                        recording,
+                        env_step=int(calls.env_step[replan]),
+                        noise_seed=repeater.noise_seed(calls, replan),
+                        coverage=calls.coverage_of(replan),
+                        dataset_actions=calls.dataset_actions_of(replan),
+                        base_actions=None if self.store.attributes.interventions.is_none else calls.actions[replan],
+                    )
+                )
+                report(replan + 1, replan + 1)
+            folder = writer.commit(attributes.success, attributes.num_steps)
+        return EpisodeResult(
+            job.task.task_id,
+            job.episode_index,
+            attributes.success,
+            attributes.num_steps,
+            calls.num_replans,
+            folder,
+        )
+
+
+@contextmanager
+def _reading_the_base() -> Iterator[None]:
+    try:
+        yield
+    except CorruptEpisode as error:
+        raise BaseDamaged(str(error)) from error
+
 
 #: Which episodes a rerun takes.
 EpisodeFilter = Callable[[StoredEpisode], bool]
@@ -61,8 +157,8 @@ class Rerun:
 
         Its changes of prompt, pictures and noise are in what the calls were given.
         """
-        own = replace(self.base.attributes.interventions, prompt=None, images=(), noise=None)
-        return Repeater(self.policy, self.recording, own, self.instructions, allow_empty=True)
+        of_attention = replace(self.base.attributes.interventions, prompt=None, images=(), noise=None)
+        return Repeater(self.policy, self.recording, of_attention, self.instructions, allow_empty=True)
 
     def check(self, limit: int | None) -> float | None:
         """Make calls of the first episode again as they were, and print how far they are from the stored ones.
@@ -74,19 +170,20 @@ class Rerun:
             return None
         calls = read_calls(self.base.episodes[0])
         count = calls.num_replans if limit is None else min(limit, calls.num_replans)
-        progress, begun_at = RerunProgress(1, count), time.monotonic()
-        progress.begin(calls.episode.name)
+        progress, begun_at = Progress(1, count, "call"), time.monotonic()
+        episode = progress.begin(calls.episode.name, count)
 
         def report(done: int) -> None:
             self.termination.check()
-            progress.update(done, count)
+            episode.update(done, done)
 
         try:
             recording = self.base.attributes.recording
             result = check_fidelity(self.unchanged, recording, calls, count, self.machine, report)
         finally:
             progress.close()
-        say(result.describe())
+        for line in result.describe().splitlines():
+            say(line)
         return (time.monotonic() - begun_at) / count
 
     def write(
@@ -113,33 +210,30 @@ class Rerun:
             StoreExists: something is at `target` and the mode is `new`.
             RunMismatch: the mode is `resume`, and the store there is of another rerun.
         """
-        own, is_new = self.base.attributes.interventions, not target.exists()
-        store = open_run(target, self._attributes(own if interventions.is_none else interventions), mode)
-        done = store.committed()
-        episodes = [episode for episode in self.base.episodes if wanted(episode)]
-        todo = [episode for episode in episodes if parse_episode_name(episode.name) not in done]
-        if len(todo) < len(episodes):
-            say(f"{len(episodes) - len(todo)} of {len(episodes)} episodes are complete already; {len(todo)} to run.")
+        of_base, is_new = self.base.attributes.interventions, not target.exists()
+        store = open_run(target, self._attributes(of_base if interventions.is_none else interventions), mode)
+        episodes = {episode.name: episode for episode in self.base.episodes if wanted(episode)}
+        jobs = [job_of(self.base, episode) for episode in episodes.values()]
+        todo = [job for job in jobs if not store.has(job.task.task_id, job.episode_index)]
+        if len(todo) < len(jobs):
+            say(f"{len(jobs) - len(todo)} of {len(jobs)} episodes are complete already; {len(todo)} to run.")
+        if not todo:
+            return 0
         repeater = self.unchanged
         if not interventions.is_none:
             repeater = Repeater(self.policy, self.recording, interventions, self.instructions, allow_empty)
-        progress = RerunProgress(len(todo), sum(episode.attributes.num_replans for episode in todo))
+        source = StoredCallsSource(repeater, store, episodes, self.machine, self.termination)
+        loop = OneByOneLoop(store, plan_of(jobs), self.termination, "call", source)
         try:
-            faults = Faults()
-            added = rerun_episodes(repeater, store, todo, self.machine, progress, self.termination, faults)
-        except UserError:
-            if is_new and not store.committed():
-                shutil.rmtree(store.path)
-            raise
+            loop.record_all(todo)
         finally:
-            progress.close()
-        self.faults.dropped.update({f"{name} of {target}": fault for name, fault in faults.dropped.items()})
-        if faults.dropped and is_new and not store.committed():
-            shutil.rmtree(store.path)
+            if is_new:
+                remove_without_episodes(store.path)
+        self.faults.dropped.update({f"{name} of {target}": fault for name, fault in loop.faults.dropped.items()})
         # With the stored prompts this was said before the first call.
         if interventions.prompt is not None and (line := repeater.attention.describe_empty()):
             say(line)
-        return added
+        return len(loop.results)
 
     def describe_disk(self, target: Path, replans: Sequence[int]) -> str:
         """Return the line about the disk space of reruns of episodes with so many policy calls."""
@@ -149,14 +243,12 @@ class Rerun:
 
     def _attributes(self, interventions: Interventions) -> RootAttributes:
         base = self.base
-        return RootAttributes(
-            format=FORMAT_NAME,
-            store_version=STORE_VERSION,
-            policy=self.policy.identity(),
-            protocol=base.attributes.protocol,
-            recording=self.recording,
-            sites=self.policy.sites,
-            provenance=dict(self.machine),
+        return root_attributes(
+            self.policy.identity(),
+            self.policy.sites,
+            base.attributes.protocol,
+            self.recording,
+            self.machine,
             interventions=interventions,
             rerun_of=RerunSource(run=base.run, name=base.path.name),
             data_set=base.attributes.data_set,

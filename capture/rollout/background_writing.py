@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord, ReplanRefused
+from vla_attention.capture.store.episode_writer import EpisodeWriter, ReplanRefused
+from vla_attention.capture.store.replan_records import EpisodeStart, ReplanRecord
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.stores.store_format import CorruptEpisode, StoreExists
 

@@ -6,9 +6,7 @@ The simulator may be in this process (`record_episode`) or in another one (`pipe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Protocol as Interface
 
 import numpy as np
@@ -19,29 +17,15 @@ from vla_attention.capture.interventions.changed_inputs import CallContext, chan
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.policies.policy import Policy, camera_grid
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
+from vla_attention.capture.rollout.episode_loop import EpisodeResult, StepReport, episode_start
 from vla_attention.capture.rollout.observation_checks import ObservationChecks
 from vla_attention.capture.rollout.policy_call import PreparedCall, RecordedCall, record_calls, replan_record
 from vla_attention.capture.rollout.simulation import Advanced, Begun, CameraPatches, Seen, Simulation, StopCheck
-from vla_attention.capture.store.episode_writer import EpisodeStart, ReplanRecord
+from vla_attention.capture.store.replan_records import EpisodeStart, ReplanRecord
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.stores.store_format import Protocol, episode_name
-
-#: Called after the actions of each replan with (environment steps done, replans done).
-StepReport = Callable[[int, int], None]
-
-
-@dataclass(frozen=True)
-class EpisodeResult:
-    """How an episode ended, and its folder in the store."""
-
-    task_id: int
-    episode_index: int
-    success: bool
-    num_steps: int
-    num_replans: int
-    folder: Path
 
 
 def max_replans(protocol: Protocol) -> int:
@@ -89,18 +73,10 @@ def episode_title(store: RunStore, task: Task, episode_index: int) -> str:
     return f"episode {episode_name(task.task_id, episode_index)} of {store.path}"
 
 
-def episode_start(run: EpisodeRun, task: Task, episode_index: int, begun: Begun) -> EpisodeStart:
-    """Return what is known of an episode before its first replan."""
-    return EpisodeStart(
-        task_id=task.task_id,
-        task_name=task.name,
-        instruction=task.instruction,
-        episode_index=episode_index,
-        initial_state_index=episode_index,
-        initial_state_digest=begun.initial_state_digest,
-        objects=begun.objects,
-        provenance=run.machine,
-        task_family=task.task_family,
+def simulated_start(run: EpisodeRun, task: Task, episode_index: int, begun: Begun) -> EpisodeStart:
+    """Return what is known of an episode of a simulator before its first replan."""
+    return episode_start(
+        task, episode_index, run.machine, state_digest=begun.initial_state_digest, objects=begun.objects
     )
 
 
@@ -206,7 +182,7 @@ def record_episode(
     store, protocol = run.store, run.store.attributes.protocol
     simulation = Simulation(environment, protocol, policy_cameras(run.policy), run.check)
     begun = simulation.begin(episode_index, episode_title(store, task, episode_index))
-    start = episode_start(run, task, episode_index, begun)
+    start = simulated_start(run, task, episode_index, begun)
     with store.episode(start, recorded_times(run), max_replans(protocol)) as writer:
         recording, result = EpisodeRecording(run, task, start), simulation.wait()
         while not recording.ended:

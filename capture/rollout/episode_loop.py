@@ -1,61 +1,148 @@
 """The loop over episodes: it claims, records and commits one after another. SIGTERM drops the unfinished one.
 
-A fault of one episode (`episode_faults.py`) drops that episode; the loop goes on with the others.
+Where the policy calls of an episode come from is the source's: a simulator (`simulator_source.py`), the calls of a
+store (`rerun/`), the frames of a data set (`replay/`). A fault of one episode (`episode_faults.py`) drops that episode;
+the loop goes on with the others.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
-from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Suite, Task
-from vla_attention.capture.environments.suites import make_environment
+import torch
+
+from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Terminated, Termination
-from vla_attention.capture.jobs.worker_records import RecordWriter
-from vla_attention.capture.rollout.episode import EpisodeResult, EpisodeRun, episode_title, record_episode
+from vla_attention.capture.jobs.worker_records import PlannedTask, RecordWriter
 from vla_attention.capture.rollout.episode_faults import EPISODE_FAULTS, Faults, MachineBroken
-from vla_attention.capture.rollout.progress import EpisodeProgress, Progress
-from vla_attention.capture.rollout.simulation import SimulationFailed, naming_the_simulator
+from vla_attention.capture.rollout.progress import EpisodeProgress, Progress, Unit
+from vla_attention.capture.store.replan_records import EpisodeStart
+from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.command_line import format_bytes
-from vla_attention.schemas.errors import listing
-from vla_attention.schemas.plurals import plural
+from vla_attention.schemas.errors import listing, plural
+from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.stores.claims import Claims, Holder
 from vla_attention.schemas.stores.store_format import StoreExists, episode_name
-from vla_attention.schemas.stores.worker import Worker
-
-#: A task and the index of one of its episodes.
-TaskEpisode = tuple[Task, int]
+from vla_attention.schemas.stores.worker import this_worker
 
 #: Seconds between two looks for an episode that another process is writing.
 _LOOK_EVERY_S = 5.0
 
 
+@dataclass(frozen=True)
+class EpisodeJob:
+    """An episode that is to be recorded. size: most units of it, for the progress; title: its name there."""
+
+    task: Task
+    episode_index: int
+    size: int
+    title: str
+
+    @property
+    def name(self) -> str:
+        """The episode's name in the store."""
+        return episode_name(self.task.task_id, self.episode_index)
+
+
+def episode_start(
+    task: Task,
+    episode_index: int,
+    machine: Mapping[str, str],
+    *,
+    state_digest: str,
+    objects: tuple[SceneObject, ...],
+    state_index: int | None = None,
+) -> EpisodeStart:
+    """Return what is known of an episode before its first replan.
+
+    machine: provenance of this process. state_digest, state_index: of the initial state, whose index is the episode's
+    where none is given.
+    """
+    return EpisodeStart(
+        task_id=task.task_id,
+        task_name=task.name,
+        instruction=task.instruction,
+        episode_index=episode_index,
+        initial_state_index=episode_index if state_index is None else state_index,
+        initial_state_digest=state_digest,
+        objects=objects,
+        provenance=dict(machine),
+        task_family=task.task_family,
+    )
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """How an episode ended, and its folder in the store. success: None where it is not known."""
+
+    task_id: int
+    episode_index: int
+    success: bool | None
+    num_steps: int
+    num_replans: int
+    folder: Path
+
+
+#: Called after each replan with (units of the episode done, replans done).
+StepReport = Callable[[int, int], None]
+
+
+class EpisodeSource(ABC):
+    """Where the policy calls of episodes come from."""
+
+    def begin(self, job: EpisodeJob) -> str | None:  # noqa: B027
+        """Make ready for an episode; returns a line to print."""
+
+    @abstractmethod
+    def record(self, job: EpisodeJob, report: StepReport) -> EpisodeResult:
+        """Make the calls of an episode, and commit it. An exception drops it."""
+
+    def close(self) -> None:  # noqa: B027
+        """Free what was made ready."""
+
+
+def plan_of(jobs: Sequence[EpisodeJob]) -> tuple[PlannedTask, ...]:
+    """Return the tasks of the jobs with the indices of their episodes, for the records of workers."""
+    indices: dict[int, set[int]] = {}
+    for job in jobs:
+        indices.setdefault(job.task.task_id, set()).add(job.episode_index)
+    tasks = {job.task.task_id: job.task for job in reversed(jobs)}
+    return tuple(
+        PlannedTask.of_episodes(number, tasks[number].name, tasks[number].instruction, indices[number])
+        for number in sorted(indices)
+    )
+
+
 @dataclass
-class EpisodeLoop:
+class EpisodeLoop(ABC):
     """Records the missing episodes of a store. Other processes may fill the same store at the same time.
 
-    Here the simulator is in this process and one episode follows the other; `pipeline.py` has the loop with simulators
-    in processes of their own.
+    plan: for the record of this worker. unit: what is counted of an episode. With steps, the line of every episode says
+    how it ended; where no environment runs, that was known before.
     """
 
-    suite: Suite
-    environment_settings: EnvironmentSettings
-    run: EpisodeRun
-    worker: Worker
-    record: RecordWriter
+    store: RunStore
+    plan: tuple[PlannedTask, ...]
     termination: Termination
+    unit: Unit
+    record: RecordWriter = field(init=False)
     results: list[EpisodeResult] = field(default_factory=list, init=False)
     faults: Faults = field(default_factory=Faults, init=False)
     claims: Claims = field(init=False)
     progress: Progress = field(init=False)
-    #: The episodes in progress and their steps, for the message after SIGTERM.
+    #: The episodes in progress and their units, for the message after SIGTERM.
     positions: dict[str, int] = field(default_factory=dict, init=False)
-    _environment: Environment | None = field(default=None, init=False)
-    _task_id: int | None = field(default=None, init=False)
 
-    def record_all(self, missing: Sequence[TaskEpisode]) -> list[EpisodeResult]:
+    def __post_init__(self) -> None:
+        """Begin the record of this worker."""
+        self.record = RecordWriter(self.store.path, this_worker(), self.plan, torch.get_num_threads())
+
+    def record_all(self, missing: Sequence[EpisodeJob]) -> list[EpisodeResult]:
         """Record the missing episodes, and return those that this process committed.
 
         After the return the store holds every episode of `missing` but those that `faults` names as dropped: the loop
@@ -66,11 +153,11 @@ class EpisodeLoop:
             MachineBroken: a fault came again and again that every episode would meet.
         """
         with ExitStack() as stack:
-            self.claims = stack.enter_context(Claims(self.run.store.path, self.worker))
-            self.progress = Progress(len(missing), self.run.store.attributes.protocol.max_steps)
+            self.claims = stack.enter_context(Claims(self.store.path, self.record.worker))
+            self.progress = Progress(len(missing), sum(job.size for job in missing), self.unit)
             stack.callback(self.progress.close)
             try:
-                with self.simulators():
+                with self.opened():
                     self._record_until_complete(missing)
             except BaseException as error:
                 self.record.end("stopped" if isinstance(error, (Terminated, KeyboardInterrupt)) else "failed")
@@ -80,15 +167,15 @@ class EpisodeLoop:
         self.record.end("failed" if self.faults.dropped else "finished")
         return self.results
 
-    @contextmanager
-    def simulators(self) -> Iterator[None]:
-        """Free what simulates at the end of the block."""
-        try:
-            yield
-        finally:
-            self._close_environment()
+    @abstractmethod
+    def opened(self) -> AbstractContextManager[None]:
+        """Free what makes the calls at the end of the block."""
 
-    def _record_until_complete(self, missing: Sequence[TaskEpisode]) -> None:
+    @abstractmethod
+    def attempt_all(self, missing: Sequence[EpisodeJob]) -> list[tuple[EpisodeJob, Holder]]:
+        """Record every episode that nobody has; return those that other processes have claimed."""
+
+    def _record_until_complete(self, missing: Sequence[EpisodeJob]) -> None:
         left = self.attempt_all(missing)
         announced: set[str] = set()
         while left:
@@ -98,86 +185,25 @@ class EpisodeLoop:
                 self.progress.say(f"Waiting for episodes that other processes are writing: {described}.")
                 announced.update(holder.episode for holder in new)
             time.sleep(_LOOK_EVERY_S)
-            left = self.attempt_all([episode for episode, _ in left])
+            left = self.attempt_all([job for job, _ in left])
 
-    def attempt_all(self, missing: Sequence[TaskEpisode]) -> list[tuple[TaskEpisode, Holder]]:
-        """Record every episode that nobody has; return those that other processes have claimed."""
-        return [(episode, holder) for episode in missing if (holder := self._attempt(*episode)) is not None]
-
-    def claim(self, task: Task, episode: int) -> bool | Holder:
+    def claim(self, job: EpisodeJob) -> bool | Holder:
         """Claim an episode: True if it is to be recorded, False if the store has it, else the holder of the claim."""
-        name = episode_name(task.task_id, episode)
         # Check before and after claiming: another process may commit the episode at any time before our claim.
-        if self.run.store.has(task.task_id, episode):
-            self.progress.skip(name)
+        if self._has(job):
+            self.progress.skip(job.name)
             return False
-        holder = self.claims.acquire(name)
+        holder = self.claims.acquire(job.name)
         if holder is not None:
             return holder
-        if self.run.store.has(task.task_id, episode):
-            self.progress.skip(name)
-            self.claims.release(name)
+        if self._has(job):
+            self.progress.skip(job.name)
+            self.claims.release(job.name)
             return False
         return True
 
-    def _attempt(self, task: Task, episode: int) -> Holder | None:
-        """Record an episode unless the store has it, or drop it after a fault.
-
-        If another process has claimed it, return that claim's holder.
-        """
-        self.termination.check()
-        claimed = self.claim(task, episode)
-        if isinstance(claimed, Holder):
-            return claimed
-        again = False
-        if claimed:
-            try:
-                again = self._record(task, episode)
-            finally:
-                self.claims.release(episode_name(task.task_id, episode))
-        self.termination.check()
-        return self._attempt(task, episode) if again else None
-
-    def _record(self, task: Task, episode: int) -> bool:
-        """Record an episode; returns whether it shall be tried again after a fault."""
-        progress = self.progress.begin(task.task_id, episode)
-        try:
-            self._record_once(task, episode, progress)
-        except EPISODE_FAULTS as error:
-            if isinstance(error, SimulationFailed):  # what it has left is not to be trusted
-                with suppress(Exception):
-                    self._close_environment()
-            return self.note_fault(episode_name(task.task_id, episode), progress, error)
-        return False
-
-    def _record_once(self, task: Task, episode: int, progress: EpisodeProgress) -> None:
-        name = episode_name(task.task_id, episode)
-        with naming_the_simulator(episode_title(self.run.store, task, episode)):
-            environment = self._environment_of(task)
-            missing = environment.missing_resets(episode, self.run.store.attributes.protocol.seed)
-
-        def report(step: int, replans: int) -> None:
-            self.positions[name] = step
-            progress.update(step, replans)
-
-        if missing:
-            self.say_resets(name, missing)
-        self.positions[name] = 0
-        with self.termination.only_at_checks():
-            try:
-                result = record_episode(self.run, environment, task, episode, report)
-            except StoreExists as error:
-                self.note_refused(name, progress, error)
-                return
-            self.note_commit(result)
-        size = sum(file.stat().st_size for file in result.folder.rglob("*") if file.is_file())
-        progress.end(describe_result(result, size), task.instruction)
-
-    def say_resets(self, name: str, missing: int) -> None:
-        """Say that an episode needs resets of other episodes first."""
-        self.progress.say(
-            f"{name}: the published furniture depends on the resets of earlier episodes; making {missing} first."
-        )
+    def _has(self, job: EpisodeJob) -> bool:
+        return self.store.has(job.task.task_id, job.episode_index)
 
     def note_commit(self, result: EpisodeResult) -> None:
         """Note that this process has committed an episode."""
@@ -185,6 +211,15 @@ class EpisodeLoop:
         self.results.append(result)
         self.record.add_commit(result.folder.name)
         self.faults.note_recorded()
+
+    def show_end(self, job: EpisodeJob, progress: EpisodeProgress, result: EpisodeResult, num_bytes: int) -> None:
+        """Show that an episode is committed."""
+        if self.unit == "call":
+            progress.drop()
+            return
+        outcome = "success" if result.success else "no success"
+        size = f"{result.num_replans} replans, {format_bytes(num_bytes)}"
+        progress.end(f"{outcome} after {result.num_steps} steps, {size}", job.task.instruction)
 
     def note_fault(self, name: str, progress: EpisodeProgress, error: Exception) -> bool:
         """Note that an episode was dropped after a fault; returns whether it shall be tried again.
@@ -213,22 +248,10 @@ class EpisodeLoop:
         progress.drop()
         self.progress.say(f"{error} This process's copy was dropped.")
 
-    def _environment_of(self, task: Task) -> Environment:
-        if self._environment is None or self._task_id != task.task_id:
-            self._close_environment()
-            self._environment = make_environment(self.suite, task.task_id, self.environment_settings)
-            self._task_id = task.task_id
-        return self._environment
-
-    def _close_environment(self) -> None:
-        if self._environment is not None:
-            environment, self._environment = self._environment, None
-            environment.close()
-
-    def _describe_stop(self, missing: Sequence[TaskEpisode]) -> str:
+    def _describe_stop(self, missing: Sequence[EpisodeJob]) -> str:
         committed = listing([result.folder.name for result in self.results], 40)
-        left = sum(not self.run.store.has(task.task_id, episode) for task, episode in missing)
-        running = [f"{name} at step {step}" for name, step in sorted(self.positions.items())]
+        left = sum(not self._has(job) for job in missing)
+        running = [f"{name} at {self.unit} {done}" for name, done in sorted(self.positions.items())]
         dropped = f"dropped {listing(running, 40)}" if running else "no episode was in progress"
         return (
             f"Stopped by SIGTERM: {dropped}; committed {plural(len(self.results), 'episode')} ({committed}); "
@@ -236,7 +259,60 @@ class EpisodeLoop:
         )
 
 
-def describe_result(result: EpisodeResult, num_bytes: int) -> str:
-    """Return how an episode ended as text."""
-    outcome = "success" if result.success else "no success"
-    return f"{outcome} after {result.num_steps} steps, {result.num_replans} replans, {format_bytes(num_bytes)}"
+@dataclass
+class OneByOneLoop(EpisodeLoop):
+    """Records one episode after the other; `pipeline.py` has the loop with simulators in processes of their own."""
+
+    source: EpisodeSource
+
+    @contextmanager
+    def opened(self) -> Iterator[None]:
+        """Close the source at the end of the block."""
+        try:
+            yield
+        finally:
+            self.source.close()
+
+    def attempt_all(self, missing: Sequence[EpisodeJob]) -> list[tuple[EpisodeJob, Holder]]:
+        """Record every episode that nobody has; return those that other processes have claimed."""
+        return [(job, holder) for job in missing if (holder := self._attempt(job)) is not None]
+
+    def _attempt(self, job: EpisodeJob) -> Holder | None:
+        """Record an episode unless the store has it, or drop it after a fault.
+
+        If another process has claimed it, return that claim's holder.
+        """
+        self.termination.check()
+        claimed = self.claim(job)
+        if isinstance(claimed, Holder):
+            return claimed
+        again = False
+        if claimed:
+            progress = self.progress.begin(job.title, job.size)
+            try:
+                self._record_once(job, progress)
+            except EPISODE_FAULTS as error:
+                again = self.note_fault(job.name, progress, error)
+            finally:
+                self.claims.release(job.name)
+        self.termination.check()
+        return self._attempt(job) if again else None
+
+    def _record_once(self, job: EpisodeJob, progress: EpisodeProgress) -> None:
+        if (line := self.source.begin(job)) is not None:
+            self.progress.say(line)
+
+        def report(done: int, replans: int) -> None:
+            self.positions[job.name] = done
+            progress.update(done, replans)
+
+        self.positions[job.name] = 0
+        with self.termination.only_at_checks():
+            try:
+                result = self.source.record(job, report)
+            except StoreExists as error:
+                self.note_refused(job.name, progress, error)
+                return
+            self.note_commit(result)
+        size = sum(file.stat().st_size for file in result.folder.rglob("*") if file.is_file())
+        self.show_end(job, progress, result, size)

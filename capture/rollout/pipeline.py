@@ -17,21 +17,20 @@ from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 
-from vla_attention.capture.environments.base import Task
-from vla_attention.capture.memory import memory_left
+from vla_attention.capture.environments.base import EnvironmentSettings, Suite
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.rollout.background_writing import BackgroundWriting, Committed, EpisodeInBackground
 from vla_attention.capture.rollout.episode import (
     EpisodeRecording,
-    EpisodeResult,
-    episode_start,
+    EpisodeRun,
     episode_title,
     max_replans,
     policy_cameras,
     recorded_times,
+    simulated_start,
 )
 from vla_attention.capture.rollout.episode_faults import EPISODE_FAULTS, SimulatorDied
-from vla_attention.capture.rollout.episode_loop import EpisodeLoop, TaskEpisode, describe_result
+from vla_attention.capture.rollout.episode_loop import EpisodeJob, EpisodeLoop, EpisodeResult
 from vla_attention.capture.rollout.policy_call import record_calls
 from vla_attention.capture.rollout.progress import EpisodeProgress
 from vla_attention.capture.rollout.simulation import Advanced, Begun, Seen, SimulationFailed
@@ -44,10 +43,10 @@ from vla_attention.capture.rollout.simulator_process import (
     SimulatorProcess,
     SimulatorSetup,
 )
+from vla_attention.capture.rollout.simulator_source import resets_line
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.claims import Holder
-from vla_attention.schemas.stores.store_format import StoreExists, episode_name
-from vla_attention.schemas.threads import available_cores
+from vla_attention.schemas.stores.store_format import StoreExists
 
 #: How often an episode is begun again after the end of its simulator.
 MOST_RESTARTS = 2
@@ -58,26 +57,6 @@ _LOOK_EVERY_S = 0.5
 NO_ANSWER_TIMES = 10
 NO_ANSWER_S = 120.0
 NO_BEGINNING_S = 1200.0
-
-
-#: The largest number of simulators that is taken without being asked for: one policy keeps few more busy.
-MOST_BY_DEFAULT = 8
-#: Memory of a simulator, for their number without being asked: in LIBERO 1.8 GB, of which the scene is most.
-SIMULATOR_BYTES = 2e9
-
-
-def default_policy_batch(device: str) -> int | None:
-    """Return the largest batch without `--policy-batch`, None for the number of simulators.
-
-    It is 1 on a processor, which does not gain by larger ones.
-    """
-    return 1 if device.startswith("cpu") else None
-
-
-def default_num_envs() -> int:
-    """Return the number of simulators without `--num-envs`: as many as there are cores, and as fit into memory."""
-    return max(1, int(min(available_cores(), MOST_BY_DEFAULT, memory_left() / SIMULATOR_BYTES)))
-
 
 _WHY_KILLED = "Signal 9 mostly means that the memory was full; a smaller --num-envs needs less. "
 
@@ -91,8 +70,7 @@ class Simulator:
     """A process, and the episode that runs in it; `recording` and `writer` from its reset on."""
 
     process: SimulatorProcess
-    task: Task
-    episode_index: int
+    job: EpisodeJob
     progress: EpisodeProgress
     begun_times: int = 1
     recording: EpisodeRecording | None = None
@@ -104,11 +82,6 @@ class Simulator:
     def begins(self) -> bool:
         """Whether it is at the beginning of the episode, which ends with the first picture."""
         return self.recording is None or not self.recording.num_replans
-
-    @property
-    def name(self) -> str:
-        """The name of the episode."""
-        return episode_name(self.task.task_id, self.episode_index)
 
     @property
     def in_episode(self) -> tuple[EpisodeRecording, EpisodeInBackground]:
@@ -127,16 +100,19 @@ class PipelinedLoop(EpisodeLoop):
     scene, and because LIBERO's published furniture depends on the resets of earlier episodes.
     """
 
+    suite: Suite
+    environment_settings: EnvironmentSettings
+    run: EpisodeRun
     num_envs: int = 2
     policy_batch: int = 1
     _idle: list[tuple[SimulatorProcess, int | None]] = field(default_factory=list, init=False)
     _running: list[Simulator] = field(default_factory=list, init=False)
     #: Episodes whose commit waits for the thread, with the progress of each.
-    _writing: dict[EpisodeInBackground, tuple[EpisodeRecording, EpisodeProgress]] = field(
+    _writing: dict[EpisodeInBackground, tuple[EpisodeJob, EpisodeRecording, EpisodeProgress]] = field(
         default_factory=dict, init=False
     )
     #: Episodes that are to be recorded and that no simulator has.
-    _left: list[TaskEpisode] = field(default_factory=list, init=False)
+    _left: list[EpisodeJob] = field(default_factory=list, init=False)
     _ready: deque[tuple[Simulator, Seen]] = field(default_factory=deque, init=False)
     #: What simulators of each task know of its resets, for the others.
     _resets: dict[int, Sequence[object]] = field(default_factory=dict, init=False)
@@ -145,7 +121,7 @@ class PipelinedLoop(EpisodeLoop):
     _slowest: dict[bool, float] = field(default_factory=lambda: {True: 0.0, False: 0.0}, init=False)
 
     @contextmanager
-    def simulators(self) -> Iterator[None]:
+    def opened(self) -> Iterator[None]:
         """Start the thread that writes; end it and all simulators at the end of the block."""
         attributes = self.run.store.attributes
         cameras = policy_cameras(self.run.policy)
@@ -161,15 +137,16 @@ class PipelinedLoop(EpisodeLoop):
             stack.callback(self._end_simulators)
             yield
 
-    def attempt_all(self, missing: Sequence[TaskEpisode]) -> list[tuple[TaskEpisode, Holder]]:
+    def attempt_all(self, missing: Sequence[EpisodeJob]) -> list[tuple[EpisodeJob, Holder]]:
         """Record every episode that nobody has; return those that other processes have claimed."""
         self.termination.check()
         self._left = list(missing)
-        elsewhere: list[tuple[TaskEpisode, Holder]] = []
+        elsewhere: list[tuple[EpisodeJob, Holder]] = []
         with self.termination.only_at_checks():
             while self._left or self._running or self._writing:
                 self.termination.check()
                 self._note_commits(self._thread.take_commits())
+                # Before the policy computes: simulators reset and step meanwhile.
                 self._begin_episodes(self._left, elsewhere)
                 if self._running or self._writing:
                     self._receive()
@@ -177,26 +154,26 @@ class PipelinedLoop(EpisodeLoop):
         self.termination.check()
         return elsewhere
 
-    def _begin_episodes(self, left: list[TaskEpisode], elsewhere: list[tuple[TaskEpisode, Holder]]) -> None:
+    def _begin_episodes(self, left: list[EpisodeJob], elsewhere: list[tuple[EpisodeJob, Holder]]) -> None:
         """Give an episode to every simulator without one; takes from `left`, adds to `elsewhere`."""
         while left and len(self._running) < self.num_envs:
             process, task_id = self._idle.pop() if self._idle else (None, None)
             place = self._choose(left, task_id)
-            if process is not None and self._would_repeat_resets(task_id, *left[place]):
+            if process is not None and self._would_repeat_resets(task_id, left[place]):
                 self._idle.append((process, task_id))
                 return
-            task, episode = left.pop(place)
-            claimed = self.claim(task, episode)
+            job = left.pop(place)
+            claimed = self.claim(job)
             if claimed is True:
                 process = process or self._start_simulator()
-                simulator = Simulator(process, task, episode, self.progress.begin(task.task_id, episode))
+                simulator = Simulator(process, job, self.progress.begin(job.title, job.size))
                 self._running.append(simulator)
                 self._begin(simulator)
                 continue
             if process is not None:
                 self._idle.append((process, task_id))
             if isinstance(claimed, Holder):
-                elsewhere.append(((task, episode), claimed))
+                elsewhere.append((job, claimed))
 
     def _start_simulator(self) -> SimulatorProcess:
         try:
@@ -207,29 +184,34 @@ class PipelinedLoop(EpisodeLoop):
                 "--resume for what is missing."
             ) from None
 
-    def _choose(self, left: Sequence[TaskEpisode], task_id: int | None) -> int:
+    def _choose(self, left: Sequence[EpisodeJob], task_id: int | None) -> int:
         """Return the place of the next episode: of the same task, else of one that no simulator has, else the first."""
-        taken = {simulator.task.task_id for simulator in self._running}
+        taken = {simulator.job.task.task_id for simulator in self._running}
         taken.update(number for _, number in self._idle if number is not None)
 
         def preference(place: int) -> tuple[bool, bool, int]:
-            other = left[place][0].task_id
+            other = left[place].task.task_id
             return (other != task_id, other in taken, place)
 
         return min(range(len(left)), key=preference)
 
-    def _would_repeat_resets(self, task_id: int | None, task: Task, episode: int) -> bool:
+    def _would_repeat_resets(self, task_id: int | None, job: EpisodeJob) -> bool:
         """Tell whether a simulator with a scene of the task would make a reset that another one is making now."""
-        known = self._resets.get(task.task_id)
-        resetting = any(other.task.task_id == task.task_id and other.recording is None for other in self._running)
-        return task_id == task.task_id and bool(known) and len(known or ()) <= episode and resetting
+        # The published furniture of an episode needs the resets of all before it, seconds each. What a simulator knows
+        # of them reaches the others when its episode has begun; until then a second one would make them all again.
+        wanted = job.task.task_id
+        known = self._resets.get(wanted)
+        resetting = any(other.job.task.task_id == wanted and other.recording is None for other in self._running)
+        return task_id == wanted and bool(known) and len(known or ()) <= job.episode_index and resetting
 
     def _begin(self, simulator: Simulator) -> None:
-        self.positions[simulator.name] = 0
+        self.positions[simulator.job.name] = 0
         simulator.asked_at = time.monotonic()
-        title = episode_title(self.run.store, simulator.task, simulator.episode_index)
-        task_id = simulator.task.task_id
-        simulator.process.begin(BeginEpisode(task_id, simulator.episode_index, title, self._resets.get(task_id)))
+        task_id, index = simulator.job.task.task_id, simulator.job.episode_index
+        simulator.process.begin(BeginEpisode(task_id, index, self._title(simulator.job), self._resets.get(task_id)))
+
+    def _title(self, job: EpisodeJob) -> str:
+        return episode_title(self.run.store, job.task, job.episode_index)
 
     def _receive(self) -> None:
         """Take what the simulators have answered; waits for an answer unless the policy has something to do."""
@@ -270,15 +252,15 @@ class PipelinedLoop(EpisodeLoop):
         match answer:
             case ResetsFirst(number):
                 # Once a task: simulators that begin at the same time cannot know of each other's resets yet.
-                if simulator.task.task_id not in self._told_of_resets:
-                    self._told_of_resets.add(simulator.task.task_id)
-                    self.say_resets(simulator.name, number)
+                if simulator.job.task.task_id not in self._told_of_resets:
+                    self._told_of_resets.add(simulator.job.task.task_id)
+                    self.progress.say(resets_line(simulator.job.name, number))
             case KnownResets(resets):
-                known = self._resets.get(simulator.task.task_id, ())
-                self._resets[simulator.task.task_id] = max(known, resets, key=len)
+                known = self._resets.get(simulator.job.task.task_id, ())
+                self._resets[simulator.job.task.task_id] = max(known, resets, key=len)
             case Begun():
-                start = episode_start(self.run, simulator.task, simulator.episode_index, answer)
-                simulator.recording = EpisodeRecording(self.run, simulator.task, start)
+                start = simulated_start(self.run, simulator.job.task, simulator.job.episode_index, answer)
+                simulator.recording = EpisodeRecording(self.run, simulator.job.task, start)
                 protocol = self.run.store.attributes.protocol
                 simulator.writer = self._thread.episode(
                     self.run.store, start, recorded_times(self.run), max_replans(protocol)
@@ -295,7 +277,7 @@ class PipelinedLoop(EpisodeLoop):
         recording, writer = simulator.in_episode
         recording.advanced(result)
         if recording.num_replans:
-            self.positions[simulator.name] = recording.step
+            self.positions[simulator.job.name] = recording.step
             simulator.progress.update(recording.step, recording.num_replans)
         if not recording.ended:
             if result.seen is None:
@@ -303,8 +285,8 @@ class PipelinedLoop(EpisodeLoop):
             self._ready.append((simulator, result.seen))
             return
         self._running.remove(simulator)
-        self._idle.append((simulator.process, simulator.task.task_id))
-        self._writing[writer] = (recording, simulator.progress)
+        self._idle.append((simulator.process, simulator.job.task.task_id))
+        self._writing[writer] = (simulator.job, recording, simulator.progress)
         writer.commit(recording.success, recording.step)
 
     def _call_policy(self) -> None:
@@ -339,13 +321,13 @@ class PipelinedLoop(EpisodeLoop):
         if simulator.writer is not None:
             simulator.writer.drop()
             simulator.recording = simulator.writer = None
-        title = episode_title(self.run.store, simulator.task, simulator.episode_index)
         if simulator.begun_times > MOST_RESTARTS:
             why = _WHY_KILLED if "signal 9" in how else ""
-            died = f"The simulator of {title} ended {simulator.begun_times} times, the last time {how}."
+            title, times = self._title(simulator.job), simulator.begun_times
+            died = f"The simulator of {title} ended {times} times, the last time {how}."
             self._fail(simulator, SimulatorDied(f"{died} {why}Nothing of this episode was kept."))
             return
-        self.progress.say(f"{simulator.name}: its simulator ended ({how}); the episode begins again.")
+        self.progress.say(f"{simulator.job.name}: its simulator ended ({how}); the episode begins again.")
         simulator.begun_times += 1
         simulator.progress.update(0, 0)
         simulator.process = self._start_simulator()
@@ -361,43 +343,40 @@ class PipelinedLoop(EpisodeLoop):
         if isinstance(error, SimulationFailed) or simulator.asked_at is not None:
             simulator.process.close()
         else:
-            self._idle.append((simulator.process, simulator.task.task_id))
-        self._after_fault(simulator.task, simulator.episode_index, simulator.progress, error)
+            self._idle.append((simulator.process, simulator.job.task.task_id))
+        self._after_fault(simulator.job, simulator.progress, error)
 
-    def _after_fault(self, task: Task, episode: int, progress: EpisodeProgress, error: Exception) -> None:
-        name = episode_name(task.task_id, episode)
-        self.claims.release(name)
-        if self.note_fault(name, progress, error):
-            self._left.insert(0, (task, episode))
+    def _after_fault(self, job: EpisodeJob, progress: EpisodeProgress, error: Exception) -> None:
+        self.claims.release(job.name)
+        if self.note_fault(job.name, progress, error):
+            self._left.insert(0, job)
 
     def _note_commits(self, commits: Sequence[Committed]) -> None:
         for commit in commits:
             if isinstance(commit.folder, EPISODE_FAULTS):
                 self._fail_in_writing(commit.episode, commit.folder)
                 continue
-            recording, progress = self._writing.pop(commit.episode)
-            start = recording.start
-            name = episode_name(start.task_id, start.episode_index)
+            job, recording, progress = self._writing.pop(commit.episode)
             if isinstance(commit.folder, StoreExists):
-                self.note_refused(name, progress, commit.folder)
+                self.note_refused(job.name, progress, commit.folder)
             else:
                 result = EpisodeResult(
-                    start.task_id,
-                    start.episode_index,
+                    job.task.task_id,
+                    job.episode_index,
                     recording.success,
                     recording.step,
                     recording.num_replans,
                     commit.folder,
                 )
                 self.note_commit(result)
-                progress.end(describe_result(result, commit.num_bytes), start.instruction)
-            self.claims.release(name)
+                self.show_end(job, progress, result, commit.num_bytes)
+            self.claims.release(job.name)
 
     def _fail_in_writing(self, writer: EpisodeInBackground, error: Exception) -> None:
         """Drop an episode that the thread could not store; its simulator may be on the way to the next replan."""
         if writer in self._writing:
-            recording, progress = self._writing.pop(writer)
-            self._after_fault(recording.task, recording.start.episode_index, progress, error)
+            job, _, progress = self._writing.pop(writer)
+            self._after_fault(job, progress, error)
             return
         for simulator in [each for each in self._running if each.writer is writer]:
             self._fail(simulator, error)

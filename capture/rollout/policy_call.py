@@ -13,8 +13,7 @@ from vla_attention.capture.policies.policy import BatchPolicy, Policy, PolicyInp
 from vla_attention.capture.recording.attention import AttentionEditor
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite, all_finite, describe_origin
 from vla_attention.capture.recording.recorder import make_recorders
-from vla_attention.capture.store.episode_writer import ReplanRecord
-from vla_attention.capture.store.recorded_rows import RecordedRows
+from vla_attention.capture.store.replan_records import RecordedRows, ReplanRecord
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.stores.store_format import Recording
 
@@ -112,8 +111,10 @@ def record_calls(
     recorders = [make_recorders(recording, policy.sites, call.policy_input.key_role, pools) for call in calls]
     inputs, seeds = [call.policy_input for call in calls], [call.noise_seed for call in calls]
     made: list[RecordedCall | NumbersNotFinite] = []
-    for call, actions, own in zip(calls, policy.act_batch(inputs, seeds, recorders), recorders, strict=True):
-        rows = {site: recorder.finish() for site, recorder in own.items()}
+    for call, actions, recorders_of_call in zip(
+        calls, policy.act_batch(inputs, seeds, recorders), recorders, strict=True
+    ):
+        rows = {site: recorder.finish() for site, recorder in recorders_of_call.items()}
         if all_finite(actions, rows):
             made.append(RecordedCall(actions, rows))
         else:

@@ -1,14 +1,18 @@
-"""The progress of a capture: a bar on a terminal, and otherwise lines for a log file."""
+"""The progress through episodes: a bar on a terminal, and otherwise lines for a log file."""
 
 from __future__ import annotations
 
 import sys
 import time
 from dataclasses import dataclass
+from typing import Literal
 
 from tqdm import tqdm
 
 from vla_attention.schemas.safe_text import plain_stderr, print_line, visible
+
+#: What is counted of an episode: environment steps, or policy calls where no environment runs.
+Unit = Literal["step", "call"]
 
 #: Seconds between two lines about episodes in progress in a log file. A GPU completes several replans a second.
 _LOG_EVERY_S = 30.0
@@ -23,18 +27,19 @@ def say(line: str) -> None:
 
 @dataclass(eq=False)
 class EpisodeProgress:
-    """The progress of one episode."""
+    """The progress of one episode. size: most units of it. done: units so far."""
 
     progress: Progress
     position: str
     name: str
+    size: int
     begun_at: float
-    step: int = 0
+    done: int = 0
     replans: int = 0
 
-    def update(self, step: int, replans: int) -> None:
-        """Show how many environment steps and replans of the episode are done."""
-        self.step, self.replans = step, replans
+    def update(self, done: int, replans: int) -> None:
+        """Show how many units and replans of the episode are done."""
+        self.done, self.replans = done, replans
         self.progress.show()
 
     def end(self, result: str, instruction: str) -> None:
@@ -49,49 +54,48 @@ class EpisodeProgress:
         """Show the episode no more: it will begin again."""
         self.progress.put_back(self)
 
-    def describe(self, max_steps: int, now: float) -> str:
+    def describe(self, unit: Unit, now: float) -> str:
         """Return what is done as text for a log file."""
-        return (
-            f"{self.position} {self.name}: step {self.step} of at most {max_steps}, {self.replans} replans, "
-            f"{now - self.begun_at:.0f} s"
-        )
+        done = f"step {self.done} of at most {self.size}, {self.replans} replans"
+        if unit == "call":
+            done = f"{self.done} of {self.size} policy calls"
+        return f"{self.position} {self.name}: {done}, {now - self.begun_at:.0f} s"
 
 
 class Progress:
     """The progress of one process through its episodes, of which several may run at a time. `close` it at the end.
 
-    num_episodes: number of episodes that the process was started for.
-    max_steps: largest number of policy steps of one episode.
+    num_episodes: number of episodes that the process was started for. size: most units of all of them.
     """
 
-    def __init__(self, num_episodes: int, max_steps: int) -> None:
+    def __init__(self, num_episodes: int, size: int, unit: Unit) -> None:
         self._num_episodes = num_episodes
-        self._max_steps = max_steps
+        self._unit = unit
         self._num_begun = 0
-        self._num_done = 0
+        self._done = 0
         self._running: list[EpisodeProgress] = []
         self._last_line_at = time.monotonic()
         hidden = not sys.stderr.isatty()
-        self._bar = tqdm(total=num_episodes * max_steps, unit="step", file=plain_stderr(), disable=hidden)
+        self._bar = tqdm(total=size, unit=unit, file=plain_stderr(), disable=hidden)
 
-    def begin(self, task_id: int, episode: int) -> EpisodeProgress:
-        """Begin an episode."""
+    def begin(self, name: str, size: int) -> EpisodeProgress:
+        """Begin an episode of at most so many units."""
         self._num_begun += 1
         now = time.monotonic()
         if not self._running:
             self._last_line_at = now
-        begun = EpisodeProgress(self, self._position(), f"task {task_id} episode {episode}", now)
+        begun = EpisodeProgress(self, self._position(), name, size, now)
         self._running.append(begun)
         self._describe_bar()
         return begun
 
     def show(self) -> None:
-        """Show the steps that are done by now."""
+        """Show what is done by now."""
         self._update_bar()
         now = time.monotonic()
         if self._bar.disable and now - self._last_line_at >= _LOG_EVERY_S:
             self._last_line_at = now
-            shown = [episode.describe(self._max_steps, now) for episode in self._running[:_MOST_SHOWN]]
+            shown = [episode.describe(self._unit, now) for episode in self._running[:_MOST_SHOWN]]
             more = len(self._running) - len(shown)
             say("; ".join(shown) + (f"; {more} more episodes" if more else ""))
 
@@ -103,7 +107,7 @@ class Progress:
     def drop(self, episode: EpisodeProgress) -> None:
         """Count an episode as done, and show it no more."""
         self._running.remove(episode)
-        self._num_done += 1
+        self._done += episode.size
         self._update_bar()
         self._describe_bar()
 
@@ -131,8 +135,8 @@ class Progress:
         return f"[{self._num_begun}/{self._num_episodes}]"
 
     def _update_bar(self) -> None:
-        steps = self._num_done * self._max_steps + sum(episode.step for episode in self._running)
-        self._bar.update(steps - self._bar.n)  # an episode that begins again takes its steps back
+        done = self._done + sum(episode.done for episode in self._running)
+        self._bar.update(done - self._bar.n)  # an episode that begins again takes its units back
 
     def _describe_bar(self) -> None:
         names = [episode.name for episode in self._running]

@@ -2,6 +2,9 @@
 
 `SimulatorProcess` is its other end, in the process of the policy. The process begins anew instead of being forked: an
 OpenGL context does not survive a fork. Every process draws with a context and one thread of its own.
+
+What is sent first decides what the process does: with a `SimulatorSetup` it simulates for a policy; with another
+`Setup` it may run whole episodes, as those of `examples/cubes_policy` do.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Any
+from typing import Protocol as Interface
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,14 +53,34 @@ _BOOT = (
 )
 
 
+class Server(Interface):
+    """A process's own side. title: what it does now, for messages."""
+
+    title: str
+
+    def serve(self) -> None:
+        """Answer until the other end closes."""
+
+
+class Setup(Interface):
+    """What a process is sent first, once."""
+
+    def server(self, connection: Connection) -> Server:
+        """Return the process's own side; called in the process."""
+
+
 @dataclass(frozen=True)
 class SimulatorSetup:
-    """What a process needs to know once."""
+    """What a process needs to know to simulate for a policy elsewhere."""
 
     suite: Suite
     settings: EnvironmentSettings
     protocol: Protocol
     cameras: tuple[CameraPatches, ...]
+
+    def server(self, connection: Connection) -> Server:
+        """Return what takes `BeginEpisode` and `Execute`."""
+        return _SimulatorServer(connection, self)
 
 
 @dataclass(frozen=True)
@@ -105,7 +129,7 @@ class Failed:
 class SimulatorProcess:
     """A running process. `connection` has its answers: `ResetsFirst`, `KnownResets`, `Begun`, `Advanced`, `Failed`."""
 
-    def __init__(self, setup: SimulatorSetup) -> None:
+    def __init__(self, setup: Setup) -> None:
         self.connection, theirs = Pipe()
         one_thread = dict.fromkeys(("OMP_NUM_THREADS", *OTHER_LIBRARIES), "1") | _DRAWS_ITSELF
         # Its temporary files are removed here: it is killed, and removes none. When this process is killed, it does.
@@ -166,8 +190,8 @@ def _has_descriptor(stream: Any) -> bool:
     return True
 
 
-class _Server:
-    """The process's own side."""
+class _SimulatorServer:
+    """Simulates for a policy at the other end."""
 
     def __init__(self, connection: Connection, setup: SimulatorSetup) -> None:
         self.connection = connection
@@ -226,7 +250,7 @@ def main(descriptor: int, temporary: str | None = None) -> None:
     connection = Connection(descriptor)
     os.nice(_NICENESS)
     try:
-        server = _Server(connection, connection.recv())
+        server = connection.recv().server(connection)
         try:
             server.serve()
         except (EOFError, ConnectionError):

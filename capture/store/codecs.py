@@ -2,8 +2,8 @@
 
 Only core codecs of Zarr v3 are used (bytes, blosc, crc32c, sharding_indexed), so that any Zarr v3 reader opens the
 store, and every chunk has a checksum. `docs/store.md` gives the reasons and measurements. Without zarr,
-`schemas/stores/shards.py` reads the layout of `create_rows` and `schemas/stores/single_chunks.py` that of
-`write_whole`; after a change here they must know the new layout, or zarr reads it, more slowly.
+`schemas/stores/shards.py` reads the layouts of `create_rows` and `write_whole`; after a change here it must know the
+new layout, or zarr reads it, more slowly.
 """
 
 from __future__ import annotations

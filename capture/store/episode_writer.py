@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,10 @@ import zarr
 from numpy.typing import NDArray
 
 from vla_attention.capture.store.codecs import write_whole
-from vla_attention.capture.store.recorded_rows import RecordedRows
-from vla_attention.capture.store.refused_writes import naming_the_failure
+from vla_attention.capture.store.replan_records import EpisodeStart, ReplanRecord
 from vla_attention.capture.store.site_writer import SiteWriter
 from vla_attention.capture.store.store_root import check_same_run, read_existing_root
-from vla_attention.schemas.errors import listing
-from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.errors import UserError, listing
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import Prompt, prompt_at
 from vla_attention.schemas.stores.content_rules import (
@@ -45,50 +44,27 @@ from vla_attention.schemas.stores.store_format import (
     episode_name,
 )
 
+
+class StoreWriteFailed(StoreError, OSError):
+    """The operating system refused a write: the disk is full, a permission is missing, a device failed."""
+
+
+@contextmanager
+def naming_the_failure(what: str) -> Iterator[None]:
+    """Turn an error of the operating system into one sentence with what was being written."""
+    try:
+        yield
+    except OSError as error:
+        if isinstance(error, UserError):
+            raise
+        raise StoreWriteFailed(
+            f"Cannot write {what}: {error.strerror or error}. Nothing of this episode was kept, and the episodes "
+            "before it are unharmed; remove the cause and go on with --resume."
+        ) from error
+
+
 #: What an episode's provenance calls the cameras whose picture is of one colour at every replan.
 CONSTANT_CAMERAS = "constant_cameras"
-
-
-@dataclass(frozen=True)
-class ReplanRecord:
-    """Everything stored about one replan.
-
-    `rows` and `key_role` are per site. `state` is (state_dim,), `actions` (horizon, action_dim) as given to the
-    environment, `frames` and `camera_frames` per policy camera (row, column, channel) uint8, `coverage` per policy
-    camera (patch, object) float32. `dataset_actions` (steps, action_dim) are those that a data set has from this replan
-    on, fewer at the end of its episode. `base_actions` (horizon, action_dim) are those that the base has for this call,
-    in a rerun. What is None is not known; all replans of an episode know the same. `constant_cameras`: cameras of the
-    simulator whose picture is of one colour.
-    """
-
-    env_step: int
-    noise_seed: int | None
-    rows: Mapping[str, RecordedRows]
-    key_role: Mapping[str, NDArray[np.uint8]]
-    prompt: Prompt
-    state: NDArray[np.float64] | None
-    actions: NDArray[np.float64] | None
-    frames: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
-    camera_frames: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
-    coverage: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
-    dataset_actions: NDArray[np.float64] | None = None
-    base_actions: NDArray[np.float64] | None = None
-    constant_cameras: frozenset[str] = frozenset()
-
-
-@dataclass(frozen=True)
-class EpisodeStart:
-    """The fields of `EpisodeAttributes` that are known before the first replan."""
-
-    task_id: int
-    task_name: str
-    instruction: str
-    episode_index: int
-    initial_state_index: int
-    initial_state_digest: str
-    objects: tuple[SceneObject, ...]
-    provenance: dict[str, str]
-    task_family: str = ""
 
 
 class ReplanRefused(StoreError):

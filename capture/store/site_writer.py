@@ -1,4 +1,10 @@
-"""Writing rows, row sums, atoms and contributions of one site of one episode; rows are written block by block."""
+"""Writing rows, row sums, atoms and contributions of one site of one episode.
+
+Rows are one shard, which is one file, whatever the number of replans. zarr-python writes whole shards only: an episode
+that is written block by block would have a file for each block, 18 of them where all queries of 104 replans are stored.
+Here the chunks of each block go to the end of the file, and the shard's index after the last one (Zarr's
+`sharding_indexed` codec). `codecs.py` decides what a chunk is.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +16,14 @@ import numpy as np
 import zarr
 from numpy.typing import DTypeLike, NDArray
 
-from vla_attention.capture.store.codecs import create_rows, replans_per_block
-from vla_attention.capture.store.recorded_rows import RecordedRows
-from vla_attention.capture.store.shard_writer import ShardWriter
+from vla_attention.capture.store.codecs import CHUNK_KEYS, create_rows, encode_row_chunk, replans_per_block
+from vla_attention.capture.store.replan_records import RecordedRows
 from vla_attention.schemas.groupings.key_counts import uniform_of_roles
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import ROLE_DTYPE, SiteLayout
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, round_mantissa
 from vla_attention.schemas.segments import Segment, merge_segments, segment_masses, segment_members, segments_of
+from vla_attention.schemas.stores.array_metadata import chunk_file
 from vla_attention.schemas.stores.content_rules import (
     absent_problems,
     gram_problems,
@@ -27,7 +33,7 @@ from vla_attention.schemas.stores.content_rules import (
     uniform_problems,
     unseen_problems,
 )
-from vla_attention.schemas.stores.digest import ArrayDigest
+from vla_attention.schemas.stores.digest import CHECKSUM_BYTES, ArrayDigest, crc32c
 from vla_attention.schemas.stores.store_format import (
     ATOM_AXES,
     CONTRIBUTION_AXES,
@@ -35,6 +41,50 @@ from vla_attention.schemas.stores.store_format import (
     ArrayRecord,
     Recording,
 )
+
+
+class ShardWriter:
+    """The file of a float32 array (replan, layer, denoise, ...), which grows by blocks of replans."""
+
+    def __init__(self, folder: Path, cells: tuple[int, ...], block: int) -> None:
+        """Begin the file in the array's folder; `cells` are its axes (layer, ...), `block` the replans of a chunk."""
+        folder.mkdir()
+        self.file = folder / chunk_file(CHUNK_KEYS, (0,) * (1 + len(cells)))
+        self.cells = cells
+        self.block = block
+        self.num_replans = 0
+        self._index: list[tuple[int, int]] = []
+        self._size = 0
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The array's shape so far."""
+        return (self.num_replans, *self.cells)
+
+    def append(self, values: NDArray[np.float32]) -> None:
+        """Write the next block, (replan, layer, denoise, ...); only the last may have fewer replans than `block`."""
+        # What a last block lacks is never read; it has the fill value, as zarr-python would write it.
+        chunk = np.full((self.block, *self.cells[2:]), np.nan, dtype="<f4")
+        with self.file.open("ab") as file:
+            for layer in range(self.cells[0]):
+                for denoise in range(self.cells[1]):
+                    chunk[: len(values)] = values[:, layer, denoise]
+                    encoded = _with_checksum(encode_row_chunk(chunk))
+                    file.write(encoded)
+                    self._index.append((self._size, len(encoded)))
+                    self._size += len(encoded)
+        self.num_replans += len(values)
+
+    def finish(self) -> None:
+        """Write the index: offset and length of every chunk, in the order of the chunk grid."""
+        index = np.array(self._index, dtype="<u8").tobytes()
+        with self.file.open("ab") as file:
+            file.write(_with_checksum(index))
+
+
+def _with_checksum(content: bytes) -> bytes:
+    return content + crc32c(content).to_bytes(CHECKSUM_BYTES, "little")
+
 
 #: Writes one complete array of the episode: name, values, axes.
 WriteArray = Callable[[str, NDArray[np.generic], tuple[str, ...]], None]

@@ -8,7 +8,7 @@ from pathlib import Path
 import zarr
 
 from vla_attention.schemas.jsonable import to_json
-from vla_attention.schemas.stores.digest import with_digest
+from vla_attention.schemas.stores.digest import run_differences, with_digest
 from vla_attention.schemas.stores.durable_files import publish
 from vla_attention.schemas.stores.partial_folders import (
     make_partial,
@@ -18,7 +18,6 @@ from vla_attention.schemas.stores.partial_folders import (
     remove_if_empty,
 )
 from vla_attention.schemas.stores.root import read_root
-from vla_attention.schemas.stores.run_differences import run_differences
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
     FormatTooNew,

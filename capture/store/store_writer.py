@@ -10,18 +10,21 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter
-from vla_attention.capture.store.refused_writes import naming_the_failure
+from vla_attention.capture.store.episode_writer import EpisodeWriter, naming_the_failure
+from vla_attention.capture.store.replan_records import EpisodeStart
 from vla_attention.capture.store.store_root import check_same_run, create_root, delete_store, read_existing_root
-from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.errors import BadArgument, UserError, plural
+from vla_attention.schemas.stores.claims import holders, jobs_folder
+from vla_attention.schemas.stores.digest import run_differences
 from vla_attention.schemas.stores.partial_folders import (
     make_partial,
     partial_folder,
+    partials_in_use,
     process_tag,
     remove_dead_partials,
     remove_if_empty,
@@ -35,6 +38,7 @@ from vla_attention.schemas.stores.store_format import (
     parse_episode_name,
 )
 from vla_attention.schemas.stores.store_place import check_place
+from vla_attention.schemas.stores.worker import is_known_dead, this_worker
 
 WriteMode = Literal["new", "resume", "overwrite"]
 
@@ -82,11 +86,13 @@ def open_run(path: Path, attributes: RootAttributes, mode: WriteMode, *, durable
     """Create a store, continue one, or replace one. `durable`: see `RunStore`.
 
     Raises:
-        StoreExists: something is at `path` and the mode is `new`.
+        StoreExists: a store with episodes is at `path`, or one that another run is writing, and the mode is `new`.
         RunMismatch: the mode is `resume` and the existing run differs; the first differing field is named.
     """
     path = make_way(path, mode)
     with _saying_where(path):
+        if mode == "new" and path.exists():
+            _take_empty(path, attributes)
         existing = read_existing_root(path) if path.exists() else create_root(path, attributes, durable)
         check_same_run(path, existing, attributes)
         remove_dead_partials(path)
@@ -97,18 +103,20 @@ def make_way(path: Path, mode: WriteMode) -> Path:
     """Look at the place of a store before it is opened, and delete the one that is to be replaced; returns the place.
 
     Raises:
-        StoreExists: something is at `path` and the mode is `new`.
+        StoreExists: a store with episodes is at `path`, and the mode is `new`.
     """
     check_place(path, "write a store at")
     # Episodes are written beside the store itself; a link to it may be on another file system.
     path = path.resolve() if path.is_symlink() else path
     with _saying_where(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.exists() and mode == "new":
-            refuse_existing(path)
+        if mode == "new":
+            refuse_recorded(path)
         if path.exists() and mode == "overwrite":
             read_existing_root(path)
             delete_store(path)
+        if mode == "overwrite":  # records and claims are of the deleted store
+            shutil.rmtree(jobs_folder(path), ignore_errors=True)
     return path
 
 
@@ -122,11 +130,41 @@ def _saying_where(path: Path) -> Iterator[None]:
         raise BadArgument(f"Cannot write a store at {path}: {error.strerror or error}; give another --store.") from None
 
 
-def refuse_existing(path: Path) -> NoReturn:
-    """Raise `StoreExists` for the store at `path`, or `StoreError` when it is not a store."""
+def refuse_recorded(path: Path) -> None:
+    """Raise `StoreExists` if a store with episodes is at `path`, and `StoreError` if it is no store.
+
+    One without an episode is left by a run that ended before its first one, and a new run may begin there.
+    """
+    if not path.exists():
+        return
     read_existing_root(path)
-    count = len(episode_folders(path))
-    raise StoreExists(
-        f"Store {path} exists already and holds {count} episodes; add --resume to continue it, "
-        "--overwrite to delete it and begin again, or give another --store."
-    )
+    if count := len(episode_folders(path)):
+        raise StoreExists(
+            f"Store {path} exists already and holds {plural(count, 'episode')}; add --resume to continue it, "
+            "--overwrite to delete it and begin again, or give another --store."
+        )
+
+
+def _take_empty(path: Path, attributes: RootAttributes) -> None:
+    """Delete the store without an episode at `path`, if it is of another run; that of this run is continued."""
+    existing = read_existing_root(path)
+    if next(iter(run_differences(existing, attributes)), None) is None:
+        return
+    if _is_being_recorded(path):
+        raise StoreExists(
+            f"Store {path} holds no episode yet, and another run is recording its first one; wait for it, add "
+            "--overwrite to delete the store and begin again, or give another --store."
+        )
+    delete_store(path)
+
+
+def remove_without_episodes(path: Path) -> None:
+    """Delete a store that this process made and that has no episode, unless another process is recording one."""
+    if not episode_folders(path) and not _is_being_recorded(path):
+        delete_store(path)
+        shutil.rmtree(jobs_folder(path), ignore_errors=True)
+
+
+def _is_being_recorded(path: Path) -> bool:
+    here = this_worker()
+    return bool(partials_in_use(path)) or any(not is_known_dead(holder.worker, here) for holder in holders(path))

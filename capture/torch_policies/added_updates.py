@@ -9,60 +9,36 @@ import torch
 from torch import Tensor, nn
 
 
-@dataclass(frozen=True)
-class Scaling:
-    """Numbers times a factor of the call, (batch, query, number): a gate, a weight, one over a norm."""
-
-    factor: Tensor
-
-    @classmethod
-    def between(cls, before: Tensor, after: Tensor) -> Scaling:
-        """Return what was made of numbers (batch, query, number) float32; a number that was 0 stays 0."""
-        return cls(torch.where(before == 0, 0.0, after / before))
-
-    def of(self, values: Tensor, row: int) -> Tensor:
-        """Return values (query, part, number) of a row of the batch, scaled."""
-        return values * self.factor[row][:, None]
+def factors_between(before: Tensor, after: Tensor) -> Tensor:
+    """Return what was made of numbers (batch, query, number) float32 by factors; a number that was 0 stays 0."""
+    return torch.where(before == 0, 0.0, after / before)
 
 
-@dataclass(frozen=True)
-class Centring:
-    """Numbers less their mean over the last axis, as in a LayerNorm."""
-
-    def of(self, values: Tensor, row: int) -> Tensor:
-        """Return values (query, part, number) of a row of the batch, centred."""
-        return values - values.mean(dim=-1, keepdim=True)
-
-
-#: With the factors of the call, each is linear.
-Steps = tuple[Scaling | Centring, ...]
-
-
-def after_steps(values: Tensor, steps: Steps, row: int) -> Tensor:
-    """Return values (query, part, number) of a row of the batch after the steps."""
-    for step in steps:
-        values = step.of(values, row)
-    return values
+def multiplied(values: Tensor, factors: Tensor | None, row: int) -> Tensor:
+    """Return values (query, part, number) of a row of the batch times the call's factors; None: as they are."""
+    return values if factors is None else values * factors[row][:, None]
 
 
 @dataclass(frozen=True)
 class AddedUpdate:
     """What was added to the residual stream.
 
+    Factors are numbers of the call, (batch, query, number): a gate, a weight, one over a norm. None: no factor.
+
     Attributes:
         mixed: the mixed values of the action queries, (batch, query, head · dim) float32.
-        before: what was done to them before the projection.
+        before: their factors before the projection.
         projected: what the projection returned for them, (batch, query, width) float32.
-        behind: what was done to that before it was added.
-        mismatch: how far numbers on the way are from what the steps make of them, relative to the largest; a tensor
-            without axes.
+        behind: the factors of that before it was added.
+        mismatch: how far numbers on the way are from what they should be, relative to the largest; a tensor without
+            axes.
         precision: the least precise dtype on the way, such as `bfloat16`.
     """
 
     mixed: Tensor
-    before: Steps
+    before: Tensor | None
     projected: Tensor
-    behind: Steps
+    behind: Tensor | None
     mismatch: Tensor
     precision: str
 
@@ -94,7 +70,8 @@ class OutputWay:
     sizes: tuple[int, ...] = field(init=False)
     #: The mixed values of the action queries, (batch, query, head · dim) float32.
     mixed: Tensor = field(init=False)
-    before: Steps = field(default=(), init=False)
+    #: Their factors before the projection.
+    before: Tensor | None = field(default=None, init=False)
     #: What the projection returned for them, (batch, query, width) float32; None before it has run.
     projected: Tensor | None = field(default=None, init=False)
     #: When it began, on the clock of what follows it.
@@ -123,8 +100,8 @@ class OutputWay:
         given = f"what the output projection '{self.path}' returned"
         return f"{self.computed} {given}" if self.computed else f"{given} is added to no tensor that was there before"
 
-    def added(self, behind: Steps) -> AddedUpdate:
-        """Return what was added, after these steps behind the projection."""
+    def added(self, behind: Tensor | None) -> AddedUpdate:
+        """Return what was added, with these factors behind the projection."""
         assert self.projected is not None
         mismatch = torch.stack([*self.mismatches, self.mixed.new_zeros(())]).amax()
         return AddedUpdate(self.mixed, self.before, self.projected, behind, mismatch, self.precision)

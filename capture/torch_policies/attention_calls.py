@@ -68,12 +68,14 @@ class CallShape:
 class CallTensors(Protocol):
     """The tensors of one call, as far as they are asked for. Every kind of call has its own class."""
 
-    def value(self) -> Tensor:
-        """Return the values (batch, kv_head, key, dim)."""
+    @property
+    def values(self) -> Tensor:
+        """The values (batch, kv_head, key, dim)."""
         ...
 
-    def output(self) -> Tensor:
-        """Return what the policy's kernel computed, (batch, head, query, dim), before any projection."""
+    @property
+    def outputs(self) -> Tensor:
+        """What the policy's kernel computed, (batch, head, query, dim), before any projection."""
         ...
 
     def rows(self, queries: Positions, batch: Positions) -> Tensor:
@@ -108,12 +110,12 @@ class AttentionCall:
     def value(self) -> Tensor:
         """The values (batch, kv_head, key, dim); errors as `rows`."""
         self._check_refused()
-        return self.tensors.value()
+        return self.tensors.values
 
     @property
     def output(self) -> Tensor:
         """What the policy's own kernel computed, (batch, head, query, dim), before the output projection."""
-        return self.tensors.output()
+        return self.tensors.outputs
 
     def rows(self, queries: Positions = slice(None), batch: Positions = slice(None)) -> Tensor:
         """Return the probabilities of these queries, (batch, head, query, key) float32, exact zeros where masked.

@@ -59,23 +59,23 @@ class KnownCalls:
     def rule(self, shape: CallShape) -> tuple[int, int | None]:
         """Return the number of a call's rule, -1 for none, and of the block in its module's path, if that names one."""
         call = shape.module, shape.kind, shape.queries, shape.keys
-        found = self._rules.get(call)
-        if found is None:
-            found = -1, None
+        rule_and_block = self._rules.get(call)
+        if rule_and_block is None:
+            rule_and_block = -1, None
             for number, rule in enumerate(self.layout.rules):
                 match = rule.fits(*call)
                 if match is not None:
-                    found = number, rule.block(match) if rule.site is not None else None
+                    rule_and_block = number, rule.block(match) if rule.site is not None else None
                     break
-            self._rules[call] = found
-        return found
+            self._rules[call] = rule_and_block
+        return rule_and_block
 
     def queries(self, site: RecordedSite, count: int) -> slice:
         """Return the action queries of a call with `count` queries; errors as `RecordedSite.queries`."""
-        found = self._queries.get((site.name, count))
-        if found is None:
-            found = self._queries[site.name, count] = slice(*site.queries(count))
-        return found
+        queries = self._queries.get((site.name, count))
+        if queries is None:
+            queries = self._queries[site.name, count] = slice(*site.queries(count))
+        return queries
 
 
 class CallOrder:
@@ -145,8 +145,8 @@ class CallOrder:
 
     def _keys_of(self, site: RecordedSite, count: int, token: int) -> NDArray[np.int64] | None:
         call = site.name, count, token
-        found = self.known.keys.get(call)
-        if found is None or (site.variable_span is not None and self._variable.get(site.name) != found[1]):
+        known_keys = self.known.keys.get(call)
+        if known_keys is None or (site.variable_span is not None and self._variable.get(site.name) != known_keys[1]):
             fitted = self._keys(site, count, token)
             if fitted is None:
                 if self.layout.autoregressive:
@@ -154,12 +154,12 @@ class CallOrder:
                         f"static and sliding caches have keys that a layout cannot name: {LOAD_WITH_DYNAMIC_CACHE}"
                     )
                 return None
-            found = self.known.keys[call] = fitted, self._variable.get(site.name, 0)
+            known_keys = self.known.keys[call] = fitted, self._variable.get(site.name, 0)
         if call not in self._noted:
             self._noted.add(call)
             present = self.present.setdefault(site.name, np.zeros(site.keys.num_keys, dtype=bool))
-            present[found[0]] = True
-        return found[0]
+            present[known_keys[0]] = True
+        return known_keys[0]
 
     def _keys(self, site: RecordedSite, count: int, token: int) -> NDArray[np.int64] | None:
         """The site's keys that a call with `count` keys has; `token`: number of tokens generated before it."""

@@ -1,4 +1,4 @@
-"""Tensors of attention calls that are given by queries, keys and masks, and how folded axes are taken apart."""
+"""Tensors of attention calls that are queries, keys and masks: their rows, folded axes, and changes of logits."""
 
 from __future__ import annotations
 
@@ -8,8 +8,64 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from vla_attention.capture.torch_policies.attention_calls import MASKED_BELOW, Positions, at_positions, position_numbers
-from vla_attention.capture.torch_policies.call_changes import causal_mask, mask_as_logits
+from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
+from vla_attention.capture.torch_policies.attention_calls import (
+    MASKED_BELOW,
+    CallShape,
+    Positions,
+    at_positions,
+    position_numbers,
+)
+from vla_attention.schemas.errors import BadArgument
+
+
+class ChangeRefused(BadArgument):
+    """An attention call that cannot be changed, or a change that does not fit it."""
+
+
+def fitted_change(change: Tensor, shape: CallShape, device: torch.device) -> Tensor:
+    """Return a watcher's change as float32 (batch or 1, head or 1, query or 1, key or 1) on the call's device.
+
+    Raises:
+        ChangeRefused: its shape does not fit the call.
+    """
+    full = (shape.batch, shape.heads, shape.queries, shape.keys)
+    fitted = change.detach().to(device=device, dtype=torch.float32)
+    if fitted.ndim > 4 or any(
+        size not in (1, expected) for size, expected in zip(reversed(fitted.shape), reversed(full), strict=False)
+    ):
+        raise ChangeRefused(
+            f"A change of shape {tuple(change.shape)} does not fit the attention call {shape}: its logits have the "
+            f"shape {full} (batch, head, query, key). Give a tensor that can be broadcast to it."
+        )
+    return fitted.reshape((1,) * (4 - fitted.ndim) + tuple(fitted.shape))
+
+
+def mask_as_logits(mask: Tensor, dtype: torch.dtype) -> Tensor:
+    """Return a mask as logits to add: bool masks (True: keep) as 0 and -inf, additive masks as they are."""
+    if mask.dtype is torch.bool:
+        return torch.zeros(mask.shape, dtype=dtype, device=mask.device).masked_fill_(~mask, float("-inf"))
+    return mask.to(dtype)
+
+
+def causal_mask(queries: Tensor, keys: int) -> Tensor:
+    """Return (query, key) bool, True where `is_causal` lets a query see a key: aligned to the top left.
+
+    queries: positions of the queries, (query,) int64.
+    """
+    return torch.arange(keys, device=queries.device)[None, :] <= queries[:, None]
+
+
+def check_keys_left(before: Tensor, after: Tensor, shape: CallShape) -> None:
+    """Raise `QueryWithoutKeys` if a query that had a key has none after a change; logits (batch, head, query, key)."""
+    lost = (before.amax(-1) > MASKED_BELOW) & (after.amax(-1) <= MASKED_BELOW)
+    if bool(lost.any()):
+        batch, head, query = (int(i) for i in lost.nonzero()[0])
+        raise QueryWithoutKeys(
+            f"An intervention leaves a query without any key in the attention call {shape}, batch row {batch}, head "
+            f"{head}, query {query}. Take a smaller group, a weight below 1, or fewer heads or layers."
+        )
+
 
 #: Where modules keep their number of heads; asked where a kernel gets (batch · head, query, dim).
 _HEAD_NAMES = ("num_heads", "n_heads", "num_attention_heads", "heads", "n_head", "num_head", "nheads", "nhead")
@@ -38,14 +94,6 @@ class LogitTensors:
     scale: float
     change: Tensor | None
 
-    def value(self) -> Tensor:
-        """Return the values (batch, kv_head, key, dim)."""
-        return self.values
-
-    def output(self) -> Tensor:
-        """Return what the kernel computed, (batch, head, query, dim)."""
-        return self.outputs
-
     def rows(self, queries: Positions, batch: Positions) -> Tensor:
         """Return float32 probabilities (batch, head, query, key) of these queries."""
         logits = query_key_logits(
@@ -55,7 +103,7 @@ class LogitTensors:
             mask = part(self.mask, queries, batch)
             logits = logits.masked_fill_(~mask, float("-inf")) if mask.dtype is torch.bool else logits.add_(mask)
         if self.causal:
-            seen = causal_mask(self._numbers(queries), self.key.shape[2])
+            seen = causal_mask(self._query_numbers(queries), self.key.shape[2])
             logits.masked_fill_(~seen, float("-inf"))
         if self.change is not None:
             logits.add_(part(self.change, queries, batch))
@@ -64,7 +112,7 @@ class LogitTensors:
     def allowed(self, queries: Positions) -> Tensor:
         """Return (batch, head or 1, query, key) bool."""
         batch, keys = self.key.shape[0], self.key.shape[2]
-        numbers = self._numbers(queries)
+        numbers = self._query_numbers(queries)
         seen = torch.ones((batch, 1, len(numbers), keys), dtype=torch.bool, device=self.query.device)
         if self.mask is not None:
             mask = part(self.mask, queries, slice(None))
@@ -73,7 +121,7 @@ class LogitTensors:
             seen &= causal_mask(numbers, keys)
         return seen
 
-    def _numbers(self, queries: Positions) -> Tensor:
+    def _query_numbers(self, queries: Positions) -> Tensor:
         return position_numbers(queries, self.query.shape[2], self.query.device)
 
 

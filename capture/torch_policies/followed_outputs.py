@@ -1,9 +1,9 @@
 """Following the output of an attention call from function to function, until a policy adds it to its residual stream.
 
 The way leads to the output projection that the layout names, and from what this returns to an addition. On it the
-output may be copied, cast, folded and transposed, multiplied and divided, and normalised. With the factors of the call
-all of that is linear: parts of the output take the same way, and add up to what was added. Where something else is done
-to it, it is not followed any further.
+output may be copied, cast, folded and transposed, multiplied and divided, and normalised by an RMS norm. With the
+factors of the call all of that is linear: parts of the output take the same way, and add up to what was added. Where
+something else is done to it, it is not followed any further.
 
 It is added to the residual stream where the other summand is older than the attention call, or made of an older tensor
 by copies, factors and sums. The sum with a younger tensor, that of a parallel feed-forward layer, is followed too, but
@@ -21,7 +21,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from vla_attention.capture.torch_policies.added_updates import AddedUpdate, Centring, OutputWay, Scaling, Steps
+from vla_attention.capture.torch_policies.added_updates import AddedUpdate, OutputWay, factors_between
 from vla_attention.capture.torch_policies.attention_calls import TOLERANCE
 from vla_attention.capture.torch_policies.softmax_axes import Axes, in_order
 from vla_attention.capture.torch_policies.tensor_functions import (
@@ -29,21 +29,14 @@ from vla_attention.capture.torch_policies.tensor_functions import (
     QUOTIENTS,
     SAME_NUMBERS,
     SUMS,
+    TensorTable,
     axes_after,
     no_dropout,
     tensors_among,
 )
-from vla_attention.capture.torch_policies.tensor_table import TensorTable
 from vla_attention.capture.torch_policies.watched_block import WatchedBlock
 
 _RMS_NORMS = {torch.nn.functional.rms_norm, torch.rms_norm}
-_LAYER_NORMS = {torch.nn.functional.layer_norm, torch.layer_norm}
-_SUMS_OF_PRODUCTS = {torch.addcmul, Tensor.addcmul, Tensor.addcmul_}
-#: Functions that often change no number.
-_OFTEN_NOTHING = {
-    torch.nan_to_num, Tensor.nan_to_num, Tensor.nan_to_num_, torch.clamp, Tensor.clamp, Tensor.clamp_,
-    torch.where, Tensor.where, torch.masked_fill, Tensor.masked_fill, Tensor.masked_fill_,
-}  # fmt: skip
 #: Functions whose result is as old as what they are given.
 _AGELESS = {
     *SAME_NUMBERS, *PRODUCTS, *QUOTIENTS, *SUMS, Tensor.__getitem__, Tensor.expand, Tensor.chunk, torch.chunk,
@@ -62,9 +55,7 @@ class _Place:
         sizes: of the output (batch, head, query, dim), or of what the projection returned, (batch, token, width).
         axes: how its axes are made of these, which may be divided; None: unknown.
         tokens: the action queries on the axis of queries or tokens.
-        start: the numbers of the action queries after `steps`, (batch, query, number) float32.
-        steps: those until `start`, from the output or from the projection.
-        scaled: whether it was multiplied since.
+        scaled: whether it was multiplied since the attention, or since the projection.
         joined: what was added, where it is the sum with a younger tensor.
     """
 
@@ -72,8 +63,6 @@ class _Place:
     sizes: tuple[int, ...]
     axes: Axes | None
     tokens: slice
-    start: Tensor
-    steps: Steps = ()
     scaled: bool = False
     joined: AddedUpdate | None = None
 
@@ -82,14 +71,22 @@ class _Place:
         """Whether it is behind the projection."""
         return len(self.sizes) == 3
 
+    @property
+    def start(self) -> Tensor:
+        """The numbers of the action queries before anything was multiplied, (batch, query, number) float32."""
+        if not self.behind:
+            return self.way.mixed
+        assert self.way.projected is not None
+        return self.way.projected
+
     def numbers(self, tensor: Tensor) -> Tensor | None:
         """Return the numbers of the action queries in the tensor, (batch, query, number) float32; None: unknown."""
         if self.axes is None:
             return None
-        found = in_order(tensor.detach(), self.axes.parts, range(len(self.axes.sizes)), self.axes.sizes)
-        found = found.reshape(self.sizes)
-        found = found if self.behind else found.transpose(1, 2).flatten(2)
-        return found[:, self.tokens].to(torch.float32, copy=True)
+        ordered = in_order(tensor.detach(), self.axes.parts, range(len(self.axes.sizes)), self.axes.sizes)
+        ordered = ordered.reshape(self.sizes)
+        ordered = ordered if self.behind else ordered.transpose(1, 2).flatten(2)
+        return ordered[:, self.tokens].to(torch.float32, copy=True)
 
 
 @dataclass(frozen=True)
@@ -129,7 +126,7 @@ class OutputFollower:
                 self._enter(way, result, (1, 0), way.queries)
             else:
                 axes = None if way.output is None else _axes_of_output(result, way.output)
-                self._put(result, _Place(way, way.sizes, axes, way.queries, way.mixed))
+                self._put(result, _Place(way, way.sizes, axes, way.queries))
             way.output = None
 
     def awaits(self, module: nn.Module) -> bool:
@@ -138,30 +135,30 @@ class OutputFollower:
 
     def project(self, module: nn.Module, given: Tensor, result: Tensor) -> None:
         """Note what a projection was given and what it returned."""
-        found = self._places.get(given)
+        place_of_given = self._places.get(given)
         with self._block.computing():
             for way in self._ways:
                 if way.projection is module and way.projected is None:
-                    place = found if found is not None and found.way is way else None
+                    place = place_of_given if place_of_given is not None and place_of_given.way is way else None
                     self._project(way, place, given, result)
 
     def _project(self, way: OutputWay, place: _Place | None, given: Tensor, result: Tensor) -> None:
         way.dtypes.add(given.dtype)
         if place is None or not place.scaled:
             # Whatever was done to it, these may be its numbers: other code than torch's may have moved them.
-            way.before, start = ((), way.mixed) if place is None else (place.steps, place.start)
-            found = _token_order(given, start, way)
-            if found is None:
+            order_and_tokens = _token_order(given, way.mixed, way)
+            if order_and_tokens is None:
                 way.misfit = "gets other numbers than the attention gave, or in another order"
                 return
-            self._enter(way, result, *found)
+            self._enter(way, result, *order_and_tokens)
             return
         numbers = place.numbers(given)
         if numbers is None or place.axes is None:
             way.misfit = "gets what the attention gave scaled, and in an order of axes that is not known"
             return
-        way.before = (*place.steps, Scaling.between(place.start, numbers))
-        # Which axis is the outer one; another order of them shows in what the projection returns.
+        way.before = factors_between(place.start, numbers)
+        # Which axis is the outer one. Scaled numbers cannot be compared with the output to tell the order of batch and
+        # token; a wrong order shows in what the projection returns.
         outer = next((axis for part in place.axes.parts for axis in part if place.axes.sizes[axis] != 1), 0)
         self._enter(way, result, (0, 1) if outer == 0 or place.sizes[0] == 1 else (1, 0), way.queries)
 
@@ -169,32 +166,32 @@ class OutputFollower:
         """Follow what a projection returned; order: of its axes for batch (0) and token (1), before the width."""
         batch, width = way.sizes[0], result.shape[-1]
         sizes = batch, result.numel() // max(1, batch * width), width
-        place = _Place(way, sizes, Axes(sizes, (order, (2,))).refolded(result.shape), tokens, way.mixed)
+        place = _Place(way, sizes, Axes(sizes, (order, (2,))).refolded(result.shape), tokens)
         numbers = place.numbers(result)
         if numbers is None:
             way.misfit = f"returns the shape {tuple(result.shape)}, in which the action queries are not known"
             return
         way.dtypes.add(result.dtype)
         way.projected = numbers
-        self._put(result, replace(place, start=numbers))
+        self._put(result, place)
 
     def follow(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], run: Callable[[], Any]) -> Any:
         """Run a function, and follow what it makes of the tensors that are followed."""
         # Of functions such as type_as and view_as, the other tensors do not count.
         operands = (*args, *kwargs.values())
         given = list(tensors_among(operands[:1] if function in SAME_NUMBERS else operands))
-        found = [(tensor, place) for tensor in given if (place := self._places.get(tensor)) is not None]
-        if not found and self._streams:
+        followed = [(tensor, place) for tensor in given if (place := self._places.get(tensor)) is not None]
+        if not followed and self._streams:
             return self._follow_stream(function, given, run)
-        if len(found) != 1:
+        if len(followed) != 1:
             result = run()
-            self._left(function, given, [place for _, place in found], result)
+            self._left(function, given, [place for _, place in followed], result)
             return result
-        tensor, place = found[0]
+        tensor, place = followed[0]
         addition = None
-        if place.behind and (function in SUMS or function in _SUMS_OF_PRODUCTS):
+        if place.behind and function in SUMS:
             with self._block.computing():  # before the tensor is written over
-                addition = self._addition(function, args, kwargs, tensor, place)
+                addition = self._addition(args, kwargs, tensor, place)
         result = run()
         if addition is None:
             if not self._moved(function, args, kwargs, tensor, place, result):
@@ -235,69 +232,36 @@ class OutputFollower:
             self._put(result, replace(place, axes=axes))
         elif function in _RMS_NORMS and place.joined is None:
             self._put(result, replace(place, scaled=True))
-        elif function in _LAYER_NORMS and place.joined is None:
-            with self._block.computing():
-                return self._layer_norm(args, kwargs, tensor, place, result)
-        elif function in _OFTEN_NOTHING and result.shape == tensor.shape:
-            with self._block.computing():
-                same = torch.equal(result, tensor)
-            if not same:
-                return False
-            self._put(result, place)
         else:
             return False
-        return True
-
-    def _layer_norm(
-        self, args: tuple[Any, ...], kwargs: Mapping[str, Any], tensor: Tensor, place: _Place, result: Tensor
-    ) -> bool:
-        names = ("input", "normalized_shape", "weight", "bias", "eps")
-        given = {"weight": None, "bias": None, "eps": 1e-5} | dict(zip(names, args, strict=False)) | dict(kwargs)
-        before, after = place.numbers(tensor), place.numbers(result)
-        if before is None or after is None or tuple(given["normalized_shape"]) != before.shape[-1:]:
-            return False
-        factor = (before.var(dim=-1, keepdim=True, unbiased=False) + given["eps"]).rsqrt()
-        if given["weight"] is not None:
-            factor = factor * given["weight"].float()
-        expected = (before - before.mean(dim=-1, keepdim=True)) * factor
-        expected = expected if given["bias"] is None else expected + given["bias"].float()
-        place.way.mismatches.append(difference(expected, after))
-        scaled: Steps = (Scaling.between(place.start, before),) if place.scaled else ()
-        steps = (*place.steps, *scaled, Centring(), Scaling(factor.expand_as(before)))
-        self._put(result, replace(place, steps=steps, start=after, scaled=False))
         return True
 
     def _addition(
-        self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], tensor: Tensor, place: _Place
+        self, args: tuple[Any, ...], kwargs: Mapping[str, Any], tensor: Tensor, place: _Place
     ) -> _Addition | None:
-        """Return what a sum adds of a followed tensor to another one as large; None for other functions and sums."""
-        operands = [*args, *(kwargs[name] for name in ("input", "other", "tensor1", "tensor2") if name in kwargs)]
-        first, *others = operands or [None]
-        summed = tensor
-        if function in SUMS and len(others) == 1:
-            other = others[0] if first is tensor else first
-            factor = 1 if first is tensor else kwargs.get("alpha", 1)
-        elif function in _SUMS_OF_PRODUCTS and len(others) == 2 and first is not tensor:
-            other, factor = first, kwargs.get("value", 1)
-            summed = others[0] * others[1]
-        else:
+        """Return what a sum adds of a followed tensor to another one as large; None for other sums."""
+        operands = (*args, *(kwargs[name] for name in ("input", "other") if name in kwargs))
+        if len(operands) != 2:
             return None
-        if not isinstance(other, Tensor) or other.numel() != tensor.numel() or summed.shape != tensor.shape:
+        first, second = operands
+        other = second if first is tensor else first
+        factor = 1 if first is tensor else kwargs.get("alpha", 1)
+        if not isinstance(other, Tensor) or other.numel() != tensor.numel():
             return None
-        scaled = place.scaled or summed is not tensor or factor != 1
         to_stream = self._may_be_stream(other, tensor, place.way)
         if place.joined is not None:
-            return None if summed is not tensor or factor != 1 else _Addition(place.joined, to_stream)
-        numbers, way = place.numbers(summed), place.way
+            return None if factor != 1 else _Addition(place.joined, to_stream)
+        numbers, way = place.numbers(tensor), place.way
+        scaled = place.scaled or factor != 1
         if scaled and numbers is None:
             return None
         way.dtypes.add(tensor.dtype)
-        steps = place.steps
+        factors = None
         if scaled and numbers is not None:
-            steps = (*steps, Scaling.between(place.start, numbers * factor))
+            factors = factors_between(place.start, numbers * factor)
         elif numbers is not None:
             way.mismatches.append(difference(numbers, place.start))
-        return _Addition(way.added(steps), to_stream)
+        return _Addition(way.added(factors), to_stream)
 
     def _finish(self, way: OutputWay, added: AddedUpdate, stream: Tensor) -> None:
         """End a way: its output was added to the residual stream."""
@@ -309,10 +273,10 @@ class OutputFollower:
 
     def _follow_stream(self, function: Any, given: Sequence[Tensor], run: Callable[[], Any]) -> Any:
         """Run a function, and see whether what was taken for the residual stream becomes a branch of another sum."""
-        found = [(tensor, stream) for tensor in given if (stream := self._streams.get(tensor)) is not None]
+        streams = [(tensor, stream) for tensor in given if (stream := self._streams.get(tensor)) is not None]
         result = run()
         self._left(function, given, [], result)
-        for tensor, stream in found:
+        for tensor, stream in streams:
             if not isinstance(result, Tensor) or result.numel() != tensor.numel():
                 continue
             if function in SAME_NUMBERS:
@@ -356,7 +320,11 @@ class OutputFollower:
         for place in places:
             if any(tensor.numel() >= place.start.numel() for tensor in written):
                 of_what = "of" if place.joined is None else "of a sum with"
-                place.way.computed = f"{self._block.running_module} computes {_name(function)} {of_what}"
+                place.way.computed = (
+                    f"{self._block.running_module} computes {getattr(function, '__name__', function)} {of_what}"
+                )
+        # A sum with the residual stream is the stream, and as old as its oldest summand of full size. What copies and
+        # factors make is as old as the youngest tensor that they were given; all else is new.
         ages = [self._made.get(tensor) or 0 for tensor in given]
         if function in SUMS and not places and made:
             whole = [age for age, tensor in zip(ages, given, strict=True) if tensor.numel() == made[0].numel()]
@@ -379,10 +347,6 @@ class _Addition:
     to_stream: bool
 
 
-def _name(function: Any) -> str:
-    return str(getattr(function, "__name__", function))
-
-
 def difference(one: Tensor, other: Tensor) -> Tensor:
     """Return the largest difference from another tensor, relative to its largest number; a tensor without axes."""
     if not one.numel():
@@ -395,8 +359,10 @@ def _axes_of_output(result: Tensor, output: Tensor) -> Axes | None:
     sizes = tuple(output.shape)
     for parts in (((0,), (1,), (2,), (3,)), ((0,), (2,), (1,), (3,)), ((0, 1), (2,), (3,))):
         if tuple(result.shape) == tuple(math.prod(sizes[axis] for axis in part) for part in parts):
-            found = in_order(result.detach(), parts, (0, 1, 2, 3), sizes)
-            if (found.data_ptr(), found.stride()) == (output.data_ptr(), output.stride()) or torch.equal(found, output):
+            ordered = in_order(result.detach(), parts, (0, 1, 2, 3), sizes)
+            if (ordered.data_ptr(), ordered.stride()) == (output.data_ptr(), output.stride()) or torch.equal(
+                ordered, output
+            ):
                 return Axes(sizes, parts)
     return None
 
@@ -421,7 +387,7 @@ def _token_order(given: Tensor, numbers: Tensor, way: OutputWay) -> tuple[tuple[
             if not 0 <= left_out <= start or stop - left_out > count:
                 continue
             chosen = slice(start - left_out, stop - left_out)
-            found = tokens[:, chosen].float()
-            if torch.equal(found, numbers) or float(difference(found, numbers)) <= most:
+            candidate = tokens[:, chosen].float()
+            if torch.equal(candidate, numbers) or float(difference(candidate, numbers)) <= most:
                 return order, chosen
     return None

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from vla_attention.capture.torch_policies.attention_calls import TOLERANCE, AttentionCall, CallShape
 from vla_attention.capture.torch_policies.key_caches import KeyCaches
-from vla_attention.capture.torch_policies.random_numbers import RandomNumbers
 from vla_attention.capture.torch_policies.unseen_attention import no_attention
-from vla_attention.capture.torch_policies.watch import watch_attention
+from vla_attention.capture.torch_policies.watch import RandomNumbers, watch_attention
 from vla_attention.schemas.errors import BadArgument
 
 #: How many queries of a call the product of rows and values is checked for.
@@ -110,8 +109,11 @@ class CallTable:
         ]
         if len(rows) > _SCREEN:
             lines.append(f"... and {len(rows) - _SCREEN} further rows: see `.rows`")
-        lines += [_refusal(row) for row in rows if row.refused]
-        if any(row.refused for row in rows):
+        refused = [row for row in rows if row.refused]
+        for row in refused:
+            pattern, _, sizes, *_ = _cells(row)
+            lines.append(f"Recording refuses {pattern}, {sizes}: {row.refused}.")
+        if refused:
             lines.append("Calls that hold no action queries are left out by a rule without a site.")
         batch = sorted({call.batch for call in self.calls})
         if batch and batch[0] > 1 and self.errors:
@@ -237,12 +239,12 @@ def _rows(calls: Sequence[CallShape], checks: Sequence[_Check]) -> Iterator[Call
         module, refused = str(entry[0]), any(why for _, why in counts[entry])
         folded.setdefault((re.sub(r"\d+", "{}", module), *entry[1:], refused), []).append((module, counts[entry]))
     for (_, kind, batch, heads, kv_heads, queries, dtype, keys, _), modules in folded.items():
-        times = [len(found) for _, found in modules]
+        times = [len(checks) for _, checks in modules]
         yield CallRow(
             modules=tuple(module for module, _ in modules), kind=kind, batch=batch, heads=heads, kv_heads=kv_heads,
             queries=queries, keys=keys, dtype=dtype, times=(min(times), max(times)),
-            product_error=max(error for _, found in modules for error, _ in found),
-            refused=next((why for _, found in modules for _, why in found if why), ""),
+            product_error=max(error for _, checks in modules for error, _ in checks),
+            refused=next((why for _, checks in modules for _, why in checks if why), ""),
         )  # fmt: skip
 
 
@@ -260,11 +262,6 @@ def _cells(row: CallRow) -> tuple[str, ...]:
     return pattern, row.kind, f"{row.queries} x {keys}", heads, row.dtype, calls, error
 
 
-def _refusal(row: CallRow) -> str:
-    pattern, _, sizes, *_ = _cells(row)
-    return f"Recording refuses {pattern}, {sizes}: {row.refused}."
-
-
 def folded_paths(paths: Sequence[str]) -> str:
     """Return paths that differ in their numbers as one, as `layers.{0..17}.self_attn`.
 
@@ -280,7 +277,7 @@ def folded_paths(paths: Sequence[str]) -> str:
     if combinations != len(paths):
         return ", ".join(paths)
     written = iter(_listed(column) if len(column) == 1 else f"{{{_listed(column)}}}" for column in columns)
-    return re.sub(r"\d+", lambda found: next(written), paths[0])
+    return re.sub(r"\d+", lambda match: next(written), paths[0])
 
 
 def _listed(numbers: Sequence[int]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +12,8 @@ from numpy.typing import NDArray
 from vla_attention.capture.interventions.attention_edits import SiteEdit, log_factors
 from vla_attention.capture.interventions.resolution import (
     ReplanPlace,
-    check_not_empty,
     check_selectors,
-    empty_replans,
+    has_empty_group,
     make_editors,
     run_vocabularies,
     site_tokens,
@@ -21,14 +21,17 @@ from vla_attention.capture.interventions.resolution import (
 from vla_attention.capture.torch_policies.attention_calls import CallShape
 from vla_attention.capture.torch_policies.call_order import CallPlace
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
+from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs
+from vla_attention.capture.torch_policies.replan_text import ReplanText
+from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import AttentionScale, Interventions, KeyKnockout
 from vla_attention.schemas.layout import Prompt, SiteLayout
 
-
-class CannotIntervene(BadArgument):
-    """An intervention that cannot be made in a policy of the caller."""
+if TYPE_CHECKING:
+    from vla_attention.capture.torch_policies.recorded_episodes import Episode
+    from vla_attention.capture.torch_policies.session import RecordedRun
 
 
 def interventions_of(
@@ -40,11 +43,11 @@ def interventions_of(
     weight: float,
     layout: PolicyLayout,
 ) -> Interventions:
-    """Return the interventions of a session; raise `CannotIntervene` for those that need more than an additive mask."""
+    """Return the interventions of a session; raise `BadArgument` for those that need more than an additive mask."""
     places = {
-        "layers": _numbers("layer", layers, layout.num_layers),
-        "heads": _numbers("head", heads, layout.num_heads),
-        "denoise_steps": _numbers("denoise step", denoise_steps, layout.num_denoise_steps),
+        "layers": _places_of_layout("layer", layers, layout.num_layers),
+        "heads": _places_of_layout("head", heads, layout.num_heads),
+        "denoise_steps": _places_of_layout("denoise step", denoise_steps, layout.num_denoise_steps),
     }
     if isinstance(knockout, Interventions):
         if keep is not None or any(chosen is not None for chosen in places.values()):
@@ -70,7 +73,7 @@ def interventions_of(
     return Interventions(keys=tuple(keys))
 
 
-def _numbers(what: str, numbers: Sequence[int] | None, count: int) -> tuple[int, ...] | None:
+def _places_of_layout(what: str, numbers: Sequence[int] | None, count: int) -> tuple[int, ...] | None:
     if numbers is None:
         return None
     for number in numbers:
@@ -81,39 +84,34 @@ def _numbers(what: str, numbers: Sequence[int] | None, count: int) -> tuple[int,
 
 def _check(interventions: Interventions) -> None:
     if interventions.changes_input or interventions.noise is not None:
-        raise CannotIntervene(
+        raise BadArgument(
             f"Cannot record with {interventions.describe()}: prompt, pictures and noise are given to the policy by "
             "your own code; change them there, and give only knockouts and factors of attention."
         )
     for edit in (*interventions.keys, *interventions.attention):
         if not isinstance(edit, (KeyKnockout, AttentionScale)):
-            raise CannotIntervene(
+            raise BadArgument(
                 f"Cannot record with {edit.describe()}: only what is added to the logits of a call can be changed, a "
                 "knockout or a factor."
             )
         if edit.queries != "action":
-            raise CannotIntervene(
+            raise BadArgument(
                 f"Cannot record with {edit.describe()}: a layout knows the action queries of a call only; use the "
                 "queries 'action'."
             )
         if isinstance(edit, KeyKnockout) and edit.random_seed is not None:
-            raise CannotIntervene(
+            raise BadArgument(
                 f"Cannot record with {edit.describe()}: which keys the policy masks is known only after the call; name "
                 "the keys of the control, for instance with patch:CAMERA[rows,columns]."
             )
 
 
-@dataclass
+@dataclass(frozen=True)
 class SessionKnockouts:
-    """Makes the edits of every replan of a session.
-
-    num_replans, num_empty: replans so far, and those in which some group had no key.
-    """
+    """Makes the edits of every replan of a session. allow_empty: a group without a key changes nothing."""
 
     interventions: Interventions
     allow_empty: bool = False
-    num_replans: int = field(default=0, init=False)
-    num_empty: int = field(default=0, init=False)
 
     @property
     def any(self) -> bool:
@@ -134,14 +132,10 @@ class SessionKnockouts:
         coverage: Mapping[str, NDArray[np.float32]],
         place: ReplanPlace,
     ) -> dict[str, Sequence[SiteEdit]]:
-        """Return the edits of one replan by site; errors as `AttentionChanges.editors`."""
-        self.num_replans += 1
+        """Return the edits of one replan by site; errors as `RunChanges.editors`."""
         tokens = site_tokens(sites, key_role, prompt, objects, coverage)
         vocabularies = run_vocabularies(sites, [prompt.instruction_text], objects)
-        if not self.allow_empty:
-            check_not_empty(self.interventions, tokens, vocabularies, place)
-        elif any(empty.any() for empty in empty_replans(self.interventions, tokens, vocabularies).values()):
-            self.num_empty += 1
+        has_empty_group(self.interventions, tokens, vocabularies, place, allow_empty=self.allow_empty)
         editors = make_editors(self.interventions, tokens, vocabularies, place)
         return {site: editor.edits for site, editor in editors.items()}
 
@@ -175,3 +169,47 @@ def logit_bias(edits: Sequence[SiteEdit], place: CallPlace, shape: CallShape) ->
 def with_name(interventions: Interventions, name: str) -> Interventions:
     """Return the interventions with the name of their condition."""
     return replace(interventions, name=name) if name else interventions
+
+
+@dataclass
+class ReplanEdits:
+    """What knockouts add to the logits of the calls of one replan; the keys are looked up at its first call."""
+
+    run: RecordedRun
+    episodes: Mapping[int, tuple[Episode, ReplanInputs]]
+    text: ReplanText
+    recorder: ReplanRecorder | None = None
+    _of_row: dict[int, dict[str, Any]] = field(default_factory=dict)
+    _known: dict[tuple[Any, ...], NDArray[np.float32]] = field(default_factory=dict)
+
+    def bias(self, row: int, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
+        """Return what is added to the logits of a call in one row of the batch, (head or 1, query, key).
+
+        Calls to which the same is added get the same array.
+        """
+        if row not in self._of_row:
+            self._of_row[row] = self._edits(row)
+        edits = edits_at(self._of_row[row].get(place.site or "", ()), place)
+        if not edits:
+            return None
+        # Where the keys of calls differ, they differ from token to token.
+        token = -1 if place.keys is None else place.step
+        sizes = shape.heads, shape.queries, shape.keys, place.queries.start, place.queries.stop, token
+        call = row, place.site, tuple(id(edit) for edit in edits), *sizes
+        if call not in self._known:
+            self._known[call] = logit_bias(edits, place, shape)
+        return self._known[call]
+
+    def _edits(self, row: int) -> dict[str, Any]:
+        episode, inputs = self.episodes[row]
+        prompt = self.text.prompt(row, None)
+        sites = self.run._sites
+        assert self.recorder is not None
+        present = self.recorder.order.present
+        roles = {site.name: self.text.roles(row, site, prompt, present.get(site.name), None) for site in sites}
+        place = ReplanPlace(episode.facts.task_id, episode.facts.episode_index, episode.num_replans)
+        return dict(
+            self.run.knockouts.edits(
+                self.run.attributes.sites, roles, prompt, episode.facts.objects, inputs.coverage, place
+            )
+        )

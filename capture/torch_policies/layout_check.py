@@ -19,14 +19,12 @@ from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace
 from vla_attention.capture.torch_policies.inspect_calls import NoAttention
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
 from vla_attention.capture.torch_policies.policy_modules import FoundPolicy, find_policy
-from vla_attention.capture.torch_policies.prompt_ids import PromptIds, embeddings_of
 from vla_attention.capture.torch_policies.prompts import TokenText
-from vla_attention.capture.torch_policies.random_numbers import RandomNumbers
 from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs
-from vla_attention.capture.torch_policies.replan_text import ReplanText
+from vla_attention.capture.torch_policies.replan_text import PromptIds, ReplanText, embeddings_of
 from vla_attention.capture.torch_policies.unseen_attention import no_attention
-from vla_attention.capture.torch_policies.watch import watch_attention
-from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.capture.torch_policies.watch import RandomNumbers, watch_attention
+from vla_attention.schemas.errors import BadArgument, listing, runs_of
 from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
 from vla_attention.schemas.groupings.selector_weights import selector_weights
 from vla_attention.schemas.layout import Span
@@ -71,10 +69,10 @@ class KeysMoved:
         """Return keys in words: spans by name, and parts of spans with the numbers of their keys."""
         words = []
         for span in self.spans:
-            own = [key for key in keys if span.start <= key < span.stop]
-            if own:
-                whole = len(own) == sum(span.start <= key < span.stop for key in self.present)
-                words.append(span.name if whole else f"{span.name} ({_ranges(own)})")
+            in_span = [key for key in keys if span.start <= key < span.stop]
+            if in_span:
+                whole = len(in_span) == sum(span.start <= key < span.stop for key in self.present)
+                words.append(span.name if whole else f"{span.name} ({_ranges(in_span)})")
         return ", ".join(words) or "nothing"
 
     @property
@@ -176,24 +174,24 @@ def check_layout(
         if tokenizer is None and any(atom.kind in _OF_WORDS for atom in atoms_of(parse_selector(selector))):
             raise BadArgument(f"'{selector}' needs tokenizer= and instruction=, which say where the words are.")
     blocks = _first_blocks(layout, site)
-    found, random = find_policy(policy), RandomNumbers()
+    known_policy, random = find_policy(policy), RandomNumbers()
     text = None if tokenizer is None else TokenText(tokenizer)
     try:
-        keys = _keys_of(found, layout, blocks, call, "the unchanged call")
+        keys = _keys_of(known_policy, layout, blocks, call, "the unchanged call")
         expected = keys.expected(layout, perturb, text, instruction)
         random.again()
-        again = _keys_of(found, layout, blocks, call, "the unchanged call, made again")
+        again = _keys_of(known_policy, layout, blocks, call, "the unchanged call, made again")
         _check_repeats(keys, again, layout)
         changes = []
         for selector, changed_call in perturb.items():
             random.again()
-            changed = _keys_of(found, layout, blocks, changed_call, f"the call for '{selector}'")
+            changed = _keys_of(known_policy, layout, blocks, changed_call, f"the call for '{selector}'")
             for name, block in blocks.items():
                 present = keys.there(name) | changed.there(name)
-                wanted, moved = _numbers(expected[selector][name]), _numbers(keys.moved(changed, name))
+                wanted, moved = _key_numbers(expected[selector][name]), _key_numbers(keys.moved(changed, name))
                 if wanted or moved:
                     spans = layout.site(name).keys.spans
-                    changes.append(KeysMoved(selector, name, block, wanted, moved, _numbers(present), spans))
+                    changes.append(KeysMoved(selector, name, block, wanted, moved, _key_numbers(present), spans))
     finally:
         random.again()
     left_out = tuple(other.name for other in layout.sites if other.name not in blocks) if site is None else ()
@@ -243,12 +241,12 @@ class _Keys:
 
     def _keep(self, call: AttentionCall, place: CallPlace, site: RecordedSite) -> None:
         count = site.keys.num_keys
-        own = np.arange(count) if place.keys is None else place.keys
+        positions = np.arange(count) if place.keys is None else place.keys
         numbers = call.value[0].detach().transpose(0, 1).flatten(1).float().cpu().numpy()
         self.values[site.name] = values = np.full((count, numbers.shape[1]), np.nan, dtype=np.float32)
-        values[own] = numbers
+        values[positions] = numbers
         self.valid[site.name] = valid = np.zeros(count, dtype=bool)
-        valid[own] = call.allowed(place.queries)[0].any(dim=(0, 1)).cpu().numpy()
+        valid[positions] = call.allowed(place.queries)[0].any(dim=(0, 1)).cpu().numpy()
         self.rounding[site.name] = _ROUNDING.get(call.precision, _ROUNDING["float32"])
 
     def there(self, site: str) -> NDArray[np.bool_]:
@@ -318,17 +316,11 @@ def _check_repeats(keys: _Keys, again: _Keys, layout: PolicyLayout) -> None:
             )
 
 
-def _numbers(chosen: NDArray[np.bool_]) -> tuple[int, ...]:
+def _key_numbers(chosen: NDArray[np.bool_]) -> tuple[int, ...]:
     return tuple(int(key) for key in np.flatnonzero(chosen))
 
 
 def _ranges(keys: Sequence[int]) -> str:
     """Return ascending numbers as text: `key 7`, `keys 4..6` or `keys 4..6, 9`."""
-    parts: list[list[int]] = []
-    for key in keys:
-        if parts and parts[-1][-1] == key - 1:
-            parts[-1].append(key)
-        else:
-            parts.append([key])
     what = "key" if len(keys) == 1 else "keys"
-    return f"{what} {listing(str(part[0]) if len(part) == 1 else f'{part[0]}..{part[-1]}' for part in parts)}"
+    return f"{what} {listing(str(run[0]) if len(run) == 1 else f'{run[0]}..{run[-1]}' for run in runs_of(keys))}"

@@ -21,13 +21,14 @@ from vla_attention.capture.torch_policies.attention_calls import (
     at_positions,
     position_numbers,
 )
-from vla_attention.capture.torch_policies.call_changes import (
+from vla_attention.capture.torch_policies.call_tensors import (
     ChangeRefused,
+    LogitTensors,
     check_keys_left,
     fitted_change,
     mask_as_logits,
+    normalised,
 )
-from vla_attention.capture.torch_policies.call_tensors import LogitTensors, normalised
 from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
 from vla_attention.capture.torch_policies.watched_block import WatchedBlock
 
@@ -96,12 +97,14 @@ class MultiheadTensors:
     given: Mapping[str, Any]
     kernel: LogitTensors | _Weights
 
-    def value(self) -> Tensor:
-        """Return the values (batch, head, key, dim), as the call has projected them."""
+    @property
+    def values(self) -> Tensor:
+        """The values (batch, head, key, dim), as the call has projected them."""
         return self.kernel.values
 
-    def output(self) -> Tensor:
-        """Return what the call's kernel computed, (batch, head, query, dim), before the output projection."""
+    @property
+    def outputs(self) -> Tensor:
+        """What the call's kernel computed, (batch, head, query, dim), before the output projection."""
         return self.kernel.outputs
 
     def rows(self, queries: Positions, batch: Positions) -> Tensor:

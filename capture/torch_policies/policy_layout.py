@@ -77,8 +77,8 @@ class CallRule:
 
     def block(self, match: re.Match[str]) -> int | None:
         """Return the number of the block in a module's path, None where the group is no number or did not match."""
-        found = match["block"]
-        return int(found) if found is not None and found.isdecimal() else None
+        digits = match["block"]
+        return int(digits) if digits is not None and digits.isdecimal() else None
 
     def describe(self) -> str:
         """The rule on one line."""

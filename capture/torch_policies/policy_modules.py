@@ -1,17 +1,21 @@
-"""The modules that a policy holds, by path, and policies whose attention no Python code computes."""
+"""The modules that a policy holds, by path, their weights, and policies whose attention no Python code computes."""
 
 from __future__ import annotations
 
+import hashlib
 import types
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
+from vla_attention.capture.policies.weights import weights_digest
 from vla_attention.capture.torch_policies.attention_calls import CallShape
+from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
+from vla_attention.capture.torch_policies.tensor_functions import tensors_among
 from vla_attention.capture.torch_policies.unseen_attention import refuse_unseen_settings
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument, did_you_mean, unknown_name
 
 #: How deep modules are looked for in objects that are no modules.
 _DEPTH = 4
@@ -84,7 +88,7 @@ def modules_of(policy: object) -> dict[str, nn.Module]:
         CannotRunEager: a part is a compiled program: TorchScript, TensorRT, AOTInductor, a CUDA graph ...
     """
     policy = getattr(policy, "__self__", policy) if isinstance(policy, types.MethodType) else policy
-    found: dict[str, nn.Module] = {}
+    modules: dict[str, nn.Module] = {}
     seen: set[int] = set()
     for path, part in _parts(policy, "", 0, seen):
         name = f"{type(part).__module__}.{type(part).__qualname__}"
@@ -99,13 +103,13 @@ def modules_of(policy: object) -> dict[str, nn.Module]:
                 "be made eager. Load the policy as an ordinary torch module; torch.compile is fine."
             )
         if isinstance(part, nn.Module):
-            found.setdefault(path, part)
-    if not found:
+            modules.setdefault(path, part)
+    if not modules:
         raise NoModules(
             f"The policy ({type(policy).__name__}) holds no torch module. Give the nn.Module itself, or an object with "
             "the module among its attributes."
         )
-    return found
+    return modules
 
 
 def _parts(part: object, path: str, depth: int, seen: set[int]) -> Iterator[tuple[str, object]]:
@@ -170,3 +174,116 @@ def _held(part: object, path: str, depth: int, seen: set[int]) -> Iterator[tuple
 
 def _joined(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
+
+
+def find_module(policy: object, path: str, what: str) -> nn.Module:
+    """Return the module at a path; the error says what it was wanted for, and the nearest that exists."""
+    modules = modules_of(policy)
+    if path not in modules:
+        raise unknown_name(f"module for {what}", path, [name for name in modules if name])
+    return modules[path]
+
+
+def _roots(policy: object) -> dict[str, nn.Module]:
+    """The modules of a policy that are in no other one, by path."""
+    inside: set[int] = set()
+    roots = {}
+    for path, module in modules_of(policy).items():
+        if id(module) not in inside:
+            roots[path] = module
+            inside.update(id(part) for part in module.modules())
+    return roots
+
+
+def policy_digest(policy: object) -> str:
+    """Return the SHA-256 (hex) over the weights of all modules of a policy."""
+    roots = _roots(policy)
+    if len(roots) == 1:
+        return weights_digest(next(iter(roots.values())))
+    digest = hashlib.sha256()
+    for name, module in sorted(roots.items()):
+        digest.update(f"{name} {weights_digest(module)}\n".encode())
+    return digest.hexdigest()
+
+
+def weights_state(policy: object) -> tuple[tuple[int, int], ...]:
+    """Return what tells quickly that weights may have changed: where they are, and how often torch wrote to them.
+
+    What is written through `.data` is not counted.
+    """
+    return tuple(
+        (weight.data_ptr(), 0 if weight.is_inference() else weight._version)
+        for module in _roots(policy).values()
+        for weight in module.parameters()
+    )
+
+
+def device_and_dtype(policy: object) -> tuple[str, str]:
+    """Return the device and the type of most weights, such as `cuda:0` and `bfloat16`."""
+    counts: dict[tuple[str, str], int] = {}
+    for module in _roots(policy).values():
+        for weight in module.parameters():
+            place = str(weight.device), str(weight.dtype).removeprefix("torch.")
+            counts[place] = counts.get(place, 0) + weight.numel()
+    return max(counts, key=lambda place: counts[place]) if counts else ("cpu", "float32")
+
+
+@dataclass(frozen=True)
+class OutputProjection:
+    """The output projection of a block, by its module and path."""
+
+    module: nn.Module
+    path: str
+
+    def __call__(self, mixed: Tensor) -> Tensor:
+        """Map mixed values (..., head · dim) float32 to (..., width), without a bias: no key gives it."""
+        if (linear := self._linear) is not None:
+            return nn.functional.linear(mixed, linear.weight.to(mixed.dtype))
+        flat = mixed.flatten(0, -2)
+        both = self._called(torch.cat([flat, torch.zeros_like(flat[:1])]))
+        return (both[:-1] - both[-1:]).view(*mixed.shape[:-1], -1)
+
+    def bias(self, mixed: Tensor) -> Tensor:
+        """Return what it gives for zeros, (width,) float32; mixed: values of the size that it takes."""
+        if (linear := self._linear) is not None:
+            zeros = linear.weight.new_zeros(len(linear.weight), dtype=torch.float32)
+            return zeros if linear.bias is None else linear.bias.float()
+        return self._called(torch.zeros_like(mixed.flatten(0, -2)[:1]))[0]
+
+    @property
+    def _linear(self) -> nn.Linear | None:
+        module = self.module
+        if isinstance(module, nn.Linear) and type(module).forward is nn.Linear.forward:
+            return module if module.weight.is_floating_point() else None
+        return None
+
+    def _called(self, mixed: Tensor) -> Tensor:
+        # Quantised weights, adapters: the module itself.
+        weights = (weight.dtype for weight in self.module.parameters() if weight.is_floating_point())
+        result = self.module(mixed.to(next(weights, mixed.dtype)))
+        return next(tensors_among((result,))).float()
+
+
+def projections_of(
+    policy: object, layout: PolicyLayout, layers: tuple[int, ...]
+) -> dict[tuple[str, int], OutputProjection]:
+    """Return (site, block) -> the output projection of a block, for the recorded layers."""
+    modules = modules_of(policy)
+    projections = {}
+    for site in layout.sites:
+        if site.projection is None:
+            raise BadArgument(
+                f"Contributions need the output projection of site '{site.name}', and the layout '{layout.name}' names "
+                "none: record with contributions=False."
+            )
+        for block in site.keys.layers or range(layout.num_layers):
+            if block not in layers:
+                continue
+            path = site.projection.replace("{block}", str(block))
+            if path not in modules:
+                raise BadArgument(
+                    f"The output projection '{path}' of site '{site.name}' is no module of the policy."
+                    f"{did_you_mean(path, modules)} Change RecordedSite.projection, or record with contributions=False."
+                )
+            projections[site.name, block] = OutputProjection(modules[path], path)
+    return projections

@@ -8,34 +8,30 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
-from vla_attention.capture.provenance import describe_machine
-from vla_attention.capture.torch_policies.batch_rows import rows_apart
+from vla_attention.capture.machine.provenance import describe_machine
+from vla_attention.capture.rollout.recording_plan import RecordingSettings, recording_of, root_attributes
 from vla_attention.capture.torch_policies.knockouts import SessionKnockouts, interventions_of, with_name
-from vla_attention.capture.torch_policies.own_setting import difference_to_own_setting, numbers_of
+from vla_attention.capture.torch_policies.own_setting import difference_to_own_setting, rows_apart
 from vla_attention.capture.torch_policies.policy_layout import (
     LayoutForAnotherVersion,
     PolicyLayout,
     RecordedSite,
     check_versions,
 )
-from vla_attention.capture.torch_policies.policy_weights import device_and_dtype, policy_digest, projections_of
+from vla_attention.capture.torch_policies.policy_modules import device_and_dtype, policy_digest, projections_of
 from vla_attention.capture.torch_policies.prompts import TokenText
 from vla_attention.capture.torch_policies.session import RecordedRun
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.jsonable import to_json
-from vla_attention.schemas.layers import select_layers
 from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
 from vla_attention.schemas.stores.store_format import (
     CALLERS_MODULES,
-    FORMAT_NAME,
-    STORE_VERSION,
     PolicyCameraView,
     PolicyIdentity,
     Protocol,
     Recording,
-    RootAttributes,
 )
 
 #: Libraries of policies whose versions can change numbers.
@@ -127,9 +123,19 @@ def record(
     other = check_versions(layout, installed)
     if other is not None and not any_version:
         raise LayoutForAnotherVersion(other)
-    recording = plan_recording(
-        layout, layers, denoise_steps, heads, queries, bits, contributions=contributions, frames=frames
+    undecided = contributions is None
+    if contributions is None:
+        contributions = all(site.projection is not None for site in layout.sites)
+    settings = RecordingSettings(
+        layers=None if layers is None else tuple(layers),
+        denoise_steps=(denoise_steps,) if isinstance(denoise_steps, (int, str)) else tuple(denoise_steps),
+        heads=None if heads is None else tuple(heads),
+        queries=queries,
+        mantissa_bits=bits,
+        frames=frames,
+        contributions=contributions,
     )
+    recording = plan_recording(settings, layout)
     changes = with_name(
         interventions_of(
             knockout, keep, knockout_layers, knockout_heads, knockout_denoise_steps, knockout_weight, layout
@@ -141,18 +147,17 @@ def record(
     facts = describe_machine(device)
     facts |= {library: version for library, version in installed.items() if version is not None}
     facts |= {"layout for another version": other} if other is not None else {}
-    facts |= _own_setting(policy, layout, own_setting)
+    facts["difference to own setting"] = "not measured"
+    if own_setting is not None:
+        facts["difference to own setting"] = str(difference_to_own_setting(policy, own_setting))
+        facts["rows of the batch of own setting"] = rows_apart(policy, layout, own_setting)
     facts |= dict(provenance or {})
-    attributes = RootAttributes(
-        format=FORMAT_NAME,
-        store_version=STORE_VERSION,
-        policy=_identity(policy, layout, checkpoint, dtype, untrained=untrained),
-        protocol=Protocol(
-            suite=suite, seed=0, wait_steps=0, replan_steps=0, max_steps=0, name="recorded", image_size=0
-        ),
-        recording=recording,
-        sites=recorded_sites(layout, recording),
-        provenance=facts,
+    attributes = root_attributes(
+        _identity(policy, layout, checkpoint, dtype, untrained=untrained),
+        recorded_sites(layout, recording),
+        Protocol(suite=suite, seed=0, wait_steps=0, replan_steps=0, max_steps=0, name="recorded", image_size=0),
+        recording,
+        facts,
         interventions=changes,
     )
     return RecordedRun(
@@ -164,28 +169,14 @@ def record(
         knockouts=SessionKnockouts(changes, allow_empty),
         tokenizer=None if tokenizer is None else TokenText(tokenizer),
         projections=projections,
-        undecided=contributions is None and recording.contributions,
+        undecided=undecided and recording.contributions,
         durable=durable,
     )
 
 
-def plan_recording(
-    layout: PolicyLayout,
-    layers: Sequence[int] | None,
-    denoise_steps: Sequence[int | str],
-    heads: Sequence[int] | None,
-    queries: str,
-    bits: int,
-    *,
-    contributions: bool | None,
-    frames: bool,
-) -> Recording:
+def plan_recording(settings: RecordingSettings, layout: PolicyLayout) -> Recording:
     """Return what is recorded; raise `BadArgument` for what the layout does not have."""
-    blocks = select_layers(layers, layout.num_layers, layout.family)
-    chosen_heads = tuple(range(layout.num_heads)) if heads is None else tuple(sorted(set(heads)))
-    for head in chosen_heads:
-        if not 0 <= head < layout.num_heads:
-            raise BadArgument(f"There is no head {head}; expected 0 to {layout.num_heads - 1}.")
+    queries, bits = settings.queries, settings.mantissa_bits
     if queries not in ("mean", "all"):
         raise BadArgument(f"Cannot record the queries '{queries}'; expected 'mean' or 'all'.")
     if queries == "all" and layout.stops_early:
@@ -195,20 +186,7 @@ def plan_recording(
         )
     if not 1 <= bits <= FLOAT32_MANTISSA_BITS:
         raise BadArgument(f"Cannot store rows with {bits} mantissa bits; expected 1 to {FLOAT32_MANTISSA_BITS}.")
-    steps = _denoise_steps(denoise_steps, layout.num_denoise_steps)
-    if contributions is None:
-        contributions = all(site.projection is not None for site in layout.sites)
-    return Recording(
-        layers=tuple(sorted(set(blocks.blocks))),
-        layer_labels=tuple(sorted(blocks.labels, key=lambda label: (label % layout.num_layers, label))),
-        denoise_steps=steps,
-        heads=chosen_heads,
-        queries="mean" if queries == "mean" else "all",
-        num_action_queries=max(num_action_queries(layout, site) for site in layout.sites),
-        mantissa_bits=bits,
-        frames=frames,
-        contributions=contributions,
-    )
+    return recording_of(settings, layout, max(num_action_queries(layout, site) for site in layout.sites))[0]
 
 
 def num_action_queries(layout: PolicyLayout, site: RecordedSite) -> int:
@@ -223,27 +201,11 @@ def recorded_sites(layout: PolicyLayout, recording: Recording) -> tuple[SiteLayo
         if site.keys.layers and not set(site.keys.layers) & set(recording.layers):
             continue
         count = num_action_queries(layout, site)
-        own = 0 if count == recording.num_action_queries else count
-        stored.append(replace(site.keys, num_action_queries=own) if own else site.keys)
+        num_queries = 0 if count == recording.num_action_queries else count
+        stored.append(replace(site.keys, num_action_queries=num_queries) if num_queries else site.keys)
     if not stored:
         raise BadArgument(f"The layers {listing(recording.layers)} have none of the sites.")
     return tuple(stored)
-
-
-def _denoise_steps(words: Sequence[int | str], count: int) -> tuple[int, ...]:
-    named = {"first": (0,), "last": (count - 1,), "all": tuple(range(count))}
-    given = [words] if isinstance(words, (int, str)) else words
-    steps: set[int] = set()
-    for word in given:
-        if isinstance(word, str) and word in named:
-            steps.update(named[word])
-        elif not isinstance(word, str) and 0 <= word < count:
-            steps.add(int(word))
-        else:
-            raise BadArgument(
-                f"There is no denoise step {word!r}; expected numbers 0 to {count - 1}, 'first', 'last' or 'all'."
-            )
-    return tuple(sorted(steps))
 
 
 def _identity(policy: object, layout: PolicyLayout, checkpoint: str, dtype: str, *, untrained: bool) -> PolicyIdentity:
@@ -268,16 +230,6 @@ def _identity(policy: object, layout: PolicyLayout, checkpoint: str, dtype: str,
             "layout": to_json(replace(layout, versions={}, config={})),
         },
     )
-
-
-def _own_setting(policy: object, layout: PolicyLayout, own_setting: Callable[[], Any] | None) -> dict[str, str]:
-    """What is measured with a policy call that can be repeated, for the store."""
-    if own_setting is None:
-        return {"difference to own setting": "not measured"}
-    return {
-        "difference to own setting": str(difference_to_own_setting(policy, own_setting)),
-        "rows of the batch of own setting": rows_apart(policy, layout, own_setting, numbers_of),
-    }
 
 
 def installed_version(library: str) -> str | None:

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.environments.coverage import patch_coverage
 from vla_attention.capture.policies.policy import camera_grid
-from vla_attention.capture.torch_policies.pictures import model_picture
-from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
+from vla_attention.capture.torch_policies.policy_layout import PictureFit, PolicyLayout
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing, unknown_name
 from vla_attention.schemas.groupings.vocabulary import SceneObject
-from vla_attention.schemas.layout import Prompt
+from vla_attention.schemas.layout import PatchGrid, Prompt
 from vla_attention.schemas.safe_text import check_text
 
 
@@ -80,7 +79,7 @@ def _seed(given: Any) -> int:
     return seed
 
 
-def _numbers(what: str, given: Any) -> NDArray[np.float64]:
+def _as_float64(what: str, given: Any) -> NDArray[np.float64]:
     """Return numbers as float64, or raise `BadArgument`."""
     values = given.detach().float().cpu().numpy() if hasattr(given, "detach") else given
     try:
@@ -162,7 +161,7 @@ def _dataset_actions(given: Any) -> NDArray[np.float64] | None:
 def _state(given: Any) -> NDArray[np.float64] | None:
     if given is None:
         return None
-    state = _numbers("state", given)
+    state = _as_float64("state", given)
     state = state[0] if state.ndim == 2 and len(state) == 1 else state
     if state.ndim != 1:
         raise BadArgument(f"The state of a replan has the shape {state.shape}; expected (state_dim,).")
@@ -173,7 +172,7 @@ def read_actions(given: Any) -> NDArray[np.float64] | None:
     """Return actions as (horizon, action_dim) float64; None where the caller gave none."""
     if given is None:
         return None
-    actions = _numbers("actions", given)
+    actions = _as_float64("actions", given)
     actions = actions[0] if actions.ndim == 3 and len(actions) == 1 else actions
     actions = actions[None] if actions.ndim == 1 else actions
     if actions.ndim != 2 or not actions.size:
@@ -181,3 +180,67 @@ def read_actions(given: Any) -> NDArray[np.float64] | None:
             f"The actions of a replan have the shape {actions.shape}; expected (horizon, action_dim) or (action_dim,)."
         )
     return actions
+
+
+def model_picture(picture: Any, camera: str, grid: PatchGrid, fit: PictureFit) -> NDArray[np.uint8]:
+    """Return a camera's picture as (height, width, 3) uint8 of the model's input size.
+
+    picture: (height, width, 3) uint8, or (3, height, width) with numbers from 0 to 1, as an array or a tensor; a batch
+    axis of length 1 may come first. fit: how other sizes become the model's, see `CameraPicture`.
+
+    Raises:
+        BadArgument: another shape or type.
+    """
+    levels = _levels(picture, camera)
+    height, width = grid.image_height, grid.image_width
+    if levels.shape[:2] == (height, width):
+        return levels
+    if fit == "stretch":
+        return _resized(levels, height, width)
+    factor = max(levels.shape[0] / height, levels.shape[1] / width)
+    inner = _resized(levels, max(1, int(levels.shape[0] / factor)), max(1, int(levels.shape[1] / factor)))
+    below, beside = height - inner.shape[0], width - inner.shape[1]
+    top, left = (below, beside) if fit == "pad_left_top" else (below // 2, beside // 2)
+    fitted = np.zeros((height, width, 3), dtype=np.uint8)
+    fitted[top : top + inner.shape[0], left : left + inner.shape[1]] = inner
+    return fitted
+
+
+def _levels(picture: Any, camera: str) -> NDArray[np.uint8]:
+    """The picture as (row, column, channel) uint8."""
+    if hasattr(picture, "detach"):
+        picture = picture.detach().cpu()
+        picture = (picture.float() if picture.is_floating_point() else picture).numpy()
+    values = np.asarray(picture)
+    values = values[0] if values.ndim == 4 and len(values) == 1 else values
+    if not values.size:
+        raise BadArgument(f"The picture of camera '{camera}' is empty: its shape is {values.shape}.")
+    if values.ndim == 3 and values.shape[-1] == 3 and values.dtype == np.uint8:
+        return np.ascontiguousarray(values)
+    if values.ndim == 3 and values.shape[0] == 3 and values.dtype == np.uint8:
+        return np.ascontiguousarray(values.transpose(1, 2, 0))
+    if values.ndim == 3 and 3 in (values.shape[0], values.shape[-1]) and values.dtype.kind == "f":
+        if values.min() >= 0 and values.max() <= 1:
+            channels_last = values if values.shape[-1] == 3 else values.transpose(1, 2, 0)
+            return np.ascontiguousarray(np.rint(channels_last * 255).astype(np.uint8))
+        raise BadArgument(
+            f"The picture of camera '{camera}' has numbers from {values.min():.3g} to {values.max():.3g}; give it "
+            "before normalising, as uint8 or from 0 to 1."
+        )
+    raise BadArgument(
+        f"The picture of camera '{camera}' has the shape {values.shape} and type {values.dtype}; expected (height, "
+        "width, 3) uint8, or (3, height, width) with numbers from 0 to 1."
+    )
+
+
+def _resized(picture: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
+    """The picture in another size, bilinear with smoothing."""
+    import torch
+
+    with torch.no_grad():
+        values = torch.from_numpy(picture).permute(2, 0, 1)[None].float()
+        small = torch.nn.functional.interpolate(
+            values, (height, width), mode="bilinear", align_corners=False, antialias=True
+        )
+        result: NDArray[np.uint8] = small[0].permute(1, 2, 0).round().clamp(0, 255).to(torch.uint8).numpy()
+    return np.ascontiguousarray(result)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor, nn
 
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
-from vla_attention.capture.torch_policies.prompt_ids import PromptIds
+from vla_attention.capture.torch_policies.policy_modules import find_module, modules_of
 from vla_attention.capture.torch_policies.prompts import (
+    PromptDoesNotFit,
     TokenText,
     prompt_from_ids,
     prompt_from_pieces,
@@ -19,7 +23,93 @@ from vla_attention.capture.torch_policies.prompts import (
 )
 from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs
 from vla_attention.capture.torch_policies.site_recorder import SiteRows
+from vla_attention.schemas.errors import listing
 from vla_attention.schemas.layout import Prompt
+
+_Look = Callable[[nn.Module, tuple[Any, ...], dict[str, Any]], None]
+
+
+def embeddings_of(policy: object, layout: PolicyLayout) -> dict[str, nn.Module]:
+    """Return the embeddings of a policy by path, that of the layout's prompt first; none where it has no prompt.
+
+    Raises:
+        UnknownName: the policy has no module at the path that the layout gives.
+    """
+    if layout.text is None:
+        return {}
+    path = layout.text.embedding
+    first = {path: find_module(policy, path, "token ids")}
+    return first | {name: module for name, module in modules_of(policy).items() if isinstance(module, nn.Embedding)}
+
+
+class PromptIds:
+    """What the embeddings of a policy are given in one policy call.
+
+    embeddings: by path, the prompt's first, see `embeddings_of`. batch: number of rows of the call.
+
+    Attributes:
+        ids: (row of the batch, token) int64, the longest that the prompt's embedding was given; None: none so far.
+    """
+
+    def __init__(self, embeddings: Mapping[str, nn.Module], batch: int) -> None:
+        self.ids: NDArray[np.int64] | None = None
+        self._embeddings = embeddings
+        self._batch = batch
+        #: Path -> the shape of the largest whole numbers that the module was given.
+        self._called: dict[str, tuple[int, ...]] = {}
+
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        """Look at what the embeddings are given within the block."""
+        with ExitStack() as stack:
+            for number, (path, module) in enumerate(self._embeddings.items()):
+                look = self._look(path, is_prompt=number == 0)
+                stack.callback(module.register_forward_pre_hook(look, with_kwargs=True).remove)
+            yield
+
+    def _look(self, path: str, *, is_prompt: bool) -> _Look:
+        def look(_module: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
+            given = next((value for value in (*arguments, *named.values()) if isinstance(value, Tensor)), None)
+            if given is None or given.is_floating_point():
+                return
+            self._called[path] = max(self._called.get(path, tuple(given.shape)), tuple(given.shape), key=np.prod)
+            rows = given[None] if given.ndim == 1 else given
+            if not is_prompt or rows.ndim != 2 or len(rows) != self._batch:
+                return
+            if self.ids is None or rows.shape[1] > self.ids.shape[1]:
+                self.ids = rows.detach().cpu().numpy().astype(np.int64)
+
+        return look
+
+    def missing(self) -> PromptDoesNotFit:
+        """Return the error for a call in which the prompt's embedding was given no ids: it says which others were."""
+        path, module = next(iter(self._embeddings.items()))
+        if path in self._called:
+            return PromptDoesNotFit(
+                f"The module '{path}', which embeds the prompt as the layout says, was given whole numbers of the "
+                f"shape {self._called[path]}, and the policy call has a batch of {self._batch}: expected token ids "
+                f"(batch, token). {_OTHERWISE}"
+            )
+        tied = {name for name in self._called if _same_weights(self._embeddings[name], module)}
+        others = sorted(self._called, key=lambda name: (name not in tied, -np.prod(self._called[name])))
+        seen = [f"'{name}' {self._called[name]}{' with the same weights' * (name in tied)}" for name in others]
+        what = f"Embeddings that were given whole numbers: {listing(seen)}" if seen else "No embedding was called"
+        return PromptDoesNotFit(
+            f"The module '{path}', which embeds the prompt as the layout says, was not called before its token ids "
+            f"were needed. {what}. Name the one that embeds the prompt in PromptText.embedding. {_OTHERWISE}"
+        )
+
+
+_OTHERWISE = (
+    "Where a policy keeps an embedded prompt, or embeds it otherwise, give its pieces with replan(prompt=...), or "
+    "record without a tokenizer."
+)
+
+
+def _same_weights(one: nn.Module, other: nn.Module) -> bool:
+    """Whether two embeddings share their numbers, as tied ones do."""
+    first, second = getattr(one, "weight", None), getattr(other, "weight", None)
+    return isinstance(first, Tensor) and isinstance(second, Tensor) and first.data_ptr() == second.data_ptr()
 
 
 class ReplanText:
@@ -38,8 +128,8 @@ class ReplanText:
         #: Site -> (key,) bool, the keys that its calls had so far.
         self.present: Mapping[str, NDArray[np.bool_]] = {}
 
-    def prompt(self, row: int, found: Mapping[str, SiteRows] | None) -> Prompt:
-        """Return the prompt of a row; `found`: what the call's sites gave, None before the call has ended.
+    def prompt(self, row: int, rows_of_sites: Mapping[str, SiteRows] | None) -> Prompt:
+        """Return the prompt of a row; `rows_of_sites`: what the call's sites gave, None before the call has ended.
 
         Raises:
             PromptDoesNotFit: the ids of its words are wanted and were not seen, or do not fit; see `prompt_from_ids`.
@@ -50,7 +140,12 @@ class ReplanText:
         sites = self.layout.text_sites
         if self.layout.text is None or not sites:
             return prompt_without_pieces(given.instruction)
-        present = self._present_keys(sites[0], found)
+        name = sites[0].name
+        present = (
+            self.present.get(name)
+            if rows_of_sites is None or name not in rows_of_sites
+            else rows_of_sites[name].present
+        )
         keys = text_keys(sites[0], self.layout.text.spans, present)
         if given.prompt is not None:
             return prompt_from_pieces(given.prompt, keys, given.instruction)
@@ -59,12 +154,12 @@ class ReplanText:
         if self.seen.ids is None:
             raise self.seen.missing()
         valid = None
-        if found is not None and any(site.name in found for site in sites):
+        if rows_of_sites is not None and any(site.name in rows_of_sites for site in sites):
             # The prompt has the same keys at every site; what else the sites hold differs.
             valid = np.zeros(max(site.keys.num_keys for site in sites), dtype=bool)
             for site in sites:
-                if site.name in found:
-                    valid[: site.keys.num_keys] |= found[site.name].valid
+                if site.name in rows_of_sites:
+                    valid[: site.keys.num_keys] |= rows_of_sites[site.name].valid
         return prompt_from_ids(self._text_ids(row), keys, self.tokenizer, given.instruction, valid)
 
     def roles(
@@ -78,7 +173,8 @@ class ReplanText:
         """Return the role codes of a site's keys, (key,), see `roles_of_keys`."""
         bos = None
         if self.layout.text is not None and self.seen.ids is not None and self.tokenizer is not None:
-            ids, first = self._text_ids(row), text_keys(site, self.layout.text.spans, None) if self._has(site) else []
+            ids = self._text_ids(row)
+            first = text_keys(site, self.layout.text.spans, None) if site in self.layout.text_sites else []
             if ids and first and ids[0] == self.tokenizer.bos:
                 bos = first[0]
         return roles_of_keys(site, self.layout, prompt, present, valid, bos, self.inputs[row].roles)
@@ -86,14 +182,6 @@ class ReplanText:
     def early_roles(self, row: int, site: RecordedSite, present: NDArray[np.bool_]) -> NDArray[np.uint8]:
         """Return the roles of a site's keys before the masks are known."""
         return self.roles(row, site, self.prompt(row, None), present, None)
-
-    def _has(self, site: RecordedSite) -> bool:
-        return site in self.layout.text_sites
-
-    def _present_keys(self, site: RecordedSite, found: Mapping[str, SiteRows] | None) -> NDArray[np.bool_] | None:
-        if found is not None and site.name in found:
-            return found[site.name].present
-        return self.present.get(site.name)
 
     def _text_ids(self, row: int) -> list[int]:
         assert self.seen.ids is not None

@@ -10,9 +10,8 @@ call, to its addition to the residual stream, where the watcher wants it.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import wraps
 from typing import Any
 
@@ -20,7 +19,7 @@ import torch
 from torch import nn, overrides
 from torch.overrides import TorchFunctionMode
 
-from vla_attention.capture.torch_policies import flex_calls, multihead_calls, sdpa_calls, softmax_calls
+from vla_attention.capture.torch_policies import fused_calls, multihead_calls, softmax_calls
 from vla_attention.capture.torch_policies.followed_outputs import OutputFollower
 from vla_attention.capture.torch_policies.tensor_functions import tensors_among
 from vla_attention.capture.torch_policies.unseen_attention import ATTENTION_OPERATOR, LOAD_WITH_SDPA, UnseenAttention
@@ -49,20 +48,42 @@ _Call = Callable[[Any, tuple[Any, ...], Mapping[str, Any]], Any]
 
 
 class SeenFunctions:
-    """Sees the attention functions of one block, in every thread that asks for it.
+    """Sees the attention functions of one block, in the thread in which it was opened.
 
     every_function: look at every function of torch, not only at those under the usual names.
 
     Attributes:
         by_names: whether no attention function was seen that was called otherwise than by its usual name.
+        block: whose functions they are.
+        softmaxes: the followed results of softmaxes.
+        outputs: the followed outputs of attention calls.
+        handlers: what is done instead of a function.
+        inside: whether a handler runs; what it calls is no call of the policy's.
     """
 
     def __init__(self, block: WatchedBlock, *, every_function: bool) -> None:
         self.by_names = True
         self.every_function = every_function
-        self._block = block
-        self._threads = threading.local()
-        self._stand_ins: dict[Any, Any] = {}
+        self.block = block
+        self.softmaxes = softmax_calls.Softmaxes(block)
+        self.outputs = OutputFollower(block)
+        self.inside = False
+        self.handlers: dict[Any, _Call] = {
+            **dict.fromkeys(fused_calls.SDPA_FUNCTIONS, self._attend(fused_calls.watch_sdpa)),
+            **dict.fromkeys(multihead_calls.FUNCTIONS, self._attend(self._multihead)),
+            **dict.fromkeys(fused_calls.FLEX_FUNCTIONS, self._attend(fused_calls.watch_flex)),
+            **dict.fromkeys(softmax_calls.SOFTMAXES, self.softmaxes.softmax),
+        }
+        #: Whether calls are seen: what stands under the names may be called after the block.
+        self._seeing = False
+        #: What `nn.MultiheadAttention` calls inside; None while none runs.
+        self._inner_calls: list[multihead_calls.InnerCall] | None = None
+        #: Sees every function of torch while it is entered.
+        self._mode = _EveryFunction(self)
+        #: Whether it is entered for what is followed.
+        self._following = False
+        #: How many modes there were before.
+        self._depth = len(_modes())
 
     @contextmanager
     def names_replaced(self) -> Iterator[None]:
@@ -71,115 +92,80 @@ class SeenFunctions:
         try:
             for owner, name in _NAMES:
                 function = getattr(owner, name)
-                self._stand_ins[function] = stand_in = self._in_place_of(function)
+                stand_in = self._in_place_of(function)
+                if function in self.handlers:  # some functions give the mode what stands under their name
+                    self.handlers[stand_in] = self.handlers[function]
                 replaced.append((owner, name, owner.__dict__.get(name), stand_in))
                 setattr(owner, name, stand_in)
             yield
         finally:
-            for owner, name, own, stand_in in replaced:
+            for owner, name, before, stand_in in replaced:
                 if owner.__dict__.get(name) is not stand_in:
                     continue  # the policy's code has set another one meanwhile
-                if own is None:  # inherited
+                if before is None:  # inherited
                     delattr(owner, name)
                 else:
-                    setattr(owner, name, own)
+                    setattr(owner, name, before)
 
     @contextmanager
-    def in_this_thread(self) -> Iterator[None]:
-        """See what is called in this thread."""
-        self._threads.own = own = _OfThread(self, self._block, self._stand_ins)
+    def seeing(self) -> Iterator[None]:
+        """See what is called in the block's thread."""
+        self._seeing = True
         try:
-            if self.every_function:
-                with own.mode:
-                    yield
-            else:
+            with self._mode if self.every_function else nullcontext():
                 yield
         finally:
-            del self._threads.own
-            own.stop_following()
+            self._seeing = False
+            self._stop_following()
 
     def at_module(self) -> None:
         """Say that a module begins or ends: where nothing is followed any more, the mode that follows ends."""
-        own = getattr(self._threads, "own", None)
-        if own is not None and own.following and not own.follows:
-            own.stop_following()
+        if self._following and not self._follows:
+            self._stop_following()
 
     def around_projection(self, module: nn.Module, forward: Callable[..., Any]) -> Callable[..., Any]:
         """Return a forward that tells what follows an output what the projection was given and what it returned."""
 
         def projected(*args: Any, **kwargs: Any) -> Any:
-            own = getattr(self._threads, "own", None)
-            if own is None or own.inside or not own.outputs.awaits(module):
+            if not self._sees or self.inside or not self.outputs.awaits(module):
                 return forward(*args, **kwargs)
             given = next(tensors_among((*args, *kwargs.values())), None)
-            own.inside = True  # the module is one step
+            self.inside = True  # the module is one step
             try:
                 result = forward(*args, **kwargs)
             finally:
-                own.inside = False
+                self.inside = False
             returned = next(tensors_among((result,)), None)
             if given is not None and returned is not None:
-                own.outputs.project(module, given, returned)
-                own.follow_what_is_left()
+                self.outputs.project(module, given, returned)
+                self._follow_what_is_left()
             return result
 
         return projected
 
     def _in_place_of(self, function: Any) -> Any:
-        threads = self._threads
-
         @wraps(function)
         def seen(*args: Any, **kwargs: Any) -> Any:
-            own = getattr(threads, "own", None)
-            if own is None:
+            if not self._sees:
                 return function(*args, **kwargs)
-            if own.inside:
+            if self.inside:
                 result = function(*args, **kwargs)
-                if own.taken is not None:
-                    own.taken.append(multihead_calls.InnerCall(function, args, result))
+                if self._inner_calls is not None:
+                    self._inner_calls.append(multihead_calls.InnerCall(function, args, result))
                 return result
-            handler = own.handlers.get(function)
+            handler = self.handlers.get(function)
             if handler is None:
                 return function(*args, **kwargs)
-            return own.handle(handler, function, args, kwargs)
+            return self.handle(handler, function, args, kwargs)
 
         return seen
 
-
-class _OfThread:
-    """What belongs to one thread.
-
-    Attributes:
-        softmaxes: the followed results of softmaxes.
-        outputs: the followed outputs of attention calls.
-        handlers: what is done instead of a function.
-        inside: whether a handler runs; what it calls is no call of the policy's.
-        taken: collects what `nn.MultiheadAttention` calls inside, None elsewhere.
-        mode: sees every function of torch while it is entered.
-        following: whether it is entered for what is followed.
-    """
-
-    def __init__(self, functions: SeenFunctions, block: WatchedBlock, stand_ins: Mapping[Any, Any]) -> None:
-        self.block = block
-        self.functions = functions
-        self.softmaxes = softmax_calls.Softmaxes(block)
-        self.outputs = OutputFollower(block)
-        self.inside = False
-        self.taken: list[multihead_calls.InnerCall] | None = None
-        self.following = False
-        self._depth = len(_modes())
-        self.handlers: dict[Any, _Call] = {
-            **dict.fromkeys(sdpa_calls.FUNCTIONS, self._attend(sdpa_calls.watch_call)),
-            **dict.fromkeys(multihead_calls.FUNCTIONS, self._attend(self._multihead)),
-            **dict.fromkeys(flex_calls.FUNCTIONS, self._attend(flex_calls.watch_call)),
-            **dict.fromkeys(softmax_calls.SOFTMAXES, self.softmaxes.softmax),
-        }
-        # Some functions give the mode what stands under their name.
-        self.handlers |= {stand_ins[known]: self.handlers[known] for known in stand_ins if known in self.handlers}
-        self.mode = _EveryFunction(self)
+    @property
+    def _sees(self) -> bool:
+        return self._seeing and self.block.in_this_thread
 
     @property
-    def follows(self) -> bool:
+    def _follows(self) -> bool:
         """Whether anything is followed."""
         return bool(self.softmaxes.followed) or bool(self.outputs)
 
@@ -194,12 +180,17 @@ class _OfThread:
             return result
         finally:
             self.inside = False
-            self.follow_what_is_left()
+            self._follow_what_is_left()
 
-    def follow_what_is_left(self) -> None:
+    def _follow_what_is_left(self) -> None:
         """Enter the mode that sees every function, if something is followed."""
-        if self.follows and not self.following and not self.functions.every_function:
-            self._follow()
+        if not self._follows or self._following or self.every_function:
+            return
+        # Below the modes that the policy's code has entered, which leave from the top.
+        above = [_pop() for _ in _modes()[self._depth :]]
+        for mode in (self._mode, *reversed(above)):
+            _push(mode)
+        self._following = True
 
     def follow(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
         """Run a function that is no attention function, and follow what it makes of what is followed."""
@@ -222,63 +213,57 @@ class _OfThread:
 
     def _multihead(self, block: WatchedBlock, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
         def run(*args: Any, **kwargs: Any) -> tuple[Any, list[multihead_calls.InnerCall]]:
-            taken: list[multihead_calls.InnerCall] = []
-            self.taken = taken
+            inner: list[multihead_calls.InnerCall] = []
+            self._inner_calls = inner
             try:
-                return function(*args, **kwargs), taken
+                return function(*args, **kwargs), inner
             finally:
-                self.taken = None
+                self._inner_calls = None
 
         return multihead_calls.watch_call(block, run, args, kwargs)
 
-    def _follow(self) -> None:
-        """Enter the mode below the modes that the policy's code has entered, which leave from the top."""
-        above = [_pop() for _ in _modes()[self._depth :]]
-        for mode in (self.mode, *reversed(above)):
-            _push(mode)
-        self.following = True
-
-    def stop_following(self) -> None:
-        """Leave the mode that follows softmaxes, wherever it stands."""
-        if not self.following or self.mode not in _modes():
+    def _stop_following(self) -> None:
+        """Leave the mode that follows softmaxes and outputs, wherever it stands."""
+        if not self._following or self._mode not in _modes():
             return  # inside of a function that the mode has seen, it is not there
+        # Torch leaves modes from the top only, and the policy's own ones may have been entered since.
         above = []
-        while (mode := _pop()) is not self.mode:
+        while (mode := _pop()) is not self._mode:
             above.append(mode)
         for mode in reversed(above):
             _push(mode)
-        self.following = False
+        self._following = False
 
 
 class _EveryFunction(TorchFunctionMode):
     """Sees every torch function of one thread."""
 
-    def __init__(self, own: _OfThread) -> None:
+    def __init__(self, seen: SeenFunctions) -> None:
         super().__init__()
-        self._own = own
+        self._seen = seen
         #: Every function of the policy comes by here: a look at each says whether anything is followed.
-        self._softmaxes, self._outputs = own.softmaxes.followed, own.outputs
+        self._softmaxes, self._outputs = seen.softmaxes.followed.entries, seen.outputs
 
     def __torch_function__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
-        own = self._own
-        if own.inside:
+        seen = self._seen
+        if seen.inside:
             return func(*args, **kwargs) if kwargs else func(*args)
-        handler = own.handlers.get(func)
+        handler = seen.handlers.get(func)
         if handler is not None:
-            own.functions.by_names = False
-            return own.handle(handler, func, args, kwargs or {})
+            seen.by_names = False
+            return seen.handle(handler, func, args, kwargs or {})
         if type(func) in _OPERATORS:
             self._refuse_unseen(func)
         if (self._softmaxes or self._outputs) and func not in _CALLS_SOFTMAX:
-            return own.handle(own.follow, func, args, kwargs or {})
+            return seen.handle(seen.follow, func, args, kwargs or {})
         return func(*args, **kwargs) if kwargs else func(*args)
 
     def _refuse_unseen(self, operator: Any) -> None:
         """Raise `UnseenAttention` for an attention operator that no handler knows."""
         name = str(getattr(operator, "_qualified_op_name", None) or operator.name())
         if ATTENTION_OPERATOR.match(name):
-            raise self._own.block.failed(
+            raise self._seen.block.failed(
                 UnseenAttention(f"The operator {name} computes attention in a way that gives no rows. {LOAD_WITH_SDPA}")
             )

@@ -5,38 +5,45 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Never, SupportsIndex, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
+from vla_attention.capture.store.episode_writer import EpisodeWriter
+from vla_attention.capture.store.replan_records import EpisodeStart, ReplanRecord
 from vla_attention.capture.store.store_root import read_existing_root
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, make_way, open_run
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit, KnownCalls
-from vla_attention.capture.torch_policies.knockouts import SessionKnockouts
+from vla_attention.capture.torch_policies.knockouts import ReplanEdits, SessionKnockouts
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
-from vla_attention.capture.torch_policies.policy_modules import find_policy
-from vla_attention.capture.torch_policies.policy_weights import OutputProjection, policy_digest, weights_state
-from vla_attention.capture.torch_policies.prompt_ids import PromptIds, embeddings_of
+from vla_attention.capture.torch_policies.policy_modules import (
+    OutputProjection,
+    find_policy,
+    policy_digest,
+    weights_state,
+)
 from vla_attention.capture.torch_policies.prompts import TokenText
-from vla_attention.capture.torch_policies.replan_edits import ReplanEdits
+from vla_attention.capture.torch_policies.recorded_episodes import (
+    Episode,
+    EpisodeBatch,
+    RecordingStopped,
+    Replan,
+    check_length,
+    rows_of_batch,
+)
 from vla_attention.capture.torch_policies.replan_inputs import (
     EpisodeFacts,
     ReplanInputs,
     read_actions,
-    read_inputs,
-    whole_number,
 )
-from vla_attention.capture.torch_policies.replan_text import ReplanText
+from vla_attention.capture.torch_policies.replan_text import PromptIds, ReplanText, embeddings_of
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder, SiteRows, final_contribution
-from vla_attention.capture.torch_policies.unseen_attention import no_attention
 from vla_attention.capture.torch_policies.watch import watch_attention
-from vla_attention.schemas.errors import BadArgument, Note, UserError, listing
-from vla_attention.schemas.layout import Prompt
+from vla_attention.schemas.errors import Note, UserError
 from vla_attention.schemas.stores.store_format import EPISODES_GROUP, RootAttributes, StoreExists, episode_name
 
 #: More replans than any episode has; the writer collects rows in blocks of two megabytes.
@@ -49,260 +56,12 @@ _BY_NAMES = (
 )
 
 
-class RecordingStopped(UserError, RuntimeError):
-    """A part of a session was used outside of its block, twice, or inside of another."""
-
-
 class WeightsChanged(UserError, RuntimeError):
     """A policy whose weights are others than when the run began."""
 
 
-class NothingRecorded(UserError, RuntimeError):
-    """An episode in which no attention was seen."""
-
-
 class ContributionsUnknown(UserError, RuntimeError):
     """Contributions of a policy of which it cannot be said what its keys add to its residual stream."""
-
-
-@dataclass
-class Replan:
-    """One policy call, inside of its block.
-
-    actions: (horizon, action_dim) or (action_dim,), set by the caller; None: not stored. With several environments, one
-        of them each, (environment, ...). All replans of an episode have them, or none.
-    recorded: after the block, whether attention ran in it.
-    """
-
-    actions: Any = None
-    recorded: bool = False
-
-
-@dataclass
-class Episode:
-    """An episode that is being recorded. Leaving its block without an exception stores it.
-
-    success: True, False, or None where it is not known. num_steps: number of executed actions; None: the last
-    environment step of a replan, and one. num_replans, num_dropped: recorded replan blocks, and blocks in which no
-    attention ran (the policy answered from a queue).
-    """
-
-    run: RecordedRun
-    facts: EpisodeFacts
-    success: bool | None = None
-    num_steps: int | None = None
-    num_dropped: int = 0
-    largest_error: float = 0.0
-    folder: Path | None = None
-    _batch: EpisodeBatch | None = field(default=None, repr=False)
-    _ended: bool = field(default=False, repr=False)
-    _stack: ExitStack = field(default_factory=ExitStack, repr=False)
-    #: None before the first policy call is recorded.
-    _writer: EpisodeWriter | None = field(default=None, repr=False)
-
-    @property
-    def name(self) -> str:
-        """The episode's name in the store."""
-        return episode_name(self.facts.task_id, self.facts.episode_index)
-
-    @property
-    def num_replans(self) -> int:
-        """Number of recorded replans."""
-        return 0 if self._writer is None else len(self._writer.records)
-
-    def _append(self, record: ReplanRecord) -> None:
-        if self._writer is None:
-            self._writer = self._stack.enter_context(self.run._writer_of(self.facts))
-        self._writer.append(record)
-
-    @contextmanager
-    def replan(
-        self,
-        *,
-        env_step: SupportsIndex,
-        frames: Mapping[str, Any] | None = None,
-        state: Any = None,
-        instruction: str | None = None,
-        prompt: Prompt | Sequence[str | None] | None = None,
-        roles: Mapping[str, Any] | None = None,
-        noise_seed: SupportsIndex | None = None,
-        masks: Mapping[str, Any] | None = None,
-        coverage: Mapping[str, Any] | None = None,
-        dataset_actions: Any = None,
-        # No type fits: for a type checker these are errors, and for `read_inputs` names that do not exist.
-        **unknown: Never,
-    ) -> Iterator[Replan]:
-        """Record the policy call in the block. What is None is not known, or that of the episode.
-
-        Args:
-            env_step: the environment step at which the call is made; it increases from call to call.
-            frames: camera of the layout -> picture as the policy gets it, (height, width, 3) uint8 or (3, height,
-                width) with numbers from 0 to 1; stored in the model's input size.
-            state: (state_dim,) numbers.
-            instruction: the instruction of this call, where it is not that of the episode.
-            prompt: the prompt's pieces, one text for each key of the prompt (None for keys without text), or a
-                `Prompt`; None: from the token ids that the policy embeds.
-            roles: site -> role codes (key,), where the layout's are not those of this call.
-            noise_seed: the seed of this call's noise.
-            masks: camera -> (height, width) whole numbers: the number of each pixel's object, counted in the episode's
-                `objects`.
-            coverage: camera -> (patch, object), the share of each patch that each object covers; instead of masks.
-            dataset_actions: (step, action_dim), the actions that a data set has from this call on; no more of them are
-                stored than the policy gives actions.
-
-        Raises:
-            BadArgument: an argument or a camera does not exist, or a value has another shape or type.
-            CallsDoNotFit: the attention calls are not those of the layout.
-            RowsDoNotMatch: the rows do not reproduce what the policy's kernel gave.
-            ContributionsUnknown: contributions are recorded, and it is not known what the parts of the keys add.
-        """
-        if self._batch is not None:
-            raise RecordingStopped("This episode is one of several; use the replan of run.episodes(...).")
-        inputs = dict(
-            frames=frames, state=state, instruction=instruction, prompt=prompt, roles=roles, noise_seed=noise_seed,
-            masks=masks, coverage=coverage, dataset_actions=dataset_actions, **unknown,
-        )  # fmt: skip
-        given = read_inputs(self.run.layout, self.facts, env_step, inputs)
-        with self.run._replan([self], [given], batch=1, rows=[0]) as replan:
-            yield replan
-
-    def _commit(self) -> None:
-        writer = self._writer
-        if writer is None or not writer.records:
-            raise NothingRecorded(
-                f"No attention was seen in the {self.num_dropped} replan blocks of {self.name}. "
-                f"{no_attention(self.run.policy)}"
-            )
-        last = writer.records[-1].env_step + 1
-        facts = {
-            **writer.start.provenance,
-            "largest P·V error": f"{self.largest_error:.3g}",
-            "replan blocks without attention": str(self.num_dropped),
-        }
-        writer.start = replace(writer.start, provenance=facts)
-        self.run._check_weights()
-        # Environments give numpy's bools and numbers.
-        success = None if self.success is None else bool(self.success)
-        num_steps = last if self.num_steps is None else whole_number("num_steps of an episode", self.num_steps)
-        self.folder = writer.commit(success, num_steps)
-        self.run.largest_error = max(self.run.largest_error, self.largest_error)
-
-
-class EpisodeBatch(Sequence[Episode]):
-    """Several episodes whose policy calls are made together.
-
-    Attributes:
-        rows: the row of the policy call's batch of each episode.
-        batch: number of rows of a policy call.
-    """
-
-    def __init__(self, run: RecordedRun, stack: ExitStack, rows: Sequence[int], batch: int) -> None:
-        self.rows = tuple(rows)
-        self.batch = batch
-        self._run = run
-        self._stack = stack
-        self._episodes: list[Episode] = []
-
-    def __len__(self) -> int:
-        return len(self._episodes)
-
-    @overload
-    def __getitem__(self, number: int) -> Episode: ...
-
-    @overload
-    def __getitem__(self, number: slice) -> list[Episode]: ...
-
-    def __getitem__(self, number: int | slice) -> Episode | list[Episode]:
-        return self._episodes[number]
-
-    @contextmanager
-    def replan(
-        self,
-        *,
-        env_step: SupportsIndex | Sequence[SupportsIndex],
-        active: Sequence[bool] | None = None,
-        frames: Sequence[Mapping[str, Any] | None] | None = None,
-        state: Any = None,
-        instruction: Sequence[str | None] | None = None,
-        prompt: Sequence[Prompt | Sequence[str | None] | None] | None = None,
-        roles: Sequence[Mapping[str, Any] | None] | None = None,
-        noise_seed: Sequence[SupportsIndex | None] | None = None,
-        masks: Sequence[Mapping[str, Any] | None] | None = None,
-        coverage: Sequence[Mapping[str, Any] | None] | None = None,
-        dataset_actions: Sequence[Any] | None = None,
-        **unknown: Never,
-    ) -> Iterator[Replan]:
-        """Record the policy call of all episodes in the block.
-
-        Args:
-            env_step: environment step of all episodes, or of each.
-            active: which episodes are recorded; None: all of them. One that has ended is left out.
-            frames, state, instruction, prompt, roles, noise_seed, masks, coverage, dataset_actions: as in
-                `Episode.replan`, each a sequence with one entry for each episode.
-        """
-        inputs = dict(
-            frames=frames, state=state, instruction=instruction, prompt=prompt, roles=roles, noise_seed=noise_seed,
-            masks=masks, coverage=coverage, dataset_actions=dataset_actions, **unknown,
-        )  # fmt: skip
-        count = len(self)
-        _check_length("active", active, count)
-        chosen = [number for number in range(count) if active is None or active[number]]
-        several: Any = env_step
-        steps: list[Any] = list(np.asarray(several)) if np.ndim(several) else [several] * count
-        for name, values in (("env_step", steps), *(inputs.items())):
-            _check_length(name, values, count)
-        given = [
-            read_inputs(
-                self._run.layout,
-                self[number].facts,
-                steps[number],
-                {name: None if values is None else values[number] for name, values in inputs.items()},
-            )
-            for number in chosen
-        ]
-        if not chosen:
-            raise BadArgument("No row of the batch is active.")
-        rows = [self.rows[number] for number in chosen]
-        with self._run._replan(
-            [self[number] for number in chosen], given, batch=self.batch, rows=rows, places=chosen, count=count
-        ) as replan:
-            yield replan
-
-    def next_episode(self, row: int, **facts: Any) -> Episode:
-        """Store an episode of the batch, by its number, and begin another one in its row; facts as in `run.episode`."""
-        self[row]._commit()
-        self._episodes[row] = self._begin(facts)
-        return self._episodes[row]
-
-    def _begin(self, facts: Mapping[str, Any]) -> Episode:
-        episode = self._run._begin(self._stack, EpisodeFacts(**facts))
-        episode._batch = self
-        return episode
-
-
-def _rows_of_batch(count: int, rows: Sequence[int] | None, batch: int | None) -> tuple[list[int], int]:
-    """Return the row of each of `count` episodes, and the number of rows of a policy call, checked."""
-    chosen = [whole_number("row of an episode", row) for row in (range(count) if rows is None else rows)]
-    size = count if batch is None else whole_number("batch of run.episodes", batch)
-    if len(chosen) != count or len(set(chosen)) != count or not all(0 <= row < size for row in chosen):
-        raise BadArgument(
-            f"run.episodes has {count} episodes at the rows {listing(chosen)} of a batch of {size}; expected a row of "
-            "its own for each of them, counted from 0."
-        )
-    return chosen, size
-
-
-def _check_length(name: str, values: Any, count: int) -> None:
-    """Raise `BadArgument` unless values are None or a sequence with one entry for each episode."""
-    if values is None:
-        return
-    try:
-        length = len(values)
-    except TypeError:
-        raise BadArgument(f"{name} is {values!r}; expected one for each of {count} episodes.") from None
-    if length != count or isinstance(values, (str, Mapping)):
-        what = f"{length} entries" if length != count else f"the type {type(values).__name__}"
-        raise BadArgument(f"{name} has {what}; expected one for each of {count} episodes.")
 
 
 class RecordedRun:
@@ -339,7 +98,7 @@ class RecordedRun:
     ) -> None:
         self.path = path
         self.policy = policy
-        self._found = find_policy(policy)
+        self._known_policy = find_policy(policy)
         self._weights = weights_state(policy)
         self._embeddings = embeddings_of(policy, layout)
         self.layout = layout
@@ -449,7 +208,7 @@ class RecordedRun:
         Raises:
             BadArgument: rows that the batch does not have, or that two episodes share.
         """
-        chosen, size = _rows_of_batch(len(episodes), rows, batch)
+        chosen, size = rows_of_batch(len(episodes), rows, batch)
         with ExitStack() as stack:
             joined = EpisodeBatch(self, stack, chosen, size)
             for facts in episodes:
@@ -549,7 +308,7 @@ class RecordedRun:
         self._in_block = True
         try:
             every_function = self.every_function or self._names_unknown
-            seen = watch_attention(self._found, recorder, every_function=every_function)
+            seen = watch_attention(self._known_policy, recorder, every_function=every_function)
             with ids.watched(), seen as functions:
                 yield replan
         finally:
@@ -581,24 +340,24 @@ class RecordedRun:
             f"replan {episode.num_replans} (environment step {inputs.env_step}) of {episode.name}"
             for episode, inputs in list(zip(episodes, given, strict=True))[:2]
         )
-        found = recorder.finish(where)
+        rows_of_sites = recorder.finish(where)
         self._check_contributions(recorder)
         if self._store is None:
             self._open()
         if count > 1:
-            _check_length("actions", replan.actions, count)
+            check_length("actions", replan.actions, count)
         replan.recorded = True
         for position, (row, episode, inputs) in enumerate(zip(rows, episodes, given, strict=True)):
             episode.largest_error = max(episode.largest_error, recorder.largest_error)
             actions = replan.actions
             if actions is not None and count > 1:
                 actions = actions[places[position]]
-            record = self._record(found[position], text, row, inputs, read_actions(actions))
+            record = self._record(rows_of_sites[position], text, row, inputs, read_actions(actions))
             episode._append(record)
 
     def _check_contributions(self, recorder: ReplanRecorder) -> None:
         """Raise `ContributionsUnknown` if a call's contributions are not known; at the first one, decide about them."""
-        unknown = recorder.contributions_unknown()
+        unknown = recorder.contributions.unknown()
         if not self._undecided:
             if unknown is not None:
                 raise ContributionsUnknown(
@@ -608,9 +367,8 @@ class RecordedRun:
                 )
             return
         if unknown is None:
-            self._decide(
-                contributions=True, because=f"what is added to the residual stream ({recorder.contributions_of()})"
-            )
+            between = recorder.contributions.describe()
+            self._decide(contributions=True, because=f"what is added to the residual stream ({between})")
             return
         self._decide(contributions=False, because=f"none: {unknown}")
         warnings.warn(
@@ -623,18 +381,18 @@ class RecordedRun:
 
     def _record(
         self,
-        found: Mapping[str, SiteRows],
+        rows_of_sites: Mapping[str, SiteRows],
         text: ReplanText,
         row: int,
         inputs: ReplanInputs,
         actions: NDArray[np.float64] | None,
     ) -> ReplanRecord:
-        prompt = text.prompt(row, found)
+        prompt = text.prompt(row, rows_of_sites)
         key_role, stored = {}, {}
         for site in self._sites:
-            of_site = found[site.name]
-            roles = text.roles(row, site, prompt, of_site.present, of_site.valid)
-            stored[site.name] = replace(of_site.rows, contribution=final_contribution(site, of_site, roles))
+            site_rows = rows_of_sites[site.name]
+            roles = text.roles(row, site, prompt, site_rows.present, site_rows.valid)
+            stored[site.name] = replace(site_rows.rows, contribution=final_contribution(site, site_rows, roles))
             key_role[site.name] = roles
         recorded = inputs.dataset_actions
         if recorded is not None and actions is not None:

@@ -11,17 +11,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vla_attention.capture.recording.contributions import gram_matrix, keys_of_parts, part_values
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
-from vla_attention.capture.store.recorded_rows import RecordedRows
-from vla_attention.capture.torch_policies.added_updates import AddedUpdate, OutputWay, Scaling, after_steps
-from vla_attention.capture.torch_policies.attention_calls import TOLERANCE, AttentionCall, CallShape
-from vla_attention.capture.torch_policies.call_changes import ChangeRefused
+from vla_attention.capture.store.replan_records import RecordedRows
+from vla_attention.capture.torch_policies.added_updates import OutputWay
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
 from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace, KnownCalls
-from vla_attention.capture.torch_policies.followed_outputs import difference
+from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.key_caches import LOAD_WITH_DYNAMIC_CACHE, first_values, slid
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
-from vla_attention.capture.torch_policies.policy_weights import OutputProjection
+from vla_attention.capture.torch_policies.policy_modules import OutputProjection
+from vla_attention.capture.torch_policies.replan_contributions import EarlyRoles, ReplanContributions, spread
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.segments import Segment, segment_members, segments_of
 from vla_attention.schemas.stores.store_format import Recording
@@ -32,8 +31,6 @@ _LARGE_COPY = 2**20
 #: What a row of the batch adds to the logits of a call (head or 1, query, key); None for nothing. The arrays live as
 #: long as the recorder, and are the same for calls to which the same is added.
 LogitBias = Callable[[int, CallPlace, CallShape], NDArray[np.float32] | None]
-#: Row of the batch, site -> the role codes of its keys (key,), before masks are known.
-EarlyRoles = Callable[[int, RecordedSite, NDArray[np.bool_]], NDArray[np.uint8]]
 
 
 class RowsDoNotMatch(UserError, ArithmeticError):
@@ -60,19 +57,14 @@ class _Collected:
     """Of one site: tensors by (block, denoise step), each (row, head, query, key); autoregressive: several.
 
     uniform: what uniform attention gives in the place of `rows`, (row, head or 1, query, key). Equal ones are one
-    tensor, of `kinds`. grams: by (block, denoise step, row of the batch), (part, part).
+    tensor, of `kinds`.
     """
 
     rows: dict[tuple[int, int], list[Tensor]] = field(default_factory=dict)
     uniform: dict[tuple[int, int], list[Tensor]] = field(default_factory=dict)
     kinds: list[Tensor] = field(default_factory=list)
-    grams: dict[tuple[int, int, int], list[Tensor]] = field(default_factory=dict)
     #: By block: the first values of the last generated token's call, see `key_caches`.
     first_values: dict[int, Tensor] = field(default_factory=dict)
-    roles: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
-    parts: dict[int, list[slice | Tensor]] = field(default_factory=dict)
-    #: What stands between the attention and the residual stream, beside the output projection.
-    between: set[str] = field(default_factory=set)
 
 
 class ReplanRecorder:
@@ -101,20 +93,16 @@ class ReplanRecorder:
         bias: LogitBias | None = None,
     ) -> None:
         self.layout = layout = known.layout
-        self.recordings = {name: found for name, found in recordings_of(recording, layout).items() if found}
+        self.recordings = {name: chosen for name, chosen in recordings_of(recording, layout).items() if chosen}
         self.batch = batch
         self.rows = tuple(rows)
         self.order = CallOrder(known, policy)
-        self.projections = projections
+        self.contributions = ReplanContributions(self.order, self.rows, projections, early_roles)
         self.output_modules = tuple(projection.module for projection in projections.values())
-        self.early_roles = early_roles
         self.bias = bias
         self.largest_error = 0.0
         self._changes: dict[tuple[int, ...], Tensor] = {}
         self._collected = {site.name: _Collected() for site in layout.sites}
-        #: Outputs that were not added to the residual stream yet, and of which call they are.
-        self._on_the_way: dict[OutputWay, CallPlace] = {}
-        self._unknown: list[str] = []
 
     @property
     def changes(self) -> bool:
@@ -211,15 +199,19 @@ class ReplanRecorder:
                 "this episode was kept."
             )
         self.largest_error = max(self.largest_error, error)
-        self._check_error(error, call, rows, place)
+        if problem := call.unfit(rows, error):
+            raise RowsDoNotMatch(
+                f"The rows of site '{place.site}', block {place.block}, step {place.step} (module "
+                f"'{call.shape.module}') {problem}."
+            )
         if self.layout.autoregressive:
             self._check_cache(call, place)
         seen = call.allowed(queries)
         uniform = seen / seen.sum(dim=-1, keepdim=True).clamp(min=1)
         keys = None if place.keys is None else torch.from_numpy(place.keys).to(rows.device)
         if keys is not None:
-            rows, uniform = _spread(rows, keys, site.keys.num_keys), _spread(uniform, keys, site.keys.num_keys)
-        way = self._contributions_way(call, rows, keys, place, site, cell) if recording.contributions else None
+            rows, uniform = spread(rows, keys, site.keys.num_keys), spread(uniform, keys, site.keys.num_keys)
+        way = self.contributions.way(call, rows, keys, place, site, cell) if recording.contributions else None
         chosen = self._chosen(rows, recording)
         collected.rows.setdefault(cell, []).append(chosen.cpu() if chosen.numel() > _LARGE_COPY else chosen)
         collected.uniform.setdefault(cell, []).append(_kind_of(self._chosen(uniform, recording), collected.kinds))
@@ -238,100 +230,13 @@ class ReplanRecorder:
 
     def _check_cache(self, call: AttentionCall, place: CallPlace) -> None:
         """Note a cache whose first key has left since the token before: its keys are not those of the layout."""
-        of_block = self._collected[place.site or ""].first_values
-        before, of_block[place.block] = of_block.get(place.block), first_values(call)
-        if before is not None and call.shape.queries == 1 and slid(before, of_block[place.block]):
+        first_of_block = self._collected[place.site or ""].first_values
+        before, first_of_block[place.block] = first_of_block.get(place.block), first_values(call)
+        if before is not None and call.shape.queries == 1 and slid(before, first_of_block[place.block]):
             self.order.problems[
                 f"the caches of site '{place.site}' lose their first key from token to token (a sliding window), so "
                 f"that no key has a place of its own: {LOAD_WITH_DYNAMIC_CACHE}"
             ] = None
-
-    def _check_error(self, error: float, call: AttentionCall, rows: Tensor, place: CallPlace) -> None:
-        problem = call.unfit(rows, error)
-        if problem:
-            raise RowsDoNotMatch(
-                f"The rows of site '{place.site}', block {place.block}, step {place.step} (module "
-                f"'{call.shape.module}') {problem}."
-            )
-
-    def _contributions_way(
-        self,
-        call: AttentionCall,
-        rows: Tensor,
-        keys: Tensor | None,
-        place: CallPlace,
-        site: RecordedSite,
-        cell: tuple[int, int],
-    ) -> OutputWay:
-        """Keep the mixed values of each part of the keys until the call's output is added to the residual stream."""
-        collected, project = self._collected[site.name], self.projections[site.name, place.block]
-        values = call.value if keys is None else _spread(call.value, keys, site.keys.num_keys, axis=2)
-        mixed = {}
-        for row in self.rows:
-            if row not in collected.roles:
-                collected.roles[row] = roles = self.early_roles(row, site, self.order.present[site.name])
-                members = segment_members(site.keys, roles[None], segments_of(site.keys, roles))[0]
-                collected.parts[row] = keys_of_parts(members, rows.device)
-            mixed[row] = part_values(rows[row], values[row], collected.parts[row])
-
-        def take(update: AddedUpdate | None) -> None:
-            if update is None:
-                self._unknown.append(f"{_where(place)} {way.describe_loss()}")
-                return
-            del self._on_the_way[way]
-            self._take_contributions(update, mixed, project, place, cell)
-
-        itself = call.shape.kind == "multihead"
-        way = OutputWay(project.module, project.path, call.output, place.queries, itself, take)
-        self._on_the_way[way] = place
-        return way
-
-    def _take_contributions(
-        self,
-        update: AddedUpdate,
-        mixed: Mapping[int, Tensor],
-        project: OutputProjection,
-        place: CallPlace,
-        cell: tuple[int, int],
-    ) -> None:
-        """Make the Gram matrices of what was added; mixed: row -> (query, part, head · dim)."""
-        collected, mismatches = self._collected[place.site or ""], [update.mismatch]
-        for row, of_parts in mixed.items():
-            # The last one is the whole output.
-            every = torch.cat([of_parts, update.mixed[row][:, None]], dim=1)
-            projected = project(after_steps(every, update.before, row))
-            mismatches.append(difference(projected[:, -1] + project.bias(every), update.projected[row]))
-            vectors = after_steps(projected, update.behind, row)
-            mismatches.append(difference(vectors[:, :-1].sum(dim=1), vectors[:, -1]))
-            gram = gram_matrix(vectors[:, :-1], vectors[:, -1])
-            collected.grams.setdefault((*cell, row), []).append(gram)
-        for steps, where in ((update.before, "before"), (update.behind, "behind")):
-            collected.between |= {
-                f"{'factors' if isinstance(step, Scaling) else 'a mean taken away'} {where} the projection"
-                for step in steps
-            }
-        mismatch, most = float(torch.stack(mismatches).max()), TOLERANCE.get(update.precision, TOLERANCE["float32"])
-        if not mismatch <= most:
-            self._unknown.append(
-                f"{_where(place)} the parts of the keys add up to something that differs from what was added by "
-                f"{mismatch:.2g} of its largest number (allowed is {most:g} for {update.precision}): the output "
-                f"projection '{project.path}' is not linear, or something changes numbers that is no function of torch"
-            )
-
-    def contributions_unknown(self) -> str | None:
-        """Say why it is not known what the parts of the keys add to the residual stream; None if it is known."""
-        if self._unknown:
-            return self._unknown[0]
-        return next((f"{_where(place)} {way.describe_loss()}" for way, place in self._on_the_way.items()), None)
-
-    def contributions_of(self) -> str:
-        """Say what stands between the attention and the residual stream, beside the output projections."""
-        found = [
-            f"{name}: {', '.join(sorted(collected.between)) or 'nothing but the projection'}"
-            for name, collected in self._collected.items()
-            if collected.grams
-        ]
-        return "; ".join(found)
 
     def finish(self, where: str) -> list[dict[str, SiteRows]]:
         """Return for each recorded row of the batch what its sites gave.
@@ -343,12 +248,13 @@ class ReplanRecorder:
             NumbersNotFinite: rows hold NaN or infinity.
         """
         self.order.check(where)
-        unknown = self.contributions_unknown() is not None
-        found: list[dict[str, SiteRows]] = [{} for _ in self.rows]
+        unknown = self.contributions.unknown() is not None
+        rows_of_sites: list[dict[str, SiteRows]] = [{} for _ in self.rows]
         for name, recording in self.recordings.items():
             site, collected = self.layout.site(name), self._collected[name]
             cells = [(block, step) for block in recording.layers for step in recording.denoise_steps]
-            stacked = self._stacked(collected, cells, recording)
+            # Moved off the device in one transfer, (cell, row of the batch, head, query, key).
+            stacked = torch.stack([self._joined(collected.rows[cell], recording) for cell in cells]).cpu().numpy()
             uniform = self._uniform(collected, cells, recording)
             for position, row in enumerate(self.rows):
                 rows = np.ascontiguousarray(stacked[:, position])
@@ -356,26 +262,16 @@ class ReplanRecorder:
                 self._check_finite(rows, recording, site.name, where)
                 contribution = None
                 if recording.contributions and not unknown:
-                    grams = [torch.stack(collected.grams[*cell, row]).mean(dim=0) for cell in cells]
-                    gram = torch.stack(grams).cpu().numpy()
+                    gram = self.contributions.grams(name, cells, row)
                     contribution = gram.reshape(*rows.shape[:2], *gram.shape[1:])
-                row_sum = rows.sum(axis=-1, dtype=np.float64).astype(np.float32)
-                own = np.ascontiguousarray(uniform[:, :, position])
-                found[position][site.name] = SiteRows(
-                    RecordedRows(rows, row_sum, contribution, own),
+                uniform_rows = np.ascontiguousarray(uniform[:, :, position])
+                rows_of_sites[position][site.name] = SiteRows(
+                    RecordedRows.summed(rows, contribution, uniform_rows),
                     self.order.present[site.name],
-                    np.asarray((own > 0).any(axis=(0, 1, 2, 3))),
-                    collected.roles.get(row),
+                    np.asarray((uniform_rows > 0).any(axis=(0, 1, 2, 3))),
+                    self.contributions.roles_of(name, row),
                 )
-        return found
-
-    def _stacked(
-        self, collected: _Collected, cells: Sequence[tuple[int, int]], recording: Recording
-    ) -> NDArray[np.float32]:
-        """All rows of a site, (cell, row of the batch, head, query, key), moved off the device in one transfer."""
-        each = [self._joined(collected.rows[cell], recording) for cell in cells]
-        result: NDArray[np.float32] = torch.stack(each).cpu().numpy()
-        return result
+        return rows_of_sites
 
     def _uniform(
         self, collected: _Collected, cells: Sequence[tuple[int, int]], recording: Recording
@@ -421,15 +317,17 @@ class ReplanRecorder:
 
 def recordings_of(recording: Recording, layout: PolicyLayout) -> dict[str, Recording | None]:
     """What is recorded of each site: of the chosen layers and heads those that it has; None where it has none."""
-    found: dict[str, Recording | None] = {}
+    recordings: dict[str, Recording | None] = {}
     for site in layout.sites:
         layers = site.keys.layers
         has_some = not layers or bool(set(layers) & set(recording.layers))
-        found[site.name] = recording.of_site(site.keys) if has_some else None
-    return found
+        recordings[site.name] = recording.of_site(site.keys) if has_some else None
+    return recordings
 
 
-def final_contribution(site: RecordedSite, found: SiteRows, key_role: NDArray[np.uint8]) -> NDArray[np.float32] | None:
+def final_contribution(
+    site: RecordedSite, site_rows: SiteRows, key_role: NDArray[np.uint8]
+) -> NDArray[np.float32] | None:
     """The contributions by the segments of the final roles, (layer, denoise, part, part).
 
     They were made for segments that know of no masks. A masked key has a probability of exactly 0, so that the segments
@@ -438,7 +336,7 @@ def final_contribution(site: RecordedSite, found: SiteRows, key_role: NDArray[np
     Raises:
         BadArgument: a segment with contributions would have to be divided.
     """
-    gram, early = found.rows.contribution, found.early_roles
+    gram, early = site_rows.rows.contribution, site_rows.early_roles
     if gram is None or early is None:
         return gram
     before, after = segments_of(site.keys, early), segments_of(site.keys, key_role)
@@ -446,7 +344,7 @@ def final_contribution(site: RecordedSite, found: SiteRows, key_role: NDArray[np
     result = np.zeros((*gram.shape[:2], size, size), dtype=np.float32)
     sources: list[int] = []
     targets: list[int] = []
-    hidden = ~(found.valid & found.present)
+    hidden = ~(site_rows.valid & site_rows.present)
     for target, segment in enumerate(after):
         members = _members(site, key_role, segment)
         if hidden[members].all():
@@ -484,16 +382,3 @@ def _kind_of(uniform: Tensor, kinds: list[Tensor]) -> Tensor:
     if len(kinds) < _MOST_KINDS:
         kinds.append(uniform)
     return uniform
-
-
-def _where(place: CallPlace) -> str:
-    return f"in block {place.block} of site '{place.site}' (step {place.step}),"
-
-
-def _spread(values: Tensor, keys: Tensor, count: int, axis: int = -1) -> Tensor:
-    """Values with their key axis at the places `keys` of an axis of `count`; 0 elsewhere."""
-    shape = list(values.shape)
-    shape[axis] = count
-    result = values.new_zeros(shape)
-    result.index_copy_(axis % values.ndim, keys, values)
-    return result

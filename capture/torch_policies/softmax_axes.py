@@ -51,8 +51,8 @@ class Axes:
             product = 1
             # An axis of size 1 is taken where one is wanted, and where it stands before a wanted one.
             while left and (product < size or (size == 1 and not taken and self.sizes[left[0]] == 1)):
-                missing, found = size // product, self.sizes[left[0]]
-                if 1 < missing < found and product * missing == size and found % missing == 0 and left[0] != self.key:
+                missing, whole = size // product, self.sizes[left[0]]
+                if 1 < missing < whole and product * missing == size and whole % missing == 0 and left[0] != self.key:
                     return self._divided(left[0], missing).refolded(shape)
                 taken.append(left.pop(0))
                 product *= self.sizes[taken[-1]]
@@ -122,14 +122,14 @@ class Product:
     def values_of(self, values: Tensor) -> Tensor:
         """Return (batch, kv_head, key, dim)."""
         heads = self.heads[: self.shared]
-        found = in_order(values, self.values, (*self.batch, *heads, self.axes.key, _DIM), self.axes.sizes)
-        found = found.expand(*(self.axes.sizes[axis] for axis in (*self.batch, *heads)), *found.shape[-2:])
-        return found.reshape(self.size(self.batch), self.size(heads), *found.shape[-2:])
+        ordered = in_order(values, self.values, (*self.batch, *heads, self.axes.key, _DIM), self.axes.sizes)
+        ordered = ordered.expand(*(self.axes.sizes[axis] for axis in (*self.batch, *heads)), *ordered.shape[-2:])
+        return ordered.reshape(self.size(self.batch), self.size(heads), *ordered.shape[-2:])
 
     def output_of(self, output: Tensor) -> Tensor:
         """Return (batch, head, query, dim)."""
-        found = in_order(output, self.output, (*self.batch, *self.heads, self.query, _DIM), self.axes.sizes)
-        return found.reshape(self.size(self.batch), self.size(self.heads), *found.shape[-2:])
+        ordered = in_order(output, self.output, (*self.batch, *self.heads, self.query, _DIM), self.axes.sizes)
+        return ordered.reshape(self.size(self.batch), self.size(self.heads), *ordered.shape[-2:])
 
 
 # A policy makes the same few products hundreds of times in a call.
@@ -177,6 +177,8 @@ def find_product(
         return None
     lead = [axis for axis in order if axis != query]
     batch, heads = _batch_and_heads(lead, free)
+    # Neighbouring heads share values (grouped queries) if the heads that the values lack are the last axes. In another
+    # order there is no (batch, kv_head, key, dim): then every head is given its values.
     first_free = next((number for number, axis in enumerate(heads) if axis in free), len(heads))
     if any(axis not in free for axis in heads[first_free:]):
         first_free = len(heads)
@@ -196,22 +198,22 @@ def _batch_and_heads(lead: Sequence[int], free: Sequence[int]) -> tuple[tuple[in
 
 def in_order(tensor: Tensor, parts: Sequence[Sequence[int]], order: Sequence[int], sizes: Sequence[int]) -> Tensor:
     """Take folded axes apart and bring the softmax's axes into an order; axes that the tensor lacks have size 1."""
-    found: list[int] = []
+    axes: list[int] = []
     shape: list[int] = []
     for size, part in zip(tensor.shape, parts, strict=True):
         if len(part) == 1 or not part:
-            found.extend(part or (-2,))
+            axes.extend(part or (-2,))
             shape.append(size)
         else:
-            found.extend(part)
+            axes.extend(part)
             shape.extend(sizes[axis] for axis in part)
     tensor = tensor.reshape(shape)
     # Axes of size 1 that stand for nothing go away.
-    for position in reversed([number for number, axis in enumerate(found) if axis not in order]):
+    for position in reversed([number for number, axis in enumerate(axes) if axis not in order]):
         tensor = tensor.squeeze(position)
-        del found[position]
+        del axes[position]
     for axis in order:
-        if axis not in found:
+        if axis not in axes:
             tensor = tensor.unsqueeze(-1)
-            found.append(axis)
-    return tensor.permute([found.index(axis) for axis in order])
+            axes.append(axis)
+    return tensor.permute([axes.index(axis) for axis in order])

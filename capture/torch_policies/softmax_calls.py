@@ -22,12 +22,19 @@ from vla_attention.capture.torch_policies.attention_calls import (
     Positions,
     at_positions,
 )
-from vla_attention.capture.torch_policies.call_changes import ChangeRefused, check_keys_left, fitted_change
-from vla_attention.capture.torch_policies.call_tensors import batch_and_heads, normalised, part
+from vla_attention.capture.torch_policies.call_tensors import (
+    ChangeRefused,
+    batch_and_heads,
+    check_keys_left,
+    fitted_change,
+    normalised,
+    part,
+)
 from vla_attention.capture.torch_policies.softmax_axes import Axes, Product, find_product
 from vla_attention.capture.torch_policies.tensor_functions import (
     CHANGES,
     SAME_NUMBERS,
+    TensorTable,
     axes_after,
     no_dropout,
 )
@@ -87,7 +94,6 @@ class _Followed:
     and row of the batch is where is not known.
     """
 
-    tensor: weakref.ref[Tensor]
     softmax: _Softmax
     axes: Axes
     altered: bool
@@ -103,23 +109,25 @@ class SoftmaxTensors:
         product: which axes are what.
         probabilities: as they were multiplied.
         altered: whether they differ from the softmax's result by more than rounding and the order of axes.
-        values, outputs: the other operand of the product, and its result.
+        operand, result: the other operand of the product, and its result.
     """
 
     softmax: _Softmax
     product: Product
     probabilities: Tensor
     altered: bool
-    values: Tensor
-    outputs: Tensor
+    operand: Tensor
+    result: Tensor
 
-    def value(self) -> Tensor:
-        """Return the values (batch, kv_head, key, dim)."""
-        return self.product.values_of(self.values.detach())
+    @property
+    def values(self) -> Tensor:
+        """The values (batch, kv_head, key, dim)."""
+        return self.product.values_of(self.operand.detach())
 
-    def output(self) -> Tensor:
-        """Return what the product computed, (batch, head, query, dim)."""
-        return self.product.output_of(self.outputs.detach())
+    @property
+    def outputs(self) -> Tensor:
+        """What the product computed, (batch, head, query, dim)."""
+        return self.product.output_of(self.result.detach())
 
     def rows(self, queries: Positions, batch: Positions) -> Tensor:
         """Return float32 probabilities (batch, head, query, key) of these queries."""
@@ -166,8 +174,7 @@ class Softmaxes:
 
     def __init__(self, block: WatchedBlock) -> None:
         self._block = block
-        #: The tensors that are followed, by their ids.
-        self.followed: dict[int, _Followed] = {}
+        self.followed: TensorTable[_Followed] = TensorTable()
 
     def softmax(self, function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
         """Run a softmax, changed if the watcher says so, and follow its result."""
@@ -209,28 +216,30 @@ class Softmaxes:
             change,
             (_times_written(logits), _times_written(result)),
         )
-        self._follow(result, softmax, Axes(sizes, first), altered=False)
+        self.followed.put(result, _Followed(softmax, Axes(sizes, first), altered=False))
         return result
 
     def follow(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
         """Run any other function, and follow what comes of a softmax's result."""
         operands = (*args[:1], *args[1]) if function is torch.einsum and isinstance(args[1], list | tuple) else args
-        given = next((found for found in map(self._found, (*operands, *kwargs.values())) if found is not None), None)
+        known = ((tensor, self.followed.get(tensor)) for tensor in (*operands, *kwargs.values()))
+        source = next(((tensor, followed) for tensor, followed in known if followed is not None), None)
         result = function(*args, **kwargs)
-        if given is None:
+        if source is None:
             return result
+        before, given = source
         if args and args[0] is not None and getattr(function, "__name__", "") in _WRITES:
-            written = self._found(args[0])
+            written = self.followed.get(args[0])
             if written is not None:
                 written.softmax.altered = True
         if function in _MATMULS or function is torch.einsum:
             self._product(function, args, kwargs, result)
         elif isinstance(result, Tensor) and result.ndim:
-            axes = _axes_after(function, args, kwargs, given, result)
+            axes = _axes_after(function, args, kwargs, before, given.axes, result)
             if axes is not None:
                 altered = given.altered or (function not in SAME_NUMBERS and not no_dropout(function, args, kwargs))
                 picked = given.picked or _picks(function, args)
-                self._follow(result, given.softmax, axes, altered=altered, picked=picked)
+                self.followed.put(result, _Followed(given.softmax, axes, altered, picked))
         return result
 
     def _may_attend(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> bool:
@@ -239,15 +248,6 @@ class Softmaxes:
         if not isinstance(logits, Tensor) or torch._C._functorch.is_functorch_wrapped_tensor(logits):
             return False
         return 3 <= logits.ndim <= 5 and axis in (-1, logits.ndim - 1)
-
-    def _found(self, given: object) -> _Followed | None:
-        followed = self.followed.get(id(given))
-        return followed if followed is not None and followed.tensor() is given else None
-
-    def _follow(self, tensor: Tensor, softmax: _Softmax, axes: Axes, *, altered: bool, picked: bool = False) -> None:
-        number, all_followed = id(tensor), self.followed
-        reference = weakref.ref(tensor, lambda gone: _forget(all_followed, number, gone))
-        all_followed[number] = _Followed(reference, softmax, axes, altered, picked)
 
     def _product(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], result: Any) -> None:
         if function is torch.einsum:
@@ -264,11 +264,13 @@ class Softmaxes:
         if letters is None:
             return
         first, second, out = letters
-        for given, values, own, other in ((0, 1, first, second), (1, 0, second, first)):
-            followed = self._found(operands[given])
+        for given, values, probability_letters, value_letters in ((0, 1, first, second), (1, 0, second, first)):
+            followed = self.followed.get(operands[given])
             if followed is None:
                 continue
-            product = find_product(followed.axes, own, other, out, tuple(operands[values].shape))
+            product = find_product(
+                followed.axes, probability_letters, value_letters, out, tuple(operands[values].shape)
+            )
             if product is not None:
                 self._saw(followed, product, operands[given], operands[values], result)
                 return
@@ -291,11 +293,16 @@ class Softmaxes:
         if softmax.change is not None:
             self._block.changed.remove(before)
         # Other tensors that come from this softmax need not be followed any more.
-        for number in [number for number, other in self.followed.items() if other.softmax is softmax]:
-            del self.followed[number]
+        self.followed.keep(lambda other: other.softmax is not softmax)
+        # What was written to the result after the softmax is in the rows that meet the values, not in those of the
+        # softmax; and logits that were written over do not give its rows again.
         before_logits, before_result = softmax.written
-        own = softmax.result()
-        altered = followed.altered or softmax.altered or (own is not None and _times_written(own) != before_result)
+        softmax_result = softmax.result()
+        altered = (
+            followed.altered
+            or softmax.altered
+            or (softmax_result is not None and _times_written(softmax_result) != before_result)
+        )
         if softmax.logits is not None and _times_written(softmax.logits) != before_logits:
             softmax.logits = None
         self._block.softmax_met_values(before, shape)
@@ -313,11 +320,9 @@ _ROUNDING = 1e-2
 
 
 def _axes_after(
-    function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], given: _Followed, result: Tensor
+    function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], before: Tensor, axes: Axes, result: Tensor
 ) -> Axes | None:
     """Return the axes of what a function made of a followed tensor, None if it cannot be followed."""
-    before, axes = given.tensor(), given.axes
-    assert before is not None
     if function in CHANGES:
         return axes if result.shape == before.shape else None
     if function in SAME_NUMBERS:
@@ -353,8 +358,8 @@ def _letters(equation: str | None, first: int, second: int) -> tuple[str, str, s
         if min(first, second) < 2:
             return None
         batch = "".join(spare[: max(first, second) - 2])
-        own, other = batch[len(batch) - (first - 2) :], batch[len(batch) - (second - 2) :]
-        return f"{own}mk", f"{other}kn", f"{batch}mn"
+        first_batch, second_batch = batch[len(batch) - (first - 2) :], batch[len(batch) - (second - 2) :]
+        return f"{first_batch}mk", f"{second_batch}kn", f"{batch}mn"
     if not isinstance(equation, str):
         return None
     inputs, arrow, out = equation.replace(" ", "").partition("->")
@@ -368,9 +373,3 @@ def _letters(equation: str | None, first: int, second: int) -> tuple[str, str, s
     dots = ["".join(spare[max(rest) - count : max(rest)]) for count in rest]
     written = [operand.replace("...", dot) for operand, dot in zip(operands, dots, strict=True)]
     return written[0], written[1], out.replace("...", "".join(spare[: max(rest)]))
-
-
-def _forget(followed: dict[int, _Followed], number: int, gone: weakref.ref[Tensor]) -> None:
-    found = followed.get(number)
-    if found is not None and found.tensor is gone:
-        del followed[number]

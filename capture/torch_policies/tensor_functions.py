@@ -1,9 +1,10 @@
-"""Functions of torch by what they do to a tensor, for following tensors from function to function."""
+"""What following tensors needs: what functions of torch do to them, and a table of what is known of some."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+import weakref
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor
@@ -80,3 +81,44 @@ def tensors_among(values: Iterable[Any]) -> Iterator[Tensor]:
             yield value
         elif isinstance(value, list | tuple):
             yield from tensors_among(value)
+
+
+_Known = TypeVar("_Known")
+
+
+class TensorTable(Generic[_Known]):
+    """What is known of some tensors, as long as they live; it does not keep them alive.
+
+    entries: by the tensors' ids. Whether it is empty costs less to ask than whether the table is.
+    """
+
+    def __init__(self) -> None:
+        self.entries: dict[int, tuple[weakref.ref[Tensor], _Known]] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self.entries)
+
+    def get(self, tensor: object) -> _Known | None:
+        """Return what is known of a tensor."""
+        entry = self.entries.get(id(tensor))
+        return None if entry is None or entry[0]() is not tensor else entry[1]
+
+    def put(self, tensor: Tensor, known: _Known) -> None:
+        """Note what is known of a tensor."""
+        number, entries = id(tensor), self.entries
+
+        def forget(gone: weakref.ref[Tensor]) -> None:
+            entry = entries.get(number)
+            if entry is not None and entry[0] is gone:
+                del entries[number]
+
+        entries[number] = weakref.ref(tensor, forget), known
+
+    def drop(self, tensor: Tensor) -> None:
+        """Forget a tensor."""
+        self.entries.pop(id(tensor), None)
+
+    def keep(self, wanted: Callable[[_Known], bool]) -> None:
+        """Forget the tensors of which something else is known."""
+        for number in [number for number, (_, known) in self.entries.items() if not wanted(known)]:
+            del self.entries[number]

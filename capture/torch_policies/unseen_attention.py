@@ -37,13 +37,13 @@ def refuse_unseen_settings(modules: Mapping[str, nn.Module]) -> None:
         setting = getattr(attributes.get("config"), "_attn_implementation", None)
         processor = type(attributes.get("processor")).__name__
         if isinstance(setting, str) and _UNSEEN_SETTING.match(setting):
-            found = f"attn_implementation='{setting}'"
+            kernels = f"attn_implementation='{setting}'"
         elif re.search(r"XFormers|Flash|Sage", processor):
-            found = f"the processor {processor}"
+            kernels = f"the processor {processor}"
         else:
             continue
         raise UnseenAttention(
-            f"{path or 'The policy'} runs attention with {found}, which gives no rows. {LOAD_WITH_SDPA}"
+            f"{path or 'The policy'} runs attention with {kernels}, which gives no rows. {LOAD_WITH_SDPA}"
         )
 
 

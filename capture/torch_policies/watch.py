@@ -28,7 +28,7 @@ class AlreadyWatched(BadArgument):
 
 @contextmanager
 def watch_attention(policy: object, watcher: Watcher, *, every_function: bool = True) -> Iterator[SeenFunctions]:
-    """Tell `watcher` about every attention call of `policy` inside the block, in whatever thread it runs.
+    """Tell `watcher` about every attention call of `policy` inside the block, in the thread of the block.
 
     The block gives `SeenFunctions`, whose `by_names` says whether `every_function` was needed.
 
@@ -39,32 +39,27 @@ def watch_attention(policy: object, watcher: Watcher, *, every_function: bool = 
         AlreadyWatched: another block is open in this process.
         NoModules, CannotRunEager: see `modules_of`.
         OtherPolicy: attention of a module that the policy does not hold ran in the block.
-        StillRunning: the policy still runs in another thread at the end.
-        NotFollowed: it ran in another thread in methods that are no forward, and no attention was seen.
+        NotFollowed: the policy ran in another thread.
         UnseenAttention: the policy is set to attention that gives no rows, such as flash-attn's, or an operator that
             computes attention so ran.
         ChangeRefused: a change that does not fit its call, or that the call does not allow.
     """
-    found = find_policy(policy)
+    known_policy = find_policy(policy)
     if not _ACTIVE.acquire(blocking=False):
         raise AlreadyWatched(
             "Attention is already recorded in another block of this process: blocks cannot be inside each other, and "
             "one block records one policy. Close the other block first."
         )
     try:
-        block = WatchedBlock(found, watcher, every_function=every_function)
-        try:
-            functions = SeenFunctions(block, every_function=every_function)
-            with (
-                seen_by_python(),
-                functions.names_replaced(),
-                block.following_modules(functions.in_this_thread, functions.at_module, functions.around_projection),
-                functions.in_this_thread(),
-            ):
-                yield functions
-        except BaseException:
-            block.abandon()
-            raise
+        block = WatchedBlock(known_policy, watcher, every_function=every_function)
+        functions = SeenFunctions(block, every_function=every_function)
+        with (
+            seen_by_python(),
+            functions.names_replaced(),
+            block.following_modules(functions.at_module, functions.around_projection),
+            functions.seeing(),
+        ):
+            yield functions
         block.close()
     finally:
         _ACTIVE.release()
@@ -80,3 +75,18 @@ def seen_by_python() -> Iterator[None]:
             yield
     finally:
         torch.backends.mha.set_fastpath_enabled(fast_path)
+
+
+class RandomNumbers:
+    """The states of torch's random numbers, on the processor and on every GPU, when this was made."""
+
+    def __init__(self) -> None:
+        self._cpu = torch.random.get_rng_state()
+        count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+        self._gpus = [torch.cuda.get_rng_state(device) for device in range(count)]
+
+    def again(self) -> None:
+        """Set the states to what they were."""
+        torch.random.set_rng_state(self._cpu)
+        for device, state in enumerate(self._gpus):
+            torch.cuda.set_rng_state(state, device)

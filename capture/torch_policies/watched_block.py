@@ -1,4 +1,4 @@
-"""One watched block: which module is running, in whatever thread, and what the watcher is told."""
+"""One watched block: which module is running, and what the watcher is told."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from vla_attention.capture.torch_policies.added_updates import OutputWay
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape, Kind, Watcher, exact
-from vla_attention.capture.torch_policies.call_changes import ChangeRefused
+from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.policy_modules import FoundPolicy
 from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
 from vla_attention.schemas.errors import BadArgument
@@ -27,12 +27,8 @@ class OtherPolicy(BadArgument):
     """Attention of modules that the watched policy does not hold."""
 
 
-class StillRunning(BadArgument):
-    """A block that ends while the policy runs in another thread."""
-
-
 class NotFollowed(BadArgument):
-    """A policy that ran in another thread, in methods in which its attention is not seen."""
+    """A policy that ran in another thread than the block that records it."""
 
 
 @dataclass(frozen=True)
@@ -43,24 +39,12 @@ class Where:
     module: nn.Module | None
 
 
-class _ThreadState(threading.local):
-    """What belongs to one thread: the modules whose forward is running, whether its calls are seen, and an output.
-
-    way: of the call that the watcher saw last, if it wants its output to be followed.
-    """
-
-    def __init__(self) -> None:
-        self.running: list[nn.Module] = []
-        self.seen = False
-        self.way: OutputWay | None = None
-
-
 class WatchedBlock:
     """What `watch_attention` and the kinds of calls share during one block."""
 
-    def __init__(self, found: FoundPolicy, watcher: Watcher, *, every_function: bool = True) -> None:
-        self.policy = found.policy
-        self.paths = {id(module): path for path, module in found.modules.items()}
+    def __init__(self, known_policy: FoundPolicy, watcher: Watcher, *, every_function: bool = True) -> None:
+        self.policy = known_policy.policy
+        self.paths = {id(module): path for path, module in known_policy.modules.items()}
         self.watcher = watcher
         #: The first error of watching, which the block raises at its end if the policy's code went on without it.
         self.error: BaseException | None = None
@@ -70,23 +54,29 @@ class WatchedBlock:
         self._began: Counter[CallShape] = Counter()
         self._met_values: Counter[tuple[CallShape, CallShape]] = Counter()
         self._every_function = every_function
-        self._found = found
-        #: Whether simple modules ran in a thread where nothing is seen.
-        self._unseen_thread = False
+        self._known_policy = known_policy
         self._number = 0
-        self._lock = threading.RLock()
-        self._thread = _ThreadState()
-        self._elsewhere = 0
-        self._closed = False
+        #: The modules whose forward is running, the innermost last.
+        self._running: list[nn.Module] = []
+        #: Of the call that the watcher saw last, if it wants its output to be followed.
+        self._way: OutputWay | None = None
+        self._thread = threading.get_ident()
+        #: Whether a module of the policy ran in another thread.
+        self._ran_elsewhere = False
+
+    @property
+    def in_this_thread(self) -> bool:
+        """Whether the code that asks runs in the block's thread; what other threads call is not the block's."""
+        return threading.get_ident() == self._thread
 
     def where(self) -> Where:
-        """Return the innermost module of the policy whose forward is running in this thread.
+        """Return the innermost module of the policy whose forward is running.
 
         Raises:
             OtherPolicy: a module that the policy does not hold is running, and none of the policy's is.
         """
-        if self._thread.running:
-            module = self._thread.running[-1]
+        if self._running:
+            module = self._running[-1]
             return Where(self.paths[id(module)], module)
         foreign = None
         for owner in _frame_owners():
@@ -108,9 +98,8 @@ class WatchedBlock:
 
     @property
     def running_module(self) -> str:
-        """The innermost module whose forward is running in this thread, in words."""
-        running = self._thread.running
-        return f"module '{self.paths[id(running[-1])]}'" if running else "the policy"
+        """The innermost module whose forward is running, in words."""
+        return f"module '{self.paths[id(self._running[-1])]}'" if self._running else "the policy"
 
     def new_shape(
         self, where: Where, kind: Kind, sizes: tuple[int, int, int, int, int], dtype: torch.dtype
@@ -131,26 +120,26 @@ class WatchedBlock:
         """Ask the watcher for a change of the call that comes next."""
         if not self.changes:
             return None
-        with self._lock, torch.no_grad(), self._failing():
-            return None if self._closed else self.watcher.change(shape)
+        with torch.no_grad(), self._failing():
+            return self.watcher.change(shape)
 
     def passes(self, shape: CallShape) -> bool:
         """Return whether a call that has run is none of the watcher's, and count it then."""
         ask = getattr(self.watcher, "passes", None)
         if ask is None:
             return False
-        with self._lock, self._failing():
-            if self._closed or not ask(shape):
-                return self._closed
-            self._number += 1
-            return True
+        with self._failing():
+            if not ask(shape):
+                return False
+        self._number += 1
+        return True
 
     def expected(self, asked: CallShape) -> CallShape | None:
         """Return what a softmax by hand turns out to be, if blocks that looked at every function know.
 
         asked: its shape without a number. None: it is not known, or looked at again in this block.
         """
-        return None if self._every_function or self.changes else self._found.softmaxes.get(asked)
+        return None if self._every_function or self.changes else self._known_policy.softmaxes.get(asked)
 
     def began_softmax(self, asked: CallShape) -> None:
         """Note a softmax by hand; asked: its shape without a number."""
@@ -164,7 +153,9 @@ class WatchedBlock:
 
     def _learn(self) -> None:
         """Remember what the softmaxes by hand of this block turned out to be."""
-        known = self._found.softmaxes
+        # A softmax that was attention at some times and a gate at others must be followed every time: what was not
+        # the same in every block, and at every softmax that looked alike, is unknown (None) from then on.
+        known = self._known_policy.softmaxes
         always = {asked: shape for (asked, shape), times in self._met_values.items() if times == self._began[asked]}
         for asked in self._began:
             shape = always.get(asked)
@@ -173,22 +164,20 @@ class WatchedBlock:
     def saw(self, call: AttentionCall) -> None:
         """Tell the watcher about a call, and count it."""
         with self.computing():
-            if self._closed:  # a thread that still runs; the block has ended with an error
-                return
-            if call.shape.number != self._number:  # another call came in between, in this thread or in another
+            if call.shape.number != self._number:  # another call came between a softmax and its product
                 call = replace(call, shape=replace(call.shape, number=self._number))
             self._number += 1
-            self._thread.way = self.watcher.saw(call)
+            self._way = self.watcher.saw(call)
 
     def take_way(self) -> OutputWay | None:
         """Return how the output of the call that was just seen is followed, once."""
-        way, self._thread.way = self._thread.way, None
+        way, self._way = self._way, None
         return way
 
     @contextmanager
     def computing(self) -> Iterator[None]:
         """Compute for the watcher beside the policy: without gradients, autocast and function modes."""
-        with self._lock, exact(), self._failing(), _without_modes():
+        with exact(), self._failing(), _without_modes():
             yield
 
     def refuse_nested(self, *tensors: Tensor) -> None:
@@ -221,120 +210,86 @@ class WatchedBlock:
             self.failed(error)
             raise
 
-    def abandon(self) -> None:
-        """End the block after an error."""
-        with self._lock:
-            self._closed = True
-
     def close(self) -> None:
-        """End the block.
+        """End a block whose code raised nothing.
 
         Raises:
-            StillRunning: the policy still runs in another thread.
-            NotFollowed: it ran in another thread so that no attention was seen.
+            NotFollowed: the policy ran in another thread.
             ChangeRefused: a softmax was changed that is no attention.
-            BaseException: an error of watching that the policy's code caught, or met in another thread.
+            BaseException: an error of watching that the policy's code caught.
         """
-        with self._lock:
-            self._closed = True
-            if self._elsewhere:
-                raise StillRunning(
-                    f"The policy ({type(self.policy).__name__}) still runs in another thread at the end of the block "
-                    "that records it. Wait for its answer inside the block."
-                )
-            if self.error is not None:
-                raise self.error
-            if self.changed:
-                raise ChangeRefused(
-                    f"A softmax that is no attention was changed as if it were the call {self.changed[0]}: it was "
-                    "multiplied with no values, as the gate of a mixture of experts. Give the layout's rule a kind or "
-                    "a number of keys that this softmax does not have, or leave its block out."
-                )
-            if self._unseen_thread and not self._number:
-                raise NotFollowed(
-                    f"The policy ({type(self.policy).__name__}) ran in another thread than the block that records it, "
-                    "in methods that are no forward of a module, and no attention was seen. Call it in the "
-                    "thread of the block."
-                )
-            self._learn()
+        if self.error is not None:
+            raise self.error
+        if self.changed:
+            raise ChangeRefused(
+                f"A softmax that is no attention was changed as if it were the call {self.changed[0]}: it was "
+                "multiplied with no values, as the gate of a mixture of experts. Give the layout's rule a kind or "
+                "a number of keys that this softmax does not have, or leave its block out."
+            )
+        if self._ran_elsewhere:
+            raise NotFollowed(
+                f"The policy ({type(self.policy).__name__}) ran in another thread than the block that records it. Open "
+                "the block in the thread that calls the policy, around that one call, and let no other thread call it "
+                "meanwhile."
+            )
+        self._learn()
 
     @contextmanager
     def following_modules(
         self,
-        seeing: Callable[[], AbstractContextManager[object]],
         at_module: Callable[[], None],
         around_projection: Callable[[nn.Module, Callable[..., Any]], Callable[..., Any]],
     ) -> Iterator[None]:
-        """Keep track of which modules run, and see the calls of every thread that runs one of them.
+        """Keep track of which modules run.
 
-        Calls are seen by threads. A module that is called in a thread where none are enters `seeing` for its forward.
         `at_module` is called where a module begins or ends, `around_projection` returns what stands in place of the
         forward of a module to which outputs are followed. Hooks would not do: `module.forward(...)` skips them, and so
         do some fast paths.
         """
         wanted = {id(module) for module in getattr(self.watcher, "output_modules", ())}
         replaced: list[_Forward] = []
-        self._thread.seen = True
 
         def replace_forward(module: nn.Module, call: Callable[..., Any]) -> None:
             replaced.append(_Forward(module, around_projection(module, call) if id(module) in wanted else call))
 
         try:
-            for module in self._found.attending:
-                replace_forward(module, self._followed(module, module.forward, seeing, at_module))
-            for module in self._found.simple:
+            for module in self._known_policy.attending:
+                replace_forward(module, self._followed(module, module.forward, at_module))
+            for module in self._known_policy.simple:
                 replace_forward(module, self._noticed(module.forward, at_module))
             yield
         finally:
-            self._thread.seen = False
             for forward in replaced:
                 forward.give_back()
 
     def _noticed(self, forward: Callable[..., Any], at_module: Callable[[], None]) -> Callable[..., Any]:
-        """Notice a simple module that runs in another thread, outside every forward that could enter a mode there."""
-        thread = self._thread
+        """Return the forward of a simple module, in which no attention runs."""
 
         def noticed(*args: Any, **kwargs: Any) -> Any:
-            if not thread.seen:
-                self._unseen_thread = True
-            at_module()
+            if self.in_this_thread:
+                at_module()
+            else:
+                self._ran_elsewhere = True
             return forward(*args, **kwargs)
 
         return noticed
 
     def _followed(
-        self,
-        module: nn.Module,
-        forward: Callable[..., Any],
-        seeing: Callable[[], AbstractContextManager[object]],
-        at_module: Callable[[], None],
+        self, module: nn.Module, forward: Callable[..., Any], at_module: Callable[[], None]
     ) -> Callable[..., Any]:
-        thread = self._thread
+        running = self._running
 
         def followed(*args: Any, **kwargs: Any) -> Any:
-            if not thread.seen:
-                return in_other_thread(args, kwargs)
+            if not self.in_this_thread:
+                self._ran_elsewhere = True
+                return forward(*args, **kwargs)
             at_module()
-            thread.running.append(module)
+            running.append(module)
             try:
                 return forward(*args, **kwargs)
             finally:
-                thread.running.pop()
+                running.pop()
                 at_module()
-
-        def in_other_thread(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-            with self._lock:
-                self._elsewhere += 1
-            try:
-                with seeing():
-                    thread.seen = True
-                    try:
-                        return followed(*args, **kwargs)
-                    finally:
-                        thread.seen = False
-            finally:
-                with self._lock:
-                    self._elsewhere -= 1
 
         return followed
 
@@ -354,7 +309,8 @@ class _Forward:
     def __init__(self, module: nn.Module, call: Callable[..., Any]) -> None:
         update_wrapper(self, module.forward)  # its signature stays what it was
         self.module = module
-        self.own = module.__dict__.get("forward")
+        #: What stood there on the instance before: a library's wrapper, as of accelerate; None: the class's forward.
+        self.before = module.__dict__.get("forward")
         self.call = call
         module.__dict__["forward"] = self
 
@@ -362,21 +318,21 @@ class _Forward:
         return self.call(*args, **kwargs)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _own_forward, (self.module, self.own)
+        return _own_forward, (self.module, self.before)
 
     def give_back(self) -> None:
         """Give the module its own forward again, unless the policy's code has set another one meanwhile."""
-        self.call = _own_forward(self.module, self.own)
+        self.call = _own_forward(self.module, self.before)
         if self.module.__dict__.get("forward") is not self:
             return
-        if self.own is None:
+        if self.before is None:
             del self.module.__dict__["forward"]
         else:
-            self.module.__dict__["forward"] = self.own
+            self.module.__dict__["forward"] = self.before
 
 
-def _own_forward(module: nn.Module, own: Callable[..., Any] | None) -> Callable[..., Any]:
-    return types.MethodType(type(module).forward, module) if own is None else own
+def _own_forward(module: nn.Module, before: Callable[..., Any] | None) -> Callable[..., Any]:
+    return types.MethodType(type(module).forward, module) if before is None else before
 
 
 def _frame_owners() -> Iterator[object]:

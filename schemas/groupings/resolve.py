@@ -200,14 +200,14 @@ def _weights(member: Membership, cells: NDArray[np.float32] | None) -> NDArray[n
 
 
 def _evaluate(selector: Selector, tokens: EpisodeTokens) -> Membership:
-    found: dict[Atom, Membership] = {}  # long unions say the same more than once
+    memberships: dict[Atom, Membership] = {}  # long unions say the same more than once
 
     def keys(part: Atom | Everything) -> Membership:
         if isinstance(part, Everything):
             return np.ones((1, tokens.layout.num_keys, 1), dtype=bool)
-        if part not in found:
-            found[part] = SELECTOR_KINDS[part.kind].keys(part.argument, tokens)
-        return found[part]
+        if part not in memberships:
+            memberships[part] = SELECTOR_KINDS[part.kind].keys(part.argument, tokens)
+        return memberships[part]
 
     def join(operator: str, left: Membership, right: Membership) -> Membership:
         if operator == "&":

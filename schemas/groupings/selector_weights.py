@@ -36,11 +36,11 @@ def check_selector(text: str, vocabularies: Mapping[str, Vocabulary]) -> None:
     """
     for atom in dict.fromkeys(atoms_of(parse_selector(text))):
         problems = {site: _problem(atom, vocabulary) for site, vocabulary in vocabularies.items()}
-        found = {site: problem for site, problem in problems.items() if problem}
-        if len(found) == len(problems):
+        unusable = {site: problem for site, problem in problems.items() if problem}
+        if len(unusable) == len(problems):
             # A site with such keys says which names exist; the others only that they have none.
-            telling = [problem for site, problem in found.items() if _has_keys(atom, vocabularies[site])]
-            raise SelectorError(f"Selector '{shortened(text)}': {(telling or list(found.values()))[0]}")
+            telling = [problem for site, problem in unusable.items() if _has_keys(atom, vocabularies[site])]
+            raise SelectorError(f"Selector '{shortened(text)}': {(telling or list(unusable.values()))[0]}")
 
 
 def selector_weights(
@@ -58,12 +58,12 @@ def selector_weights(
     check_selector(text, vocabularies)
     selector = parse_selector(text)
     weights: dict[str, NDArray[np.float64]] = {}
-    for site, there in tokens.items():
+    for site, episode_tokens in tokens.items():
         known = [atom for atom in atoms_of(selector) if not _problem(atom, vocabularies[site])]
         if known or not atoms_of(selector):
-            weights[site] = weights_of(_only(selector, known), there).astype(np.float64)
+            weights[site] = weights_of(_only(selector, known), episode_tokens).astype(np.float64)
         else:
-            weights[site] = np.zeros((1, there.layout.num_keys))
+            weights[site] = np.zeros((1, episode_tokens.layout.num_keys))
     return weights
 
 
@@ -84,9 +84,9 @@ def _has_keys(atom: Atom, vocabulary: Vocabulary) -> bool:
 
 def _only(selector: Selector, known: list[Atom]) -> Selector:
     """The selector with `_NOTHING` in place of the parts that are not known."""
-    there = set(known)
+    existing = set(known)
 
     def leaf(part: Atom | Everything) -> Selector:
-        return part if isinstance(part, Everything) or part in there else _NOTHING
+        return part if isinstance(part, Everything) or part in existing else _NOTHING
 
     return folded(selector, leaf, Operation)

@@ -119,8 +119,8 @@ def _role_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> 
 
 def _word_keys(argument: str, tokens: EpisodeTokens) -> Membership:
     # Prompts that differ in their state share their words (`words_of`): the phrase is looked for once.
-    found = {id(words): words for words in tokens.words}
-    places = {of: find_phrase(words, argument) for of, words in found.items()}
+    by_identity = {id(words): words for words in tokens.words}
+    places = {of: find_phrase(words, argument) for of, words in by_identity.items()}
     return _keys_of_words(tokens, [places[id(words)] for words in tokens.words])
 
 

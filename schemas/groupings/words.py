@@ -46,8 +46,8 @@ def _words_in(text: str, first: int, pieces: tuple[Piece, ...]) -> tuple[Word, .
     places = [(first + start, first + stop) for start, stop in split_words(text)]
     keys = _keys_between(pieces, places)
     return tuple(
-        Word(text[start - first : stop - first], start, stop, tuple(own))
-        for (start, stop), own in zip(places, keys, strict=True)
+        Word(text[start - first : stop - first], start, stop, tuple(word_keys))
+        for (start, stop), word_keys in zip(places, keys, strict=True)
     )
 
 
@@ -99,10 +99,10 @@ def _keys_between(pieces: Sequence[Piece], places: Sequence[tuple[int, int]]) ->
     keys: list[list[int]] = [[] for _ in places]
     most, touched = 10 * (len(pieces) + len(places)) + 1000, 0
     for piece in pieces:
-        there = range(bisect_right(stops, piece.start), bisect_left(starts, piece.stop))
-        touched += len(there)
+        overlapping = range(bisect_right(stops, piece.start), bisect_left(starts, piece.stop))
+        touched += len(overlapping)
         if touched > most:
             raise BadArgument(f"The pieces of a prompt overlap: {len(pieces)} touch the {len(places)} words too often.")
-        for i in there:
+        for i in overlapping:
             keys[i].append(piece.key)
     return keys

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,8 +19,9 @@ from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import listing, shortened
 from vla_attention.schemas.limit_checks import check_decoded
 from vla_attention.schemas.limits import ARRAY_AXES, ARRAY_BYTES
-from vla_attention.schemas.stores.shards import CHECKSUM_BYTES, chunks_of_a_shard
-from vla_attention.schemas.stores.store_format import CorruptEpisode, FileRecord
+from vla_attention.schemas.stores.digest import CHECKSUM_BYTES
+from vla_attention.schemas.stores.seal_content import FileRecord
+from vla_attention.schemas.stores.store_format import CorruptEpisode
 
 #: Types of numbers that a store holds.
 TYPES = ("uint8", "int32", "int64", "float32", "float64")
@@ -45,6 +46,9 @@ class ArrayMetadata:
         file_shape: extents of what one file holds: a shard, or a chunk.
         chunk_shape: extents of what is decoded at once.
         shard_chunks: chunks in each file whose checksums the seal lists; None where it cannot.
+        codecs: those of a chunk, by name.
+        endian: the order of bytes in a number; None where it is not stated.
+        typesize: bytes that the codec blosc shuffles together.
         stored: bytes of the array's files, as the seal lists them.
     """
 
@@ -54,21 +58,29 @@ class ArrayMetadata:
     file_shape: tuple[int, ...]
     chunk_shape: tuple[int, ...]
     shard_chunks: int | None
+    codecs: tuple[str, ...]
+    endian: str | None
+    typesize: int
     stored: int
+
+    @property
+    def is_sharded(self) -> bool:
+        """Whether a file is a shard, of several chunks with an index."""
+        return bool(self.document["codecs"][0]["name"] == "sharding_indexed")
+
+    @property
+    def has_default_keys(self) -> bool:
+        """Whether the files of chunks have the names that `chunk_file` gives."""
+        return bool(self.document["chunk_key_encoding"]["name"] == "default")
+
+    def file(self, place: Sequence[int]) -> str:
+        """The path of a chunk, or shard, in the array's folder; see `chunk_file`."""
+        return chunk_file(self.document["chunk_key_encoding"], place)
 
     @property
     def chunk_bytes(self) -> int:
         """Decoded bytes of a chunk."""
         return math.prod(self.chunk_shape) * self.dtype.itemsize
-
-    @property
-    def typesize(self) -> int:
-        """Bytes that the codec blosc shuffles together; the array has this codec."""
-        codecs = self.document["codecs"]
-        if codecs[0]["name"] == "sharding_indexed":
-            codecs = codecs[0]["configuration"]["codecs"]
-        size: int = codecs[1]["configuration"].get("typesize", 1)
-        return size
 
     def check_reading(self, shape: tuple[int, ...]) -> None:
         """Raise `CorruptEpisode` when values of this shape would take more memory than the files can hold."""
@@ -87,18 +99,20 @@ def array_metadata(content: bytes, shape: tuple[int, ...], name: str, files: Map
     Raises:
         CorruptEpisode: it is nothing that a capture writes; the message says what, without a full stop.
     """
-    found = _described(content) if len(content) <= _KEPT_BYTES else _describe(content)
-    if found.shape != shape:
+    metadata = _described(content) if len(content) <= _KEPT_BYTES else describe_array(content)
+    if metadata.shape != shape:
         raise CorruptEpisode("it has another shape than its attributes say")
-    numbers = [record.size for file, record in files.items() if file.startswith(f"{name}/") and _is_chunk(file)]
-    needed = math.prod(-(-extent // part) for extent, part in zip(shape, found.file_shape, strict=True))
+    numbers = [
+        record.size for file, record in files.items() if file.startswith(f"{name}/") and not file.endswith("/zarr.json")
+    ]
+    needed = math.prod(-(-extent // part) for extent, part in zip(shape, metadata.file_shape, strict=True))
     if needed > len(numbers):
         raise CorruptEpisode(f"it has {needed:,} files of chunks, and its seal lists {len(numbers):,}")
-    _check_decoded("a chunk of it", math.prod(found.chunk_shape), found.dtype, max(numbers, default=0))
-    return replace(found, stored=sum(numbers))
+    _check_decoded("a chunk of it", math.prod(metadata.chunk_shape), metadata.dtype, max(numbers, default=0))
+    return replace(metadata, stored=sum(numbers))
 
 
-def _describe(content: bytes) -> ArrayMetadata:
+def describe_array(content: bytes) -> ArrayMetadata:
     """What a `zarr.json` says, without what the seal says of the files."""
     try:
         document = decode_json(content)
@@ -118,23 +132,20 @@ def _describe(content: bytes) -> ArrayMetadata:
         raise CorruptEpisode("its chunk_grid is not regular")
     file_shape = _extents(_configuration(grid).get("chunk_shape"), shape, "chunks")
     chunk_shape = _check_codecs(document.get("codecs"), file_shape, sharded=True) or file_shape
-    shard_chunks = chunks_of_a_shard(document)
-    sharded = document["codecs"][0]["name"] == "sharding_indexed"
-    if sharded and shard_chunks is None and "blosc" in inner_codecs(document):
-        raise CorruptEpisode("its shards hold compressed chunks without checksums, or have their index elsewhere")
-    return ArrayMetadata(document, shape, dtype, file_shape, chunk_shape, shard_chunks, 0)
+    shard_chunks, codecs = chunks_of_a_shard(document), document["codecs"]
+    if codecs[0]["name"] == "sharding_indexed":
+        codecs = codecs[0]["configuration"]["codecs"]
+        if shard_chunks is None and any(codec["name"] == "blosc" for codec in codecs):
+            raise CorruptEpisode("its shards hold compressed chunks without checksums, or have their index elsewhere")
+    settings = {codec["name"]: _configuration(codec) for codec in codecs}
+    endian, typesize = settings["bytes"].get("endian"), settings.get("blosc", {}).get("typesize", 1)
+    return ArrayMetadata(
+        document, shape, dtype, file_shape, chunk_shape, shard_chunks, tuple(settings), endian, typesize, stored=0
+    )
 
 
 #: Arrays of one run differ in the number of replans only: most are described already.
-_described = functools.lru_cache(maxsize=512)(_describe)
-
-
-def inner_codecs(document: Mapping[str, Any]) -> list[str]:
-    """The names of the codecs of a chunk, of a checked `zarr.json`."""
-    codecs = document["codecs"]
-    if codecs[0]["name"] == "sharding_indexed":
-        codecs = codecs[0]["configuration"]["codecs"]
-    return [codec["name"] for codec in codecs]
+_described = functools.lru_cache(maxsize=512)(describe_array)
 
 
 def check_shard(metadata: ArrayMetadata, record: FileRecord, file: str) -> None:
@@ -142,6 +153,42 @@ def check_shard(metadata: ArrayMetadata, record: FileRecord, file: str) -> None:
     listed = len(record.chunks) // (2 * CHECKSUM_BYTES)
     if listed and listed != metadata.shard_chunks:
         raise CorruptEpisode(f"its {file} has {metadata.shard_chunks} chunks, and its seal lists {listed}")
+
+
+def chunks_of_a_shard(metadata: dict[str, Any]) -> int | None:
+    """Number of chunks in each shard of an array, or None where single chunks of it cannot be bound to a seal.
+
+    They can when every chunk ends with its crc32c, and the file with its index. `metadata` is the array's `zarr.json`;
+    that of a group gives None, too.
+    """
+    try:
+        codecs = metadata.get("codecs", [])
+        if [codec["name"] for codec in codecs] != ["sharding_indexed"]:
+            return None
+        inner = codecs[0]["configuration"]
+        shard = metadata["chunk_grid"]["configuration"]["chunk_shape"]
+        bound = (
+            inner["codecs"][-1]["name"] == "crc32c"
+            and inner.get("index_location", "end") == "end"
+            and [codec["name"] for codec in inner["index_codecs"]] == ["bytes", "crc32c"]
+            and inner["index_codecs"][0]["configuration"]["endian"] == "little"
+        )
+        counts = [extent // chunk for extent, chunk in zip(shard, inner["chunk_shape"], strict=True)]
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError, ZeroDivisionError):
+        return None  # whoever reads the array says what is wrong with it
+    return math.prod(counts) if bound else None
+
+
+def chunk_file(keys: Mapping[str, Any], place: Sequence[int]) -> str:
+    """The path of a chunk, or shard, in its array's folder, from its place in the grid and the array's chunk keys.
+
+    Raises:
+        ValueError: the `chunk_key_encoding` of the array is another one than Zarr's default.
+    """
+    separator = keys.get("configuration", {}).get("separator", "/")
+    if keys.get("name") != "default" or separator not in ("/", "."):
+        raise ValueError(f"the chunk keys {dict(keys)} are not known")
+    return str(separator).join(("c", *map(str, place)))
 
 
 def _shape(given: Any, dtype: np.dtype[Any]) -> tuple[int, ...]:
@@ -154,10 +201,6 @@ def _shape(given: Any, dtype: np.dtype[Any]) -> tuple[int, ...]:
     return tuple(given)
 
 
-def _is_chunk(file: str) -> bool:
-    return not file.endswith("/zarr.json")
-
-
 def _check_decoded(what: str, elements: int, dtype: np.dtype[Any], stored: int) -> None:
     try:
         check_decoded(what, elements * dtype.itemsize, stored)
@@ -167,7 +210,8 @@ def _check_decoded(what: str, elements: int, dtype: np.dtype[Any], stored: int) 
 
 def _check_keys(keys: Any) -> None:
     name = keys.get("name") if isinstance(keys, dict) else None
-    separator = _configuration(keys).get("separator", "/") if isinstance(keys, dict) else None
+    configuration = keys.get("configuration", {}) if isinstance(keys, dict) else None
+    separator = configuration.get("separator", "/") if isinstance(configuration, dict) else None
     if name not in ("default", "v2") or separator not in ("/", "."):
         raise CorruptEpisode(f"its chunk_key_encoding is {_shown(keys)}; expected 'default' with '/' or '.'")
 
@@ -184,9 +228,11 @@ def _check_codecs(codecs: Any, shape: tuple[int, ...], *, sharded: bool) -> tupl
         chunk = _extents(inner.get("chunk_shape"), shape, "chunks")
         if any(extent % part for extent, part in zip(shape, chunk, strict=True)):
             raise CorruptEpisode(f"its chunks of {_shown(chunk)} do not divide its shards of {_shown(shape)}")
-        found = _names(inner.get("index_codecs"))
-        if found != _INDEX_CODECS:
-            raise CorruptEpisode(f"the index of its shards has the codecs {listing(found)}; expected bytes and crc32c")
+        index_codecs = _names(inner.get("index_codecs"))
+        if index_codecs != _INDEX_CODECS:
+            raise CorruptEpisode(
+                f"the index of its shards has the codecs {listing(index_codecs)}; expected bytes and crc32c"
+            )
         _check_codecs(inner.get("codecs"), chunk, sharded=False)
         return chunk
     if names not in _CHAINS:
@@ -226,8 +272,8 @@ def _is_list(given: Any) -> bool:
 
 
 def _configuration(holder: Mapping[str, Any]) -> Mapping[str, Any]:
-    found = holder.get("configuration", {})
-    return found if isinstance(found, dict) else {}
+    configuration = holder.get("configuration", {})
+    return configuration if isinstance(configuration, dict) else {}
 
 
 def _expected(names: tuple[str, ...]) -> str:

@@ -65,8 +65,8 @@ def names_in(files: Any, path: str, within_s: float) -> list[str]:
     """
     if _is_web(files):
         return _linked_names(files, path, within_s)
-    found = asked_within(files, "ls", path, detail=False, seconds=within_s)
-    return [str(name).rstrip("/").rpartition("/")[2] for name in _not_too_many(found)]
+    paths = asked_within(files, "ls", path, detail=False, seconds=within_s)
+    return [str(name).rstrip("/").rpartition("/")[2] for name in _not_too_many(paths)]
 
 
 def files_below(files: Any, path: str, within_s: float) -> list[str]:
@@ -77,9 +77,9 @@ def files_below(files: Any, path: str, within_s: float) -> list[str]:
     """
     if _is_web(files):
         raise NotImplementedError("a web server lists no files below a folder")
-    found = asked_within(files, "find", path, seconds=within_s)
+    paths = asked_within(files, "find", path, seconds=within_s)
     base = str(files._strip_protocol(path)).rstrip("/") + "/"
-    return [str(name).removeprefix(base) for name in _not_too_many(found)]
+    return [str(name).removeprefix(base) for name in _not_too_many(paths)]
 
 
 def asked_within(files: Any, method: str, *given: Any, seconds: float, **named: Any) -> Any:
@@ -133,7 +133,7 @@ def _linked_names(files: Any, url: str, within_s: float) -> list[str]:
     if len(page) > LISTING_BYTES:
         raise TooMuch(f"its list has more than {LISTING_BYTES:,} bytes")
     base = f"{url.rstrip('/')}/"
-    found = dict[str, None]()
+    names = dict[str, None]()
     for link in _LINK.findall(page):
         try:
             address = urljoin(base, link.decode("utf-8", "replace"))
@@ -141,16 +141,16 @@ def _linked_names(files: Any, url: str, within_s: float) -> list[str]:
             continue
         if address.startswith(base):
             path = re.split("[?#]", address.removeprefix(base), maxsplit=1)[0]
-            found[unquote(path.partition("/")[0])] = None
-    return [name for name in found if name]
+            names[unquote(path.partition("/")[0])] = None
+    return [name for name in names if name]
 
 
 def _over_http(files: Any, url: str, start: int | None, end: int | None, most: int, within_s: float) -> bytes:
     """One request, whose answer is read up to `most` bytes; fsspec reads all that the server sends."""
     from fsspec.asyn import sync
 
-    found: bytes = sync(files.loop, _answer, files, url, start, end, most, within_s)
-    return found
+    content: bytes = sync(files.loop, _answer, files, url, start, end, most, within_s)
+    return content
 
 
 async def _answer(files: Any, url: str, start: int | None, end: int | None, most: int, within_s: float) -> bytes:

@@ -89,12 +89,12 @@ class Folder:
         """See `ByteSource`."""
         handle, size = self._open(file)
         try:
-            found = []
+            pieces = []
             for length in lengths:
                 # Memory is taken for as many bytes as are asked for. One more than there are shows a file that grows.
-                found.append(os.pread(handle, min(length, max(0, size - offset) + 1), offset))
+                pieces.append(os.pread(handle, min(length, max(0, size - offset) + 1), offset))
                 offset += length
-            return found
+            return pieces
         finally:
             os.close(handle)
 
@@ -185,8 +185,8 @@ def copy_into(memory: Memory, content: bytes) -> int:
 
 def split(content: bytes, lengths: Sequence[int]) -> list[bytes]:
     """Neighbouring parts of some bytes."""
-    found, at = [], 0
+    pieces, at = [], 0
     for length in lengths:
-        found.append(content[at : at + length])
+        pieces.append(content[at : at + length])
         at += length
-    return found
+    return pieces

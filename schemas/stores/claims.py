@@ -224,8 +224,8 @@ def holders(store: Path) -> list[Holder]:
     """Return the holders of all claims on the store's episodes, dead or alive. Times are by this machine's clock."""
     folder, now = _claims_folder(store), time.time()
     last = {episode: numbers[-1] for episode, numbers in sorted(_claims(folder).items())}
-    found = (_read(folder, episode, generation, now) for episode, generation in last.items())
-    return [holder for holder in found if holder is not None]
+    read = (_read(folder, episode, generation, now) for episode, generation in last.items())
+    return [holder for holder in read if holder is not None]
 
 
 def _claims_folder(store: Path) -> Path:
@@ -238,12 +238,12 @@ def _name(episode: str, generation: int) -> str:
 
 def _claims(folder: Path) -> dict[str, list[int]]:
     """The generations of the claims on each episode, in ascending order. What has another name is no claim."""
-    found: dict[str, list[int]] = {}
+    generations_of: dict[str, list[int]] = {}
     for name in job_files(folder):
         match = _CLAIM.fullmatch(name)
         if match is not None and is_episode_name(match[1]):
-            found.setdefault(match[1], []).append(int(match[2]))
-    return {episode: sorted(generations) for episode, generations in found.items()}
+            generations_of.setdefault(match[1], []).append(int(match[2]))
+    return {episode: sorted(generations) for episode, generations in generations_of.items()}
 
 
 def _generations(folder: Path, episode: str) -> list[int]:

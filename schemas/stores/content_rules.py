@@ -40,10 +40,10 @@ def add_up(rows: NDArray[np.float32], row_sum: NDArray[np.float32], mantissa_bit
     Where it says no, `row_problems` decides: sums in float32 err by some 1e-6.
     """
     with np.errstate(over="ignore", invalid="ignore"):  # of numbers that no row has
-        found = rows.reshape(-1, rows.shape[-1]) @ np.ones(rows.shape[-1], np.float32)
+        sums = rows.reshape(-1, rows.shape[-1]) @ np.ones(rows.shape[-1], np.float32)
     expected = row_sum.reshape(-1)
     most = np.float32(row_sum_bound(mantissa_bits) - _SUMMATION_TOLERANCE / 2)
-    return bool((np.abs(found - expected) <= most * expected).all())  # a NaN is in no bound
+    return bool((np.abs(sums - expected) <= most * expected).all())  # a NaN is in no bound
 
 
 def row_problems(

@@ -6,9 +6,8 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vla_attention.schemas.errors import listing
-from vla_attention.schemas.plurals import plural
-from vla_attention.schemas.stores.completeness import check_presence
+from vla_attention.schemas.errors import listing, plural
+from vla_attention.schemas.stores.episode_files import check_presence
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import StoreError
 from vla_attention.schemas.stores.verify import episode_faults

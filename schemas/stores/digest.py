@@ -1,18 +1,24 @@
-"""The digests in a store (sha256, in hexadecimal): of an array's values, a file, a run's configuration, a seal."""
+"""The digests in a store (sha256, in hexadecimal): of an array's values, a file, a run's configuration, a seal.
+
+Where two runs have different digests, `run_differences` says in which fields.
+"""
 
 from __future__ import annotations
 
 import copy
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.schemas.stores.store_format import JOB_RECORDS
+from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.stores.store_format import JOB_RECORDS, RootAttributes
 
+#: Bytes of the checksum `crc32c`, which stands behind each chunk and each index of a shard.
+CHECKSUM_BYTES = 4
 #: Bytes of sha256 that a seal has of every chunk: by chance, one of 2^64 others would pass.
 CHUNK_DIGEST_BYTES = 8
 
@@ -84,3 +90,23 @@ def with_digest(attributes: Mapping[str, Any]) -> dict[str, Any]:
 def _canonical(document: object) -> bytes:
     """JSON in one form: keys sorted, no white space, other characters than ASCII escaped."""
     return json.dumps(document, sort_keys=True, separators=(",", ":")).encode()
+
+
+#: Path of a field, and its values in the one and in the other run; None where a run has no such field.
+Difference = tuple[str, object, object]
+
+
+def run_differences(one: RootAttributes, other: RootAttributes) -> Iterator[Difference]:
+    """The fields in which two runs' configurations differ, in the order of the root's attributes."""
+    yield from _differences(run_configuration(to_json(one)), run_configuration(to_json(other)), "")
+
+
+def _differences(one: Any, other: Any, where: str) -> Iterator[Difference]:
+    if isinstance(one, dict) and isinstance(other, dict):
+        for key in [*one, *(key for key in other if key not in one)]:
+            yield from _differences(one.get(key), other.get(key), f"{where}.{key}".lstrip("."))
+    elif isinstance(one, list) and isinstance(other, list) and len(one) == len(other) and where.startswith("sites"):
+        for i, (a, b) in enumerate(zip(one, other, strict=True)):
+            yield from _differences(a, b, f"{where}[{i}]")
+    elif one != other:
+        yield where, one, other

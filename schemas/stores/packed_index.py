@@ -104,8 +104,8 @@ def unlisted_episodes(place: StorePlace, index: PackedIndex) -> tuple[str, ...]:
     Raises:
         NotListed: the place has no list of its files.
     """
-    found = _zips_elsewhere(place, index) if isinstance(place, StoreUrl) else set(_zips_and_folders(place))
-    names = {path: path.rpartition("/")[2].removesuffix(".zip") for path in found}
+    zips = _zips_elsewhere(place, index) if isinstance(place, StoreUrl) else set(_zips_and_folders(place))
+    names = {path: path.rpartition("/")[2].removesuffix(".zip") for path in zips}
     return tuple(sorted(path for path, name in names.items() if is_episode_name(name) and name not in index.episodes))
 
 
@@ -115,10 +115,10 @@ def _zips_elsewhere(place: StoreUrl, index: PackedIndex) -> set[str]:
     except (OSError, NotImplementedError) as error:
         raise NotListed(str(error).rstrip(".")) from None
     # Services name files in their own ways: with the bucket, with the repository and its commit.
-    found = {"/".join((EPISODES_GROUP, *file.split("/")[-2:])) for file in files if file.endswith(".zip")}
-    if index.episodes and found.isdisjoint(entry.file for entry in index.episodes.values()):
+    zips = {"/".join((EPISODES_GROUP, *file.split("/")[-2:])) for file in files if file.endswith(".zip")}
+    if index.episodes and zips.isdisjoint(entry.file for entry in index.episodes.values()):
         raise NotListed("its list has none of the zips that the index names")
-    return found
+    return zips
 
 
 def _zips_and_folders(store: Path) -> Iterator[str]:

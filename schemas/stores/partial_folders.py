@@ -72,6 +72,12 @@ def dead_partials(store: Path) -> list[Path]:
     return [folder for folder in _partials(store) if _process_of(folder) and not _is_running(_process_of(folder))]
 
 
+def partials_in_use(store: Path) -> list[Path]:
+    """What processes that may still run are writing beside the store, here or on other machines."""
+    dead = set(dead_partials(store))
+    return [folder for folder in _partials(store) if folder not in dead]
+
+
 def partials_of_others(store: Path) -> list[Path]:
     """What processes of other machines are writing beside the store, or have left there."""
     return [folder for folder in _partials(store) if not _process_of(folder)]

@@ -30,7 +30,6 @@ from vla_attention.schemas.stores.packed_index import (
     INDEX_FILE,
     LIST_AGAIN,
     NotListed,
-    PackedEpisode,
     PackedIndex,
     read_index,
     unlisted_episodes,
@@ -38,13 +37,13 @@ from vla_attention.schemas.stores.packed_index import (
 from vla_attention.schemas.stores.remote_source import RemoteFailure, at_commit, kept_bytes, source_of
 from vla_attention.schemas.stores.root import group_attributes, list_episodes, read_run
 from vla_attention.schemas.stores.seal import digests_problem, identity_problem, read_seal
+from vla_attention.schemas.stores.seal_content import EpisodeSeal
 from vla_attention.schemas.stores.sealed_files import SealedFiles
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
     NUMBERS,
     CorruptEpisode,
     EpisodeAttributes,
-    EpisodeSeal,
     RootAttributes,
     episode_name,
     parse_episode_name,
@@ -57,8 +56,7 @@ if TYPE_CHECKING:
     import zarr
 
     from vla_attention.schemas.stores.array_metadata import ArrayMetadata
-    from vla_attention.schemas.stores.shards import ShardedLayers
-    from vla_attention.schemas.stores.single_chunks import SingleChunk
+    from vla_attention.schemas.stores.shards import ShardedLayers, SingleChunk
 
 Read = TypeVar("Read")
 
@@ -160,20 +158,15 @@ class StoredEpisode:
             raise CorruptEpisode(f"Episode {self.name} is damaged: {error}.", error.file) from None
 
     @cached_property
-    def _opened(self) -> dict[str, zarr.Array[Any]]:
+    def _kept(self) -> dict[tuple[Callable[..., Any], str], Any]:
+        """What was made of arrays, by what makes it and the array's name."""
         return {}
 
-    @cached_property
-    def _single_chunks(self) -> dict[str, SingleChunk | None]:
-        return {}
-
-    @cached_property
-    def _described(self) -> dict[str, ArrayMetadata]:
-        return {}
-
-    @cached_property
-    def _layers(self) -> dict[str, ShardedLayers | None]:
-        return {}
+    def _once(self, make: Callable[[StoredEpisode, str], Read], name: str) -> Read:
+        if (make, name) not in self._kept:
+            self._kept[make, name] = make(self, name)
+        kept: Read = self._kept[make, name]
+        return kept
 
     def has(self, name: str) -> bool:
         """Whether the episode has an array of that name, or numbers of that name in its attributes."""
@@ -185,9 +178,7 @@ class StoredEpisode:
         Raises:
             CorruptEpisode: it has another shape than in the attributes, or its metadata are damaged.
         """
-        if name not in self._opened:
-            self._opened[name] = self._open(name)
-        return self._opened[name]
+        return self._once(StoredEpisode._open, name)
 
     def _open(self, name: str) -> zarr.Array[Any]:
         import zarr
@@ -207,14 +198,16 @@ class StoredEpisode:
 
     def _metadata(self, name: str) -> ArrayMetadata:
         """What an array's `zarr.json` says, checked against the attributes, the seal and the format."""
-        if name not in self._described:
-            from vla_attention.schemas.stores.array_metadata import array_metadata
+        return self._once(StoredEpisode._described, name)
 
-            shape, content = self._listed_shape(name), self.sealed(f"{name}/zarr.json")
-            self._described[name] = self._readable(
-                name, lambda: array_metadata(content, shape, name, self.files.records)
-            )
-        return self._described[name]
+    def _described(self, name: str) -> ArrayMetadata:
+        from vla_attention.schemas.stores.array_metadata import array_metadata
+
+        recorded = self.attributes.arrays.get(name)
+        if recorded is None:
+            raise CorruptEpisode(f"Episode {self.name} lacks the array {name}: its attributes do not list it.")
+        content = self.sealed(f"{name}/zarr.json")
+        return self._readable(name, lambda: array_metadata(content, tuple(recorded.shape), name, self.files.records))
 
     def reading_step(self, name: str) -> int:
         """Indices along the first axis of an array that are read at once without more memory than is stored for them.
@@ -239,11 +232,14 @@ class StoredEpisode:
         Raises:
             CorruptEpisode: it is not there, or a chunk of it is missing or not the one that was sealed.
         """
-        stored = self._numbers(name)
+        stored = self._numbers_as_array(name)
         if stored is None:
-            stored = self._single_chunk(name)
+            stored = self._once(StoredEpisode._single_chunk, name)
             if stored is None:
-                self._check_reading(name, index)
+                metadata = self._metadata(name)
+                # A view of one number in the array's shape takes no memory, and shows what the index takes.
+                shape = np.broadcast_to(np.empty((), metadata.dtype), metadata.shape)[index].shape
+                self._readable(name, partial(metadata.check_reading, shape))
                 stored = self.array(name)
         try:
             values = np.asarray(stored[index])
@@ -252,15 +248,13 @@ class StoredEpisode:
         except Exception as error:  # damaged bytes can make codecs raise anything
             problem, file = str(error).rstrip("."), getattr(error, "file", None)
             raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {problem}.", file) from error
-        if name.endswith("/key_role") and not values.all():
-            raise _lost_chunk(self, name)
         self.refuse_missing(name, values)
         return values
 
     def _numbers_of(self, name: str) -> tuple[float, ...]:
         return getattr(self.attributes, name) if name in NUMBERS else ()
 
-    def _numbers(self, name: str) -> Any:
+    def _numbers_as_array(self, name: str) -> Any:
         """The numbers of that name in the attributes, None without any."""
         numbers = self._numbers_of(name)
         try:
@@ -269,22 +263,13 @@ class StoredEpisode:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: its {name} is damaged ({error}).") from None
 
     def _single_chunk(self, name: str) -> SingleChunk | None:
-        if name not in self._single_chunks:
-            from vla_attention.schemas.stores.single_chunks import SingleChunk
+        from vla_attention.schemas.stores.shards import SingleChunk
 
-            self._single_chunks[name] = SingleChunk.of(self._metadata(name).document, self.files, name)
-        return self._single_chunks[name]
+        return SingleChunk.of(self._metadata(name), self.files.whole, name)
 
     def shape_of(self, name: str) -> tuple[int, ...]:
         """Shape of one array; raises `CorruptEpisode` for one that its files cannot have."""
         return self._metadata(name).shape
-
-    def _listed_shape(self, name: str) -> tuple[int, ...]:
-        """Shape of one array, as the attributes list it; `CorruptEpisode` when they do not."""
-        recorded = self.attributes.arrays.get(name)
-        if recorded is None:
-            raise CorruptEpisode(f"Episode {self.name} lacks the array {name}: its attributes do not list it.")
-        return tuple(recorded.shape)
 
     def read_layer(self, name: str, layer: int, denoise: int) -> NDArray[np.float32]:
         """One layer and denoise step (positions) of an array (replan, layer, denoise, ...), without those two axes."""
@@ -298,7 +283,7 @@ class StoredEpisode:
         Each is gone when the next one is asked for. They are not searched for missing values: give `refuse_missing`
         what is made of them, which has far fewer numbers.
         """
-        layers = self._sharded(name)
+        layers = self._once(StoredEpisode._sharded, name)
         memory = None if layers is None else self._readable(name, layers.memory)
         for layer, denoise in places:
             if layers is None:
@@ -307,20 +292,10 @@ class StoredEpisode:
                 yield self._readable(name, partial(layers.read, layer, denoise, memory))
 
     def _sharded(self, name: str) -> ShardedLayers | None:
-        if name not in self._layers:
-            from vla_attention.schemas.stores.shards import ShardedLayers
+        from vla_attention.schemas.stores.shards import ShardedLayers
 
-            files = self.files
-            metadata = self._metadata(name).document
-            self._layers[name] = ShardedLayers.of(metadata, lambda file: files.shard(f"{name}/{file}"))
-        return self._layers[name]
-
-    def _check_reading(self, name: str, index: Any) -> None:
-        """Raise `CorruptEpisode` before more memory is taken than the files of an array can hold."""
-        metadata = self._metadata(name)
-        # A view of one number in the array's shape takes no memory.
-        shape = np.broadcast_to(np.empty((), metadata.dtype), metadata.shape)[index].shape
-        self._readable(name, lambda: metadata.check_reading(shape))
+        files = self.files
+        return ShardedLayers.of(self._metadata(name), lambda file: files.shard(f"{name}/{file}"))
 
     def _readable(self, name: str, read: Callable[[], Read]) -> Read:
         try:
@@ -330,8 +305,8 @@ class StoredEpisode:
 
     def refuse_missing(self, name: str, values: NDArray[Any]) -> None:
         """Raise `CorruptEpisode` when values of an array, or sums of them, have the mark of a lost chunk."""
-        if _holds_missing(values):
-            raise _lost_chunk(self, name)
+        if _holds_missing(values) or (name.endswith("/key_role") and not values.all()):
+            raise CorruptEpisode(f"Array {name} of episode {self.name} has missing values: a chunk is lost.")
 
     def tokens(self, root: RootAttributes, site: str) -> EpisodeTokens:
         """What every key of a site is in this episode."""
@@ -341,9 +316,11 @@ class StoredEpisode:
         roles = self.read(f"{site}/key_role")
         if roles.max(initial=0) > max(Role):
             raise CorruptEpisode(f"Array {site}/key_role of episode {self.name} has codes that are no roles.")
+        same = bool((roles == roles[:1]).all())
         return EpisodeTokens(
             layout=layout,
-            key_role=_once_if_same(roles),
+            # In memory once where all replans have the same, which are 50 kB an episode.
+            key_role=np.broadcast_to(roles[0].copy(), roles.shape) if len(roles) and same else roles,
             prompts=self.prompts(root, site),
             prompt_index=self.read("prompt_index"),
             objects=self.attributes.objects,
@@ -425,7 +402,12 @@ def open_store(path: str | StorePlace) -> Store:
     if index is not None:
         _name_unlisted(path, index)
         in_order = sorted(index.episodes.items(), key=lambda item: parse_episode_name(item[0]))
-        return Store(path, root, run, tuple(_packed(path, source, run, version, *item) for item in in_order))
+        members = {
+            name: ZipMembers(source.bound_to(entry.seal), entry.file, entry.bytes, entry.tail, entry.frame)
+            for name, entry in in_order
+        }
+        packed = (StoredEpisode(path / e.file, name, run, version, members[name], e.seal) for name, e in in_order)
+        return Store(path, root, run, tuple(packed))
     folders, strays = list_episodes(path)
     if strays:
         warnings.warn(
@@ -451,23 +433,6 @@ def _name_unlisted(path: StorePlace, index: PackedIndex) -> None:
             Note,
             stacklevel=3,
         )
-
-
-def _packed(
-    path: StorePlace, source: ByteSource, run: str, version: int, name: str, entry: PackedEpisode
-) -> StoredEpisode:
-    members = ZipMembers(source.bound_to(entry.seal), entry.file, entry.bytes, entry.tail, entry.frame)
-    return StoredEpisode(path / entry.file, name, run, version, members, entry.seal)
-
-
-def _once_if_same(values: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Values (replan, key); in memory once where all replans have the same, which are 50 kB an episode."""
-    same = (values == values[:1]).all()
-    return np.broadcast_to(values[0].copy(), values.shape) if same and len(values) else values
-
-
-def _lost_chunk(episode: StoredEpisode, name: str) -> CorruptEpisode:
-    return CorruptEpisode(f"Array {name} of episode {episode.name} has missing values: a chunk is lost.")
 
 
 def _holds_missing(values: NDArray[Any]) -> bool:

@@ -25,8 +25,7 @@ from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.limits import ANSWER_WITHIN_S, ROOT_BYTES, SLOWEST_BYTES_A_SECOND, WHOLE_FILE_BYTES
 from vla_attention.schemas.stores.bounded_fetch import TooSlow, asked_within, fetched, files_below, names_in
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder, Memory, copy_into, split
-from vla_attention.schemas.stores.hub_address import HUB_PROTOCOL, HubAddress, stated_commit
-from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
+from vla_attention.schemas.stores.store_url import HUB_PROTOCOL, HubAddress, StorePlace, StoreUrl, stated_commit
 from vla_attention.schemas.user_cache import user_cache
 
 FOLDER_VARIABLE = "VLA_REMOTE_CACHE"
@@ -155,9 +154,9 @@ class RemoteFolder:
         kept = kept_bytes() if self.digest else None
         key = f"{self.digest}\n{file}\n{start}\n{end}"
         if kept is not None and not fresh:
-            found = kept.get(key)
-            if found is not None:
-                return found
+            answer = kept.get(key)
+            if answer is not None:
+                return answer
         content = self._fetch(file, start, end, most)
         if kept is not None:
             kept.put(key, content)
@@ -190,13 +189,13 @@ class KeptBytes:
             content = path.read_bytes()
         except OSError:
             return None
-        found = content[_DIGEST_BYTES:]
-        if hashlib.sha256(found).digest() != content[:_DIGEST_BYTES]:
+        kept = content[_DIGEST_BYTES:]
+        if hashlib.sha256(kept).digest() != content[:_DIGEST_BYTES]:
             path.unlink(missing_ok=True)
             return None
         with suppress(OSError):
             os.utime(path)  # the least recently used is removed first
-        return found
+        return kept
 
     def put(self, key: str, content: bytes) -> None:
         """Keep bytes; a folder without room or rights keeps nothing."""

@@ -16,14 +16,13 @@ from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.byte_source import Folder
 from vla_attention.schemas.stores.claims import Claims, Holder, jobs_folder
 from vla_attention.schemas.stores.damaged_episodes import DamagedEpisode, look_at
-from vla_attention.schemas.stores.durable_files import publish_file
+from vla_attention.schemas.stores.durable_files import lock_for_writing, publish_file
 from vla_attention.schemas.stores.packed_index import INDEX_FILE, read_index
 from vla_attention.schemas.stores.partial_folders import no_link, process_tag, remove_if_empty
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.root import group_document, refuse_linked_group
 from vla_attention.schemas.stores.seal import read_seal
 from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, StoreError
-from vla_attention.schemas.stores.store_lock import lock_for_writing
 from vla_attention.schemas.stores.store_url import local_path
 from vla_attention.schemas.stores.verify import episode_report, store_faults
 from vla_attention.schemas.stores.worker import this_worker
@@ -74,9 +73,9 @@ def repair_store(path: Path, verify: bool = False, dry_run: bool = False) -> lis
     if is_packed(path):
         return _repair_packed(store, path, verify, dry_run)
     looks = [(episode, look_at(store, episode, verify)) for episode in store.episodes]
-    damaged = [(episode, found) for episode, found in looks if found is not None]
+    damaged = [(episode, fault) for episode, fault in looks if fault is not None]
     if dry_run or not damaged:
-        return [Finding(found) for _, found in damaged]
+        return [Finding(fault) for _, fault in damaged]
     try:
         with Claims(path, this_worker()) as claims:
             return [finding for item, _ in damaged if (finding := _move(store, item, claims, verify)) is not None]

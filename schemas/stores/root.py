@@ -1,4 +1,7 @@
-"""The root of a store: the run's attributes and the folders of its episodes. Read as plain JSON; zarr is not needed."""
+"""The root of a store: the run's attributes and the folders of its episodes. Read as plain JSON; zarr is not needed.
+
+`decode_root` decides which versions of the format are read; `docs/store.md` ("Versions") has the rule for changes.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from typing import Any
 
 from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
-from vla_attention.schemas.jsonable import MalformedDocument
+from vla_attention.schemas.jsonable import MalformedDocument, from_json
 from vla_attention.schemas.limits import ROOT_BYTES
 from vla_attention.schemas.regular_files import read_regular
 from vla_attention.schemas.stores.digest import run_digest
@@ -17,13 +20,14 @@ from vla_attention.schemas.stores.remote_source import RemoteFailure, RemoteFold
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
     FORMAT_NAME,
+    STORE_VERSION,
+    FormatTooNew,
     RootAttributes,
     StoreError,
     StoreNotFound,
     is_episode_name,
 )
 from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
-from vla_attention.schemas.stores.versions import decode_root
 
 #: What the document of a group may say; zarr-python writes the last one as null.
 _GROUP_FIELDS = {"attributes", "zarr_format", "node_type", "consolidated_metadata"}
@@ -43,7 +47,7 @@ def read_run(path: StorePlace) -> tuple[RootAttributes, str]:
         FormatTooNew: a later version wrote it.
     """
     if isinstance(path, Path) and not path.exists():
-        nearby = sorted(str(found) for found in path.parent.glob("*.zarr")) if path.parent.is_dir() else []
+        nearby = sorted(str(store) for store in path.parent.glob("*.zarr")) if path.parent.is_dir() else []
         raise StoreNotFound(
             f"There is no store at {path}.{did_you_mean(str(path), nearby)} "
             f"Stores in {path.parent}: {listing(nearby, 5)}. Make one with vla-capture."
@@ -78,10 +82,10 @@ def _refuse_inside(path: Path, attributes: dict[str, Any]) -> None:
         return
     for above in path.absolute().parents:
         try:
-            found = group_attributes(read_regular(above / "zarr.json", ROOT_BYTES))
+            stated = group_attributes(read_regular(above / "zarr.json", ROOT_BYTES))
         except (OSError, ValueError):
             return  # the store's groups are all above one another
-        if found.get("format") == FORMAT_NAME:
+        if stated.get("format") == FORMAT_NAME:
             raise StoreError(f"{path} is a group inside of a store; give the folder above, {above}.")
 
 
@@ -103,7 +107,7 @@ def list_episodes(path: StorePlace) -> tuple[list[StorePlace], list[str]]:
                 f"The episodes of {path} cannot be listed ({str(error).rstrip('.')}), and it has no index; vla-analyze "
                 "copy --packed makes a store that is read without listing."
             ) from None
-        found = {name: is_episode_name(name) for name in names}
+        is_episode_of = {name: is_episode_name(name) for name in names}
     elif (path / INDEX_FILE).is_file():
         raise StoreError(
             f"{path} is packed: its episodes are zip files, and nothing is added to them or moved. vla-analyze copy "
@@ -113,17 +117,17 @@ def list_episodes(path: StorePlace) -> tuple[list[StorePlace], list[str]]:
         refuse_linked_group(path)
         try:
             entries = (path / EPISODES_GROUP).iterdir()
-            found = {entry.name: is_episode_name(entry.name) and entry.is_dir() for entry in entries}
+            is_episode_of = {entry.name: is_episode_name(entry.name) and entry.is_dir() for entry in entries}
         except OSError as error:
             raise StoreError(
                 f"The store {path} cannot be read: its group '{EPISODES_GROUP}': {error.strerror or error}."
             ) from None
-    if any(map(is_pack_folder, found)):
+    if any(map(is_pack_folder, is_episode_of)):
         raise StoreError(
             f"The store {path} cannot be read: it is packed, and its {INDEX_FILE} is lost; make the packed copy again."
         )
-    strays = sorted(name for name, is_episode in found.items() if not is_episode and name != "zarr.json")
-    return [path / EPISODES_GROUP / name for name, is_episode in found.items() if is_episode], strays
+    strays = sorted(name for name, is_episode in is_episode_of.items() if not is_episode and name != "zarr.json")
+    return [path / EPISODES_GROUP / name for name, is_episode in is_episode_of.items() if is_episode], strays
 
 
 def refuse_linked_group(path: Path) -> None:
@@ -166,3 +170,49 @@ def without_other_fields(content: bytes) -> bytes:
 def group_document(attributes: dict[str, Any]) -> bytes:
     """The `zarr.json` of a group, as zarr-python writes it."""
     return json.dumps({"attributes": attributes, "zarr_format": 3, "node_type": "group"}, indent=2).encode()
+
+
+#: What drafts of the format said in place of `store_version`, which no release wrote.
+_DRAFT = "format_version"
+
+
+def decode_root(attributes: dict[str, Any], path: object) -> RootAttributes:
+    """The root attributes of a store of any version that this program reads.
+
+    Raises:
+        FormatTooNew: a later version wrote the store.
+        StoreError: it is no store of this tool, or its version is none.
+        MalformedDocument, ValueError: its attributes have other fields or values than that version.
+    """
+    check_version(attributes, path)
+    return from_json(RootAttributes, attributes)
+
+
+def check_version(attributes: dict[str, Any], path: object) -> None:
+    """Raise unless root attributes belong to a store that this program can read; see `decode_root`."""
+    if attributes.get("format") != FORMAT_NAME:
+        raise StoreError(
+            f"{path} is a Zarr group, but not a store of this tool: its attribute 'format' is not '{FORMAT_NAME}'."
+        )
+    if _DRAFT in attributes:
+        raise StoreError(
+            f"{path} says {_DRAFT}: it is of a draft of the format, before version 1, and this program reads versions "
+            f"1 to {STORE_VERSION}; capture the episodes again."
+        )
+    version = attributes.get("store_version")
+    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
+        given = f"has the store_version {_short(version)}" if "store_version" in attributes else "has no store_version"
+        raise StoreError(f"{path} {given}; expected a whole number, 1 to {STORE_VERSION}.")
+    if version > STORE_VERSION:
+        raise FormatTooNew(
+            f"{path} is a store of version {_short(version)}, and this program reads stores up to version "
+            f"{STORE_VERSION}; install a newer version of it."
+        )
+
+
+def _short(value: object) -> str:
+    """A value of a document as text; a number of thousands of digits cannot be printed."""
+    if isinstance(value, int) and value.bit_length() > 64:
+        return "with more than 19 digits"
+    text = repr(value)
+    return text if len(text) <= 40 else f"{text[:40]}..."

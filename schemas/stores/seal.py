@@ -16,11 +16,19 @@ from typing import Any
 
 from vla_attention.schemas.jsonable import from_json, to_json
 from vla_attention.schemas.limits import DOCUMENT_BYTES
+from vla_attention.schemas.stores.array_metadata import chunks_of_a_shard
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder
-from vla_attention.schemas.stores.digest import CHUNK_DIGEST_BYTES, bytes_digest, chunk_digest, seal_digest
+from vla_attention.schemas.stores.digest import (
+    CHECKSUM_BYTES,
+    CHUNK_DIGEST_BYTES,
+    bytes_digest,
+    chunk_digest,
+    seal_digest,
+)
 from vla_attention.schemas.stores.root import group_attributes
-from vla_attention.schemas.stores.shards import CHECKSUM_BYTES, chunks_of_a_shard, index_size, read_index
-from vla_attention.schemas.stores.store_format import SEAL_GROUP, EpisodeSeal, FileRecord
+from vla_attention.schemas.stores.seal_content import EpisodeSeal, FileRecord
+from vla_attention.schemas.stores.shards import index_size, read_index
+from vla_attention.schemas.stores.store_format import SEAL_GROUP
 
 SEAL_FILE = f"{SEAL_GROUP}/zarr.json"
 

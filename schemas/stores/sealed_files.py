@@ -12,8 +12,9 @@ from vla_attention.schemas.regular_files import NotRegular
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder
 from vla_attention.schemas.stores.digest import bytes_digest
 from vla_attention.schemas.stores.remote_source import RemoteFailure
+from vla_attention.schemas.stores.seal_content import FileRecord
 from vla_attention.schemas.stores.shards import SealedShard
-from vla_attention.schemas.stores.store_format import CorruptEpisode, FileRecord
+from vla_attention.schemas.stores.store_format import CorruptEpisode
 from vla_attention.schemas.stores.zip_members import DamagedZip
 
 #: Bytes of a file that are in memory at once where no more than its digest is wanted.
@@ -120,18 +121,18 @@ class SealedFiles:
 
     def problems(self) -> dict[str, str]:
         """What is wrong, by file: it is missing, or has another size than in the seal. Reads none of them."""
-        found = {}
+        wrong = {}
         for file, record in self.records.items():
             try:
                 size = self.source.size(file)
             except RemoteFailure:
                 raise
             except OSError as error:
-                found[file] = _lost(file, error)
+                wrong[file] = _lost(file, error)
                 continue
             if size != record.size:
-                found[file] = f"its {file} has {size} bytes; its seal says {record.size}"
-        return found
+                wrong[file] = f"its {file} has {size} bytes; its seal says {record.size}"
+        return wrong
 
     def _record(self, file: str) -> FileRecord:
         record = self.records.get(file)

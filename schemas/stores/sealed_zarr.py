@@ -9,9 +9,10 @@ from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Sto
 from zarr.core.buffer import Buffer, BufferPrototype
 
 from vla_attention.schemas.limits import WHOLE_FILE_BYTES
-from vla_attention.schemas.stores.array_metadata import ArrayMetadata, check_shard, inner_codecs
+from vla_attention.schemas.stores.array_metadata import ArrayMetadata, check_shard
+from vla_attention.schemas.stores.digest import CHECKSUM_BYTES
 from vla_attention.schemas.stores.sealed_files import SealedFiles
-from vla_attention.schemas.stores.shards import CHECKSUM_BYTES, SealedShard, check_blosc_frame
+from vla_attention.schemas.stores.shards import SealedShard, check_blosc_frame
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 
 
@@ -33,7 +34,6 @@ class SealedArrayStore(Store):
         self._files = files
         self._name = name
         self._metadata = metadata
-        self._codecs = inner_codecs(metadata.document)
 
     async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
         """The bytes of a file of the array, or of a part of it."""
@@ -53,7 +53,7 @@ class SealedArrayStore(Store):
                 return part
         content = self._files.whole(file, WHOLE_FILE_BYTES if shard is None else None)
         if shard is None:
-            self._check_frame(content[:-CHECKSUM_BYTES] if self._codecs[-1] == "crc32c" else content, file)
+            self._check_frame(content[:-CHECKSUM_BYTES] if self._metadata.codecs[-1] == "crc32c" else content, file)
         else:
             stored = np.frombuffer(content, np.uint8)
             for number, (offset, length) in enumerate(shard.index.tolist()):
@@ -90,7 +90,7 @@ class SealedArrayStore(Store):
 
     def _check_frame(self, frame: bytes, file: str) -> None:
         """Compare the sizes in the header of an encoded chunk, without its checksum, with those of the array."""
-        if "blosc" not in self._codecs:
+        if "blosc" not in self._metadata.codecs:
             return
         try:
             check_blosc_frame(frame, self._metadata.chunk_bytes, self._metadata.typesize)

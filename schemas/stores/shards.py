@@ -1,9 +1,10 @@
-"""Reading chunks straight from a shard's file, and one layer and denoise step of an array.
+"""Reading arrays without zarr-python: those that are one chunk in one file, and single chunks of a shard's file.
 
 A shard is a file of compressed chunks, with an index of their positions at its end (Zarr's `sharding_indexed` codec).
 zarr-python reads it through an event loop, and passing the chunks between threads takes as long as decoding them; an
-analysis of words reads thousands of chunks. `ShardedLayers` handles the one layout that `capture/store/codecs.py`
-writes. An array of any other layout is read with zarr-python.
+analysis of words reads thousands of chunks, and opens hundreds of episodes with several small arrays each.
+`ShardedLayers` handles the layout of rows, and `SingleChunk` that of most other arrays, as `create_rows` and
+`write_whole` of `capture/store/codecs.py` write them. An array of any other layout is read with zarr-python.
 
 Nothing that a file says is believed: the index, each chunk, and the checksum at its end are compared with the
 episode's seal, positions with the file's size, and the header of each compressed chunk with the size of the decoded
@@ -15,7 +16,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,52 +25,24 @@ from numpy.typing import NDArray
 
 from vla_attention.schemas.cached_property import cached_property
 from vla_attention.schemas.limit_checks import TooLarge, check_decoded
+from vla_attention.schemas.limits import WHOLE_FILE_BYTES
+from vla_attention.schemas.stores.array_metadata import ArrayMetadata
 from vla_attention.schemas.stores.byte_source import ByteSource, Memory
-from vla_attention.schemas.stores.digest import CHUNK_DIGEST_BYTES, bytes_digest, chunk_digest, crc32c
+from vla_attention.schemas.stores.digest import (
+    CHECKSUM_BYTES,
+    CHUNK_DIGEST_BYTES,
+    bytes_digest,
+    chunk_digest,
+    crc32c,
+)
 from vla_attention.schemas.stores.remote_source import RemoteFailure
-from vla_attention.schemas.stores.store_format import CorruptEpisode, FileRecord
+from vla_attention.schemas.stores.seal_content import FileRecord
+from vla_attention.schemas.stores.store_format import CorruptEpisode
 
-CHECKSUM_BYTES = 4
 _ABSENT = np.uint64(2**64 - 1)
 #: The header of a Blosc frame: format, version of the codec, flags, typesize; decoded bytes, bytes of a block, bytes of
 #: the frame (c-blosc, README_CHUNK_FORMAT.rst).
 _BLOSC_HEADER = struct.Struct("<BBBBIII")
-
-
-def chunks_of_a_shard(metadata: dict[str, Any]) -> int | None:
-    """Number of chunks in each shard of an array, or None where single chunks of it cannot be bound to a seal.
-
-    They can when every chunk ends with its crc32c, and the file with its index. `metadata` is the array's `zarr.json`;
-    that of a group gives None, too.
-    """
-    try:
-        codecs = metadata.get("codecs", [])
-        if [codec["name"] for codec in codecs] != ["sharding_indexed"]:
-            return None
-        inner = codecs[0]["configuration"]
-        shard = metadata["chunk_grid"]["configuration"]["chunk_shape"]
-        bound = (
-            inner["codecs"][-1]["name"] == "crc32c"
-            and inner.get("index_location", "end") == "end"
-            and [codec["name"] for codec in inner["index_codecs"]] == ["bytes", "crc32c"]
-            and inner["index_codecs"][0]["configuration"]["endian"] == "little"
-        )
-        counts = [extent // chunk for extent, chunk in zip(shard, inner["chunk_shape"], strict=True)]
-    except (AttributeError, IndexError, KeyError, TypeError, ValueError, ZeroDivisionError):
-        return None  # whoever reads the array says what is wrong with it
-    return math.prod(counts) if bound else None
-
-
-def chunk_file(keys: Mapping[str, Any], place: Sequence[int]) -> str:
-    """The path of a chunk, or shard, in its array's folder, from its place in the grid and the array's chunk keys.
-
-    Raises:
-        ValueError: the `chunk_key_encoding` of the array is another one than Zarr's default.
-    """
-    separator = keys.get("configuration", {}).get("separator", "/")
-    if keys.get("name") != "default" or separator not in ("/", "."):
-        raise ValueError(f"the chunk keys {dict(keys)} are not known")
-    return str(separator).join(("c", *map(str, place)))
 
 
 def index_size(chunks: int) -> int:
@@ -164,12 +137,12 @@ class SealedShard:
         problem: str | None = None
         for fresh in (False, True) if self.source.remembers else (False,):
             try:
-                found = self.source.read_into(stored, self.file, offset, fresh=fresh)
+                count = self.source.read_into(stored, self.file, offset, fresh=fresh)
             except RemoteFailure:
                 raise
             except OSError as error:
                 raise CorruptEpisode(f"its {self.file} cannot be read: {error.strerror or error}", self.file) from None
-            problem = self.problem(number, stored[:found])
+            problem = self.problem(number, stored[:count])
             if problem is None:
                 return stored[:-CHECKSUM_BYTES]
         raise CorruptEpisode(str(problem), self.file)
@@ -193,12 +166,13 @@ class SealedShard:
         for number in np.flatnonzero(self.index[:, 1]).tolist():
             self.chunk(number, memory)
 
+    def _digest(self, number: int) -> bytes:
+        """The digest of one chunk, from the seal."""
+        return self.digests[CHUNK_DIGEST_BYTES * number : CHUNK_DIGEST_BYTES * (number + 1)]
+
     def checksum(self, number: int) -> bytes:
         """The checksum of one chunk, from the seal."""
         return self.checksums[CHECKSUM_BYTES * number : CHECKSUM_BYTES * (number + 1)]
-
-    def _digest(self, number: int) -> bytes:
-        return self.digests[CHUNK_DIGEST_BYTES * number : CHUNK_DIGEST_BYTES * (number + 1)]
 
 
 def check_blosc_frame(frame: bytes | memoryview, decoded_bytes: int, typesize: int) -> None:
@@ -220,6 +194,59 @@ def check_blosc_frame(frame: bytes | memoryview, decoded_bytes: int, typesize: i
         raise CorruptEpisode(f"its header says blocks of {blocksize} bytes; expected 1 to {decoded_bytes}")
 
 
+def _decode(frame: bytes | memoryview, values: NDArray[Any], typesize: int, what: str, file: str) -> None:
+    """Decode a chunk into memory of its size; `CorruptEpisode`, which begins with `what`, where it is another's."""
+    from numcodecs import blosc
+
+    try:
+        check_blosc_frame(frame, values.nbytes, typesize)
+        blosc.decompress(frame, values)
+    except (CorruptEpisode, RuntimeError, ValueError) as error:
+        raise CorruptEpisode(f"{what} cannot be decoded: {error}", file) from None
+
+
+#: The codecs of a chunk that are handled here.
+_CODECS = ("bytes", "blosc", "crc32c")
+
+
+@dataclass(frozen=True)
+class SingleChunk:
+    """An array that is one chunk in one file, read when it is indexed.
+
+    Attributes:
+        whole: gives all bytes of the file, compared with the seal.
+        file: path of the array's file in the episode.
+        metadata: of the array.
+    """
+
+    whole: Callable[[str, int], bytes]
+    file: str
+    metadata: ArrayMetadata
+
+    @classmethod
+    def of(cls, metadata: ArrayMetadata, whole: Callable[[str, int], bytes], name: str) -> SingleChunk | None:
+        """The array `name`, or None when it has another layout."""
+        known = (
+            not metadata.is_sharded
+            and metadata.file_shape == metadata.shape
+            and metadata.codecs == _CODECS
+            and metadata.endian in (None, "little")
+            and metadata.has_default_keys
+        )
+        return cls(whole, f"{name}/{metadata.file((0,) * len(metadata.shape))}", metadata) if known else None
+
+    def __getitem__(self, index: Any) -> NDArray[Any]:
+        """Values at a numpy index; raises `CorruptEpisode` for other bytes than were sealed, and for other sizes."""
+        content = self.whole(self.file, WHOLE_FILE_BYTES)
+        frame, checksum = content[:-CHECKSUM_BYTES], content[-CHECKSUM_BYTES:]
+        if crc32c(frame) != int.from_bytes(checksum, "little"):
+            raise CorruptEpisode(f"the checksum of its {self.file} does not fit", self.file)
+        values = np.empty(self.metadata.shape, self.metadata.dtype.newbyteorder("<"))
+        _decode(frame, values, self.metadata.typesize, f"its {self.file}", self.file)
+        selected: NDArray[Any] = values[index]
+        return selected
+
+
 @dataclass(frozen=True)
 class LayerMemory:
     """Memory for `ShardedLayers.read`, used again for every layer and denoise step.
@@ -238,42 +265,43 @@ class ShardedLayers:
     """A float32 array (replan, layer, denoise, ...) whose chunks hold one layer and one denoise step each.
 
     Attributes:
-        shape: shape of the array.
-        block: extent of a chunk along the replans.
-        blocks_per_shard: how many of them a file has.
-        keys: the array's `chunk_key_encoding`.
+        metadata: of the array.
         shard: gives the shard in a file of the array, by its path in the array; None when the seal lists no chunks.
     """
 
-    shape: tuple[int, ...]
-    block: int
-    blocks_per_shard: int
-    keys: Mapping[str, Any]
+    metadata: ArrayMetadata
     shard: Callable[[str], SealedShard | None]
 
     @classmethod
-    def of(cls, metadata: dict[str, Any], shard_in: Callable[[str], SealedShard | None]) -> ShardedLayers | None:
-        """The array's reader, or None when its metadata (its `zarr.json`) describe another layout."""
-        try:
-            shape = tuple(metadata["shape"])
-            shard = tuple(metadata["chunk_grid"]["configuration"]["chunk_shape"])
-            if len(shape) < 4 or chunks_of_a_shard(metadata) is None:
-                return None
-            inner = metadata["codecs"][0]["configuration"]
-            block = inner["chunk_shape"][0]
-            chunk_file(metadata["chunk_key_encoding"], ())
-            known = (
-                metadata["data_type"] == "float32"
-                and not metadata.get("storage_transformers")
-                and shard[1:] == shape[1:]
-                and shard[0] % block == 0
-                and tuple(inner["chunk_shape"]) == (block, 1, 1, *shape[3:])
-                and [codec["name"] for codec in inner["codecs"]] == ["bytes", "blosc", "crc32c"]
-                and inner["codecs"][0]["configuration"]["endian"] == "little"
-            )
-        except (AttributeError, IndexError, KeyError, TypeError, ValueError, ZeroDivisionError):
-            return None  # zarr says what is wrong with them
-        return cls(shape, block, shard[0] // block, metadata["chunk_key_encoding"], shard_in) if known else None
+    def of(cls, metadata: ArrayMetadata, shard_in: Callable[[str], SealedShard | None]) -> ShardedLayers | None:
+        """The array's reader, or None when it has another layout."""
+        shape = metadata.shape
+        known = (
+            metadata.shard_chunks is not None
+            and len(shape) >= 4
+            and metadata.dtype == np.float32
+            and metadata.file_shape[1:] == shape[1:]
+            and metadata.chunk_shape[1:] == (1, 1, *shape[3:])
+            and metadata.codecs == _CODECS
+            and metadata.endian == "little"
+            and metadata.has_default_keys
+        )
+        return cls(metadata, shard_in) if known else None
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the array."""
+        return self.metadata.shape
+
+    @property
+    def block(self) -> int:
+        """Extent of a chunk along the replans."""
+        return self.metadata.chunk_shape[0]
+
+    @property
+    def blocks_per_shard(self) -> int:
+        """How many chunks along the replans a file has."""
+        return self.metadata.file_shape[0] // self.block
 
     @property
     def num_blocks(self) -> int:
@@ -284,7 +312,7 @@ class ShardedLayers:
     def _shards(self) -> tuple[SealedShard, ...]:
         rest = (0,) * (len(self.shape) - 1)
         count = -(-self.num_blocks // self.blocks_per_shard)
-        return tuple(self._open(chunk_file(self.keys, (i, *rest))) for i in range(count))
+        return tuple(self._open(self.metadata.file((i, *rest))) for i in range(count))
 
     def _open(self, file: str) -> SealedShard:
         shard = self.shard(file)
@@ -317,8 +345,6 @@ class ShardedLayers:
         Raises:
             CorruptEpisode: a chunk is missing, is not the one that was sealed, or decodes to another size.
         """
-        from numcodecs import blosc
-
         if not (0 <= layer < self.shape[1] and 0 <= denoise < self.shape[2]):
             raise IndexError(f"layer {layer} and denoise {denoise} of an array of shape {self.shape}")
         memory = memory or self.memory()
@@ -328,10 +354,5 @@ class ShardedLayers:
             number = (place * self.shape[1] + layer) * self.shape[2] + denoise
             frame = shard.chunk(number, memory.chunk)
             chunk = values[i * self.block : (i + 1) * self.block]
-            try:
-                check_blosc_frame(frame.data, chunk.nbytes, chunk.itemsize)
-                blosc.decompress(frame, chunk)
-            except (CorruptEpisode, RuntimeError, ValueError) as error:
-                problem = f"chunk {number} of its {shard.file} cannot be decoded: {error}"
-                raise CorruptEpisode(problem, shard.file) from None
+            _decode(frame.data, chunk, chunk.itemsize, f"chunk {number} of its {shard.file}", shard.file)
         return values[: self.shape[0]]

@@ -19,7 +19,7 @@ NAME.zarr/                            attributes: `RootAttributes`
     frames/<camera>                   (replan, row, column, channel) uint8, as the model sees it
     camera_frames/<camera>            the same, as the camera gave it; only where `frames` is a rounded model input
     objects/<camera>                  (replan, patch, object) float32
-    seal/                             attributes: `EpisodeSeal`, which binds all of the above
+    seal/                             attributes: `EpisodeSeal` (`seal_content.py`), which binds all of the above
 """
 
 from __future__ import annotations
@@ -77,8 +77,6 @@ SEAL_GROUP = "seal"
 
 #: Numbers of up to twelve digits.
 _EPISODE_NAME = re.compile(r"task([0-9]{3,12})_episode([0-9]{3,12})")
-_CHECKSUMS = re.compile(r"([0-9a-fA-F]{8})*")
-_DIGESTS = re.compile(r"([0-9a-fA-F]{16})*")
 
 
 class StoreError(UserError, ValueError):
@@ -376,58 +374,6 @@ class ArrayRecord:
 
 
 @dataclass(frozen=True)
-class FileRecord:
-    """Size in bytes and sha256 of a file of an episode.
-
-    A shard, from which parts are read, has three fields more. `index` is the sha256 of the index at its end (with the
-    index's checksum). `chunks` has the crc32c of every chunk, the 4 bytes at the chunk's end, in the index's order: 8
-    hexadecimal digits each, without a separator; `00000000` for a chunk that was not written. `digests` has, in the
-    same order, the first 8 bytes of the sha256 of every chunk as it is stored, with its crc32c: 16 hexadecimal digits
-    each; zeros for a chunk that was not written. Version 1 has no digests.
-    """
-
-    size: int
-    sha256: str
-    index: str = ""
-    chunks: str = ""
-    digests: str = ""
-
-    def __post_init__(self) -> None:
-        """Check the size, the form of checksums and digests, and that there is one of each for every chunk."""
-        if self.size < 0:
-            raise BadArgument(f"a file of {self.size} bytes")
-        if self.chunks and not _CHECKSUMS.fullmatch(self.chunks):
-            raise BadArgument("the checksums of the chunks of a file are not 8 hexadecimal digits each")
-        if self.digests and not _DIGESTS.fullmatch(self.digests):
-            raise BadArgument("the digests of the chunks of a file are not 16 hexadecimal digits each")
-        checksums, digests = len(self.chunks) // 8, len(self.digests) // 16
-        if digests not in (0, checksums):
-            raise BadArgument(f"a file has {digests} digests of chunks and {checksums} checksums; expected one of each")
-
-
-@dataclass(frozen=True)
-class EpisodeSeal:
-    """What binds every file of an episode to the episode's name and to its run.
-
-    `episode` is the name of the episode's group, `run` the digest of the run's configuration (`run_digest`), `files`
-    every file of the episode but the seal itself, by its path. `copied_from` is the digest of the captured episode's
-    seal, in a copy that leaves something out. `digest` is the sha256 of the other fields (`seal_digest`).
-    """
-
-    episode: str
-    run: str
-    files: dict[str, FileRecord]
-    digest: str
-    copied_from: str = ""
-
-    def __post_init__(self) -> None:
-        """Check the paths: a seal lists files inside of its episode's folder."""
-        check_at_most("The number of files", len(self.files), EPISODE_FILES)
-        for path in self.files:
-            check_inner_path(path)
-
-
-@dataclass(frozen=True)
 class EpisodeAttributes:
     """Attributes of one episode's group.
 
@@ -435,8 +381,7 @@ class EpisodeAttributes:
     the one that solved the task; 0 where it is not known. The instruction and the prompts are any text; what is shown
     of them is made `safe_text.visible`.
 
-    `task_family`: what the task shares with others of the same sentence template; empty where nobody knows it, and in
-    version 1.
+    `task_family`: what tasks of one sentence template share; empty where nobody knows it, and in version 1.
 
     `NUMBERS` are of each replan, and the noise level or flow time of each recorded denoise step; `env_step` counts the
     waiting steps too, `prompt_index` is the number of a prompt, `dataset_action_count` how many of `dataset_actions`

@@ -50,3 +50,13 @@ def _is_store(folder: Path) -> bool:
         return group_attributes(read_regular(folder / "zarr.json", ROOT_BYTES)).get("format") == FORMAT_NAME
     except (OSError, ValueError):
         return False
+
+
+def check_writable(path: Path, option: str) -> None:
+    """Raise `BadArgument` if nothing can be created at `path`, or if it is in a store. Creates nothing itself."""
+    refuse_in_store(path, "write to")
+    nearest = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
+    if not nearest.is_dir():
+        raise BadArgument(f"Cannot write to {path}: {nearest} is a file; give another {option}.")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise BadArgument(f"Cannot write to {path}: no permission to write in {nearest}; give another {option}.")

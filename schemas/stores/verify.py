@@ -12,10 +12,9 @@ from dataclasses import dataclass
 from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.limits import ROOT_BYTES
-from vla_attention.schemas.stores.completeness import check_presence
 from vla_attention.schemas.stores.digest import seal_digest
 from vla_attention.schemas.stores.episode_checks import content_problems
-from vla_attention.schemas.stores.foreign_files import foreign_in_episode
+from vla_attention.schemas.stores.episode_files import check_presence, foreign_in_episode
 from vla_attention.schemas.stores.packed_index import INDEX_FILE, LIST_AGAIN, NotListed, read_index, unlisted_episodes
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of

@@ -55,7 +55,7 @@ def run_verify(
     stores: Sequence[StorePlace], *, quick: bool, as_json: bool, reports: Reports = one_after_the_other
 ) -> int:
     """Check stores, and print what was found; returns the exit code: 1 if anything is wrong."""
-    from vla_attention.schemas.stores.foreign_files import foreign_in_store
+    from vla_attention.schemas.stores.episode_files import foreign_in_store
     from vla_attention.schemas.stores.reader import open_store
     from vla_attention.schemas.stores.verify import look_beside
 
@@ -66,27 +66,31 @@ def run_verify(
             store = open_store(path)
         faults, unchecked = look_beside(store)
         foreign = foreign_in_store(store)
-        found = []
+        reports_of_store = []
         if not as_json:
             _print_faults(path, faults)
         with _counter(len(store.episodes), quiet=not as_json and sys.stdout.isatty()) as count:
             for report in reports(store, quick):
                 count()
-                found.append(report)
-                if not as_json:
-                    _print_episode(path, report)
-        wrong = wrong or bool(faults) or any(report.problems for report in found)
+                reports_of_store.append(report)
+                if as_json:
+                    continue
+                _print_faults(path, report.faults)
+                if not report.problems:
+                    whole = f"whole, {report.files} files, {format_bytes(report.bytes)}"
+                    print(f"{path}: {report.episode}: {whole}", flush=True)
+        wrong = wrong or bool(faults) or any(report.problems for report in reports_of_store)
         if as_json:
-            documents.append(_document(store, quick, faults, unchecked, foreign, found))
+            documents.append(_document(store, quick, faults, unchecked, foreign, reports_of_store))
         else:
             for line in unchecked:
                 print_line(f"{path}: {line}")
-            _print_foreign(path, foreign, found)
-            number = len(faults) + sum(len(report.problems) for report in found)
+            _print_foreign(path, foreign, reports_of_store)
+            number = len(faults) + sum(len(report.problems) for report in reports_of_store)
             result = "all whole" if not number else "1 fault" if number == 1 else f"{number} faults"
             looked = " (seals, metadata, presence and sizes; without --quick every byte is read)" if quick else ""
-            plural = "" if len(found) == 1 else "s"
-            print(f"{path}: {len(found)} episode{plural}, {result}{looked}.", flush=True)
+            plural = "" if len(reports_of_store) == 1 else "s"
+            print(f"{path}: {len(reports_of_store)} episode{plural}, {result}{looked}.", flush=True)
     if as_json:
         print(json.dumps(documents, indent=1))
     return 1 if wrong else 0
@@ -97,15 +101,8 @@ def _print_faults(path: StorePlace, faults: Iterable[Fault]) -> None:
         print_line(f"{path}: {fault.where}: {fault.problem}")
 
 
-def _print_episode(path: StorePlace, report: EpisodeReport) -> None:
-    if report.problems:
-        _print_faults(path, report.faults)
-    else:
-        print(f"{path}: {report.episode}: whole, {report.files} files, {format_bytes(report.bytes)}", flush=True)
-
-
 def _print_foreign(path: StorePlace, beside: Sequence[str], found: Iterable[EpisodeReport]) -> None:
-    from vla_attention.schemas.stores.foreign_files import MOST_NAMED
+    from vla_attention.schemas.stores.episode_files import MOST_NAMED
 
     lists = [("", beside), *((f"{report.episode}: ", report.foreign) for report in found)]
     for where, names in lists:

@@ -200,6 +200,6 @@ class _Tail(io.RawIOBase):
         start = self._at - self._offset
         if start < 0:
             raise EOFError("its directory is not where the index says")
-        found = self._content[start:] if size < 0 else self._content[start : start + size]
-        self._at += len(found)
-        return found
+        content = self._content[start:] if size < 0 else self._content[start : start + size]
+        self._at += len(content)
+        return content

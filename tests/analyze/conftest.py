@@ -1,33 +1,54 @@
-"""Tests draw pictures as PNG of low resolution. With `--slow`, those with the mark `pdf` draw as the product does."""
+"""The fast tests draw pictures where they have the mark `drawn` or `pdf`; in others a file has one white pixel.
+
+Pictures that are drawn are PNG files of low resolution. With `--slow` all tests and fixtures draw, and tests with the
+mark `pdf` as the product does.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import io
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from matplotlib.figure import Figure
+from PIL import Image
 
-DRAW = Figure.savefig
+from vla_attention.analyze.show import plot_style
+
+HERE, DRAW = Path(__file__).parent, Figure.savefig
+
+
+def white_pixel() -> bytes:
+    buffer = io.BytesIO()
+    Image.new("RGB", (1, 1), "white").save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+#: Whole files, and what PDF files begin with.
+BLANK = {"png": white_pixel(), "pdf": b"%PDF-1.4\n"}
+
+
+def leave_blank(_figure: Figure, file: Any, **options: Any) -> None:
+    Path(file).write_bytes(BLANK[options["format"]])
 
 
 def draw_quickly(figure: Figure, file: Any, **options: Any) -> None:
     """Write a PDF's header only: drawing it takes longer than drawing the PNG."""
     if options.get("format") == "pdf":
-        Path(file).write_bytes(b"%PDF-1.4\n")
+        Path(file).write_bytes(BLANK["pdf"])
     else:
         DRAW(figure, file, **options | {"dpi": 50})
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _pictures_are_drawn_quickly() -> Iterator[None]:
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Around a test and the fixtures that it sets up; those of other folders draw as they like."""
+    slow, pdf = item.config.option.slow, item.get_closest_marker("pdf")
+    draws = slow or pdf or item.get_closest_marker("drawn")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Figure, "savefig", draw_quickly)
-        yield
-
-
-@pytest.fixture(autouse=True)
-def _pictures_are_drawn_as_they_are(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    if request.config.option.slow and request.node.get_closest_marker("pdf"):
-        monkeypatch.setattr(Figure, "savefig", DRAW)
+        if item.path.is_relative_to(HERE) and not (slow and pdf):
+            patch.setattr(Figure, "savefig", draw_quickly if draws else leave_blank)
+            patch.setattr(plot_style, "find_places", plot_style.find_places if draws else lambda _figure: None)
+        return (yield)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import polars as pl
 import pytest
 
 from tests.kit.questions import question_about
+from tests.kit.slow import slow_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.measures.contributions import contribution_table
 from vla_attention.analyze.measures.sinks import SinkRule, search_sinks
@@ -69,7 +71,7 @@ def test_absent_keys_are_never_called_padding(stores, capsys):
     question = question_about(stores["growing"])
     groups = step_tables(measure_episodes(question), question.grouping).groups
     assert (groups.filter(group="padding")["keys"] == 0).all()
-    analyze(["report", str(stores["growing"]), "--out", str(stores["growing"].parent / "report")])
+    analyze(["report", str(stores["growing"]), "--quick", "--out", str(stores["growing"].parent / "report")])
     assert "Padding" not in (stores["growing"].parent / "report" / "report.html").read_text()
 
 
@@ -137,22 +139,24 @@ def test_unknown_outcomes_are_in_no_share_of_solved_episodes(stores, capsys):
     assert "outcomes not known" in " ".join(analyse(question_about(stores["bare"])).answer)
 
 
-@pytest.mark.parametrize("name", [*KINDS, "bare"])
-@pytest.mark.parametrize(
-    ("command", "says"),
-    [
-        ("", ""),
-        ("--list", "not known: picture size"),
-        ("heads", ""),
-        ("words", ""),
-        ("time", "gripper whose commands are known"),
-        ("groups", ""),
-        ("overlay", ""),
-        ("verify", "all whole"),
-        ("report", ""),
-    ],
-)
-def test_commands(stores, tmp_path, capsys, name, command, says):
+#: What each command says of any of the stores.
+SAYS = {
+    "": "",
+    "--list": "not known: picture size",
+    "heads": "",
+    "words": "",
+    "time": "gripper whose commands are known",
+    "groups": "",
+    "overlay": "",
+    "verify": "all whole",
+    "report": "",
+}
+#: Every command once, and every store with the default question.
+FAST = [(command, "growing") for command in SAYS if command != "report"] + [("", name) for name in (*KINDS, "bare")]
+
+
+@pytest.mark.parametrize(("command", "name"), slow_except(FAST, product(SAYS, (*KINDS, "bare")), several=True))
+def test_commands(stores, tmp_path, capsys, command, name):
     given = [str(stores[name]), "--list"] if command == "--list" else [*command.split(), str(stores[name])]
     if command not in ("--list", "verify"):
         given += [
@@ -162,7 +166,7 @@ def test_commands(stores, tmp_path, capsys, name, command, says):
         ]
     assert analyze(given) == 0
     printed = capsys.readouterr()
-    assert says in " ".join(printed.out.split())
+    assert SAYS[command] in " ".join(printed.out.split())
 
 
 def test_effects_of_recorded_rollouts(stores, tmp_path, capsys):

@@ -57,5 +57,8 @@ def test_a_process_is_measured_and_a_failing_one_is_an_error():
     cost = run_process([sys.executable, "-c", "x = bytearray(60_000_000); x[::4096] = bytes(len(x[::4096]))"])
     assert cost.peak_mb > 60
     assert cost.seconds > 0
+    here = bytearray(200_000_000)  # of the process that measures: it is no part of the peak of what it starts
+    here[::4096] = bytes(len(here[::4096]))
+    assert run_process([sys.executable, "-c", "pass"]).peak_mb < 60
     with pytest.raises(RuntimeError, match="so it fails"):
         run_process([sys.executable, "-c", "raise SystemExit('so it fails')"])

@@ -21,10 +21,10 @@ import pytest
 from tests.kit.lerobot_data_sets import made_up_episodes, write_data_set
 from tests.kit.paths import GOLDEN
 from tests.kit.still_scene import capture_without_simulator
-from vla_attention.capture import capture_run
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.capture.rollout.progress import Progress
+from vla_attention.capture.run import capture_run
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.schemas.command_line import run_command
 from vla_attention.schemas.errors import BadArgument
@@ -157,6 +157,7 @@ def test_a_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str], comman
     config.write_text(json.dumps(json.loads(config.read_text()) | {HOSTILE: HOSTILE}))
     words = ("pi",) if command == "doctor" else ()
     model = ("--checkpoint", checkpoint, "--tokenizer", EMBEDDED_TOKENIZER, "--device", "cpu")
+    model += ("--store", tmp_path / "a.zarr")
     code = run(command, *words, *model, "--task-suite", "cubes")
     assert code == (1 if command == "doctor" else 2)
     assert r"\x1b[2J\u202e" in check_output(capsys)
@@ -183,8 +184,8 @@ def test_a_run_whose_instruction_is_hostile(tmp_path: Path, monkeypatch, capsys:
 
 def test_progress_lines(capsys: pytest.CaptureFixture[str]):
     def show() -> int:
-        progress = Progress(2, 5)
-        episode = progress.begin(0, 0)
+        progress = Progress(2, 10, "step")
+        episode = progress.begin(HOSTILE, 5)
         episode.update(1, 1)
         episode.end("solved", HOSTILE)
         progress.skip(HOSTILE)
@@ -193,7 +194,7 @@ def test_progress_lines(capsys: pytest.CaptureFixture[str]):
         return 0
 
     assert run_command("program", show, "") == 0
-    assert check_output(capsys).count(r"x\x1b[2J\u202e") == 3
+    assert check_output(capsys).count(r"x\x1b[2J\u202e") == 4
 
 
 def test_errors_of_the_library():

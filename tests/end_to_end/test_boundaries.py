@@ -23,7 +23,7 @@ from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 
 #: Boundaries of each kind of work; the last one is always among them.
-SAMPLES = 4
+SAMPLES = 3
 LAST = "task000_episode001"
 
 

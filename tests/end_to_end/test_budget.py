@@ -8,18 +8,14 @@ from pathlib import Path
 import pytest
 
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.capture.arguments import build_parser
-from vla_attention.capture.capture_run import plan_protocol, plan_recording
+from vla_attention.capture.budget.trial import Trial, run_trial
+from vla_attention.capture.commands.arguments import build_parser
 from vla_attention.capture.environments.base import EnvironmentSettings
-from vla_attention.capture.environments.suites import list_tasks
-from vla_attention.capture.interventions.run_changes import RunChanges
-from vla_attention.capture.run_settings import run_settings
-from vla_attention.capture.store.measured_size import mean_size
-from vla_attention.capture.trial import Trial, run_trial
-from vla_attention.schemas.interventions import Interventions
+from vla_attention.capture.run.capture_run import plan_run
+from vla_attention.capture.run.run_settings import run_settings
+from vla_attention.capture.store.disk_estimate import mean_size
 from vla_attention.schemas.precision import parse_precision
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.schemas.stores.store_format import FORMAT_NAME, STORE_VERSION, RootAttributes
 
 pytestmark = pytest.mark.simulator
 
@@ -29,18 +25,9 @@ def trials_of(arguments: list[str], tasks: tuple[int, ...]) -> list[Trial]:
     parsed = build_parser().parse_args(arguments)
     settings = run_settings(parsed)
     policy = parsed.family.build(parsed, "cpu")
-    attributes = RootAttributes(
-        FORMAT_NAME,
-        STORE_VERSION,
-        policy.identity(),
-        plan_protocol(settings, policy.default_protocol, policy),
-        plan_recording(settings.recording, policy)[0],
-        policy.sites,
-        {},
-    )
-    environment = EnvironmentSettings(policy.default_protocol)
-    changes = RunChanges(Interventions(), {})
-    return [run_trial(policy, attributes, list_tasks(settings.suite)[task], environment, changes) for task in tasks]
+    plan = plan_run(settings, policy, {})
+    environment = EnvironmentSettings(plan.evaluation)
+    return [run_trial(policy, plan.attributes, plan.tasks[task], environment, plan.changes) for task in tasks]
 
 
 def bytes_of(folder: Path) -> int:

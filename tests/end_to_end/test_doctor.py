@@ -51,6 +51,26 @@ def test_a_store_that_the_run_cannot_continue_is_missing(tmp_path, capfd):
         assert lines_of(capfd.readouterr().out)["store"][0] == "MISSING"
 
 
+def test_the_run_that_was_made_is_no_fault(tmp_path, capfd):
+    store = write_store(tmp_path / "a.zarr", tasks=(0,), episodes=1)
+    options = ["--task-id", "0", "--num-episodes", "1", "--max-steps", "4", "--store", str(store)]
+    assert capture(["doctor", *options]) == 0
+    said = capfd.readouterr().out
+    status, text = lines_of(said)["store"]
+    assert (status, "holds 1 episode already. A run there needs --resume" in text) == ("note", True)
+    assert said.endswith("Nothing is missing for the run.\n")
+
+
+def test_missing_assets_are_said_before_anything_is_written(tmp_path, capfd, monkeypatch):
+    monkeypatch.delenv(ASSETS_VARIABLE, raising=False)
+    run = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "libero_10", "--store", str(tmp_path / "a.zarr")]
+    lacking = tmp_path / "assets"
+    for _ in range(2):
+        assert capture([*run, "--libero-assets", str(lacking)]) == 2
+        assert f"The LIBERO asset folder '{lacking}' (--libero-assets) does not exist" in capfd.readouterr().err
+        assert list(tmp_path.iterdir()) == []
+
+
 def test_what_a_run_needs_and_lacks_is_exit_code_1(tmp_path, capfd, monkeypatch):
     monkeypatch.delenv(ASSETS_VARIABLE, raising=False)
     lacking = ["--libero-assets", str(tmp_path), "--store", str(tmp_path / "a.zarr")]
@@ -72,15 +92,15 @@ def test_what_a_run_needs_and_lacks_is_exit_code_1(tmp_path, capfd, monkeypatch)
 
 
 def test_a_disk_that_is_too_small_and_a_budget(tmp_path, capfd, monkeypatch):
-    from vla_attention.capture.doctor import command
+    from vla_attention.capture.store import disk_estimate
 
     run = ["doctor", "--num-episodes", "50", "--store", str(tmp_path / "a.zarr")]
-    monkeypatch.setattr(command, "_free", lambda path: 10**7)
+    monkeypatch.setattr(disk_estimate, "free_bytes", lambda path: 10**7)
     assert capture(run) == 1
     status, text = lines_of(capfd.readouterr().out)["size"]
     assert "measured on 8 replans of one task." in text
     assert (status, "10 MB are free: give --budget, fewer episodes" in text) == ("MISSING", True)
-    monkeypatch.setattr(command, "_free", lambda path: 10**9)
+    monkeypatch.setattr(disk_estimate, "free_bytes", lambda path: 10**9)
     assert capture([*run, "--budget", "400MB"]) == 0
     status, text = lines_of(capfd.readouterr().out)["size"]
     assert (status, "Budget 400 MB: recording " in text) == ("ok", True)

@@ -65,6 +65,7 @@ def test_your_checkpoint_and_then_your_question(tmp_path, monkeypatch, capsys):
     assert "bit-equal" in printed
 
 
+@pytest.mark.slow
 def test_your_robots_data(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     cameras = ("observation.images.front", "observation.images.wrist")

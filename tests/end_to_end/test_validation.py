@@ -137,9 +137,9 @@ def test_a_page_without_marks_is_refused(tmp_path):
 @pytest.fixture(scope="module")
 def work(tmp_path_factory):
     """The reduced run about two policies that were trained for one step."""
-    from vla_attention.capture.small_policy.dataset import read_demonstrations
-    from vla_attention.capture.small_policy.export import export
-    from vla_attention.capture.small_policy.training import TrainingSettings, train
+    from examples.cubes_policy.dataset import read_demonstrations
+    from examples.cubes_policy.export import export
+    from examples.cubes_policy.training import TrainingSettings, train
 
     folder = tmp_path_factory.mktemp("validation")
     demonstrations = read_demonstrations(write_demonstrations(folder / "demonstrations"))

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from tests.hostile.make import CASES, PROGRAMS, make_case, originals
+from tests.kit.slow import asked_for, slow_except
 
 ROOT = Path(__file__).resolve().parents[2]
 #: Bytes that a command may have resident beyond those of a command that works.
@@ -52,8 +53,11 @@ def problems_of(case: Any, result: dict[str, Any]) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def ended(tmp_path_factory) -> dict[str, list[dict[str, Any]]]:
-    """How the command of each case ended, by what it changes. One process runs all, as its start takes longest."""
+def ended(request, tmp_path_factory) -> dict[str, list[dict[str, Any]]]:
+    """How the command of each case ended, by what it changes. One process runs all, as its start takes longest.
+
+    Only the kinds are run that tests of this session ask for.
+    """
     folder = tmp_path_factory.mktemp("hostile")
     made = originals(folder / "originals")
     commands = [
@@ -62,17 +66,18 @@ def ended(tmp_path_factory) -> dict[str, list[dict[str, Any]]]:
         ("capture", ["status", str(made["jobs"])]),
     ]
     works = len(commands)
-    for kind, cases in CASES.items():
+    run = {kind: CASES[kind] for kind in asked_for(request, "kind", CASES)}
+    for kind, cases in run.items():
         program = PROGRAMS.get(kind, "analyze")
         for i, case in enumerate(cases):
             commands.append((program, make_case(kind, case, made[kind], folder / kind / f"{i:02d}")))
     results = run_in_child(commands)
     assert [result["code"] for result in results[:works]] == [0] * works, results[:works]
     rest = iter(results[works:])
-    return {kind: [next(rest) for _ in cases] for kind, cases in CASES.items()}
+    return {kind: [next(rest) for _ in cases] for kind, cases in run.items()}
 
 
-@pytest.mark.parametrize("kind", CASES)
+@pytest.mark.parametrize("kind", slow_except(("roots", "jobs", "groupings"), CASES))
 def test_hostile_files_end_with_their_sentence(ended, kind):
     pairs = list(zip(CASES[kind], ended[kind], strict=True))
     if os.environ.get("HOSTILE_FIGURES"):

@@ -35,10 +35,6 @@ def _import_everything() -> None:
     import torch
     import zarr  # noqa: F401
 
-    import vla_attention.capture.capture_run
-    import vla_attention.capture.policies.cosmos.build
-    import vla_attention.capture.policies.cosmos.parity
-    import vla_attention.capture.policies.pi.build  # noqa: F401
     from vla_attention.capture.environments.robosuite_installation import import_robosuite
 
     torch.set_num_threads(1)
@@ -50,6 +46,7 @@ def main(argv: list[str]) -> int:
     """Run the named cases, or all."""
     folder, names = Path(argv[0]), argv[1:] or list(CASES)
     _import_everything()
+    hostile_runs.ready_to_fork()
     for number, name in enumerate(names):
         print(json.dumps(run(name, folder / f"{number:03d}")), flush=True)
     return 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,11 +31,13 @@ class Case:
 
 
 def hostile(change: Callable[[Path], object], *, version: str = "v2.1", video: bool = False) -> Make:
-    """A data set with one change: of its folder."""
+    """A data set with one change: of its folder. What is changed is a copy of one that the first case has written."""
 
     def make(folder: Path) -> list[str]:
-        robot = folder / "robot"
-        write_data_set(robot, version, made_up_episodes((FRAMES,), (CAMERA,)), video=H264 if video else None)
+        whole, robot = folder.parent / f"{version}{' video' if video else ''}", folder / "robot"
+        if not whole.exists():
+            write_data_set(whole, version, made_up_episodes((FRAMES,), (CAMERA,)), video=H264 if video else None)
+        shutil.copytree(whole, robot)
         change(robot)
         return command(folder)
 

@@ -38,7 +38,7 @@ def _import_everything() -> None:
     import torch
     import zarr  # noqa: F401
 
-    import vla_attention.capture.policies.pi.build
+    import vla_attention.capture.policies.pi.loading
     import vla_attention.capture.replay.command
     import vla_attention.capture.replay.family_replay  # noqa: F401
 
@@ -51,6 +51,7 @@ def main(argv: list[str]) -> int:
     """Run the named cases, or all."""
     folder, makes = Path(argv[0]), {**GOOD, **{name: case.make for name, case in CASES.items()}}
     _import_everything()
+    hostile_runs.ready_to_fork()
     for number, name in enumerate(argv[1:] or makes):
         here = folder / f"{number:03d}"
         print(json.dumps({"name": name, **hostile_runs.run(makes[name], here)}), flush=True)

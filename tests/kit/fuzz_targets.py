@@ -34,14 +34,15 @@ from vla_attention.schemas.groupings.resolve import check_names, resolve
 from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vocabulary
 from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.stores.array_metadata import ArrayMetadata, describe_array
 from vla_attention.schemas.stores.byte_source import Memory, copy_into
 from vla_attention.schemas.stores.digest import bytes_digest, chunk_digest, crc32c, seal_digest
 from vla_attention.schemas.stores.episode_checks import content_problems
 from vla_attention.schemas.stores.packed_index import INDEX_FILE
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.seal import SEAL_FILE, read_seal
-from vla_attention.schemas.stores.shards import SealedShard, ShardedLayers, chunks_of_a_shard, index_size
-from vla_attention.schemas.stores.store_format import FileRecord
+from vla_attention.schemas.stores.seal_content import FileRecord
+from vla_attention.schemas.stores.shards import SealedShard, ShardedLayers, index_size
 from vla_attention.schemas.stores.zip_members import ZipMembers
 from vla_attention.testing.stores import StoreSpec, write_store
 from vla_attention.testing.tokens import small_tokens
@@ -212,16 +213,15 @@ def _read(name: str, file: str, content: bytes) -> None:
 
 
 @cache
-def _rows_metadata() -> dict[str, Any]:
+def _rows_metadata() -> ArrayMetadata:
     folder = _store("shards") / "episodes" / _original("shards").name
-    found: dict[str, Any] = json.loads((folder / _ROWS / "zarr.json").read_text())
-    return found
+    return describe_array((folder / _ROWS / "zarr.json").read_bytes())
 
 
 def shards(content: bytes) -> None:
     """A shard of rows, with the checksums that belong to its bytes, read with the fast reader."""
     metadata = _rows_metadata()
-    count = chunks_of_a_shard(metadata)
+    count = metadata.shard_chunks
     assert count is not None
     size = index_size(count)
     if len(content) < size:

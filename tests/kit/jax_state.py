@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from vla_attention.capture.policies.pi.config import PiConfig
-from vla_attention.capture.policies.pi.jax_lora import merge_lora
-from vla_attention.capture.policies.pi.jax_weights import plan_leaves
-from vla_attention.capture.policies.pi.model_weights import expected_shapes
-from vla_attention.capture.policies.strict_loading import check_shapes, shapes_of
+from vla_attention.capture.policies.pi.jax_weights import merge_lora, plan_leaves
+from vla_attention.capture.policies.pi.model import expected_shapes
+from vla_attention.capture.policies.weights import check_shapes, shapes_of
 
 
 def from_jax_flat(leaves: Mapping[str, np.ndarray], config: PiConfig) -> dict[str, Tensor]:

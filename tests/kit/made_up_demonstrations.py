@@ -1,4 +1,4 @@
-"""A folder of made-up demonstrations in the format that `small_policy demonstrate` writes: coloured dots, no simulator.
+"""A folder of made-up demonstrations in the format of `examples.cubes_policy demonstrate`: coloured dots, no simulator.
 
 The action points from the gripper to the named dot, so that a policy can learn something from few samples.
 """

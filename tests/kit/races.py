@@ -194,8 +194,8 @@ def prepare() -> None:
     """Import what a capture imports; no threads are started."""
     import torch
 
-    from vla_attention.capture import capture_run
     from vla_attention.capture.policies.pi import family, policy
+    from vla_attention.capture.run import capture_run
 
     torch.set_num_threads(1)
     assert all((capture_run, family, policy))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.store.episode_writer import ReplanRecord
+from vla_attention.capture.store.replan_records import ReplanRecord
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange, PromptChange
 from vla_attention.testing.stores import (

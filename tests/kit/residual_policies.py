@@ -213,12 +213,6 @@ def gemma_part(block: Block, call: Call, share: Tensor) -> Tensor:
     return projected(block, share) * rms(block.out(call.mixed)) * (1 + block.post_norm.weight)
 
 
-def layer_norm_part(block: Block, call: Call, share: Tensor) -> Tensor:
-    update, each = block.out(call.mixed), projected(block, share)
-    scale = (update.var(-1, keepdim=True, unbiased=False) + block.layer_norm.eps).rsqrt()
-    return (each - each.mean(-1, keepdim=True)) * scale * block.layer_norm.weight
-
-
 def before(block: Block, call: Call) -> Tensor:
     return torch.sigmoid(block.gate_proj(call.normed))
 
@@ -229,10 +223,6 @@ WAYS: dict[str, Way] = {
     "dropout": Way(lambda b, c: b.dropout(b.out(c.mixed)) + c.stream, lambda b, c, s: projected(b, s)),
     "adaLN": Way(
         lambda b, c: c.stream + chunk(b, c, 2) * b.out(c.mixed), lambda b, c, s: projected(b, s) * chunk(b, c, 2)
-    ),
-    "adaLN in one function": Way(
-        lambda b, c: torch.addcmul(c.stream, b.out(c.mixed), chunk(b, c, 2)),
-        lambda b, c, s: projected(b, s) * chunk(b, c, 2),
     ),
     "gate before the projection": Way(
         lambda b, c: c.stream + b.out(c.mixed * before(b, c)), lambda b, c, s: projected(b, s * before(b, c))
@@ -252,11 +242,6 @@ WAYS: dict[str, Way] = {
     "RMSNorm": Way(
         lambda b, c: c.stream + b.rms_norm(b.out(c.mixed)),
         lambda b, c, s: projected(b, s) * rms(b.out(c.mixed), 1.2e-7) * b.rms_norm.weight,
-    ),
-    "LayerNorm": Way(lambda b, c: c.stream + b.layer_norm(b.out(c.mixed)), layer_norm_part),
-    "LayerNorm and gate": Way(
-        lambda b, c: c.stream + chunk(b, c, 0) * b.layer_norm(b.out(c.mixed)),
-        lambda b, c, s: layer_norm_part(b, c, s) * chunk(b, c, 0),
     ),
     "LayerScale": Way(lambda b, c: c.stream + b.scale(b.out(c.mixed)), lambda b, c, s: projected(b, s) * b.scale.gamma),
     "LayerScale in place": Way(in_place, lambda b, c, s: projected(b, s) * b.scale.gamma),
@@ -292,6 +277,13 @@ WAYS: dict[str, Way] = {
 #: Ways of which it cannot be said what each part adds, and a word of the sentence that says why.
 UNKNOWN: dict[str, tuple[Add, str]] = {
     "tanh": (lambda b, c: c.stream + torch.tanh(b.out(c.mixed)), "tanh"),
+    "LayerNorm": (lambda b, c: c.stream + b.layer_norm(b.out(c.mixed)), "layer_norm"),
+    "LayerNorm before the projection": (
+        lambda b, c: c.stream + b.out(functional.layer_norm(c.mixed, c.mixed.shape[-1:])),
+        "layer_norm",
+    ),
+    "adaLN in one function": (lambda b, c: torch.addcmul(c.stream, b.out(c.mixed), chunk(b, c, 2)), "addcmul"),
+    "clamped": (lambda b, c: c.stream + b.out(c.mixed).clamp(-100, 100), "clamp"),
     "second linear layer": (lambda b, c: c.stream + b.second(b.out(c.mixed)), "linear"),
     "gate of a sum": (lambda b, c: c.stream + chunk(b, c, 2) * (b.out(c.mixed) + b.mlp(c.normed)), "mul"),
     "gate of a sum with an older branch": (

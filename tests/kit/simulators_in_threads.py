@@ -61,7 +61,7 @@ def simulators_in_threads(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     monkeypatch.setattr(ThreadOfTests, "started", [], raising=False)
     monkeypatch.setattr(simulator_process, "make_environment", lambda suite, task_id, settings: made.make())
     monkeypatch.setattr(
-        "vla_attention.capture.rollout.episode_loop.make_environment", lambda suite, task_id, settings: made.make()
+        "vla_attention.capture.rollout.simulator_source.make_environment", lambda suite, task_id, settings: made.make()
     )
     monkeypatch.setattr(pipeline, "SimulatorProcess", ThreadOfTests)
     return made

@@ -37,6 +37,6 @@ class StillScene:
 def capture_without_simulator(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let captures of this test run in a `StillScene`."""
     monkeypatch.setattr(
-        "vla_attention.capture.rollout.episode_loop.make_environment", lambda suite, task_id, settings: StillScene()
+        "vla_attention.capture.rollout.simulator_source.make_environment", lambda suite, task_id, settings: StillScene()
     )
-    monkeypatch.setattr("vla_attention.capture.capture_run.default_num_envs", lambda: 1)
+    monkeypatch.setattr("vla_attention.capture.run.capture_run.default_num_envs", lambda: 1)

@@ -8,7 +8,8 @@ from typing import Any
 
 from vla_attention.capture.environments.episode_protocol import OPENPI
 from vla_attention.capture.policies.family import ParityCases, PolicyFamily
-from vla_attention.capture.policies.model_arguments import add_threads
+from vla_attention.capture.policies.model_arguments import POLICY_THREADS
+from vla_attention.schemas.threads import add_threads
 
 
 def _build(arguments: argparse.Namespace, device: str) -> Any:
@@ -89,7 +90,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("model")
     group.add_argument("--checkpoint", default="toy-weights")
     group.add_argument("--device", default="cpu")
-    add_threads(group)
+    add_threads(group, POLICY_THREADS)
     group.add_argument("--toy-size", type=int, default=4, help="actions of a chunk")
 
 

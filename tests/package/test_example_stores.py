@@ -48,7 +48,7 @@ def test_they_are_small():
 
 
 def test_the_policy_is_the_one_that_comes_along():
-    from vla_attention.capture.policies.pi.shipped import CUBES_POLICY
+    from vla_attention.capture.policies.pi.family import CUBES_POLICY
 
     policy = va.open(CUBES).attributes.policy
     assert policy.name == CUBES_POLICY

@@ -7,7 +7,7 @@ import tomllib
 
 import vla_attention as va
 from tests.kit.paths import ROOT
-from vla_attention.schemas.installing import INSTALL_LIBERO
+from vla_attention.schemas.errors import INSTALL_LIBERO
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 

@@ -27,7 +27,8 @@ from typing import Any, assert_type
 import vla_attention as va
 from vla_attention.capture.torch_policies.inspect_calls import CallTable
 from vla_attention.capture.torch_policies.layout_check import LayoutCheck
-from vla_attention.capture.torch_policies.session import Episode, EpisodeBatch, RecordedRun, Replan
+from vla_attention.capture.torch_policies.recorded_episodes import Episode, EpisodeBatch, Replan
+from vla_attention.capture.torch_policies.session import RecordedRun
 
 def collect(policy: object, state: list[float], pictures: dict[str, Any]) -> None:
     span = va.Span("image_front", "image", 0, 4, "front", va.PatchGrid(2, 2, 8, 8))
@@ -67,7 +68,7 @@ MISTAKES = {
 def test_a_user_s_file(tmp_path):
     wrong = [
         "import vla_attention as va",
-        "from vla_attention.capture.torch_policies.session import Episode, EpisodeBatch",
+        "from vla_attention.capture.torch_policies.recorded_episodes import Episode, EpisodeBatch",
         "def use(policy: object, layout: va.PolicyLayout, episode: Episode, batch: EpisodeBatch) -> None:",
         *(f"    {line}" for line in MISTAKES),
     ]

@@ -13,8 +13,7 @@ pytest.importorskip("lerobot", reason="run by make test-policies, in .venv-lerob
 import vla_attention as va
 from tests.policies import lerobot_models as models
 from vla_attention.capture.policies.pi.config import GemmaConfig, PiConfig, SiglipConfig
-from vla_attention.capture.policies.pi.model import PiModel
-from vla_attention.capture.policies.pi.model_weights import expected_shapes, model_from_state
+from vla_attention.capture.policies.pi.model import PiModel, expected_shapes, model_from_state
 from vla_attention.capture.recording.recorder import make_recorders
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import open_store

@@ -25,7 +25,7 @@ from tests.policies.policy_checks import (
     softmax_rows,
 )
 from tests.policies.word_tokenizer import INSTRUCTION
-from vla_attention.capture.torch_policies.layouts.find_policy import NotThisPolicy
+from vla_attention.capture.torch_policies.layouts.layout_building import NotThisPolicy
 from vla_attention.schemas.stores.reader import open_store
 
 PATCHES, CHUNK, STEPS, HEADS, DIM = 16, 5, 3, 3, 16

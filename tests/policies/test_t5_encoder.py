@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from tests.hostile_checkpoints.hostile_files import TRACE, executing_pickle
-from vla_attention.capture.policies.cosmos.t5_encoder import EncoderUnusable, T5Encoder
+from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint
+from vla_attention.capture.policies.cosmos.text import T5Encoder
 from vla_attention.schemas.errors import BadArgument
 
 transformers = pytest.importorskip("transformers", reason="run by make test-policies, in .venv-transformers")
@@ -44,7 +45,7 @@ def test_the_embedding_is_that_of_the_model_and_padding_is_zero(folder):
 
 
 def test_another_width_and_too_many_tokens_are_refused(folder):
-    with pytest.raises(EncoderUnusable, match="gives 16 numbers a position, but the policy reads 1024"):
+    with pytest.raises(UnreadableCheckpoint, match="gives 16 numbers a position, but the policy reads 1024"):
         T5Encoder(folder).encode(IDS, POSITIONS, 1024)
     with pytest.raises(BadArgument, match="has 5 tokens, but the policy reads 4"):
         T5Encoder(folder).encode(IDS, 4, WIDTH)
@@ -59,6 +60,6 @@ def test_what_cannot_be_loaded_is_a_sentence(folder, tmp_path, name):
         (tmp_path / "pytorch_model.bin").write_bytes(executing_pickle(tmp_path))
     elif name == "no JSON":
         (tmp_path / "config.json").write_text("{")
-    with pytest.raises(EncoderUnusable, match="cannot be loaded"):
+    with pytest.raises(UnreadableCheckpoint, match="cannot be loaded"):
         T5Encoder(tmp_path).encode(IDS, POSITIONS, WIDTH)
     assert not (tmp_path / TRACE).exists()

@@ -204,10 +204,10 @@ STOPPED = "complete episodes are kept, continue with --resume."
 @pytest.mark.parametrize(
     ("moment", "times"),
     [
-        (at_import("vla_attention.capture.command_line"), 1),
+        (at_import("vla_attention.capture.commands.command_line"), 1),
         (at_import("torch"), 1),
         (at_import("torch.nn"), 2),
-        (after_call("vla_attention.capture.device", "", "load_torch"), 1),
+        (after_call("vla_attention.capture.machine.device", "", "load_torch"), 1),
     ],
     ids=["start", "torch", "twice", "loading"],
 )

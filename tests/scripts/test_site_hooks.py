@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 
+import pytest
+
 from scripts.site_hooks import OUTSIDE, commands_of, fill_marks, help_texts, names_of_pages, translate_links
 from vla_attention.analyze.commands import COMMANDS
 from vla_attention.capture.policies.families import policy_families
@@ -36,6 +38,7 @@ def test_other_links_and_code_stay():
     assert translate_links(text, "store.md", {}) == text
 
 
+@pytest.mark.slow
 def test_every_command_has_its_help_text():
     text = help_texts()
     headings = re.findall(r"^#+ `(.*)`$", text, re.MULTILINE)

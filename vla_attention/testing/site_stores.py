@@ -19,8 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.store.episode_writer import EpisodeStart, ReplanRecord
-from vla_attention.capture.store.recorded_rows import RecordedRows
+from vla_attention.capture.store.replan_records import EpisodeStart, RecordedRows, ReplanRecord
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.groupings.key_counts import uniform_rows
 from vla_attention.schemas.interventions import Interventions, RerunSource
@@ -272,4 +271,4 @@ def _rows(
         vectors = mass[..., None] * generator.normal(size=(*mass.shape, 4))
         parts = np.concatenate([vectors, vectors.sum(axis=2, keepdims=True)], axis=2)
         gram = np.einsum("ldaw,ldbw->ldab", parts, parts).astype(np.float32)
-    return RecordedRows(rows, rows.sum(axis=-1, dtype=np.float64).astype(np.float32), gram, uniform.astype(np.float32))
+    return RecordedRows.summed(rows, gram, uniform.astype(np.float32))

@@ -17,8 +17,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.store.episode_writer import EpisodeStart, EpisodeWriter, ReplanRecord
-from vla_attention.capture.store.recorded_rows import RecordedRows
+from vla_attention.capture.store.episode_writer import EpisodeWriter
+from vla_attention.capture.store.replan_records import EpisodeStart, RecordedRows, ReplanRecord
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run
 from vla_attention.schemas.groupings.key_counts import uniform_of_roles
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
@@ -250,9 +250,8 @@ def episode_records(spec: StoreSpec, task: int, episode: int) -> tuple[EpisodeSt
                 env_step=10 + 5 * replan,
                 noise_seed=noise_seed,
                 rows={
-                    "joint": RecordedRows(
+                    "joint": RecordedRows.summed(
                         rows[replan],
-                        rows[replan].sum(axis=-1, dtype=np.float64).astype(np.float32),
                         gram_of(contribution_vectors(spec, tokens, seed, replan)) if spec.contributions else None,
                         None if uniform is None else uniform[replan],
                     )

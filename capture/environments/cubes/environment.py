@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import ROBOT, EnvironmentSettings, StepResult, Task
-from vla_attention.capture.environments.cubes.mark import MARK_VERBS, paste_mark
-from vla_attention.capture.environments.cubes.scene import EVALUATION, draw_scene, scene_seed
+from vla_attention.capture.environments.cubes.scene import EVALUATION, MARK_VERBS, draw_scene, paste_mark, scene_seed
 from vla_attention.capture.environments.cubes.tasks import COLOURS, CUBE_TASKS, MARK_ONLY, MARKED, CubeTask
 from vla_attention.capture.environments.episode_protocol import CAMERAS
 from vla_attention.capture.environments.simulator import SimulatedEnvironment

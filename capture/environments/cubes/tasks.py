@@ -79,7 +79,7 @@ NUM_BASE_TASKS = 12
 
 
 #: Suites for control policies: the base tasks, with a mark in the picture that says what the instruction says
-#: (`mark.py`). In `cubes_marked` both are given; in `cubes_mark_only` all instructions are `MARK_INSTRUCTION`.
+#: (`scene.paste_mark`). In `cubes_marked` both are given; in `cubes_mark_only` all instructions are `MARK_INSTRUCTION`.
 MARKED, MARK_ONLY = "cubes_marked", "cubes_mark_only"
 MARK_INSTRUCTION = "do what the mark says"
 

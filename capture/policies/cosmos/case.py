@@ -81,16 +81,16 @@ class CosmosCase:
             rope_w_extrapolation=stated.get("rope_w_extrapolation_ratio", 3.0),
         )
         config = infer_dit_config(weights, base)
-        for name, found in (
+        for name, of_weights in (
             ("model_channels", config.width),
             ("num_blocks", config.num_blocks),
             ("num_heads", config.num_heads),
             ("in_channels", config.in_channels),
             ("crossattn_emb_channels", config.text_dim),
         ):
-            if stated.get(name, found) != found:
+            if stated.get(name, of_weights) != of_weights:
                 raise UnusableCase(
-                    f"'{self.folder / CASE_FILE}' states {name} {stated[name]}, but the weights have {found}."
+                    f"'{self.folder / CASE_FILE}' states {name} {stated[name]}, but the weights have {of_weights}."
                 )
         return config, weights
 

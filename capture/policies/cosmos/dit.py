@@ -14,8 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vla_attention.capture.policies.cosmos.config import DitConfig
-from vla_attention.capture.policies.heads import join_heads, split_heads
-from vla_attention.capture.recording.attention import LogitChange, RowSink, attend
+from vla_attention.capture.recording.attention import LogitChange, RowSink, attend, join_heads, split_heads
 
 NORM_EPS = 1e-6
 
@@ -298,8 +297,8 @@ class FinalLayer(nn.Module):
 
     def forward(self, x: Tensor, time: Tensor, shared_modulation: Tensor) -> Tensor:
         """Return the features of each token, ordered (row in the patch, column in the patch, channel)."""
-        own = self.adaln_modulation(time)
-        shift, scale = (own + shared_modulation[..., : own.shape[-1]])[:, :, None].chunk(2, dim=-1)
+        modulation = self.adaln_modulation(time)
+        shift, scale = (modulation + shared_modulation[..., : modulation.shape[-1]])[:, :, None].chunk(2, dim=-1)
         features: Tensor = self.linear(modulate(x, shift, scale))
         return features
 

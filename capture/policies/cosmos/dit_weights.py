@@ -8,11 +8,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from vla_attention.capture.policies.checkpoints import MAX_BLOCKS, MAX_SIZE, CheckpointMismatch, check_size
+from vla_attention.capture.policies.checkpoints import (
+    MAX_BLOCKS,
+    MAX_SIZE,
+    CheckpointMismatch,
+    UnreadableCheckpoint,
+    check_size,
+)
 from vla_attention.capture.policies.cosmos.config import DitConfig
 from vla_attention.capture.policies.cosmos.dit import Dit
-from vla_attention.capture.policies.cosmos.tensor_files import UnreadableTensors
-from vla_attention.capture.policies.strict_loading import Shapes, check_shapes, fill, make_empty, shapes_of
+from vla_attention.capture.policies.weights import Shapes, check_shapes, fill, make_empty, shapes_of
 from vla_attention.schemas.errors import listing
 
 PREFIX = "net."
@@ -39,7 +44,7 @@ def dit_tensors(stored: Mapping[str, Any]) -> dict[str, Tensor]:
         if plain.startswith(COUNTER_PREFIX) or plain.endswith(EXTRA_STATE):
             continue
         if not isinstance(value, Tensor):
-            raise UnreadableTensors(f"'{name}' of the checkpoint is no tensor, but {type(value).__name__}.")
+            raise UnreadableCheckpoint(f"'{name}' of the checkpoint is no tensor, but {type(value).__name__}.")
         if not value.is_floating_point() or value.element_size() < 2:
             raise CheckpointMismatch(
                 f"'{name}' of the checkpoint has numbers of type {value.dtype}; expected floating point numbers of 16 "

@@ -1,4 +1,4 @@
-"""Load a Cosmos policy from a published checkpoint: weights, statistics, text embeddings and image encoder."""
+"""Load a Cosmos policy from a published checkpoint, or build one from the options of the command line."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import torch
 
 from vla_attention.capture.policies.cosmos.config import DEFAULT_CONFIG_NAME, CosmosConfig, find_config
 from vla_attention.capture.policies.cosmos.dit_weights import build_dit, dit_tensors, infer_dit_config
+from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, random_policy
 from vla_attention.capture.policies.cosmos.locate import (
     EMBEDDINGS_NAME,
     STATISTICS_NAME,
@@ -24,13 +25,15 @@ from vla_attention.capture.policies.cosmos.locate import (
 from vla_attention.capture.policies.cosmos.model import CosmosModel
 from vla_attention.capture.policies.cosmos.policy import ACTION_FRAME, CosmosPolicy
 from vla_attention.capture.policies.cosmos.preprocess import read_statistics
-from vla_attention.capture.policies.cosmos.t5_encoder import T5Encoder
+from vla_attention.capture.policies.cosmos.sampler import noise_levels
 from vla_attention.capture.policies.cosmos.t5_pickle import read_embeddings
 from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
-from vla_attention.capture.policies.cosmos.text import PieceTokenizer, PrecomputedText
+from vla_attention.capture.policies.cosmos.text import PieceTokenizer, PrecomputedText, T5Encoder
 from vla_attention.capture.policies.cosmos.vae import build_encoder, infer_vae_config
 from vla_attention.capture.policies.hub import downloads, hub_version
 from vla_attention.capture.policies.identity import PolicySource
+from vla_attention.capture.policies.model_arguments import UNTRAINED, UNTRAINED_TINY, check_not_renamed
+from vla_attention.capture.policies.weights import find_dtype
 from vla_attention.schemas.errors import BadArgument
 
 
@@ -139,6 +142,102 @@ def load_cosmos_policy(
         PrecomputedText(embeddings, tokenizer, encoder),
         statistics,
         source,
+        open_loop_steps=options.open_loop_steps(config),
+        query_frame=options.query_frame,
+    )
+
+
+def select_call(config: CosmosConfig, prefer_s: int | None, prefer_call: str) -> int:
+    """Return the denoise step that `--prefer-S` and `--prefer-call` choose.
+
+    prefer_s: sequence length that the call must have; None takes any. prefer_call: `last` or `first` of those.
+    Raises `BadArgument` when no call has that length.
+    """
+    if prefer_call not in ("last", "first"):
+        raise BadArgument(f"Cannot use --prefer-call '{prefer_call}'; expected 'last' or 'first'.")
+    count = len(noise_levels(config.sampler))
+    length = config.frames.count * config.tokens_per_frame
+    if prefer_s is not None and prefer_s != length:
+        raise BadArgument(
+            f"No call has --prefer-S {prefer_s}: all {count} calls of this policy have S = {length} "
+            f"({config.frames.count} latent frames of {config.tokens_per_frame} tokens)."
+        )
+    return 0 if prefer_call == "first" else count - 1
+
+
+_UNTRAINED = {UNTRAINED: EMBEDDED_CONFIG, UNTRAINED_TINY: DUMMY_CONFIG}
+
+
+def build_cosmos_policy(
+    checkpoint: str,
+    *,
+    device: str,
+    config_name: str = DEFAULT_CONFIG_NAME,
+    num_denoising_steps_action: int | None = None,
+    chunk_size: int | None = None,
+    num_open_loop_steps: int | None = None,
+    dataset_stats_path: str | None = None,
+    t5_text_embeddings_path: str | None = None,
+    t5_tokenizer: str | None = None,
+    t5_encoder: str | None = None,
+    vae_path: str | None = None,
+    dtype: str | None = None,
+    query_frame: str = ACTION_FRAME,
+    visual_frame: str = "curr_last",
+    text_frame: str = "frame0",
+    prefer_s: int | None = None,
+    prefer_call: str = "last",
+) -> CosmosPolicy:
+    """Build the policy and check the options against it; parameters are the options of the command line.
+
+    `checkpoint` is a folder, a file of weights, a name on the hub, or one of the untrained policies that come with the
+    package: `untrained`, `untrained-tiny`. Raises `BadArgument` or `UnknownName` for frames and calls that do not
+    exist.
+    """
+    find_config(config_name)  # checked first, so that the error comes before any download
+    options = CosmosOptions(
+        config_name=config_name,
+        num_denoising_steps=num_denoising_steps_action,
+        chunk_size=chunk_size,
+        num_open_loop_steps=num_open_loop_steps,
+        statistics_path=dataset_stats_path,
+        embeddings_path=t5_text_embeddings_path,
+        vae_path=vae_path,
+        t5_tokenizer=t5_tokenizer,
+        t5_encoder=t5_encoder,
+        query_frame=query_frame,
+        dtype=find_dtype(dtype) if dtype is not None else None,
+    )
+    check_not_renamed(checkpoint)
+    if checkpoint in _UNTRAINED:
+        policy = _untrained(checkpoint, options, device)
+    else:
+        policy = load_cosmos_policy(checkpoint, options=options, device=device)
+    for frame in (visual_frame, text_frame):
+        policy.config.frames.index(frame)
+    select_call(policy.config, prefer_s, prefer_call)
+    return policy
+
+
+def _untrained(name: str, options: CosmosOptions, device: str) -> CosmosPolicy:
+    files = (
+        options.statistics_path,
+        options.embeddings_path,
+        options.vae_path,
+        options.t5_tokenizer,
+        options.t5_encoder,
+    )
+    if any(files) or options.dtype == torch.bfloat16 or options.config_name != DEFAULT_CONFIG_NAME:
+        raise BadArgument(
+            f"The policy '{name}' comes with the program, in float32; --config-name, --dataset-stats-path, "
+            "--t5-text-embeddings-path, --t5-tokenizer, --t5-encoder, --vae-path and --dtype bfloat16 are for "
+            "checkpoints."
+        )
+    config = options.apply(_UNTRAINED[name])
+    return random_policy(
+        name,
+        config,
+        device=device,
         open_loop_steps=options.open_loop_steps(config),
         query_frame=options.query_frame,
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from vla_attention.capture.foreign_files.regular_files import check_regular
+from vla_attention.capture.foreign_files.checked_files import check_regular
 from vla_attention.capture.policies.checkpoints import (
     CheckpointNotFound,
     UnreadableCheckpoint,
@@ -62,16 +62,16 @@ def find_weights(checkpoint: Path) -> Path:
             f"'{checkpoint}' has its weights in the distributed form (folder 'model'), which the reference would read "
             "first and which is not read here; convert it to one .pt file, and give that file as --ckpt-path."
         )
-    found = sorted([*checkpoint.glob("*.pt"), *checkpoint.glob("*.safetensors")])
-    if len(found) != 1:
+    files = sorted([*checkpoint.glob("*.pt"), *checkpoint.glob("*.safetensors")])
+    if len(files) != 1:
         inside = listing(sorted(path.name for path in checkpoint.iterdir()))
-        what = "no .pt file" if not found else f"several files of weights ({listing(path.name for path in found)})"
+        what = "no .pt file" if not files else f"several files of weights ({listing(path.name for path in files)})"
         raise CheckpointNotFound(
             f"The checkpoint '{checkpoint}' has {what}; expected one, and found {inside}."
-            + (" Give one of them as --ckpt-path." if found else "")
+            + (" Give one of them as --ckpt-path." if files else "")
         )
-    check_checkpoint_file(found[0])
-    return found[0]
+    check_checkpoint_file(files[0])
+    return files[0]
 
 
 def find_vae(checkpoint: Path, given: str | None, *, from_hub: bool = False) -> Path:
@@ -123,4 +123,4 @@ def find_t5_tokenizer(checkpoint: Path, given: str | None) -> Path | None:
     folder = checkpoint if checkpoint.is_dir() else checkpoint.parent
     if (folder / T5_TOKENIZER).is_file():
         return folder / T5_TOKENIZER
-    return next((found for name in T5_REPOSITORIES if (found := in_hub_cache(name, T5_TOKENIZER))), None)
+    return next((cached for name in T5_REPOSITORIES if (cached := in_hub_cache(name, T5_TOKENIZER))), None)

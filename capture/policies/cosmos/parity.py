@@ -75,13 +75,13 @@ class ParityReport:
 
     def compare(self, stage: str, ours: np.ndarray | Tensor, expected: np.ndarray, tolerance: Tolerance) -> None:
         """Compare one stage and add it to the report."""
-        found = np.asarray(ours.detach().cpu().numpy() if isinstance(ours, Tensor) else ours, dtype=np.float64)
+        numbers = np.asarray(ours.detach().cpu().numpy() if isinstance(ours, Tensor) else ours, dtype=np.float64)
         wanted = np.asarray(expected, dtype=np.float64)
-        if found.shape != wanted.shape:
+        if numbers.shape != wanted.shape:
             raise UnusableCase(
-                f"'{stage}' of the case '{self.case}' has shape {wanted.shape}, but ours has {found.shape}."
+                f"'{stage}' of the case '{self.case}' has shape {wanted.shape}, but ours has {numbers.shape}."
             )
-        difference = np.abs(found - wanted)
+        difference = np.abs(numbers - wanted)
         allowed = tolerance.atol + tolerance.rtol * np.abs(wanted)
         with np.errstate(divide="ignore", invalid="ignore"):
             shares = np.where(difference == 0, 0.0, difference / allowed)
@@ -184,13 +184,13 @@ def _run_forward(case: CosmosCase, device: str) -> ParityReport:
         observer,
     )
     for layer in range(dit.config.num_blocks):
-        found: dict[str, tuple[Tensor, Tolerance]] = {
+        stages: dict[str, tuple[Tensor, Tolerance]] = {
             "self_attn_probs": (observer.probabilities("self", layer), PROBABILITIES),
             "frame_contrib_norms": (observer.contribution_norms[layer], NORMS),
             "cross_attn_probs": (observer.probabilities("cross", layer), PROBABILITIES),
             "residual_norms": (observer.residual_norms[layer], NORMS),
         }
-        for name, (ours, tolerance) in found.items():
+        for name, (ours, tolerance) in stages.items():
             if (stage := f"{name}_{layer:02d}") in case.expected:
                 report.compare(stage, ours, case.expected[stage], tolerance)
     report.compare("output", output, case.expected["output"], OUTPUTS)

@@ -12,17 +12,24 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import Observation
 from vla_attention.capture.policies.cosmos.config import CosmosConfig
-from vla_attention.capture.policies.cosmos.latents import action_shares, query_pools, read_actions, read_value
-from vla_attention.capture.policies.cosmos.layout import CROSS, SELF, cameras, self_roles
+from vla_attention.capture.policies.cosmos.family import COSMOS
+from vla_attention.capture.policies.cosmos.latents import (
+    CROSS,
+    SELF,
+    action_shares,
+    cameras,
+    query_pools,
+    read_actions,
+    read_value,
+    self_roles,
+)
 from vla_attention.capture.policies.cosmos.model import CosmosModel, Recorders
 from vla_attention.capture.policies.cosmos.preprocess import Statistics, model_picture, proprio_of, upright
-from vla_attention.capture.policies.cosmos.protocol import COSMOS
 from vla_attention.capture.policies.cosmos.sampler import flow_time
 from vla_attention.capture.policies.cosmos.text import TextSource
 from vla_attention.capture.policies.identity import PolicySource, describe_policy
 from vla_attention.capture.policies.policy import GivenInputs, PolicyInput, camera_frame
-from vla_attention.capture.policies.precision import dtype_name
-from vla_attention.capture.policies.weights import weights_digest
+from vla_attention.capture.policies.weights import dtype_name, weights_digest
 from vla_attention.capture.recording.attention import AttentionEditor, RowCollector
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.store_format import PolicyIdentity

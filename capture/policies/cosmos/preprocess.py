@@ -14,20 +14,13 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from vla_attention.capture.foreign_files.json_objects import read_object
-from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.capture.foreign_files.checked_files import read_object
+from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
+from vla_attention.schemas.errors import BadArgument
 
 JPEG_QUALITY = 95
 #: Share of the area that the reference crops out of the middle when the policy was trained with image augmentation.
 CROP_AREA = 0.9
-
-
-class StatisticsNotFound(UserError, FileNotFoundError):
-    """There is no file of dataset statistics."""
-
-
-class BadStatistics(UserError, ValueError):
-    """The dataset statistics lack an entry or do not fit the policy."""
 
 
 def upright(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -103,27 +96,29 @@ _FIELDS = ("actions_min", "actions_max", "proprio_min", "proprio_max")
 
 
 def make_statistics(content: Mapping[str, object], where: str, action_dim: int, proprio_dim: int) -> Statistics:
-    """Check ranges and return them; `BadStatistics` names the entry that is missing or of the wrong length.
+    """Check ranges and return them; `UnreadableCheckpoint` names the entry that is missing or of the wrong length.
 
     where: completes the sentence "The dataset statistics ..." in an error."""
     arrays = {}
     for name in _FIELDS:
         if name not in content:
-            raise BadStatistics(f"The dataset statistics {where} have no '{name}'.")
+            raise UnreadableCheckpoint(f"The dataset statistics {where} have no '{name}'.")
         try:
             array = np.asarray(content[name], dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
-            raise BadStatistics(f"'{name}' of the dataset statistics {where} is no list of numbers.") from None
+            raise UnreadableCheckpoint(f"'{name}' of the dataset statistics {where} is no list of numbers.") from None
         dim = action_dim if name.startswith("actions") else proprio_dim
         if array.shape != (dim,) or not np.isfinite(array).all():
-            raise BadStatistics(
+            raise UnreadableCheckpoint(
                 f"'{name}' of the dataset statistics {where} has shape {array.shape}; expected {dim} finite numbers."
             )
         arrays[name] = array
     if not (arrays["actions_max"] >= arrays["actions_min"]).all():
-        raise BadStatistics(f"The dataset statistics {where} have an 'actions_max' below 'actions_min'.")
+        raise UnreadableCheckpoint(f"The dataset statistics {where} have an 'actions_max' below 'actions_min'.")
     if not (arrays["proprio_max"] > arrays["proprio_min"]).all():
-        raise BadStatistics(f"The dataset statistics {where} have a 'proprio_max' that is not above 'proprio_min'.")
+        raise UnreadableCheckpoint(
+            f"The dataset statistics {where} have a 'proprio_max' that is not above 'proprio_min'."
+        )
     return Statistics(**arrays)
 
 
@@ -131,9 +126,9 @@ def read_statistics(path: str | Path, action_dim: int = 7, proprio_dim: int = 9)
     """Read a file of dataset statistics (JSON)."""
     path = Path(path)
     try:
-        content = read_object(path, BadStatistics)
+        content = read_object(path, UnreadableCheckpoint)
     except FileNotFoundError:
-        raise StatisticsNotFound(
+        raise CheckpointNotFound(
             f"There are no dataset statistics at '{path}'; give --dataset-stats-path (libero_dataset_statistics.json "
             "of the checkpoint)."
         ) from None

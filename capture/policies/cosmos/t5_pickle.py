@@ -15,6 +15,7 @@ from typing import Any, BinaryIO, NoReturn
 import torch._utils
 from torch import Tensor
 
+from vla_attention.capture.foreign_files.checked_files import check_regular
 from vla_attention.capture.foreign_files.pickles import (
     TENSORS,
     Check,
@@ -24,18 +25,10 @@ from vla_attention.capture.foreign_files.pickles import (
     check_pickle,
     nothing,
 )
-from vla_attention.capture.foreign_files.regular_files import check_regular
 from vla_attention.capture.foreign_files.torch_files import check_tensors, load_torch
+from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
 from vla_attention.capture.policies.cosmos.tensor_files import RefusedPickle
-from vla_attention.schemas.errors import UnknownName, UserError, listing
-
-
-class EmbeddingsNotFound(UserError, FileNotFoundError):
-    """There is no file of text embeddings."""
-
-
-class BadEmbeddings(UserError, ValueError):
-    """The file of text embeddings is damaged, or does not hold instruction -> tensor."""
+from vla_attention.schemas.errors import UnknownName, listing
 
 
 def _load_storage(content: bytes) -> Any:
@@ -102,24 +95,26 @@ class TextEmbeddings:
 def read_embeddings(path: str | Path) -> TextEmbeddings:
     """Read a pickle of text embeddings.
 
-    Raises `EmbeddingsNotFound`, `BadEmbeddings`, or `RefusedPickle` (nothing was executed) when it holds more than
-    tensors.
+    Raises `CheckpointNotFound`, `UnreadableCheckpoint`, or `RefusedPickle` when it holds more than tensors; nothing of
+    it was executed then.
     """
     path = Path(path)
     try:
-        size = check_regular(path, BadEmbeddings)
+        size = check_regular(path, UnreadableCheckpoint)
     except FileNotFoundError:
-        raise EmbeddingsNotFound(
+        raise CheckpointNotFound(
             f"There are no text embeddings at '{path}'; give --t5-text-embeddings-path (libero_t5_embeddings.pkl of "
             "the checkpoint)."
         ) from None
     if size > MAX_EMBEDDINGS_BYTES:
-        raise BadEmbeddings(f"'{path}' has {size} bytes; text embeddings of {MAX_EMBEDDINGS_BYTES} at most are read.")
+        raise UnreadableCheckpoint(
+            f"'{path}' has {size} bytes; text embeddings of {MAX_EMBEDDINGS_BYTES} at most are read."
+        )
     with path.open("rb") as file:
-        found = _read(file, path)
+        content = _read(file, path)
         file.seek(0)
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return TextEmbeddings(str(path), _checked(found, path), digest)
+    return TextEmbeddings(str(path), _checked(content, path), digest)
 
 
 def _read(file: BinaryIO, path: Path) -> Any:
@@ -129,24 +124,24 @@ def _read(file: BinaryIO, path: Path) -> Any:
         return _RestrictedUnpickler(file).load()
     except (PickleRefused, RefusedPickle) as error:
         if isinstance(error, PickleDamaged):
-            raise BadEmbeddings(f"'{path}' cannot be read as text embeddings: it {error}.") from error
+            raise UnreadableCheckpoint(f"'{path}' cannot be read as text embeddings: it {error}.") from error
         raise RefusedPickle(
             f"'{path}' was refused: it {error}, and text embeddings need tensors only; nothing of it was executed."
         ) from error
     except Exception as error:  # a damaged pickle raises almost anything
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise BadEmbeddings(f"'{path}' cannot be read as text embeddings ({first}).") from error
+        raise UnreadableCheckpoint(f"'{path}' cannot be read as text embeddings ({first}).") from error
 
 
 def _checked(found: Any, path: Path) -> dict[str, Tensor]:
     if not isinstance(found, dict) or not found:
-        raise BadEmbeddings(
+        raise UnreadableCheckpoint(
             f"'{path}' holds no text embeddings (a dictionary of instructions), but {type(found).__name__}."
         )
     shapes = set()
     for name, value in found.items():
         if not isinstance(name, str) or not isinstance(value, Tensor) or value.ndim != 3 or value.shape[0] != 1:
-            raise BadEmbeddings(
+            raise UnreadableCheckpoint(
                 f"'{path}' should hold instruction -> tensor (1, position, width), but has an entry for {name!r} that "
                 f"is {tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__}."
             )
@@ -154,7 +149,7 @@ def _checked(found: Any, path: Path) -> dict[str, Tensor]:
     try:
         check_tensors(found.values())
     except PickleRefused as error:
-        raise BadEmbeddings(f"'{path}' {error}.") from error
+        raise UnreadableCheckpoint(f"'{path}' {error}.") from error
     if len(shapes) > 1:
-        raise BadEmbeddings(f"The embeddings of '{path}' have different shapes: {listing(sorted(shapes))}.")
+        raise UnreadableCheckpoint(f"The embeddings of '{path}' have different shapes: {listing(sorted(shapes))}.")
     return dict(found)

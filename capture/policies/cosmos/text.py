@@ -1,9 +1,13 @@
-"""An instruction for the policy: its embedding, the role of each text position, and its word pieces."""
+"""An instruction for the policy: its embedding, the role of each text position, and its word pieces.
+
+Without a precomputed embedding, T5's encoder of the transformers library makes one.
+"""
 
 from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,18 +16,68 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vla_attention.capture.policies.cosmos.t5_encoder import T5Encoder
-from vla_attention.capture.policies.cosmos.t5_pickle import BadEmbeddings, TextEmbeddings
-from vla_attention.capture.policies.sentencepiece_model import SentencepieceModel
-from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint
+from vla_attention.capture.policies.cosmos.locate import T5_TOKENIZER
+from vla_attention.capture.policies.cosmos.t5_pickle import TextEmbeddings
+from vla_attention.capture.policies.hub import first_line
+from vla_attention.schemas.errors import BadArgument, MissingDependency
 from vla_attention.schemas.layout import ROLE_DTYPE, Piece, Prompt, Role
+
+
+class T5Encoder:
+    """T5's encoder (`google-t5/t5-11b` for the published policies) from a local folder, in float32.
+
+    Loaded at the first use: it is many times as large as the policy, and most runs need precomputed embeddings only.
+    """
+
+    def __init__(self, folder: str | Path):
+        self.folder = Path(folder).expanduser()
+        if not (self.folder / "config.json").is_file():
+            raise UnreadableCheckpoint(
+                f"There is no T5 encoder at '{self.folder}'; give --t5-encoder a folder with config.json, the weights "
+                f"and {T5_TOKENIZER}."
+            )
+        self._model: Any = None
+
+    def encode(self, ids: list[int], positions: int, width: int) -> Tensor:
+        """Return the embedding (1, position, width) bfloat16 of token ids with the end token; other positions are 0."""
+        if len(ids) > positions:
+            raise BadArgument(
+                f"The instruction has {len(ids)} tokens, but the policy reads {positions}; shorten the instruction."
+            )
+        model = self._load()
+        if model.config.d_model != width:
+            raise UnreadableCheckpoint(
+                f"The T5 encoder at '{self.folder}' gives {model.config.d_model} numbers a position, but the policy "
+                f"reads {width}: it is another size of T5."
+            )
+        with torch.no_grad():
+            hidden = model(input_ids=torch.tensor([ids])).last_hidden_state
+        embedding = torch.zeros(1, positions, width, dtype=torch.bfloat16)
+        embedding[:, : len(ids)] = hidden.to(torch.bfloat16)
+        return embedding
+
+    def _load(self) -> Any:
+        if self._model is None:
+            try:
+                library = import_module("transformers")
+            except ImportError as error:
+                raise MissingDependency(
+                    f"--t5-encoder needs the transformers library ({error}); install it with `pip install "
+                    "transformers`, or precompute the embeddings elsewhere and give --t5-text-embeddings-path."
+                ) from error
+            try:
+                self._model = library.T5EncoderModel.from_pretrained(
+                    str(self.folder), local_files_only=True, dtype=torch.float32
+                ).eval()
+            except Exception as error:  # safetensors and pickle have errors of their own
+                why = first_line(error)
+                raise UnreadableCheckpoint(f"The T5 encoder at '{self.folder}' cannot be loaded ({why}).") from error
+        return self._model
+
 
 #: T5 ends every text with this token, which has a position and no characters.
 END_TOKENS = 1
-
-
-class TokenizerUnusable(UserError, ValueError):
-    """The tokenizer is not the one that the embeddings were made with, or an encoder lacks it."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +103,9 @@ class PieceTokenizer:
     """T5's sentencepiece model: a text's pieces and the characters of each."""
 
     def __init__(self, path: str | Path):
+        # Here: T5's encoder is also tried where transformers is, and sentencepiece is not.
+        from vla_attention.capture.policies.sentencepiece_model import SentencepieceModel
+
         self.model = SentencepieceModel(path, "give T5's spiece.model")
         self.path = self.model.path
         #: SHA-256 (hex) of the file
@@ -90,7 +147,7 @@ class PrecomputedText:
         self, embeddings: TextEmbeddings, tokenizer: PieceTokenizer | None = None, encoder: T5Encoder | None = None
     ):
         if encoder is not None and tokenizer is None:
-            raise TokenizerUnusable("--t5-encoder needs T5's tokenizer; give --t5-tokenizer PATH (spiece.model).")
+            raise UnreadableCheckpoint("--t5-encoder needs T5's tokenizer; give --t5-tokenizer PATH (spiece.model).")
         self.embeddings = embeddings
         self.tokenizer = tokenizer
         self.encoder = encoder
@@ -107,12 +164,12 @@ class PrecomputedText:
         return self._encoded[instruction]
 
     def encode(self, instruction: str) -> EncodedText:
-        """Return the embedding and its roles; `UnknownName` or `TokenizerUnusable` if either does not fit."""
+        """Return the embedding and its roles; `UnknownName` or `UnreadableCheckpoint` if either does not fit."""
         embedding = self._embedding(instruction)
         is_real = embedding[0].ne(0).any(dim=-1).numpy()
         count = int(is_real.sum())
         if not is_real[:count].all():
-            raise BadEmbeddings(
+            raise UnreadableCheckpoint(
                 f"The text embedding of '{instruction}' in '{self.embeddings.path}' has zero positions between real "
                 "ones; expected the real tokens first and zeros after them."
             )
@@ -122,7 +179,7 @@ class PrecomputedText:
         pieces = self.tokenizer.pieces(instruction)
         # An embedding of zeros only is a text that was left out on purpose.
         if count and count != len(pieces) + END_TOKENS:
-            raise TokenizerUnusable(
+            raise UnreadableCheckpoint(
                 f"The tokenizer '{self.tokenizer.path}' cuts '{instruction}' into {len(pieces)} pieces and an end "
                 f"token, but its embedding has {count} real positions: it is another model's tokenizer."
             )

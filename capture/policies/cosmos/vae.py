@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from vla_attention.capture.policies.checkpoints import check_size
 from vla_attention.capture.policies.cosmos.config import VaeConfig
-from vla_attention.capture.policies.strict_loading import Shapes, check_shapes, fill, make_empty, shapes_of
+from vla_attention.capture.policies.weights import Shapes, check_shapes, fill, make_empty, shapes_of
 from vla_attention.schemas.errors import MissingDependency
 
 #: Pixel frames of every latent frame but the first, which has one.
@@ -101,18 +101,16 @@ def expected_vae_shapes(config: VaeConfig) -> Shapes:
 def infer_vae_config(state: Mapping[str, Any], base: VaeConfig | None = None) -> VaeConfig:
     """Return the sizes of a stored VAE: its own base width, and the rest from `base`, which loading then checks."""
     base = base or VaeConfig()
-    first = state.get("encoder.conv1.weight")
+    first, base_dim = state.get("encoder.conv1.weight"), base.base_dim
+    if isinstance(first, Tensor):
+        base_dim = check_size("The width of the image encoder's first layer", first.shape[0] if first.ndim else 0)
     return VaeConfig(
-        base_dim=_base_dim(first) if isinstance(first, Tensor) else base.base_dim,
+        base_dim=base_dim,
         latent_channels=base.latent_channels,
         dim_mult=base.dim_mult,
         num_res_blocks=base.num_res_blocks,
         temporal_downsample=base.temporal_downsample,
     )
-
-
-def _base_dim(weight: Tensor) -> int:
-    return check_size("The width of the image encoder's first layer", weight.shape[0] if weight.ndim else 0)
 
 
 class CausalEncoder(nn.Module):

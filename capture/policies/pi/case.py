@@ -24,7 +24,7 @@ from vla_attention.capture.policies.parity_case import CASE_FILE, UnusableCase, 
 from vla_attention.capture.policies.pi.config import CAMERA_SLOTS, GemmaConfig, PiConfig, SiglipConfig
 from vla_attention.capture.policies.pi.formats import CheckpointFormat
 from vla_attention.capture.policies.pi.lerobot_config import MAX_CAMERAS
-from vla_attention.capture.policies.precision import DTYPES
+from vla_attention.capture.policies.weights import DTYPES
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.safe_text import check_name, check_text
 
@@ -97,7 +97,7 @@ def read_config(path: Path) -> PiConfig:
 
 
 def states_sizes(path: Path) -> bool:
-    """Return whether a checkpoint's config.json states all sizes itself, like a case.json (see `small_policy`)."""
+    """Return whether a checkpoint's config.json states all sizes itself, like a case.json (`examples/cubes_policy`)."""
     content = read_json_object(path)
     return "model" in content and isinstance(content.get("config"), Mapping)
 

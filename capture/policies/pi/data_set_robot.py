@@ -114,5 +114,5 @@ def robot_for(folder: Path, found: CheckpointFormat, data: RobotData, *, relativ
 
 def asset_name(folder: Path) -> str | None:
     """Return the name under which an openpi checkpoint keeps its statistics, for instance droid; None for several."""
-    found = [path.parent for path in find_norm_stats(folder)]
-    return found[0].relative_to(folder / "assets").as_posix() if len(found) == 1 else None
+    folders = [path.parent for path in find_norm_stats(folder)]
+    return folders[0].relative_to(folder / "assets").as_posix() if len(folders) == 1 else None

@@ -14,16 +14,14 @@ from vla_attention.capture.environments.episode_protocol import OPENPI_REPLAN_ST
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.model_arguments import UNTRAINED, UNTRAINED_TINY
 from vla_attention.capture.policies.pi.config import GemmaConfig, PiConfig, SiglipConfig, find_variant
-from vla_attention.capture.policies.pi.model import PiModel
-from vla_attention.capture.policies.pi.model_weights import expected_shapes, model_from_state
+from vla_attention.capture.policies.pi.model import PiModel, expected_shapes, model_from_state
 from vla_attention.capture.policies.pi.policy import PiPolicy
 from vla_attention.capture.policies.pi.preprocess import ENVIRONMENT_ACTION_DIM, NormStats, Statistics
 from vla_attention.capture.policies.pi.processing import STATE_DIM, OpenpiProcessing
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
 from vla_attention.capture.policies.robot import Robot
 from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
-from vla_attention.capture.policies.strict_loading import Shapes
-from vla_attention.capture.policies.weights import random_tensor
+from vla_attention.capture.policies.weights import Shapes, random_tensor
 
 #: Rows of the token table; the tokenizer has fewer.
 _VOCABULARY = 1024

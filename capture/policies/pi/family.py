@@ -4,21 +4,41 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_attention.capture.environments.episode_protocol import LEROBOT, OPENPI
-from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedScript
+from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedRate, PublishedScript
 from vla_attention.capture.policies.model_arguments import FORMER_NAMES, UNTRAINED_POLICIES, add_model_arguments
-from vla_attention.capture.policies.pi.published_rates import PUBLISHED_RATES
-from vla_attention.capture.policies.pi.shipped import CUBES_POLICY, SHIPPED
 from vla_attention.capture.policies.robot import Robot
 from vla_attention.schemas.jsonable import from_json
 
 if TYPE_CHECKING:
     from vla_attention.capture.policies.pi.policy import PiPolicy
     from vla_attention.schemas.stores.store_format import PolicyIdentity
+
+#: A small pi0.5 for the suite `cubes`; `docs/cubes.md` says how it was trained and what it can do.
+CUBES_POLICY = "pi05_cubes"
+SHIPPED: dict[str, Path] = {CUBES_POLICY: Path(__file__).parent / CUBES_POLICY}
+
+_OPENPI = "examples/libero/README.md of openpi"
+_LEROBOT = "docs/source/libero.mdx of LeRobot"
+#: Per cent by suite. openpi's client runs 50 episodes of each of the ten tasks, LeRobot's page says 10.
+_OF_OPENPI = {"libero_spatial": 98.8, "libero_object": 98.2, "libero_goal": 98.0, "libero_10": 92.4}
+_OF_LEROBOT = {"libero_spatial": 97.0, "libero_object": 99.0, "libero_goal": 98.0, "libero_10": 96.0}
+
+PUBLISHED_RATES = (
+    PublishedRate(CUBES_POLICY, "cubes", 842, 850, "docs/cubes.md"),
+    *(
+        PublishedRate("gs://openpi-assets/checkpoints/pi05_libero", suite, round(5 * rate), 500, _OPENPI)
+        for suite, rate in _OF_OPENPI.items()
+    ),
+    *(
+        PublishedRate(name, suite, round(rate), 100, _LEROBOT)
+        for name in ("lerobot/pi05_libero_finetuned", "lerobot/pi05_libero_finetuned_v044")
+        for suite, rate in _OF_LEROBOT.items()
+    ),
+)
 
 _EXAMPLES = """\
   vla-capture pi                                             a small trained policy and its tasks, docs/cubes.md
@@ -66,7 +86,7 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _build(arguments: argparse.Namespace, device: str) -> PiPolicy:
-    from vla_attention.capture.policies.pi.build import build_pi_policy
+    from vla_attention.capture.policies.pi.loading import build_pi_policy
 
     return build_pi_policy(
         arguments.checkpoint,
@@ -103,10 +123,6 @@ def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
     return settings | ({"config_name": named[1]} if named else {})
 
 
-def _is_pi_case(content: Mapping[str, Any]) -> bool:
-    return "model" in content or "config" in content
-
-
 def _run_parity(arguments: argparse.Namespace, device: str) -> int:
     from vla_attention.capture.policies.pi.parity import run_parity
 
@@ -127,7 +143,7 @@ FAMILY = PolicyFamily(
     built_in=(*SHIPPED, *UNTRAINED_POLICIES),
     default_suite="cubes",
     parity=ParityCases(
-        recognises=_is_pi_case,
+        recognises=lambda content: "model" in content or "config" in content,
         run=_run_parity,
         formats=("orbax", "openpi", "lerobot"),
         default_limit="5e-5; 0.1 for bfloat16 cases",

@@ -15,9 +15,17 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from vla_attention.capture.policies.heads import join_heads, split_heads
 from vla_attention.capture.policies.pi.config import GemmaConfig
-from vla_attention.capture.recording.attention import LogitChange, PieceSink, RowSink, UpdateSink, attend, attend_unseen
+from vla_attention.capture.recording.attention import (
+    LogitChange,
+    PieceSink,
+    RowSink,
+    UpdateSink,
+    attend,
+    attend_unseen,
+    join_heads,
+    split_heads,
+)
 from vla_attention.capture.recording.contributions import Projection
 
 RMS_NORM_EPS = 1e-6
@@ -218,15 +226,15 @@ class GemmaBlock(nn.Module):
         Returns x after the block and the keys and values of x alone.
         """
         normed, gate = self.input_layernorm(x, condition)
-        own = self.self_attn.keys_values(normed, rotation)
-        seen = own if before is None else before.then(own)
+        keys_values = self.self_attn.keys_values(normed, rotation)
+        seen = keys_values if before is None else before.then(keys_values)
         update = gated(self.self_attn(normed, seen, mask, rotation, calls), gate)
         if calls is not None and calls.update_to is not None:
             factor = None if gate is None else gate[0]
             calls.update_to(seen.values, Projection(self.self_attn.o_proj.weight, factor), update)
         x = x + update
         normed, gate = self.post_attention_layernorm(x, condition)
-        return add_branch(x, self.mlp(normed), gate), own
+        return add_branch(x, self.mlp(normed), gate), keys_values
 
 
 class GemmaModel(nn.Module):

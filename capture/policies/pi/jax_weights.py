@@ -2,6 +2,11 @@
 
 A leaf is named by its path in the parameter tree joined by "/", without the leading "params" and the trailing "value".
 Leaves of the transformers carry all layers on their first axis (openpi scans over them).
+
+LoRA arrays are merged into the weights that they adapt. openpi scales the update by alpha / rank, which is 1 in all its
+LoRA variants (gemma_2b_lora, gemma_300m_lora), so that the merged weight is w + a · b. The output projection of the
+attention differs: its equation sums over the heads in both factors, so that the rows of every head are multiplied by
+the sum of all heads' b.
 """
 
 from __future__ import annotations
@@ -13,9 +18,51 @@ from dataclasses import dataclass
 import numpy as np
 
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch
-from vla_attention.capture.policies.pi.jax_lora import LoraPair, find_lora_pairs
-from vla_attention.capture.policies.strict_loading import Shapes
+from vla_attention.capture.policies.weights import Shapes
 from vla_attention.schemas.errors import listing
+
+_LORA = re.compile(r"(.*[/_])lora_([ab])\Z")
+
+
+@dataclass(frozen=True)
+class LoraPair:
+    """The paths of the two factors that adapt one leaf."""
+
+    a: str
+    b: str
+
+
+def find_lora_pairs(paths: Iterable[str]) -> dict[str, LoraPair]:
+    """Return adapted leaf -> its pair. A single factor, or one without a leaf to adapt, is in no pair."""
+    known = set(paths)
+    pairs = {}
+    for path in known:
+        match = _LORA.fullmatch(path)
+        if match is None or match[2] != "a":
+            continue
+        # Attention: .../q_einsum/{w, lora_a, lora_b}. Feed-forward: .../{gating_einsum, gating_einsum_lora_a, ...}.
+        base = match[1] + "w" if match[1].endswith("/") else match[1][:-1]
+        other = f"{match[1]}lora_b"
+        if base in known and other in known:
+            pairs[base] = LoraPair(path, other)
+    return pairs
+
+
+def merge_lora(path: str, w: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return one layer of the leaf `path` with its LoRA factors merged, in float32.
+
+    w: (..., in, out); a: (..., in, rank); b: (..., rank, out), with the same leading axes (heads, or gate and up).
+    """
+    fits = w.shape[:-1] == a.shape[:-1] and (*w.shape[:-2], a.shape[-1], w.shape[-1]) == b.shape
+    if not fits:
+        raise CheckpointMismatch(
+            f"The LoRA arrays of {path} have shapes {a.shape} and {b.shape}, which do not fit its {w.shape} (one layer "
+            "each)."
+        )
+    a, b = np.asarray(a, dtype=np.float32), np.asarray(b, dtype=np.float32)
+    update = np.einsum("nhl,ld->nhd", a, b.sum(axis=0)) if "/attn_vec_einsum" in path else a @ b
+    return np.asarray(w + update, dtype=np.float32)
+
 
 VISION = "paligemma_with_expert.paligemma.model.vision_tower.vision_model."
 PROJECTOR = "paligemma_with_expert.paligemma.model.multi_modal_projector.linear."
@@ -167,8 +214,8 @@ def plan_leaf(path: str) -> LeafPlan | None:
     """Return the conversion of a JAX leaf by its path, or None for a leaf that no pi model has."""
     image_block, image, language = "PaliGemma/img/Transformer/encoderblock/", "PaliGemma/img/", "PaliGemma/llm/"
     if path.startswith(image_block):
-        found = _IMAGE_BLOCK.get(path.removeprefix(image_block))
-        return None if found is None else LeafPlan((found,), VISION + "encoder.layers.")
+        place = _IMAGE_BLOCK.get(path.removeprefix(image_block))
+        return None if place is None else LeafPlan((place,), VISION + "encoder.layers.")
     if path.startswith(image):
         return _single("", _IMAGE.get(path.removeprefix(image)))
     if path.startswith(language):
@@ -195,13 +242,13 @@ def plan_leaves(paths: Iterable[str]) -> tuple[dict[str, LeafPlan], dict[str, Lo
     paths = list(paths)
     pairs = find_lora_pairs(paths)
     merged = {path for pair in pairs.values() for path in (pair.a, pair.b)}
-    found = {path: plan_leaf(path) for path in paths if path not in merged}
-    unknown = sorted(path for path, plan in found.items() if plan is None)
+    plans = {path: plan_leaf(path) for path in paths if path not in merged}
+    unknown = sorted(path for path, plan in plans.items() if plan is None)
     if unknown:
         family = "" if any(path.startswith("action_in_proj/") for path in paths) else OTHER_OPENPI_MODEL
         raise CheckpointMismatch(
             f"The checkpoint has {len(unknown)} arrays that a pi model does not have: {listing(unknown, 40)}.{family}"
         )
-    if "action_in_proj/kernel" not in found:
+    if "action_in_proj/kernel" not in plans:
         raise CheckpointMismatch(f"The checkpoint has no action_in_proj.{OTHER_OPENPI_MODEL}")
-    return {path: plan for path, plan in found.items() if plan is not None}, pairs
+    return {path: plan for path, plan in plans.items() if plan is not None}, pairs

@@ -138,13 +138,13 @@ def _config(content: dict[str, Any], where: str) -> LerobotConfig:
         state_dim=inputs.get(STATE_FEATURE, ("STATE", max_state_dim))[1],
         action_dim=outputs.get(ACTION_FEATURE, ("ACTION", max_action_dim))[1],
         normalization=texts_by_name(content.get("normalization_mapping"), f"{where} has normalization_mapping"),
-        raw={"chunk_size": chunk_size, "max_action_dim": max_action_dim, **_variants(content)},
+        raw={
+            "chunk_size": chunk_size,
+            "max_action_dim": max_action_dim,
+            "paligemma_variant": str(content.get("paligemma_variant", "gemma_2b")),
+            "action_expert_variant": str(content.get("action_expert_variant", "gemma_300m")),
+        },
     )
-
-
-def _variants(content: Mapping[str, Any]) -> dict[str, str]:
-    defaults = {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"}
-    return {name: str(content.get(name, default)) for name, default in defaults.items()}
 
 
 def _refuse_unknown(content: Mapping[str, Any], where: str) -> None:
@@ -197,15 +197,15 @@ def _features(content: Mapping[str, Any], name: str, where: str) -> dict[str, tu
     """Return feature -> (type, last size) of input_features or output_features, in their order."""
     features = content.get(name) or {}
     try:
-        found = {key: (str(feature["type"]), int(feature["shape"][-1])) for key, feature in features.items()}
+        sizes = {key: (str(feature["type"]), int(feature["shape"][-1])) for key, feature in features.items()}
     except (TypeError, KeyError, IndexError, ValueError, AttributeError, OverflowError):
         raise UnsupportedLerobotFeature(f"{where} has {name} without types and shapes: {features!r}.") from None
-    for key, (_, size) in found.items():
+    for key, (_, size) in sizes.items():
         if not 1 <= size <= MAX_SIZE:
             raise UnsupportedLerobotFeature(
                 f"{where} has {name} with '{key}' of {size} numbers; expected 1 to {MAX_SIZE}."
             )
-    return found
+    return sizes
 
 
 def _image_size(content: Mapping[str, Any], where: str) -> int:

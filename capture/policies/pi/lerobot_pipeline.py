@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.policies.checkpoints import (
+    UnreadableCheckpoint,
     UnsupportedCheckpoint,
     read_json_object,
     values_of,
@@ -27,7 +28,6 @@ from vla_attention.capture.policies.pi.lerobot_config import (
     UnsupportedLerobotFeature,
     texts_by_name,
 )
-from vla_attention.capture.policies.pi.preprocess import UnusableNormStats
 from vla_attention.capture.policies.safetensors_file import SafetensorsFile, open_safetensors
 from vla_attention.schemas.errors import listing
 
@@ -127,18 +127,18 @@ def _steps(folder: Path, name: str, known: set[str]) -> dict[str, dict[str, Any]
             "kept its pipelines must be migrated with LeRobot's script first."
         )
     steps = read_json_object(path).get("steps")
-    found: dict[str, dict[str, Any]] = {}
+    by_name: dict[str, dict[str, Any]] = {}
     for step in steps if isinstance(steps, list) else ():
         registered = step.get("registry_name") if isinstance(step, dict) else None
         if not isinstance(registered, str) or registered not in known:
             called = registered or (step.get("class") if isinstance(step, dict) else step)
             raise UnsupportedLerobotFeature(f"'{path}' has a step that is not supported: {called!r}.")
-        if registered in found and registered not in _NOTHING:
+        if registered in by_name and registered not in _NOTHING:
             raise UnsupportedLerobotFeature(f"'{path}' has the step {registered} twice.")
         if not isinstance(step.get("config", {}), dict):
             raise UnsupportedLerobotFeature(f"'{path}' has the step {registered} with settings that are no table.")
-        found[registered] = step
-    return found
+        by_name[registered] = step
+    return by_name
 
 
 def _settings(steps: Mapping[str, Mapping[str, Any]], name: str) -> Mapping[str, Any]:
@@ -202,20 +202,20 @@ def _statistics(
     path = folder / str(state_file)
     # A name with folders in it could lead out of the checkpoint.
     if not isinstance(state_file, str) or Path(state_file).name != state_file or not os.path.lexists(path):
-        raise UnusableNormStats(f"The statistics of '{feature}' should be in '{path}', which is not there.")
+        raise UnreadableCheckpoint(f"The statistics of '{feature}' should be in '{path}', which is not there.")
     with open_safetensors(path) as stored:
         present = set(stored.names())
         missing = [f"{feature}.{key}" for key in needed if f"{feature}.{key}" not in present]
         if missing:
-            raise UnusableNormStats(f"'{path}' lacks {listing(missing)}; it has {listing(sorted(present))}.")
+            raise UnreadableCheckpoint(f"'{path}' lacks {listing(missing)}; it has {listing(sorted(present))}.")
         return {key: _vector(stored, path, f"{feature}.{key}", dim) for key in needed}
 
 
 def _vector(stored: SafetensorsFile, path: Path, name: str, dim: int) -> NDArray[np.float32]:
     shape = stored.shape(name)
     if shape != (dim,):
-        raise UnusableNormStats(f"The statistics '{name}' of '{path}' have shape {shape}; {dim} numbers are needed.")
+        raise UnreadableCheckpoint(f"The statistics '{name}' of '{path}' have shape {shape}; {dim} numbers are needed.")
     values: NDArray[np.float32] = stored.read(name).float().numpy()
     if not np.isfinite(values).all():
-        raise UnusableNormStats(f"The statistics '{name}' of '{path}' hold NaN or infinity.")
+        raise UnreadableCheckpoint(f"The statistics '{name}' of '{path}' hold NaN or infinity.")
     return values

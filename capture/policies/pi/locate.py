@@ -51,20 +51,18 @@ def find_checkpoint(name: str) -> Path:
         return _from_openpi_cache(name.rstrip("/"))
     path = Path(name).expanduser()
     on_hub = None if path.exists() else split_hub_name(name)
-    return path if on_hub is None else _from_hub(*on_hub)
+    if on_hub is None:
+        return path
+    how = (
+        f"fetch it where there is a network with `hf download {on_hub[0]}`, copy the folder here and give its path "
+        "(there is no such local folder)"
+    )
+    return fetch_from_hub(on_hub[0], HUB_FILES, how, revision=on_hub[1])
 
 
 def openpi_cache() -> Path:
     """Return the folder that openpi downloads to: OPENPI_DATA_HOME, else ~/.cache/openpi."""
     return Path(os.environ.get("OPENPI_DATA_HOME", "~/.cache/openpi")).expanduser()
-
-
-def _from_hub(name: str, revision: str | None) -> Path:
-    how = (
-        f"fetch it where there is a network with `hf download {name}`, copy the folder here and give its path "
-        "(there is no such local folder)"
-    )
-    return fetch_from_hub(name, HUB_FILES, how, revision=revision)
 
 
 def _from_openpi_cache(url: str) -> Path:

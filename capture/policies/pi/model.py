@@ -7,10 +7,11 @@ suffix pass (state and noisy actions through the expert) for each denoise step. 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -18,8 +19,8 @@ from torch import Tensor, nn
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.flow_time import denoise_times, embed_times
 from vla_attention.capture.policies.pi.gemma import AttentionCalls, GemmaModel, KeysValues, Rotation
-from vla_attention.capture.policies.pi.pieces import pieces_of_keys
 from vla_attention.capture.policies.pi.siglip import Projector, VisionTower
+from vla_attention.capture.policies.weights import Shapes, check_shapes, fill, make_empty, shapes_of
 from vla_attention.capture.recording.attention import AttentionEditor, RowCollector
 
 if TYPE_CHECKING:
@@ -43,7 +44,7 @@ class Denoising:
     """What all denoise steps of a call have in common.
 
     state: (batch, action dim). rotation, mask (batch, suffix query, key) bool: of the suffix. cache: as in `Prefix`.
-    pieces: of the value products (`pieces.py`), or None for one product.
+    pieces: of the value products (`pieces_of_keys`), or None for one product.
     """
 
     state: Tensor
@@ -195,8 +196,8 @@ class PiModel(nn.Module):
         keys = torch.arange(embedded.shape[1]) if tokens is None else tokens
         for layer, block in enumerate(earlier):
             change = editor.prefix_change(layer, keys) if editor is not None else None
-            x, own = block(x, mask, rotation, calls=None if change is None else AttentionCalls(change=change))
-            cache.append(own)
+            x, keys_values = block(x, mask, rotation, calls=None if change is None else AttentionCalls(change=change))
+            cache.append(keys_values)
         cache.append(last.keys_values(x, rotation))
         return Prefix(cache=tuple(cache), valid=valid)
 
@@ -322,3 +323,64 @@ class PiModel(nn.Module):
         normed, _ = self._expert.norm(hidden[:, action_queries], condition)
         velocity: Tensor = self.action_out_proj(normed.float())
         return velocity
+
+
+def pieces_of_keys(config: PiConfig, prefix_valid: Tensor, device: torch.device) -> tuple[slice, ...] | None:
+    """Return the pieces of the keys of a denoise step, or None where the product is made at once.
+
+    prefix_valid: (batch, prefix key) bool. device: of the model. Pieces are for a batch of one on a processor.
+    """
+    if prefix_valid.shape[0] != 1 or device.type != "cpu":
+        return None
+    valid = prefix_valid[0].numpy()
+    lengths = [*[config.siglip.num_tokens] * len(config.cameras), config.max_token_len]
+    pieces: list[slice] = []
+    start = 0
+    for length in lengths:
+        inside = np.flatnonzero(valid[start : start + length]) + start
+        runs = np.split(inside, np.flatnonzero(np.diff(inside) > 1) + 1) if inside.size else []
+        pieces += [slice(int(run[0]), int(run[-1]) + 1) for run in runs]
+        start += length
+    first_action = start + config.first_action_query
+    if first_action > start:
+        pieces.append(slice(start, first_action))
+    return (*pieces, slice(first_action, start + config.suffix_len))
+
+
+def expected_tensors(config: PiConfig, dtype: torch.dtype = torch.float32) -> dict[str, Tensor]:
+    """Return name -> tensor without memory (meta) of `PiModel(config, dtype)`: shapes, and the precision of each."""
+    return make_empty(lambda: PiModel(config, dtype)).state_dict()
+
+
+def expected_shapes(config: PiConfig) -> Shapes:
+    """Return name -> shape of every tensor of `PiModel(config)`, without allocating any."""
+    return shapes_of(expected_tensors(config))
+
+
+def build_model(
+    config: PiConfig,
+    names: Iterable[str],
+    read: Callable[[str], Tensor],
+    *,
+    dtype: torch.dtype = torch.float32,
+    device: str | torch.device = "cpu",
+) -> PiModel:
+    """Build the model and fill it tensor by tensor, so that a full-size checkpoint is never in memory twice.
+
+    `read(name)` returns one tensor by its name in the model; each is cast to the precision of that tensor in the model.
+    """
+    model = make_empty(lambda: PiModel(config, dtype))
+    empty = model.state_dict()
+    return fill(model, {name: read(name).to(device=device, dtype=empty[name].dtype) for name in names})
+
+
+def model_from_state(
+    config: PiConfig,
+    state: Mapping[str, Tensor],
+    *,
+    dtype: torch.dtype = torch.float32,
+    device: str | torch.device = "cpu",
+) -> PiModel:
+    """Build the model from tensors in memory; differences of names or shapes raise `CheckpointMismatch`."""
+    check_shapes(shapes_of(state), expected_shapes(config))
+    return build_model(config, state, state.__getitem__, dtype=dtype, device=device)

@@ -17,17 +17,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vla_attention.capture.foreign_files.regular_files import check_folder
+from vla_attention.capture.foreign_files.checked_files import check_folder
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint, read_json_object
 from vla_attention.capture.policies.hub import first_line
 from vla_attention.capture.policies.pi.config import PiConfig, find_config
 from vla_attention.capture.policies.pi.formats import detect_format
-from vla_attention.capture.policies.pi.jax_lora import merge_lora
-from vla_attention.capture.policies.pi.jax_weights import plan_leaves
-from vla_attention.capture.policies.pi.model import PiModel
-from vla_attention.capture.policies.pi.model_weights import build_model, expected_shapes, expected_tensors
+from vla_attention.capture.policies.pi.jax_weights import merge_lora, plan_leaves
+from vla_attention.capture.policies.pi.model import PiModel, build_model, expected_shapes, expected_tensors
 from vla_attention.capture.policies.pi.sizes import check_jax_heads
-from vla_attention.capture.policies.strict_loading import Shapes, check_shapes
+from vla_attention.capture.policies.weights import Shapes, check_shapes
 from vla_attention.schemas.errors import MissingDependency, listing
 
 #: Arrays of a checkpoint; a pi model has about fifty.
@@ -207,8 +205,8 @@ def implied_config_name(paths: Iterator[str]) -> str:
 
 def _shapes_of(shapes: Any, leaf: OpenLeaf) -> Shapes:
     try:
-        found: Shapes = shapes(leaf.shape)
+        of_leaf: Shapes = shapes(leaf.shape)
     except (ValueError, IndexError):
         # An array with another number of axes than its conversion expects is reported by its JAX name.
-        found = {leaf.path: leaf.shape}
-    return found
+        of_leaf = {leaf.path: leaf.shape}
+    return of_leaf

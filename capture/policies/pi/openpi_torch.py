@@ -13,11 +13,10 @@ from torch import Tensor
 from vla_attention.capture.policies.checkpoints import read_json_object
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.formats import detect_format
-from vla_attention.capture.policies.pi.model import PiModel
-from vla_attention.capture.policies.pi.model_weights import build_model, expected_shapes
+from vla_attention.capture.policies.pi.model import PiModel, build_model, expected_shapes
 from vla_attention.capture.policies.pi.sizes import PALIGEMMA, TABLE, infer_config
 from vla_attention.capture.policies.safetensors_file import SafetensorsFile, open_safetensors
-from vla_attention.capture.policies.strict_loading import Shapes, check_shapes
+from vla_attention.capture.policies.weights import Shapes, check_shapes
 
 #: The text table is tied to the language model's output layer. safetensors keeps one name of tied tensors, this one.
 TIED_TABLE = PALIGEMMA + "lm_head.weight"
@@ -36,10 +35,10 @@ def model_names(stored: Iterable[str]) -> dict[str, str]:
     names = list(stored)
     prefix = LEROBOT_PREFIX if names and all(name.startswith(LEROBOT_PREFIX) for name in names) else ""
     plain = {name.removeprefix(prefix): name for name in names}
-    found = {name: raw for name, raw in plain.items() if name not in (JUNK, TIED_TABLE)}
+    raw_names = {name: raw for name, raw in plain.items() if name not in (JUNK, TIED_TABLE)}
     if TIED_TABLE in plain:
-        found.setdefault(TABLE, plain[TIED_TABLE])
-    return found
+        raw_names.setdefault(TABLE, plain[TIED_TABLE])
+    return raw_names
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from vla_attention.capture.policies.pi.case import (
 )
 from vla_attention.capture.policies.pi.loading import load_pi_model
 from vla_attention.capture.policies.pi.model import PiModel
-from vla_attention.capture.policies.precision import dtype_name
+from vla_attention.capture.policies.weights import dtype_name
 from vla_attention.capture.recording.attention import RowCollector
 from vla_attention.schemas.errors import BadArgument, listing
 

@@ -22,10 +22,8 @@ from vla_attention.capture.policies.pi.preprocess import libero_state, pad_to
 from vla_attention.capture.policies.pi.processing import Processing, image_tensor
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, TokenizedPrompt, check_vocabulary
 from vla_attention.capture.policies.policy import GivenInputs, PolicyInput, camera_frame
-from vla_attention.capture.policies.precision import dtype_name
-from vla_attention.capture.policies.weights import weights_digest
-from vla_attention.capture.recording.attention import AttentionEditor, RowCollector
-from vla_attention.capture.recording.batches import BatchCollector
+from vla_attention.capture.policies.weights import dtype_name, weights_digest
+from vla_attention.capture.recording.attention import AttentionEditor, BatchCollector, RowCollector
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, roles_from_spans
@@ -133,12 +131,9 @@ class PiPolicy:
 
     def prepare(self, observation: Observation, instruction: str) -> PolicyInput:
         """Turn an observation and an instruction into the model's input (batch 1)."""
-        size = self.model.config.siglip.image_size
-        raw = {camera.name: camera_frame(observation, camera.source) for camera in self.cameras}
-        pictures = {camera: self.processing.model_picture(frame, size) for camera, frame in raw.items()}
+        frames = {camera.name: camera_frame(observation, camera.source) for camera in self.cameras}
         state = libero_state(observation.eef_pos, observation.eef_quat, observation.gripper_qpos)
-        kept = raw if self.needs_camera_frames else {}
-        return self._input_of(pictures, kept, state, instruction, may_be_empty=False)
+        return self._input_of_frames(frames, state, instruction)
 
     def prepare_robot(
         self, pictures: Mapping[str, NDArray[np.uint8]], state: NDArray[np.float64], instruction: str
@@ -149,11 +144,17 @@ class PiPolicy:
         """
         if state.shape != (self.robot.state_dim,):
             raise BadArgument(f"The state has the shape {state.shape}; expected ({self.robot.state_dim},).")
+        frames = {camera.name: pictures[camera.source] for camera in self.cameras}
+        return self._input_of_frames(frames, np.asarray(state, dtype=np.float64), instruction)
+
+    def _input_of_frames(
+        self, frames: Mapping[str, NDArray[np.uint8]], state: NDArray[np.float64], instruction: str
+    ) -> PolicyInput:
+        """Return the model's input of the cameras' own pictures."""
         size = self.model.config.siglip.image_size
-        raw = {camera.name: pictures[camera.source] for camera in self.cameras}
-        models = {camera: self.processing.model_picture(frame, size) for camera, frame in raw.items()}
-        kept = raw if self.needs_camera_frames else {}
-        return self._input_of(models, kept, np.asarray(state, dtype=np.float64), instruction, may_be_empty=False)
+        pictures = {camera: self.processing.model_picture(frame, size) for camera, frame in frames.items()}
+        kept = frames if self.needs_camera_frames else {}
+        return self._input_of(pictures, kept, state, instruction, may_be_empty=False)
 
     def prepare_again(self, given: GivenInputs) -> PolicyInput:
         """Turn what a call was given into the model's input (batch 1)."""
@@ -255,7 +256,7 @@ class PiPolicy:
         """Make several calls as one batch; see `BatchPolicy`. Compiled denoise steps are made call by call."""
         if self.model.compiled_steps is not None:
             calls = zip(policy_inputs, noise_seeds, recorders, strict=True)
-            return [self.act(given, seed, own) for given, seed, own in calls]
+            return [self.act(given, seed, call_recorders) for given, seed, call_recorders in calls]
         site = self.sites[0].name
         tensors = {name: torch.cat([each.tensors[name] for each in policy_inputs]) for name in policy_inputs[0].tensors}
         collector = BatchCollector([each[site] for each in recorders]) if all(site in r for r in recorders) else None

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from vla_attention.capture.foreign_files.json_objects import read_object
-from vla_attention.capture.foreign_files.regular_files import MAX_FILES
-from vla_attention.schemas.errors import UserError, listing
+from vla_attention.capture.foreign_files.checked_files import MAX_FILES, read_object
+from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
+from vla_attention.schemas.errors import listing
 
 NormalisationMode = Literal["quantile", "z-score"]
 
@@ -33,14 +33,6 @@ _MAX_ASSET_DEPTH = 8
 ENVIRONMENT_ACTION_DIM = 7
 #: Of these, openpi's pi0_libero gives differences to the state: all but the gripper's.
 RELATIVE_ACTIONS = 6
-
-
-class NormStatsNotFound(UserError, FileNotFoundError):
-    """The checkpoint has no normalisation statistics."""
-
-
-class UnusableNormStats(UserError, ValueError):
-    """The normalisation statistics are damaged, or incomplete for the mode."""
 
 
 def model_image(frame: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
@@ -117,7 +109,7 @@ class Statistics:
 
     def _quantiles(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         if self.q01 is None or self.q99 is None:
-            raise UnusableNormStats("The normalisation statistics have no q01 and q99, which quantile mode needs.")
+            raise UnreadableCheckpoint("The normalisation statistics have no q01 and q99, which quantile mode needs.")
         return self.q01, self.q99
 
 
@@ -131,7 +123,7 @@ class NormStats:
     def check(
         self, mode: NormalisationMode, state_dim: int, padded_dim: int, action_dim: int = ENVIRONMENT_ACTION_DIM
     ) -> None:
-        """Raise `UnusableNormStats` unless they fit the state and the environment's actions in this mode.
+        """Raise `UnreadableCheckpoint` unless they fit the state and the environment's actions in this mode.
 
         Older checkpoints hold statistics padded to the model's `padded_dim`; any other length belongs to another robot.
         """
@@ -140,12 +132,14 @@ class NormStats:
             ("actions", self.actions, action_dim),
         ):
             if len(statistics.mean) not in (needed, padded_dim):
-                raise UnusableNormStats(
+                raise UnreadableCheckpoint(
                     f"The normalisation statistics of '{name}' have {len(statistics.mean)} numbers; {needed} are "
                     f"needed (or {padded_dim}, padded)."
                 )
             if mode == "quantile" and (statistics.q01 is None or statistics.q99 is None):
-                raise UnusableNormStats(f"The normalisation statistics of '{name}' lack q01 and q99 for quantile mode.")
+                raise UnreadableCheckpoint(
+                    f"The normalisation statistics of '{name}' lack q01 and q99 for quantile mode."
+                )
 
 
 def pad_to(x: NDArray[np.floating], dim: int) -> NDArray[np.float64]:
@@ -177,27 +171,29 @@ def parse_norm_stats(content: object, where: str) -> NormStats:
     """Build the statistics from the content of openpi's norm_stats.json; `where` names it in errors."""
     groups = content.get("norm_stats") if isinstance(content, Mapping) else None
     if not isinstance(groups, Mapping):
-        raise UnusableNormStats(f"{where} has no 'norm_stats' with statistics of 'state' and 'actions'.")
+        raise UnreadableCheckpoint(f"{where} has no 'norm_stats' with statistics of 'state' and 'actions'.")
     return NormStats(state=_statistics(groups, "state", where), actions=_statistics(groups, "actions", where))
 
 
 def _statistics(groups: Mapping[str, Any], name: str, where: str) -> Statistics:
     numbers = groups.get(name)
     if not isinstance(numbers, Mapping) or numbers.get("mean") is None or numbers.get("std") is None:
-        raise UnusableNormStats(f"{where} has no mean and std for '{name}'.")
+        raise UnreadableCheckpoint(f"{where} has no mean and std for '{name}'.")
     arrays: dict[str, NDArray[np.float64] | None] = {}
     for key in ("mean", "std", "q01", "q99"):
         given = numbers.get(key)
         try:
             arrays[key] = None if given is None else np.asarray(given, dtype=np.float64)
         except (TypeError, ValueError, OverflowError) as error:
-            raise UnusableNormStats(f"{where} has other values than numbers as '{key}' of '{name}'.") from error
+            raise UnreadableCheckpoint(f"{where} has other values than numbers as '{key}' of '{name}'.") from error
         array = arrays[key]
         if array is not None and not np.isfinite(array).all():
-            raise UnusableNormStats(f"{where} has NaN or infinity in '{key}' of '{name}'.")
+            raise UnreadableCheckpoint(f"{where} has NaN or infinity in '{key}' of '{name}'.")
     lengths = {array.shape for array in arrays.values() if array is not None}
     if len(lengths) != 1 or len(next(iter(lengths))) != 1:
-        raise UnusableNormStats(f"{where} has statistics of unequal lengths for '{name}': {listing(sorted(lengths))}.")
+        raise UnreadableCheckpoint(
+            f"{where} has statistics of unequal lengths for '{name}': {listing(sorted(lengths))}."
+        )
     mean, std = arrays["mean"], arrays["std"]
     # checked above; for mypy
     assert mean is not None
@@ -211,28 +207,30 @@ def read_norm_stats(checkpoint: str | Path) -> NormStats:
     The asset id may be several folders deep. No file, or more than one, is an error.
     """
     assets = Path(checkpoint) / "assets"
-    found = find_norm_stats(Path(checkpoint))
-    if not found:
-        raise NormStatsNotFound(f"The checkpoint '{checkpoint}' has no norm_stats.json below '{assets}'.")
-    if len(found) > 1:
-        raise UnusableNormStats(f"The checkpoint '{checkpoint}' has more than one norm_stats.json: {listing(found)}.")
+    files = find_norm_stats(Path(checkpoint))
+    if not files:
+        raise CheckpointNotFound(f"The checkpoint '{checkpoint}' has no norm_stats.json below '{assets}'.")
+    if len(files) > 1:
+        raise UnreadableCheckpoint(
+            f"The checkpoint '{checkpoint}' has more than one norm_stats.json: {listing(files)}."
+        )
     try:
-        content = read_object(found[0], UnusableNormStats, inside=Path(checkpoint))
+        content = read_object(files[0], UnreadableCheckpoint, inside=Path(checkpoint))
     except FileNotFoundError:
-        raise UnusableNormStats(f"'{found[0]}' is a link to a file that does not exist.") from None
-    return parse_norm_stats(content, f"'{found[0]}'")
+        raise UnreadableCheckpoint(f"'{files[0]}' is a link to a file that does not exist.") from None
+    return parse_norm_stats(content, f"'{files[0]}'")
 
 
 def find_norm_stats(checkpoint: Path) -> list[Path]:
     """Return the files norm_stats.json below the folder `assets` of a checkpoint, in the order of their paths."""
-    found, level = [], [checkpoint / "assets"]
+    files, level = [], [checkpoint / "assets"]
     for _ in range(_MAX_ASSET_DEPTH):
         entries = [entry for folder in level for entry in _entries(folder)]
-        found += [Path(entry.path) for entry in entries if entry.name == "norm_stats.json" and not entry.is_dir()]
+        files += [Path(entry.path) for entry in entries if entry.name == "norm_stats.json" and not entry.is_dir()]
         level = [Path(entry.path) for entry in entries if entry.is_dir(follow_symlinks=False)]
         if len(entries) > MAX_FILES:
-            raise UnusableNormStats(f"'{checkpoint / 'assets'}' holds more than {MAX_FILES} files.")
-    return sorted(found)
+            raise UnreadableCheckpoint(f"'{checkpoint / 'assets'}' holds more than {MAX_FILES} files.")
+    return sorted(files)
 
 
 def _entries(folder: Path) -> list[os.DirEntry[str]]:

@@ -10,9 +10,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from vla_attention.capture.policies.heads import join_heads, split_heads
 from vla_attention.capture.policies.pi.config import SiglipConfig
-from vla_attention.capture.recording.attention import attend_unseen
+from vla_attention.capture.recording.attention import attend_unseen, join_heads, split_heads
 
 LAYER_NORM_EPS = 1e-6
 

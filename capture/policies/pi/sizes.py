@@ -14,7 +14,7 @@ from vla_attention.capture.policies.checkpoints import (
     check_size,
 )
 from vla_attention.capture.policies.pi.config import GEMMA_VARIANTS, GemmaConfig, PiConfig, SiglipConfig
-from vla_attention.capture.policies.strict_loading import Shapes
+from vla_attention.capture.policies.weights import Shapes
 from vla_attention.schemas.errors import listing
 
 PALIGEMMA = "paligemma_with_expert.paligemma."
@@ -65,7 +65,8 @@ def infer_config(
             )
         check_size(f"'{name}' of the checkpoint's config.json", config_json[name], MAX_STEPS)
     siglip = _siglip_sizes(shapes)
-    variants = {key: _variant(config_json.get(key)) for key in _VARIANT_KEYS}
+    # openpi's LoRA variants have the sizes of the plain ones.
+    variants = {key: GEMMA_VARIANTS.get(str(config_json.get(key)).removesuffix("_lora")) for key in _VARIANT_KEYS}
     heads_of = next((variant for variant in variants.values() if variant is not None), None)
     if heads_of is None:
         raise CheckpointMismatch(_unknown_heads(shapes, config_json))
@@ -96,13 +97,8 @@ def _size(shapes: Shapes, name: str, axis: int) -> int:
 
 
 def _depth(shapes: Shapes, layers: str) -> int:
-    found = {name.removeprefix(layers).split(".")[0] for name in shapes if name.startswith(layers)}
-    return check_size(f"The number of blocks of the checkpoint's {layers.rstrip('.')}", len(found), MAX_BLOCKS)
-
-
-def _variant(name: object) -> GemmaConfig | None:
-    """The Gemma variant of a name in config.json; openpi's LoRA variants have the sizes of the plain ones."""
-    return GEMMA_VARIANTS.get(str(name).removesuffix("_lora"))
+    numbers = {name.removeprefix(layers).split(".")[0] for name in shapes if name.startswith(layers)}
+    return check_size(f"The number of blocks of the checkpoint's {layers.rstrip('.')}", len(numbers), MAX_BLOCKS)
 
 
 def _unknown_heads(shapes: Shapes, config_json: Mapping[str, Any]) -> str:

@@ -15,8 +15,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint
 from vla_attention.capture.policies.pi.config import PALIGEMMA_VOCABULARY
-from vla_attention.capture.policies.sentencepiece_model import SentencepieceModel, Token, UnreadableTokenizer
+from vla_attention.capture.policies.sentencepiece_model import SentencepieceModel, Token
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import ROLE_DTYPE, Piece, Prompt, Role
 
@@ -60,11 +61,6 @@ def clean_instruction(instruction: str) -> str:
     return instruction.strip().replace("_", " ").replace("\n", " ")
 
 
-def _check_not_empty(instruction: str) -> None:
-    if not clean_instruction(instruction).strip():
-        raise BadArgument(f"The instruction {instruction!r} is empty: a policy needs at least one word.")
-
-
 def digitise_state(state: NDArray[np.floating]) -> NDArray[np.int64]:
     """Return the bin of each normalised state value, (state,): 0..255 over [-1, 1), 255 above, -1 below.
 
@@ -83,7 +79,7 @@ class PromptTokenizer:
         #: SHA-256 (hex) of the file
         self.digest = self.model.digest
         if self.model.bos_id < 0:
-            raise UnreadableTokenizer(
+            raise UnreadableCheckpoint(
                 f"The tokenizer '{model_path}' has no BOS token, which every pi prompt starts with."
             )
 
@@ -114,8 +110,8 @@ class PromptTokenizer:
             cut: cut a longer prompt as the reference implementations do, instead of refusing it as a `BadArgument`.
             may_be_empty: accept an instruction without words, instead of refusing it as a `BadArgument`.
         """
-        if not may_be_empty:
-            _check_not_empty(instruction)
+        if not may_be_empty and not clean_instruction(instruction).strip():
+            raise BadArgument(f"The instruction {instruction!r} is empty: a policy needs at least one word.")
         if prompt_format is None:
             prompt_format = "instruction-newline" if state is None else "task-state-action"
         sections = _sections(instruction, state, prompt_format)
@@ -200,8 +196,8 @@ def _role(token: Token, text: str, role_of_character: list[Role]) -> Role:
     """Return the role of most visible characters of the token; for spaces only, of the first character."""
     characters = range(token.start, token.stop) or range(token.start, token.start + 1)
     visible = [i for i in characters if i < len(text) and not text[i].isspace()]
-    found = [role_of_character[i] for i in visible] or [role_of_character[min(token.start, len(text) - 1)]]
-    return max(dict.fromkeys(found), key=found.count)
+    roles = [role_of_character[i] for i in visible] or [role_of_character[min(token.start, len(text) - 1)]]
+    return max(dict.fromkeys(roles), key=roles.count)
 
 
 def check_vocabulary(tokenizer: PromptTokenizer, table_rows: int, model: str) -> None:

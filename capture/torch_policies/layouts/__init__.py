@@ -7,9 +7,7 @@ argument. docs/policies.md says with which versions each was tried, and what was
 from vla_attention.capture.torch_policies.layouts.act import act
 from vla_attention.capture.torch_policies.layouts.gr00t import gr00t
 from vla_attention.capture.torch_policies.layouts.openvla import openvla, openvla_oft
-from vla_attention.capture.torch_policies.layouts.pi0_fast import pi0_fast
-from vla_attention.capture.torch_policies.layouts.pi0_pytorch import pi0_pytorch
-from vla_attention.capture.torch_policies.layouts.pi0_transformers import pi0_transformers
+from vla_attention.capture.torch_policies.layouts.pi0 import pi0_fast, pi0_pytorch, pi0_transformers
 from vla_attention.capture.torch_policies.layouts.smolvla import smolvla
 from vla_attention.capture.torch_policies.layouts.xvla import xvla
 

@@ -6,8 +6,13 @@ There is no text: ACT reads no instruction, and ratios of vision to language are
 
 from __future__ import annotations
 
-from vla_attention.capture.torch_policies.layouts.find_policy import camera_name, find_policy, inside, rule_path
-from vla_attention.capture.torch_policies.layouts.key_order import KeyOrder
+from vla_attention.capture.torch_policies.layouts.layout_building import (
+    KeyOrder,
+    camera_name,
+    find_policy,
+    inside,
+    rule_path,
+)
 from vla_attention.capture.torch_policies.policy_layout import CallRule, CameraPicture, PolicyLayout
 
 _NAME = "act"
@@ -23,8 +28,8 @@ def act(policy: object) -> PolicyLayout:
     Raises:
         NotThisPolicy: no ACTPolicy.
     """
-    path, found = find_policy(policy, ("ACTPolicy",), _NAME)
-    config = found.config
+    path, module = find_policy(policy, ("ACTPolicy",), _NAME)
+    config = module.config
     keys = KeyOrder()
     keys.add("latent", "state", 1, "learned")
     keys.add("state", "state", int(bool(config.robot_state_feature)), "state")

@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from vla_attention.capture.torch_policies.layouts.find_policy import (
+from vla_attention.capture.torch_policies.layouts.layout_building import (
+    KeyOrder,
     NotThisPolicy,
     find_policy,
     inside,
     rule_path,
     square,
 )
-from vla_attention.capture.torch_policies.layouts.key_order import KeyOrder
 from vla_attention.capture.torch_policies.policy_layout import (
     CallRule,
     CameraPicture,
@@ -56,15 +56,15 @@ def gr00t(
         NotThisPolicy: no GR00TN15 or GR00TN17.
         BadArgument: the ids do not hold one picture for each camera.
     """
-    path, found = find_policy(policy, ("GR00TN15", "GR00TN17"), _NAME)
-    head = found.action_head
-    placeholder = _placeholder(found) if image_token is None else image_token
+    path, module = find_policy(policy, ("GR00TN15", "GR00TN17"), _NAME)
+    head = module.action_head
+    placeholder = _placeholder(module) if image_token is None else image_token
     ids = [int(token) for token in input_ids]
     keys, texts = _encoder_keys(ids, placeholder, cameras, picture_size, prompt_tokens)
     blocks = len(head.model.transformer_blocks)
     interleaved = bool(head.model.config.interleave_self_attention)
-    own = tuple(range(1, blocks, 2)) if interleaved else ()
-    cross = tuple(block for block in range(blocks) if block not in own)
+    self_blocks = tuple(range(1, blocks, 2)) if interleaved else ()
+    cross = tuple(block for block in range(blocks) if block not in self_blocks)
     horizon = int(head.action_horizon)
     learned = head.future_tokens.num_embeddings if hasattr(head, "future_tokens") else 0
     queries = (-horizon, None)
@@ -76,19 +76,19 @@ def gr00t(
         for name, layers in groups.items()
         if layers
     ]
-    if own:
+    if self_blocks:
         tokens = KeyOrder()
         tokens.add("state", "state", state_tokens, "state")
         tokens.add("learned", "state", learned, "learned")
         tokens.add("actions", "action", horizon, "action")
-        sites.append(tokens.site("self", queries, layers=own, projection=output))
+        sites.append(tokens.site("self", queries, layers=self_blocks, projection=output))
     steps = int(head.num_inference_timesteps)
     return PolicyLayout(
         name="gr00t_n1.7" if every is not None else "gr00t_n1.5",
         family="gr00t",
         sites=tuple(sites),
         rules=(
-            *(_block_rule(path, layers, name) for name, layers in (*groups.items(), ("self", own)) if layers),
+            *(_block_rule(path, layers, name) for name, layers in (*groups.items(), ("self", self_blocks)) if layers),
             CallRule(rule_path(path, r"action_head\.vl_self_attention\..*"), None),
             CallRule(rule_path(path, r"backbone\..*"), None),
         ),
@@ -97,7 +97,7 @@ def gr00t(
         num_denoise_steps=steps,
         denoise_times=tuple(step / steps for step in range(steps)),
         cameras=tuple(CameraPicture(camera) for camera in cameras),
-        text=PromptText(tuple(texts), _embedding(path, found), skip_ids=(placeholder,)),
+        text=PromptText(tuple(texts), _embedding(path, module), skip_ids=(placeholder,)),
         action_horizon=horizon,
         action_dim=int(head.action_dim),
         versions={"lerobot": ("0.4.",)} if every is None else {},
@@ -114,8 +114,8 @@ def _by_turns(cross: tuple[int, ...], every: int) -> dict[str, tuple[int, ...]]:
     return {"cross_text": text, "cross_image": tuple(block for block in cross if block not in text)}
 
 
-def _placeholder(found: Any) -> int:
-    backbone = found.backbone
+def _placeholder(module: Any) -> int:
+    backbone = module.backbone
     for model, name in (("eagle_model", "image_token_index"), ("model", "config.image_token_id")):
         thing: Any = getattr(backbone, model, None)
         for part in name.split("."):
@@ -125,13 +125,13 @@ def _placeholder(found: Any) -> int:
     raise NotThisPolicy("The model does not say which id stands for a patch; give gr00t(..., image_token=...).")
 
 
-def _embedding(path: str, found: Any) -> str:
+def _embedding(path: str, module: Any) -> str:
     names = (
         *("backbone.eagle_model.language_model.model.embed_tokens", "backbone.model.language_model.embed_tokens"),
         "backbone.model.model.language_model.embed_tokens",
     )
     for name in names:
-        thing: Any = found
+        thing: Any = module
         for part in name.split("."):
             thing = getattr(thing, part, None)
         if thing is not None:

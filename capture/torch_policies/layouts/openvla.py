@@ -12,8 +12,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from vla_attention.capture.torch_policies.layouts.find_policy import find_policy, inside, rule_path, square
-from vla_attention.capture.torch_policies.layouts.key_order import KeyOrder
+from vla_attention.capture.torch_policies.layouts.layout_building import (
+    KeyOrder,
+    find_policy,
+    inside,
+    rule_path,
+    square,
+)
 from vla_attention.capture.torch_policies.policy_layout import CallRule, CameraPicture, PolicyLayout, PromptText
 from vla_attention.schemas.errors import BadArgument
 
@@ -36,13 +41,13 @@ def openvla(
     Raises:
         NotThisPolicy: no OpenVLAForActionPrediction.
     """
-    path, found = find_policy(policy, _CLASSES, "openvla")
-    keys = _prefix([camera], prompt_tokens, patches, _picture_size(found), 0, "openvla")
+    path, module = find_policy(policy, _CLASSES, "openvla")
+    keys = _prefix([camera], prompt_tokens, patches, _picture_size(module), 0, "openvla")
     keys.add_growing("action_tokens", action_dim - 1)
     return _layout(
         "openvla",
         path,
-        found,
+        module,
         keys,
         (-1, None),
         [camera],
@@ -80,15 +85,15 @@ def openvla_oft(
     Raises:
         NotThisPolicy: no OpenVLAForActionPrediction.
     """
-    path, found = find_policy(policy, _CLASSES, "openvla_oft")
+    path, module = find_policy(policy, _CLASSES, "openvla_oft")
     placeholders = action_dim * chunk
-    keys = _prefix(cameras, prompt_tokens, patches, _picture_size(found), int(proprio), "openvla_oft", diffusion_steps)
+    keys = _prefix(cameras, prompt_tokens, patches, _picture_size(module), int(proprio), "openvla_oft", diffusion_steps)
     keys.add("actions", "action", placeholders, "action")
     keys.add("stop", "text", 1, "template")
     return _layout(
         "openvla_oft",
         path,
-        found,
+        module,
         keys,
         (-(placeholders + 2), -2),
         cameras,
@@ -98,8 +103,8 @@ def openvla_oft(
     )
 
 
-def _picture_size(found: Any) -> int:
-    sizes = getattr(found.config, "image_sizes", None) or [224]
+def _picture_size(module: Any) -> int:
+    sizes = getattr(module.config, "image_sizes", None) or [224]
     return int(sizes[0] if isinstance(sizes, list | tuple) else sizes)
 
 
@@ -122,15 +127,15 @@ def _prefix(
 def _layout(
     name: str,
     path: str,
-    found: Any,
+    module: Any,
     keys: KeyOrder,
     queries: tuple[int, int | None],
     cameras: Sequence[str],
-    **of_policy: Any,
+    **fields: Any,
 ) -> PolicyLayout:
     llama = inside(path, "language_model.model")
     site = keys.site("joint", queries, projection=f"{llama}.layers.{{block}}.self_attn.o_proj", variable="prompt")
-    text = found.config.text_config
+    text = module.config.text_config
     # OFT embeds its placeholders and the stop token with the prompt.
     after = [span.name for span in keys.spans if span.name in ("actions", "stop")]
     return PolicyLayout(
@@ -145,5 +150,5 @@ def _layout(
         num_heads=text.num_attention_heads,
         cameras=tuple(CameraPicture(camera) for camera in cameras),
         text=PromptText(("bos", "prompt", *after), f"{llama}.embed_tokens"),
-        **of_policy,
+        **fields,
     )

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from vla_attention.capture.torch_policies.layouts.find_policy import (
+from vla_attention.capture.torch_policies.layouts.layout_building import (
+    KeyOrder,
     NotThisPolicy,
     camera_name,
     find_policy,
@@ -17,7 +18,6 @@ from vla_attention.capture.torch_policies.layouts.find_policy import (
     rule_path,
     square,
 )
-from vla_attention.capture.torch_policies.layouts.key_order import KeyOrder
 from vla_attention.capture.torch_policies.policy_layout import (
     CallRule,
     CameraPicture,
@@ -38,8 +38,8 @@ def smolvla(policy: object) -> PolicyLayout:
     Raises:
         NotThisPolicy: no SmolVLAPolicy, or one whose calls cannot be told from the prefix's by their numbers.
     """
-    path, found = find_policy(policy, ("SmolVLAPolicy",), _NAME)
-    config, model = found.config, found.model.vlm_with_expert
+    path, module = find_policy(policy, ("SmolVLAPolicy",), _NAME)
+    config, model = module.config, module.model.vlm_with_expert
     prompt = config.tokenizer_max_length
     if config.prefix_length > 0 and config.pad_language_to != "max_length":
         raise NotThisPolicy(
@@ -95,8 +95,8 @@ def _sequence(config: Any, model: Any) -> list[tuple[str, int]]:
     for layer in range(model.num_vlm_layers):
         if multiple > 1 and layer % multiple:
             continue
-        own = "cross" not in model.attention_mode or (every > 0 and layer % every == 0)
-        calls.append(("self" if own else "cross", layer // max(multiple, 1)))
+        is_self = "cross" not in model.attention_mode or (every > 0 and layer % every == 0)
+        calls.append(("self" if is_self else "cross", layer // max(multiple, 1)))
     return calls
 
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from vla_attention.capture.torch_policies.layouts.find_policy import (
+from vla_attention.capture.torch_policies.layouts.layout_building import (
+    KeyOrder,
     NotThisPolicy,
     camera_name,
     find_policy,
     inside,
     rule_path,
 )
-from vla_attention.capture.torch_policies.layouts.key_order import KeyOrder
 from vla_attention.capture.torch_policies.policy_layout import CallRule, CameraPicture, PolicyLayout, PromptText
 
 _NAME = "xvla"
@@ -31,8 +31,8 @@ def xvla(policy: object) -> PolicyLayout:
     Raises:
         NotThisPolicy: no XVLAPolicy, or one with other picture features than means and patches.
     """
-    path, found = find_policy(policy, ("XVLAPolicy",), _NAME)
-    config, vision = found.config, found.model.vlm.config.vision_config
+    path, module = find_policy(policy, ("XVLAPolicy",), _NAME)
+    config, vision = module.config, module.model.vlm.config.vision_config
     cameras = [(camera_name(feature), config.image_features[feature].shape) for feature in config.image_features]
     views = max(config.num_image_views or 0, len(cameras))
     keys = KeyOrder()
@@ -70,7 +70,7 @@ def xvla(policy: object) -> PolicyLayout:
         ),
         text=PromptText(("prompt",), inside(path, "model.vlm.language_model.model.shared")),
         action_horizon=config.chunk_size,
-        action_dim=found.model.dim_action,
+        action_dim=module.model.dim_action,
         versions={"lerobot": ("0.4.",)},
     )
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.cache.housekeeping import clear, kept_segments, make_room
+from vla_attention.analyze.cache.housekeeping import clear, kept_files, make_room
+from vla_attention.analyze.cache.kept_files import ENDING, kept_bytes, write_file
 from vla_attention.analyze.cache.places import CachePlace, cache_place, parse_size
-from vla_attention.analyze.cache.remembered import question_folder
-from vla_attention.analyze.cache.segments import SegmentWriter, question_digest
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.testing.stores import StoreSpec, write_store
 
@@ -21,24 +22,22 @@ def store(tmp_path_factory) -> Path:
     return write_store(tmp_path_factory.mktemp("store") / "a.zarr", spec=StoreSpec(tasks=(0, 1), episodes=2))
 
 
-def segment(place: CachePlace, question: str, size: int, used: float) -> Path:
-    digest = question_digest(question)
-    writer = SegmentWriter(question_folder(place, digest), digest, f"about {question}")
-    writer.add(bytes(32), bytes(32), bytes(size))
-    writer.close()
-    assert writer.path is not None
-    os.utime(writer.path, (used, used))
-    return writer.path
+def kept(place: CachePlace, question: str, size: int, used: float) -> Path:
+    key = hashlib.sha256(question.encode()).digest()
+    path = place.folder / key.hex()[:32] / f"{key.hex()[:32]}{ENDING}"
+    write_file(path, kept_bytes(key, f"about {question}", {"mass": np.zeros(size // 8)}))
+    os.utime(path, (used, used))
+    return path
 
 
 def test_what_was_not_used_for_longest_goes_first(tmp_path):
     place = CachePlace(tmp_path / "cache", 3_000)
-    paths = [segment(place, name, 1_000, used) for name, used in (("b", 20), ("a", 10), ("c", 30))]
+    paths = [kept(place, name, 1_000, used) for name, used in (("b", 20), ("a", 10), ("c", 30))]
     stranger = place.folder / "notes.txt"
     stranger.write_text("mine")
     assert make_room(place) > 1_000
     assert [path.exists() for path in paths] == [True, False, True]
-    assert sum(one.size for one in kept_segments(place.folder)) <= 3_000
+    assert sum(one.size for one in kept_files(place.folder)) <= 3_000
     assert not paths[1].parent.exists()
     assert make_room(place) == 0
     assert clear(place.folder) > 2_000
@@ -47,19 +46,29 @@ def test_what_was_not_used_for_longest_goes_first(tmp_path):
 
 def test_a_question_larger_than_the_cache_stays_within_it(cache, store, tmp_path, monkeypatch):
     assert main([str(store), "--no-plots", "--output", str(tmp_path / "out")]) == 0
-    all_of_it = sum(one.size for one in kept_segments(cache))
+    all_of_it = sum(one.size for one in kept_files(cache))
     clear(cache)
     monkeypatch.setenv("VLA_CACHE_SIZE", str(all_of_it // 2))
     assert main([str(store), "--no-plots", "--output", str(tmp_path / "out")]) == 0
-    assert 0 < sum(one.size for one in kept_segments(cache)) <= all_of_it // 2
+    assert 0 < sum(one.size for one in kept_files(cache)) <= all_of_it // 2
 
 
 def test_a_smaller_size_holds_although_nothing_is_new(cache, store, tmp_path, monkeypatch):
     assert main([str(store), "--no-plots", "--output", str(tmp_path / "out")]) == 0
-    (kept,) = kept_segments(cache)
-    monkeypatch.setenv("VLA_CACHE_SIZE", str(kept.size - 1))
+    before = kept_files(cache)
+    assert len(before) == 4  # one for each episode
+    monkeypatch.setenv("VLA_CACHE_SIZE", str(max(one.size for one in before)))
     assert main([str(store), "--no-plots", "--output", str(tmp_path / "out")]) == 0
-    assert kept_segments(cache) == []
+    (left,) = kept_files(cache)
+    assert left.path in {one.path for one in before}
+
+
+def test_what_a_killed_process_was_writing_is_removed(cache, store, tmp_path):
+    assert main([str(store), "--no-plots", "--output", str(tmp_path / "out")]) == 0
+    question = kept_files(cache)[0].path.parent
+    (question / f"{'a' * 32}.partial").write_bytes(b"half")
+    clear(cache)
+    assert not question.exists()
 
 
 def test_the_command_shows_and_removes(cache, store, tmp_path, capsys):
@@ -76,7 +85,7 @@ def test_the_command_shows_and_removes(cache, store, tmp_path, capsys):
     assert "masses of grouping default, site joint, 1 layer," in printed
     assert main(["cache", "--clear"]) == 0
     assert "Removed" in capsys.readouterr().out
-    assert kept_segments(cache) == []
+    assert kept_files(cache) == []
 
 
 def test_nothing_is_written_without_a_cache(cache, store, tmp_path, monkeypatch, capsys):

@@ -18,8 +18,9 @@ from vla_attention.analyze.compare.runs import (
     open_runs,
     parse_runs,
 )
-from vla_attention.analyze.compare.text import comparison_text
+from vla_attention.analyze.compare.text import comparison_sections
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.show.answer import text_of
 from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, PromptChange
 from vla_attention.schemas.layout import Role
@@ -122,7 +123,7 @@ def test_with_another_seed_allowed_the_initial_state_alone_makes_a_pair(stores):
     assert (row["paired"], row["num_pairs"]) == (True, 4)
     assert found.pairs.height == 4 * 3 * len(found.quantities)
     assert [note for note in found.notes if "seed" in note]
-    text = " ".join(comparison_text(found).split())
+    text = " ".join(text_of(comparison_sections(found)).split())
     assert "4 pairs of episodes with the same suite, task and initial state. Their seeds may differ" in text
     assert "initial state and seed" not in text
     assert (row["d_z"], row["d_z_low"]) == (None, None)  # four pairs are too few for an effect size
@@ -134,7 +135,7 @@ def test_episodes_without_a_partner_are_counted_and_named(stores):
     alone = found.unpaired.group_by("run").len().sort("run").rows()
     assert alone == [("base", 4), ("lower", 3)]
     assert one(found.differences, scope="all", layer="layers_avg", quantity="log2_ratio")["num_pairs"] == 12
-    text = comparison_text(found)
+    text = text_of(comparison_sections(found))
     assert "task000_episode000" in text
     assert "task001_episode004" in text
     assert max(map(len, text.splitlines())) <= 101
@@ -164,7 +165,7 @@ def test_nothing_that_pairs_is_compared_unpaired_and_said(stores):
     assert row["high"] - row["low"] > 1.0  # scenes are in it
     assert found.pairs.is_empty()
     assert found.unpaired.height == 32
-    assert "NOT PAIRED" in comparison_text(found)
+    assert "NOT PAIRED" in text_of(comparison_sections(found))
     assert found.runs_with_common_tasks == ()
 
 
@@ -370,7 +371,7 @@ def test_a_rerun_pairs_at_every_replan(stores, tmp_path):
         assert row["episode_other"] == episode
         wanted = (log_ratio(1, task, episode) - log_ratio(0, task, episode)) / np.log(2)
         assert row["difference"] == pytest.approx(wanted, rel=1e-3)
-    text = " ".join(comparison_text(found).split())
+    text = " ".join(text_of(comparison_sections(found)).split())
     assert "12 pairs of episodes, replan by replan: rerun is a rerun of base, the same calls." in text
     assert "Of base, 4 have no partner" in text
     assert found.reruns == ("rerun",)
@@ -387,7 +388,7 @@ def test_a_rerun_without_any_ratio_has_its_fractions_compared(stores, tmp_path):
     found = compare(opened(known, "base", "rerun"))
     row = one(found.differences, scope="all", layer="layers_avg", quantity="visual_fraction")
     assert (row["mean_other"], row["num_pairs"]) == (0.0, 16)
-    text = " ".join(comparison_text(found).split())
+    text = " ".join(text_of(comparison_sections(found)).split())
     assert "every replan is a pair. It changed: the keys of 'role:image' knocked out for the action queries." in text
 
 
@@ -427,10 +428,10 @@ def test_differences_over_tasks_are_by_families(tmp_path):
     assert row["difference"] == pytest.approx(means.mean())
     assert (row["low"], row["high"]) == pytest.approx((means.mean() - reach, means.mean() + reach))
     assert row["d_z_low"] < row["d_z"] < row["d_z_high"]
-    said = " ".join(comparison_text(found).split())
+    said = " ".join(text_of(comparison_sections(found)).split())
     assert "about tasks like these, by 4 families" in said
     assert "4 families of tasks where these are the units" in said
     plain = compare(opened(stores, "first", "other", intervals="independent-tasks"))
     apart = one(plain.differences, scope="all", layer="layers_avg", quantity="log2_ratio")
     assert apart["low"] == pytest.approx(stats.ttest_1samp(means, 0).confidence_interval().low)
-    assert "3 tasks where tasks are the units" in " ".join(comparison_text(plain).split())
+    assert "3 tasks where tasks are the units" in " ".join(text_of(comparison_sections(plain)).split())

@@ -13,9 +13,9 @@ import pytest
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.copy.copying import PARTS, check_parts, copy_store, part_sizes
 from vla_attention.schemas.errors import BadArgument, UnknownName
+from vla_attention.schemas.stores.durable_files import lock_for_writing
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode, RunMismatch, StoreError
-from vla_attention.schemas.stores.store_lock import lock_for_writing
 from vla_attention.schemas.stores.verify import verify_store
 from vla_attention.testing.stores import StoreSpec, reseal, write_store
 

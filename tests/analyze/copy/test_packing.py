@@ -153,7 +153,7 @@ def numbers_of(folder: Path, stores: dict[str, str]) -> dict[str, object]:
     return found
 
 
-@pytest.mark.parametrize("command", slow_except(("ratios", "groups", "objects", "compare", "export"), WORDS))
+@pytest.mark.parametrize("command", slow_except(("ratios", "objects", "export"), WORDS))
 def test_every_command_gives_the_same_tables_as_from_the_folder(command, tmp_path, monkeypatch, capsys):
     folders = prepared(command, tmp_path)
     packed = tuple(pack(path, tmp_path / "packed" / path.name) for path in folders)

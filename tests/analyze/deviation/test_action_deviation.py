@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from vla_attention.analyze.deviation.action_deviation import rank_correlation, root_mean_square, scaled_deviation
+from vla_attention.analyze.deviation.deviation_study import rank_correlation, root_mean_square, scaled_deviation
 
 
 def test_steps_that_only_one_side_has_are_not_compared():

@@ -96,6 +96,7 @@ def test_stores_without_one_of_the_two(tmp_path, changes, says):
         study_deviation(question_about(path))
 
 
+@pytest.mark.drawn
 def test_the_command_and_the_section_of_the_report(store, tmp_path, capsys):
     assert analyze(["deviation", str(store), "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out

@@ -27,8 +27,9 @@ from vla_attention.analyze.effects.action_changes import action_spread
 from vla_attention.analyze.effects.effect_study import study_effects
 from vla_attention.analyze.effects.group_rows import group_rows
 from vla_attention.analyze.effects.paired_replans import BaseEpisode, changes_of
-from vla_attention.analyze.effects.text import effects_text
+from vla_attention.analyze.effects.text import effects_sections
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.show.answer import text_of
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange, RerunSource
 from vla_attention.schemas.layout import Role
@@ -149,7 +150,7 @@ def test_a_selector_that_the_base_does_not_know_has_no_attention(folder, tmp_pat
     write_rerun(tmp_path / "cup.zarr", folder / "base.zarr", planted)
     study = study_effects(folder / "base.zarr", [tmp_path / "cup.zarr"], AnalysisSettings())
     assert study.episodes["mass"].null_count() == study.episodes.height
-    assert "no attention beside 'word:cup'" in effects_text(study)
+    assert "no attention beside 'word:cup'" in text_of(effects_sections(study))
 
 
 def test_groups_stand_with_what_keeps_them(study):
@@ -159,17 +160,17 @@ def test_groups_stand_with_what_keeps_them(study):
 
 
 def test_the_text_answers_and_names_its_floors(study):
-    text = " ".join(effects_text(study).split())
+    text = " ".join(text_of(effects_sections(study)).split())
     assert "Without visual the action changes by 1.2" in text
     assert "with linguistic alone by 1.0" in text
     assert "Attention in the same replans: the ratio visual / linguistic is" in text
     assert "Of 6 conditions, 5 show an effect beyond the noise" in text
-    assert max(map(len, effects_text(study).splitlines())) <= 100
+    assert max(map(len, text_of(effects_sections(study)).splitlines())) <= 100
 
 
 def test_without_a_noise_rerun_the_text_says_what_is_missing(folder):
     study = study_effects(folder / "base.zarr", [folder / "series" / "without_visual.zarr"], AnalysisSettings())
-    text = " ".join(effects_text(study).split())
+    text = " ".join(text_of(effects_sections(study)).split())
     assert "nobody knows how much of an effect another noise would give" in text
     assert "--noise-seed 1" in text
     assert row_of(study, "without_visual")["over_noise"] is None
@@ -179,7 +180,7 @@ def test_an_effect_within_the_noise_is_called_so(folder, tmp_path):
     """The grouping's own state group, planted as large as the noise."""
     settings = AnalysisSettings(groups=("state=role:state", "rest=*"), ratio="state/rest")
     series = [folder / "series" / f"{name}.zarr" for name in ("noise", "without_state")]
-    text = " ".join(effects_text(study_effects(folder / "base.zarr", series, settings)).split())
+    text = " ".join(text_of(effects_sections(study_effects(folder / "base.zarr", series, settings))).split())
     assert "Without state the action changes by 0.091" in text
     assert "not shown to exceed the noise" in text
 
@@ -191,7 +192,7 @@ def test_nothing_changed_is_an_effect_of_zero(folder, tmp_path):
     assert study.episodes["effect"].unique().to_list() == [0.0]
     assert study.episodes["angle"].unique().to_list() == [0.0]
     assert row_of(study, "same")["effect_low"] is None
-    assert "same" in effects_text(study)
+    assert "same" in text_of(effects_sections(study))
 
 
 def test_the_units_do_not_change_with_the_selected_tasks(folder, study):
@@ -214,9 +215,10 @@ def test_episodes_without_a_partner_are_named(folder, tmp_path):
     (note,) = study.notes
     assert "lacks task001_episode000, task001_episode001" in note
     assert "has task005_episode000, task005_episode001, which the base lacks" in note
-    assert "note: prompt_empty lacks" in effects_text(study)
+    assert "note: prompt_empty lacks" in text_of(effects_sections(study))
 
 
+@pytest.mark.drawn
 def test_the_command_prints_a_screen_and_writes_tables_and_pictures(folder, tmp_path, capsys):
     given = ["effects", str(folder / "base.zarr"), str(folder / "series"), "--output", str(tmp_path)]
     assert main(given) == 0
@@ -319,7 +321,7 @@ def test_a_rerun_without_any_key_of_its_group_is_left_out_by_name(folder, tmp_pa
     given = [tmp_path, folder / "series" / "noise.zarr"]
     study = study_effects(folder / "base.zarr", given, AnalysisSettings())
     assert [condition.name for condition in study.conditions] == ["noise"]
-    assert "note: without_bowl is left out" in effects_text(study)
+    assert "note: without_bowl is left out" in text_of(effects_sections(study))
     with pytest.raises(BadArgument, match=r"No rerun of .*base.zarr can be compared: without_bowl is left out"):
         study_effects(folder / "base.zarr", [tmp_path], AnalysisSettings())
 
@@ -340,7 +342,7 @@ def test_dimensions_that_are_mostly_noise_are_named(folder, tmp_path):
     noisy = write_store(tmp_path / "noise.zarr", spec=spec)
     study = study_effects(folder / "base.zarr", [noisy], AnalysisSettings())
     assert study.spread.left_out == (4,)
-    assert "not compared: dimensions 4 (mostly noise) of the action." in effects_text(study)
+    assert "not compared: dimensions 4 (mostly noise) of the action." in text_of(effects_sections(study))
     assert row_of(study, "noise")["effect"] < 0.15
     all_of_them = study_effects(folder / "base.zarr", [noisy], AnalysisSettings(), dimensions=tuple(range(7)))
     assert all_of_them.spread.left_out == ()
@@ -366,21 +368,21 @@ def test_what_is_seen_and_read_is_told_without_a_ratio_too(folder):
     series = [folder / "series" / f"{name}.zarr" for name in ("noise", "without_visual")]
     study = study_effects(folder / "base.zarr", series, AnalysisSettings(groups=("image=role:image",)))
     assert study.analysis.grouping.ratio is None
-    assert "Without visual the action changes by 1.2" in " ".join(effects_text(study).split())
+    assert "Without visual the action changes by 1.2" in " ".join(text_of(effects_sections(study)).split())
 
 
 def test_a_rerun_of_a_part_is_not_said_to_be_of_all(study):
     part = replace(study, episodes=study.episodes.filter(pl.col("task_id") == 0))
     assert (study.measured, part.measured) == ((6, 3), (2, 1))
-    text = " ".join(effects_text(part).split())
+    text = " ".join(text_of(effects_sections(part)).split())
     assert "Attention in all 6 episodes of the base, of which effects were measured in 2: the ratio" in text
     assert "in the same replans" not in text
 
 
 def test_the_header_says_in_how_many_episodes_effects_were_measured(study):
-    assert "Effects were measured in 6 episodes of 3 tasks." in effects_text(study).splitlines()
+    assert "Effects were measured in 6 episodes of 3 tasks." in text_of(effects_sections(study)).splitlines()
     part = replace(study, episodes=study.episodes.filter(pl.col("task_id") == 0))
-    assert "Effects were measured in 2 episodes of 1 task." in effects_text(part).splitlines()
+    assert "Effects were measured in 2 episodes of 1 task." in text_of(effects_sections(part)).splitlines()
 
 
 def test_a_word_that_no_selected_task_has_leaves_its_rerun_out(folder, tmp_path):
@@ -393,7 +395,7 @@ def test_a_word_that_no_selected_task_has_leaves_its_rerun_out(folder, tmp_path)
         study = study_effects(folder / "base.zarr", given, AnalysisSettings(tasks=(1, 2)))
         assert [condition.name for condition in study.conditions] == ["noise"]
         assert study.episodes["condition"].unique().to_list() == ["noise"]
-        text = " ".join(effects_text(study).split())
+        text = " ".join(text_of(effects_sections(study)).split())
         assert "note: without_bowl is left out" in text
         assert reason in text
         assert "no attention beside" not in text
@@ -466,6 +468,6 @@ def test_it_is_said_where_the_number_of_executed_steps_is_not_known(study):
     base = study.given.base
     protocol = replace(base.attributes.protocol, name="recorded", replan_steps=0)
     other = replace(base, attributes=replace(base.attributes, protocol=protocol))
-    text = " ".join(effects_text(replace(study, given=replace(study.given, base=other))).split())
+    text = " ".join(text_of(effects_sections(replace(study, given=replace(study.given, base=other)))).split())
     assert "root mean square change of the chunk's actions" in text
-    assert "root mean square change of the executed actions" in " ".join(effects_text(study).split())
+    assert "root mean square change of the executed actions" in " ".join(text_of(effects_sections(study)).split())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import polars as pl
+import pytest
 
 from vla_attention.analyze.effects.conditions import Condition, Kind
 from vla_attention.analyze.effects.effect_study import summary_of, with_floors
@@ -49,6 +50,7 @@ def named(table: pl.DataFrame, floor: str) -> list[str]:
     return summary.filter(pl.col(floor) > 0, pl.col(f"{floor}_q") <= 0.025)["condition"].to_list()
 
 
+@pytest.mark.slow
 def test_nothing_is_named_where_nothing_exceeds_the_floors():
     tables = [drawn_table(seed) for seed in range(DRAWS)]
     both = [bool(named(table, "minus_noise")) + bool(named(table, "minus_random")) > 0 for table in tables]

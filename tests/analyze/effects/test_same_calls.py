@@ -13,8 +13,9 @@ import pytest
 from tests.kit.reruns import BASE, PLANTED, base_actions, changed_actions, knockout, write_with
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.effects.effect_study import study_effects
-from vla_attention.analyze.effects.text import effects_text
+from vla_attention.analyze.effects.text import effects_sections
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.show.answer import text_of
 from vla_attention.schemas.interventions import ImageChange, Interventions, NoiseChange, PromptChange
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import StoreError
@@ -202,7 +203,7 @@ def test_what_only_one_of_both_stores_holds_is_said(base, tmp_path):
         "without_state was not compared with the base in the pictures of camera 'base_0_rgb', pictures of camera "
         "'left_wrist_0_rgb', which one of the two stores lacks.",
     )
-    assert "was not compared" in effects_text(study)
+    assert "was not compared" in text_of(effects_sections(study))
 
 
 def test_equal_pictures_are_compared_without_being_read(base, tmp_path, monkeypatch):

@@ -107,6 +107,7 @@ def test_the_picture_shows_the_chosen_replan(store, tmp_path):
     assert patches == [{1, 2}, {3, 4}]
 
 
+@pytest.mark.drawn
 def test_a_store_without_frames_is_drawn_too(tmp_path):
     path = write_bowl_store(tmp_path / "bare.zarr", frames=False, tasks=(0,), episodes=1)
     assert main(["groups", str(path), "--grouping", "objects", "--output", str(tmp_path / "out")]) == 0

@@ -89,6 +89,7 @@ def test_every_error_reads_as_described():
         assert message in str(caught.value)
 
 
+@pytest.mark.drawn
 def test_every_command_runs(tmp_path, monkeypatch, capsys):
     write_bowl_store(tmp_path / "runs" / "libero_10.zarr", tasks=(0,), episodes=1, layers=(0,), denoise_steps=(0,))
     monkeypatch.chdir(tmp_path)

@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, measured_of, replans_of
 from tests.kit.questions import question_about
 from tests.kit.raw_rows import FEW, raw_episodes, weights_of
-from vla_attention.analyze.heads.denoise import denoise_tables
 from vla_attention.analyze.heads.depth import depth_table
-from vla_attention.analyze.heads.head_study import study_heads
+from vla_attention.analyze.heads.head_study import denoise_tables, study_heads
 from vla_attention.analyze.heads.layer_time import MOST_BINS, layer_time_table
 from vla_attention.analyze.measures.frames import Tables
 from vla_attention.analyze.measures.steps import MeasuredEpisode

@@ -18,8 +18,8 @@ from tests.kit.made_up_steps import (
     replans_of,
 )
 from tests.kit.slow import slow_except
-from vla_attention.analyze.heads.denoise import denoise_tables
 from vla_attention.analyze.heads.head_measures import episode_heads, heads_tables
+from vla_attention.analyze.heads.head_study import denoise_tables
 from vla_attention.analyze.heads.layer_time import layer_time_table
 from vla_attention.analyze.heads.plot_denoise_profile import plot_denoise_profile
 from vla_attention.analyze.heads.plot_head_grid import plot_head_grid
@@ -56,7 +56,7 @@ FAST = ("one of everything", "some infinite", "many groups")
 
 
 @pytest.mark.pdf
-@pytest.mark.parametrize("case", slow_except(FAST, CASES))
+@pytest.mark.parametrize("case", slow_except(FAST, CASES, slow=("all infinite", "no ratio", "many of everything")))
 def test_every_picture_of_every_case_is_drawn_without_a_warning(case, tmp_path):
     wanted, grouping = CASES[case]
     steps = make_steps(**({"grouping": grouping} | wanted))

@@ -23,9 +23,10 @@ from vla_attention.analyze.heads import command as heads_command
 from vla_attention.analyze.heads.head_measures import ranked_heads
 from vla_attention.analyze.heads.head_study import study_heads
 from vla_attention.analyze.heads.row_metrics import RowOptions, row_metrics
-from vla_attention.analyze.heads.text import heads_text
+from vla_attention.analyze.heads.text import heads_sections
 from vla_attention.analyze.measures.sinks import SinkRule, search_sinks, without_sinks
 from vla_attention.analyze.ratios.analysis import analyse
+from vla_attention.analyze.show.answer import text_of
 from vla_attention.schemas.groupings.resolve import resolve
 from vla_attention.schemas.precision import mass_error_bound
 from vla_attention.testing.stores import StoreSpec, write_store
@@ -176,7 +177,7 @@ def test_planted_specialist_heads_are_found_and_named(tmp_path):
     assert (first["block"], first["head"]) == (2, 1)
     assert (last["block"], last["head"]) == (0, 0)
     assert first["log2_lift_low"] > 0 > last["log2_lift_high"]
-    text = heads_text(study, top=1)
+    text = text_of(heads_sections(study, top=1))
     lines = text.splitlines()
     assert ranked.height == 4
     looking = lines.index("HEADS IN ORDER OF lift of the ratio: the first 1 of 4")

@@ -16,6 +16,7 @@ from vla_attention.analyze.measures.aggregate import (
     task_tables,
 )
 from vla_attention.analyze.measures.frames import LAYERS_AVG
+from vla_attention.analyze.measures.masses import GROUP_MEASURES
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.schemas.groupings.grouping import Ratio
 
@@ -208,6 +209,13 @@ def test_groupings_without_a_ratio_give_masses_fractions_and_lifts_only():
         assert {"group", "mass", "fraction", "lift"} <= set(tables.groups.columns)
         assert not [name for name in tables.cells.columns if "ratio" in name or "geometric" in name]
     assert tasks.groups.filter(group="base")["fraction_low"].null_count() == 0
+
+
+def test_every_measure_of_a_group_is_a_column_of_every_table():
+    replans = replans_of(make_steps())
+    episodes = episode_tables(replans, GROUPING)
+    for tables in (replans, episodes, task_tables(episodes, GROUPING, Sampling())):
+        assert set(GROUP_MEASURES) <= set(tables.groups.columns)
 
 
 def test_same_task_ids_of_two_suites_stay_two_tasks():

@@ -10,7 +10,7 @@ import pytest
 import vla_attention.testing.stores as kit
 from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
-from vla_attention.analyze.measures.role_masses import role_masses
+from vla_attention.analyze.measures.steps import role_masses
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import open_store
 

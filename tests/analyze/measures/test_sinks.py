@@ -18,7 +18,7 @@ from tests.kit.questions import question_about
 from tests.kit.raw_rows import FEW, RawEpisode, leaky, raw_episodes, weights_of
 from vla_attention.analyze.heads.head_study import study_heads
 from vla_attention.analyze.heads.row_metrics import RowOptions, row_metrics
-from vla_attention.analyze.heads.text import sinks_text
+from vla_attention.analyze.heads.text import sinks_section
 from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.analyze.measures.sink_kinds import kind_name, may_be_empty
 from vla_attention.analyze.measures.sinks import (
@@ -119,7 +119,9 @@ def test_keys_of_the_policys_own_actions_are_no_sinks():
     assert not actions["widespread"].any()
     assert set(search.sinks["role"]) == {"instruction", "image", "template", "state"}
     assert not set(search.heads["key"]) & set(actions["key"])
-    assert "keys of the policy's own actions are not counted" in " ".join(sinks_text(search, SinkRule()).split())
+    assert "keys of the policy's own actions are not counted" in " ".join(
+        str(sinks_section(search, SinkRule())).split()
+    )
     # So they stay where everything is computed without sinks.
     without = without_sinks(question, search.sinks, SinkRule())
     assert not {key for item in without.selected for key in item.without} & set(actions["key"])
@@ -334,7 +336,7 @@ def test_with_few_keys_the_text_says_that_the_rule_cannot_fire(tmp_path, capsys)
         )
         search = search_sinks(question_about(path))
         assert search.sinks["key"].to_list() == ([2] if task else [])
-        text = " ".join(sinks_text(search, SinkRule()).split())
+        text = " ".join(str(sinks_section(search, SinkRule())).split())
         assert said in text
         assert "valid keys none can take more than 10 x its uniform share" in text
         assert "None." not in text

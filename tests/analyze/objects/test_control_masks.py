@@ -97,7 +97,7 @@ def stored(path: Path, **changes) -> Path:
 def bowl_of(path: Path) -> dict:
     tables = object_tables(question_about(path), ObjectSettings(spatial=False))
     of_bowl = (pl.col("camera") == "all") & (pl.col("item") == "akita_black_bowl_1")
-    return objects_summary(tables.objects.whole, Sampling()).filter(of_bowl).row(0, named=True)
+    return objects_summary(tables.objects, Sampling()).filter(of_bowl).row(0, named=True)
 
 
 def test_attention_to_the_middle_has_enrichment_but_none_over_the_control(tmp_path):
@@ -124,7 +124,7 @@ def test_of_an_object_that_does_not_move_the_control_cannot_tell(tmp_path, capsy
     (line, *_) = [line for line in printed.splitlines() if line.lstrip().startswith("[of interest]")]
     assert "cannot tell" in line
     tables = object_tables(question_about(path), ObjectSettings(spatial=False))
-    assert followed_objects(tables.objects.whole, Sampling()) == []
+    assert followed_objects(tables.objects, Sampling()) == []
 
 
 def raw(path: Path, task: int, episode: int, camera: str) -> tuple[np.ndarray, np.ndarray]:

@@ -27,8 +27,7 @@ from vla_attention.analyze.objects.object_study import followed_objects, iou_sum
 from vla_attention.analyze.objects.object_views import site_of_pictures
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.units import Estimand
-from vla_attention.analyze.words.word_reading import words_table
-from vla_attention.analyze.words.word_study import site_of_words
+from vla_attention.analyze.words.word_study import site_of_words, words_table
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import SiteLayout, Span
@@ -270,7 +269,7 @@ def _of_all(objects: pl.DataFrame) -> np.ndarray:
 
 
 def test_a_planted_follower_is_found_and_named(follower_store):
-    tables = measured(follower_store, per_head=True)
+    tables = object_tables(question_about(follower_store, per_head=True))
     assert tables.iou is not None
     names = [
         (one.name, one.found.is_named()) for one in followed_objects(tables.objects, Sampling(Estimand.THESE_TASKS))

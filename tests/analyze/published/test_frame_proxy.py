@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from vla_attention.analyze.published.frame_proxy import frame_proxy
+from vla_attention.analyze.published.results_writer import frame_proxy
 from vla_attention.schemas.groupings.builtin_groupings import BUILTIN_GROUPINGS
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.schemas.groupings.vocabulary import Vocabulary

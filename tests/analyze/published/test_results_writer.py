@@ -96,10 +96,11 @@ def test_num_steps_is_the_counter_of_the_published_loop():
 
 def test_every_step_says_what_its_fractions_are_of_and_how_many_keys_each_side_has():
     replans = replans_of(make_steps())
+    table = flat(replans)
     for result in episode_results(replans, GROUPING):
         for layer, steps in result.per_step_ratios.items():
             number = layer.removeprefix("layer_")
-            rows = flat(replans).filter(task_id=result.task_id, episode_index=result.episode_idx, layer=number)
+            rows = table.filter(task_id=result.task_id, episode_index=result.episode_idx, layer=number)
             total = rows.select(pl.sum_horizontal(f"{name}_mass" for name in GROUPING.names)).to_series()
             assert [step.total_mass for step in steps] == pytest.approx(total.to_list())
             for step in steps:

@@ -15,10 +15,11 @@ from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.analyze.ratios.contribution_text import (
-    contributions_section,
-    group_contributions_section,
+    contribution_sections,
+    group_contribution_sections,
     same_sides,
 )
+from vla_attention.analyze.show.answer import text_of
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.testing.stores import StoreSpec, write_store
@@ -42,7 +43,7 @@ def tables_of(question: Question) -> Tables | None:
 def test_the_summary_has_a_line_per_layer_and_an_interval(store):
     analysis = analyse(question_about(store, "objects"))  # cut segments, and have no norms
     assert analysis.contribution_rows is not None
-    section = contributions_section(analysis.contribution_rows)
+    section = text_of(contribution_sections(analysis.contribution_rows))
     assert section in analysis.summary
     assert analysis.summary.count("CONTRIBUTIONS") == 1
     lines = [line.split() for line in section.splitlines()]
@@ -90,7 +91,7 @@ def test_a_block_that_is_named_twice_counts_once_in_the_average_over_layers(tmp_
     assert tables is not None
     table = flat(tables)
     assert table["layer"].unique().sort().to_list() == [0, 2, 4]
-    text = group_contributions_section(tables, question.grouping, "joint", sampling=Sampling())
+    text = text_of(group_contribution_sections(tables, question.grouping, "joint", Sampling()))
     lines = {line.split()[0]: line.split() for line in text.splitlines() if line[:1].strip()}
     means = {layer: table.filter(layer=layer)["images_norm"].mean() for layer in (0, 2)}
     # Episodes have as many replans each, so that the mean over episodes is that over rows.
@@ -104,9 +105,8 @@ def test_a_block_that_is_named_twice_counts_once_in_the_average_over_layers(tmp_
 
 def test_a_group_without_keys_is_named_and_has_no_column(store):
     grouping = grouping_of(images=("role:image",), nothing=("span:right_wrist_0_rgb & role:image",))
-    text = group_contributions_section(
-        tables_of(question_about(store, grouping)), grouping, "joint", sampling=Sampling()
-    )
+    tables = tables_of(question_about(store, grouping))
+    text = text_of(group_contribution_sections(tables, grouping, "joint", Sampling()))
     assert "The keys of nothing add exactly nothing." in text
     assert "|images|" in text
     assert "|nothing|" not in text
@@ -115,5 +115,5 @@ def test_a_group_without_keys_is_named_and_has_no_column(store):
 def test_when_every_group_is_cut_the_summary_says_why(store):
     question = question_about(store, grouping_of(word=("word:the",)))
     assert tables_of(question) is None
-    text = group_contributions_section(None, question.grouping, "joint", sampling=Sampling())
+    text = text_of(group_contribution_sections(None, question.grouping, "joint", Sampling()))
     assert "Not of word: contributions are stored for whole segments" in text

@@ -53,10 +53,11 @@ CASES = {
 }
 #: Cases that the fast part of the suite draws.
 FAST = ("one of everything", "some infinite", "many groups")
+SLOW = ("all infinite", "a layer infinite", "custom", "ninety tasks")
 
 
 @pytest.mark.pdf
-@pytest.mark.parametrize("case", slow_except(FAST, CASES))
+@pytest.mark.parametrize("case", slow_except(FAST, CASES, slow=SLOW))
 def test_every_picture_of_every_case_is_drawn_without_a_warning(case, tmp_path):
     steps, grouping = CASES[case]()
     replans = replans_of(steps, grouping)

@@ -8,7 +8,7 @@ import pytest
 
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.ratios.answer import conclusion, headline_of, ratio_sentence
-from vla_attention.analyze.show.screen import SCREEN_LINES
+from vla_attention.analyze.show.answer import SCREEN_LINES
 from vla_attention.testing.stores import StoreSpec, write_store
 
 SMALL = StoreSpec(replans=1, heads=(0,), frames=False, contributions=True)

@@ -7,8 +7,9 @@ import pytest
 
 from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups, replans_of
 from vla_attention.analyze.measures.aggregate import episode_tables, task_tables
-from vla_attention.analyze.ratios.summary_text import AnalysedRun, summary_text
+from vla_attention.analyze.ratios.summary_text import AnalysedRun, summary_sections
 from vla_attention.analyze.ratios.verdict import verdict
+from vla_attention.analyze.show.answer import text_of
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.units import Units
 
@@ -24,7 +25,7 @@ RUN = AnalysedRun(
 
 def summarise(steps, grouping, run=RUN):
     episodes = episode_tables(replans_of(steps, grouping), grouping)
-    return summary_text(run, grouping, episodes, task_tables(episodes, grouping, Sampling()))
+    return text_of(summary_sections(run, grouping, episodes, task_tables(episodes, grouping, Sampling())))
 
 
 def two_suites():

@@ -10,7 +10,6 @@ from vla_attention.analyze.show.headings import (
     untrained_warning,
     wrap,
 )
-from vla_attention.analyze.show.text_table import episode_counts, text_table
 
 PLAIN = {"stores": ["runs/a.zarr"], "site": "joint", "layer": "layer 3", "num_episodes": 1, "num_tasks": 1}
 
@@ -49,11 +48,3 @@ def test_notes_and_the_level_of_intervals():
     assert note_lines(["first", "second"]) == ["note: first", "note: second"]
     assert interval_note(0.95, "tasks like these").startswith("Intervals: 95%, about tasks like these")
     assert interval_note(0.9, "these tasks", "pointwise").startswith("Intervals: 90%, pointwise, about these tasks")
-
-
-def test_a_table_is_aligned_and_counts_tasks_where_there_are_several():
-    table = text_table(["a", "bb"], [["x", "1"], ["yy", "10"]], left=(0,))
-    assert table.splitlines() == ["a   bb", "······", "x    1", "yy  10"]
-    rows = [{"num_episodes": 4, "num_tasks": 2}]
-    assert episode_counts(rows, several_tasks=True) == ("episodes (tasks)", ["4 (2)"])
-    assert episode_counts(rows, several_tasks=False) == ("episodes", ["4"])

@@ -5,7 +5,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from vla_attention.analyze.show.output_files import report_files, write_csv, write_parquet, write_text, writing
+from vla_attention.analyze.show.output_files import files_lines, write_csv, write_parquet, write_text, writing
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.store_format import StoreNotFound
 
@@ -31,14 +31,13 @@ def test_what_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
         raise StoreNotFound("no store")
 
 
-def test_tables_become_files_and_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_tables_become_files_and_are_listed(tmp_path: Path) -> None:
     table = pl.DataFrame({"ratio": [1.5, float("inf"), None]})
     files = [*write_parquet(tmp_path / "out", a=table), *write_csv(tmp_path / "out", a=table)]
     assert pl.read_parquet(files[0]).equals(table)
     assert files[1].read_text() == "ratio\n1.5\ninf\n\n"
     inside = [tmp_path / "out" / "episodes" / f"{i}.png" for i in range(3)]
-    report_files(tmp_path / "out", [*files, *inside])
-    printed = " ".join(capsys.readouterr().out.split())
+    printed = " ".join(" ".join(files_lines(tmp_path / "out", [*files, *inside])).split())
     assert printed == f"5 files in {tmp_path / 'out'}: a (.parquet .csv); 3 in episodes/"
 
 

@@ -46,6 +46,7 @@ def test_the_formats_are_back_after_an_error():
     assert picture_formats() == ("png", "pdf")
 
 
+@pytest.mark.drawn
 def test_a_picture_is_drawn_once_for_a_format(tmp_path, monkeypatch):
     drawn = []
     draw = Figure.draw

@@ -5,6 +5,7 @@ from __future__ import annotations
 from tests.kit.made_up_steps import many_groups
 from vla_attention.analyze.show.plot_axes import label_positions, legend_above, ratio_axis, share_ticks, uniform_line
 from vla_attention.analyze.show.plot_colours import FIXED_COLORS, group_styles
+from vla_attention.analyze.show.plot_rows import draw_estimate, label_rows, legend_of_rows
 from vla_attention.analyze.show.plot_style import new_figure
 
 
@@ -37,3 +38,16 @@ def test_the_line_of_uniform_attention_is_in_the_legend_above_the_axes():
     uniform_line(axes, 2.0, label="uniform attention")
     legend_above(axes)
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["uniform attention"]
+
+
+def test_rows_of_estimates_have_a_bar_only_where_there_is_an_interval():
+    axes = new_figure(4, 3).subplots()
+    draw_estimate(axes, 0, 2.0, (1.0, 3.0))
+    draw_estimate(axes, 1, 2.5, (None, None), few=False)
+    bar, point, alone = axes.get_lines()
+    assert [list(bar.get_xdata()), list(bar.get_ydata())] == [[1.0, 3.0], [0, 0]]
+    assert point.get_markersize() > alone.get_markersize()
+    label_rows(axes, ["first", "second"])
+    assert axes.get_ylim()[0] > axes.get_ylim()[1]  # the first one stands at the top
+    legend_of_rows(axes, 2, "mean", dots="single episode")
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["mean", "single episode"]

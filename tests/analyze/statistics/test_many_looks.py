@@ -91,7 +91,7 @@ def test_the_leader_of_a_table_is_named_by_its_columns():
         for word, lift in (("bowl", generator.normal(3, 0.1)), ("the", generator.normal(1, 0.1)))
     ]
     table = pl.DataFrame(rows, schema_overrides={"head": pl.Int64})
-    leading = leader_of_table(table, ("word", "head"), "lift", Sampling())
+    leading = leader_of_table([table], ("word", "head"), "lift", Sampling())
     assert leading.name == {"word": "bowl", "head": None}
     assert leading.apart == ()
     assert leading.found.is_named()
@@ -126,12 +126,12 @@ def test_where_one_item_alone_is_of_four_families_leaders_are_about_these_tasks(
         if word == "the" or e % 8 < 4
     ]
     families = {("s", task): "abcd"[task // 2] for task in range(8)}
-    leading = leader_of_table(pl.DataFrame(rows), ("word",), "lift", Sampling(families=families))
+    leading = leader_of_table([pl.DataFrame(rows)], ("word",), "lift", Sampling(families=families))
     assert leading.name == {"word": "the"}
     assert leading.found.is_named()
     assert leading.units.words == "these tasks"
     everywhere = [row | {"word": "on"} for row in rows if row["word"] == "the"]
-    leading = leader_of_table(pl.DataFrame(rows + everywhere), ("word",), "lift", Sampling(families=families))
+    leading = leader_of_table([pl.DataFrame(rows + everywhere)], ("word",), "lift", Sampling(families=families))
     assert (leading.found.num_items, leading.units.words) == (2, "tasks like these, by 4 families")
 
 

@@ -20,6 +20,7 @@ def two_threads(monkeypatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
 
 
+@pytest.mark.drawn
 def test_pictures_are_the_same_from_another_process(tmp_path, two_threads, monkeypatch):
     monkeypatch.setattr(Figure, "savefig", DRAW)
     store = write_store(tmp_path / "a.zarr")

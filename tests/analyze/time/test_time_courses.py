@@ -12,6 +12,7 @@ from scipy import stats
 
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.show.answer import text_of
 from vla_attention.analyze.time.alignment import (
     around_event,
     change_and_placebo,
@@ -20,7 +21,7 @@ from vla_attention.analyze.time.alignment import (
     on_episode_time,
     replan_starts,
 )
-from vla_attention.analyze.time.text import time_text
+from vla_attention.analyze.time.text import time_sections
 from vla_attention.analyze.time.time_courses import ALL, FAILURE, GRIPPER_CLOSING, SUCCESS, TimeSettings, time_courses
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import Role
@@ -252,7 +253,7 @@ def test_a_steady_drift_is_no_change_at_the_closing(tmp_path):
     assert row["low"] > 1.1  # the change alone
     assert row["beyond_low"] < 1 < row["beyond_high"]
     assert row["q"] > 0.05
-    said = " ".join(time_text(question_about(path), found, TimeSettings(5, 3)).split())
+    said = " ".join(text_of(time_sections(question_about(path), found, TimeSettings(5, 3))).split())
     assert "none shows a change beyond that elsewhere" in said
 
 
@@ -268,7 +269,7 @@ def test_the_planted_effect_of_success_is_found(courses):
 
 
 def test_the_text_says_what_was_found(question, courses):
-    text = time_text(question, courses, TimeSettings(5, 3))
+    text = text_of(time_sections(question, courses, TimeSettings(5, 3)))
     assert max(map(len, text.splitlines())) <= 101
     assert "closes in 15 of 16 episodes" in text
     assert "Geyer" in text
@@ -281,7 +282,7 @@ def test_one_class_alone_is_said_and_not_computed(tmp_path):
     found = time_courses(question)
     assert found.course["outcome"].unique().to_list() == [ALL]
     assert found.outcomes["difference"].null_count() == found.outcomes.height
-    assert "0 solved and 4 failed; at least 2 of either" in time_text(question, found, TimeSettings())
+    assert "0 solved and 4 failed; at least 2 of either" in text_of(time_sections(question, found, TimeSettings()))
 
 
 @pytest.mark.pdf

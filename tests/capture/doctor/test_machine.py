@@ -8,16 +8,17 @@ from typing import Any
 
 import pytest
 
-from vla_attention.capture.doctor.findings import Finding, something_missing
 from vla_attention.capture.doctor.machine import (
+    Finding,
     checked,
     find_drawing,
     find_gpu,
     find_memory,
     find_precision,
     find_processor,
+    find_simulator,
+    something_missing,
 )
-from vla_attention.capture.doctor.simulators import find_simulator
 from vla_attention.capture.environments.libero_installation import ASSET_SUBFOLDERS, ASSETS_VARIABLE
 from vla_attention.capture.environments.suites import find_suite
 from vla_attention.schemas.errors import BadArgument

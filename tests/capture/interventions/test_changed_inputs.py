@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vla_attention.capture.interventions import images
-from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
+from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs, rotated, shifted
 from vla_attention.capture.policies.policy import GivenInputs
 from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.groupings.vocabulary import SceneObject
@@ -55,7 +54,7 @@ def test_only_the_named_camera_changes_and_loses_its_own_picture(given):
 
 def test_changes_of_one_camera_follow_each_other(given):
     both = Interventions(images=(ImageChange("base", "rotated"), ImageChange("base", "shifted", rows=1)))
-    expected = images.shifted(images.rotated(given.frames["base"]), GRID, 1, 0)
+    expected = shifted(rotated(given.frames["base"]), GRID, 1, 0)
     np.testing.assert_array_equal(changed_inputs(given, both, SITES, context()).frames["base"], expected)
 
 

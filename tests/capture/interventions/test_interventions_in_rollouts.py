@@ -156,11 +156,12 @@ def test_empty_groups_are_allowed_on_request(base, tmp_path, capsys):
     np.testing.assert_array_equal(same.episodes[0].read("actions"), base.episodes[0].read("actions"))
 
 
+@pytest.mark.slow
 def test_compiled_denoise_steps_refuse_interventions_and_batches_before_a_store_is_made(tmp_path, monkeypatch, capsys):
-    from vla_attention.capture.policies.pi import build
+    from vla_attention.capture.policies.pi import loading
     from vla_attention.capture.policies.pi.compiled import compile_steps
 
-    monkeypatch.setattr(build, "compile_steps", lambda model: compile_steps(model, backend="eager"))
+    monkeypatch.setattr(loading, "compile_steps", lambda model: compile_steps(model, backend="eager"))
     store, refused = tmp_path / "a.zarr", "with compiled denoise steps (--compile), which no intervention reaches"
     compiled = ("--task-id", "0", "--compile")
     assert run(store, *compiled, "--knockout", "camera:base_0_rgb") == 2

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from vla_attention.capture.interventions.prompts import (
-    SynonymsUnreadable,
     changed_instruction,
     check_synonyms,
     read_synonyms,
@@ -84,7 +83,7 @@ def test_files_of_synonyms(tmp_path):
 )
 def test_files_that_are_no_synonyms_are_one_sentence(tmp_path, name, content, message):
     (tmp_path / name).write_text(content)
-    with pytest.raises(SynonymsUnreadable, match=message):
+    with pytest.raises(BadArgument, match=message):
         read_synonyms(tmp_path / name)
-    with pytest.raises(SynonymsUnreadable, match="Cannot read the synonyms"):
+    with pytest.raises(BadArgument, match="Cannot read the synonyms"):
         read_synonyms(tmp_path / "nothing.json")

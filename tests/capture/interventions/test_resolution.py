@@ -8,9 +8,9 @@ import pytest
 from vla_attention.capture.interventions.resolution import (
     ReplanPlace,
     TooFewKeys,
-    check_not_empty,
     check_selectors,
     empty_replans,
+    has_empty_group,
     make_editors,
     run_vocabularies,
     selectors_of,
@@ -149,7 +149,7 @@ def test_empty_groups():
     with pytest.raises(
         EmptyGroup, match=r"'object:plate_1' .* no key at replan 7 of task000_episode002: .*--allow-empty"
     ):
-        check_not_empty(interventions, tokens, vocabularies(tokens), PLACE)
+        has_empty_group(interventions, tokens, vocabularies(tokens), PLACE)
     # What is empty changes nothing, `keep` neither.
     editors = make_editors(Interventions(keys=interventions.keys), tokens, vocabularies(tokens), PLACE)
     assert editors == {}
@@ -160,7 +160,7 @@ def test_a_camera_whose_keys_are_all_masked_is_an_empty_group():
     tokens = site_tokens((JOINT,), roles, prompt(4), OBJECTS, COVERAGE)
     change = Interventions(keys=(KeyKnockout("camera:base"),))
     with pytest.raises(EmptyGroup, match="'camera:base' of an intervention has no key"):
-        check_not_empty(change, tokens, vocabularies(tokens), PLACE)
+        has_empty_group(change, tokens, vocabularies(tokens), PLACE)
 
 
 def test_replans_of_an_episode_in_which_an_object_is_out_of_view():

@@ -14,7 +14,6 @@ from vla_attention.capture.jobs.status import store_status
 from vla_attention.capture.jobs.worker_records import (
     PlannedTask,
     RecordWriter,
-    delete_jobs_folder,
     planned_tasks,
     read_records,
 )
@@ -130,8 +129,6 @@ def test_records_of_an_earlier_store_with_the_same_name_are_ignored(store):
     os.utime(store / "zarr.json", (1, 1))
     assert read_records(store) == []
     assert store_status(store).complete is None
-    delete_jobs_folder(store)
-    assert not jobs_folder(store).exists()
 
 
 def test_damaged_records_are_named_and_ignored(store):

@@ -12,8 +12,12 @@ import pytest
 from vla_attention.capture.policies.cosmos.family import FAMILY as COSMOS
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.pi.family import FAMILY as PI
-from vla_attention.capture.published.environment_variables import arguments_from_environment, describe_job
-from vla_attention.capture.published.evaluate import evaluate_attention_ratio, evaluate_attention_ratio_cosmos
+from vla_attention.capture.published.evaluate import (
+    arguments_from_environment,
+    describe_job,
+    evaluate_attention_ratio,
+    evaluate_attention_ratio_cosmos,
+)
 from vla_attention.schemas.errors import BadArgument
 
 SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"

@@ -18,12 +18,8 @@ from tests.kit.lerobot_data_sets import (
     write_data_set,
 )
 from vla_attention.capture.policies.hub import CheckpointUnavailable
-from vla_attention.capture.replay.data_set_errors import (
-    DamagedDataSet,
-    DataSetNotFound,
-    UndecodableVideo,
-    UnsupportedDataSet,
-)
+from vla_attention.capture.replay.data_set_files import UndecodableVideo, UnsupportedDataSet
+from vla_attention.capture.replay.data_tables import DamagedDataSet, DataSetNotFound
 from vla_attention.capture.replay.lerobot_dataset import open_dataset
 from vla_attention.schemas.errors import BadArgument, UnknownName
 

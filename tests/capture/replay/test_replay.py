@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,8 @@ from tests.kit.spoiled_policy import spoil_actions
 from tests.kit.still_scene import capture_without_simulator
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
+from vla_attention.capture.jobs.termination import EXIT_TERMINATED
+from vla_attention.capture.replay import family_replay
 from vla_attention.schemas.stores.reader import open_store
 
 LIBERO_COLUMNS = {"base_0_rgb": "image", "left_wrist_0_rgb": "wrist_image"}
@@ -133,8 +137,13 @@ def test_the_store_says_what_was_replayed(tmp_path, capsys):
         frames = stored[f"frames/{camera}"][:]
         assert [number_of(np.repeat(np.repeat(f[5:23], 8, 0), 8, 1)) for f in frames] == [first, first + 3, first + 6]
     # with --resume, what is missing is added
+    shutil.rmtree(store / "episodes" / "task000_episode002")
+    assert run("status", store, "--check") == 1
+    assert "missing: task 0 lacks 1 of 1 episodes: 2" in capsys.readouterr().out
     assert run("replay", data, *options, "--resume") == 0
-    assert "2 of 3 episodes are complete already; 1 to run" in capsys.readouterr().out
+    assert "1 of 3 episodes are complete already; 2 to run" in capsys.readouterr().out
+    assert run("status", store, "--check") == 0
+    assert "complete: the store has every expected episode." in capsys.readouterr().out
     assert sorted(path.name for path in (store / "episodes").glob("task*")) == [
         "task000_episode000",
         "task000_episode002",
@@ -184,6 +193,27 @@ def test_a_call_that_turns_nan_costs_its_episode(tmp_path, monkeypatch, capsys):
     assert run(*words, "--resume") == 0
     assert sorted(path.name for path in (store / "episodes").glob("task*")) == whole
     assert analyze(["verify", str(store)]) == 0
+
+
+def test_sigterm_ends_before_the_next_call(tmp_path, monkeypatch, capsys):
+    data = write_data_set(tmp_path / "data", "v2.1", made_up_episodes((6, 6), tuple(LIBERO_COLUMNS.values())))
+    store, calls = tmp_path / "replay.zarr", []
+    record_call = family_replay.record_call
+
+    def stopped(*given: object) -> object:
+        calls.append(given)
+        if len(calls) == 4:  # of three in the first episode, and the first of the second
+            os.kill(os.getpid(), signal.SIGTERM)
+        return record_call(*given)
+
+    monkeypatch.setattr(family_replay, "record_call", stopped)
+    words = ("replay", data, *TINY, "--every", 2, "--store", store)
+    assert run(*words) == EXIT_TERMINATED
+    assert len(calls) == 4
+    assert len(list((store / "episodes").glob("task*"))) == 1
+    assert "at call 0; committed 1 episode" in capsys.readouterr().out
+    assert run(*words, "--resume") == 0
+    assert len(list((store / "episodes").glob("task*"))) == 2
 
 
 def lerobot_checkpoint(folder: Path, cameras: dict[str, str], state: int, action: int) -> Path:

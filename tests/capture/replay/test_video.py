@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from tests.kit.lerobot_data_sets import H264, Encoding, number_of, numbered_picture, write_video
-from vla_attention.capture.replay.data_set_errors import DamagedDataSet, DataSetNotFound, UndecodableVideo
+from vla_attention.capture.replay.data_set_files import UndecodableVideo
+from vla_attention.capture.replay.data_tables import DamagedDataSet, DataSetNotFound
 from vla_attention.capture.replay.video import VideoFile
 
 FPS, FRAMES = 10, 90

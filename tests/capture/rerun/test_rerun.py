@@ -13,10 +13,10 @@ from tests.capture.rerun.conftest import capture
 from tests.kit.spoiled_policy import spoil_actions
 from vla_attention.capture.__main__ import main
 from vla_attention.capture.policies.pi.embedded import dummy_policy
-from vla_attention.capture.rerun.calls import Repeater
 from vla_attention.capture.rerun.fidelity import InputsDiffer, check_fidelity
-from vla_attention.capture.rerun.stored_calls import read_calls
+from vla_attention.capture.rerun.stored_calls import Repeater, StoredCalls, read_calls
 from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import Recording
 from vla_attention.schemas.stores.verify import verify_store
 
 
@@ -143,6 +143,16 @@ def test_stores_without_pictures_are_refused(tmp_path, pi_store, capsys):
     assert "it has no pictures (it was captured with --no-frames" in refused(capsys, "rerun", bare)
 
 
+def test_what_differs_is_a_line_of_its_own(pi_store, monkeypatch, capsys):
+    def moved(unchanged: Repeater, recording: Recording, calls: StoredCalls, *rest: object) -> object:
+        return check_fidelity(unchanged, recording, replace(calls, actions=calls.actions + 1), *rest)
+
+    monkeypatch.setattr("vla_attention.capture.rerun.rerun_store.check_fidelity", moved)
+    assert main(["rerun", str(pi_store), "--check", "1"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line for line in lines if line.startswith("Between the capture and now differ: ")]
+
+
 def test_a_damaged_episode_is_refused(pi_store, tmp_path, capsys):
     damaged = tmp_path / "damaged.zarr"
     shutil.copytree(pi_store, damaged)
@@ -161,6 +171,13 @@ def test_a_damaged_episode_is_refused(pi_store, tmp_path, capsys):
     said = refused(capsys, "rerun", damaged, "--task-id", "0")
     assert "frames" in said
     assert "task000_episode000" in said
+    # It is no fault of the run: what is read again is the same.
+    words = ("rerun", str(damaged), "--task-id", "0", "--check", "0", "--store", str(tmp_path / "again.zarr"))
+    assert main([*words]) == 2
+    ended = capsys.readouterr()
+    assert "The episode begins again." not in ended.out
+    assert "is missing" not in ended.err
+    assert not (tmp_path / "again.zarr").exists()
 
 
 @pytest.mark.parametrize(("times", "missing"), [(1, []), (100, ["task000_episode001"])])
@@ -171,7 +188,7 @@ def test_a_call_that_turns_nan_costs_its_episode(pi_store, tmp_path, capsys, mon
     assert left[0] < times
     said = capsys.readouterr()
     assert ("task000_episode001: The policy's numbers turned NaN or infinite at replan 1" in said.out) is True
-    assert ("It begins again." in said.out) is (times == 1)
+    assert ("The episode begins again." in said.out) is (times == 1)
     if missing:
         assert said.err.startswith(
             f"vla-capture: 1 of the episodes asked for is missing: task000_episode001 of {target}. "

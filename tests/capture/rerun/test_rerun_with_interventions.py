@@ -12,7 +12,7 @@ from tests.capture.rerun.test_rerun import refused
 from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.capture.__main__ import main
 from vla_attention.capture.rerun.arguments import add_rerun_arguments
-from vla_attention.capture.rerun.series_run import SeriesRun
+from vla_attention.capture.rerun.series import SeriesRun
 from vla_attention.schemas.interventions import KeyKnockout, NoiseChange, queries_suffix
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import Store, open_store
@@ -102,6 +102,7 @@ def test_prompts_of_another_task_shuffled_and_with_synonyms(pi_store, tmp_path):
     assert sorted(order.split()) == ["cube", "lift", "red", "the"]
 
 
+@pytest.mark.slow
 def test_cosmos_without_words_and_with_the_wrist_alone(cosmos_store, tmp_path, capsys):
     target = tmp_path / "without.zarr"
     store = rerun(cosmos_store, target, "--knockout", "word:cube", "--keep", "frame:wrist")
@@ -168,6 +169,7 @@ def test_a_series_makes_its_own_interventions(pi_store, capsys, option):
     assert f"Cannot use {option} with --series" in said
 
 
+@pytest.mark.slow
 def test_a_series_has_every_group_and_word_with_its_controls(pi_store, tmp_path, capsys):
     """One store for each condition; groups without keys are named; a second run finds all of them whole."""
     folder = tmp_path / "series"
@@ -183,7 +185,7 @@ def test_a_series_has_every_group_and_word_with_its_controls(pi_store, tmp_path,
     assert "policy calls, about" in said
     assert "Keys of words are cut for all queries, those of other groups for the action queries;" in said
     assert "without_word_green_queries_all: the keys of 'word:\"green\"' knocked out for all queries, layers 2" in said
-    names = {path.stem for path in folder.iterdir()}
+    names = {path.stem for path in folder.glob("*.zarr")}
     assert {"noise", "without_upper", "only_upper", "random_upper", "without_red"} <= names
     assert {f"{kind}_word_green_queries_all" for kind in ("without", "only", "random")} <= names
     assert not any("pads" in name or "rest" in name for name in names)

@@ -16,7 +16,7 @@ from vla_attention.capture.environments.base import Observation, StepResult, Tas
 from vla_attention.capture.environments.episode_protocol import WAIT_ACTION, WAIT_STEPS
 from vla_attention.capture.policies.policy import PolicyInput
 from vla_attention.capture.rollout.episode import EpisodeRun, check_protocol, max_replans, record_episode
-from vla_attention.capture.store.episode_writer import ReplanRecord
+from vla_attention.capture.store.replan_records import ReplanRecord
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.layout import PatchGrid, Prompt, Role, SiteLayout, Span

@@ -25,7 +25,7 @@ from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.jobs.status import store_status
 from vla_attention.capture.jobs.termination import EXIT_TERMINATED
-from vla_attention.capture.rerun.same_policy import machine_differences
+from vla_attention.capture.rerun.base_store import machine_differences
 from vla_attention.capture.rollout import pipeline, simulator_process
 from vla_attention.capture.rollout.policy_call import record_calls
 from vla_attention.capture.rollout.simulation import Advanced
@@ -502,17 +502,3 @@ def test_a_killed_simulator_is_replaced(tmp_path):
     assert store_status(run.store).complete
     assert analyze(["verify", str(run.store)]) == 0
     assert list(run.temporary.glob("vla-*")) == []
-
-
-@pytest.mark.parametrize(("cores", "expected"), [(1, 1), (3, 3), (64, 8)])
-def test_there_are_as_many_simulators_as_cores_and_no_more_than_eight(cores, expected, monkeypatch):
-    monkeypatch.setattr(pipeline, "available_cores", lambda: cores)
-    monkeypatch.setattr(pipeline, "memory_left", lambda: 1e12)
-    assert pipeline.default_num_envs() == expected
-
-
-@pytest.mark.parametrize(("left", "expected"), [(7e9, 3), (1e9, 1), (float("inf"), 8)])
-def test_simulators_fit_into_the_memory(left, expected, monkeypatch):
-    monkeypatch.setattr(pipeline, "available_cores", lambda: 64)
-    monkeypatch.setattr(pipeline, "memory_left", lambda: left)
-    assert pipeline.default_num_envs() == expected

@@ -26,8 +26,8 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 def test_lines_of_a_log_file(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
-    progress = Progress(num_episodes=3, max_steps=200)
-    episode = progress.begin(4, 0)
+    progress = Progress(3, 3 * 200, "step")
+    episode = progress.begin("task 4 episode 0", 200)
     clock.now += 10
     episode.update(5, 1)  # too early for a line
     clock.now += 25
@@ -36,7 +36,7 @@ def test_lines_of_a_log_file(clock: Clock, capsys: pytest.CaptureFixture[str]) -
     episode.update(80, 16)  # 25 s after the last line
     episode.end("success after 80 steps", "lift the red cube")
     progress.skip("task004_episode001")
-    episode = progress.begin(4, 2)
+    episode = progress.begin("task 4 episode 2", 200)
     clock.now += 7
     episode.end("no success after 200 steps", "lift the red cube")
     progress.close()
@@ -51,14 +51,14 @@ def test_lines_of_a_log_file(clock: Clock, capsys: pytest.CaptureFixture[str]) -
 
 
 def test_one_line_is_about_all_episodes_in_progress(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
-    progress = Progress(num_episodes=9, max_steps=200)
-    episodes = [progress.begin(0, number) for number in range(2)]
+    progress = Progress(9, 9 * 200, "step")
+    episodes = [progress.begin(f"task 0 episode {number}", 200) for number in range(2)]
     clock.now += 31
     episodes[1].update(5, 1)
     clock.now += 29
     episodes[0].update(10, 2)  # 29 s after the last line
     episodes[0].end("success after 10 steps", "lift the red cube")
-    more = [progress.begin(1, number) for number in range(5)]
+    more = [progress.begin(f"task 1 episode {number}", 200) for number in range(5)]
     clock.now += 1
     more[0].update(1, 1)
     for episode in (episodes[1], *more):
@@ -73,3 +73,13 @@ def test_one_line_is_about_all_episodes_in_progress(clock: Clock, capsys: pytest
         "[4/9] task 1 episode 1: step 0 of at most 200, 0 replans, 1 s; "
         "[5/9] task 1 episode 2: step 0 of at most 200, 0 replans, 1 s; 2 more episodes",
     ]
+
+
+def test_policy_calls_are_counted_where_no_environment_runs(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    progress = Progress(2, 30, "call")
+    episode = progress.begin("task000_episode000", 10)
+    clock.now += 31
+    episode.update(4, 4)
+    episode.drop()
+    progress.close()
+    assert capsys.readouterr().out.splitlines() == ["[1/2] task000_episode000: 4 of 10 policy calls, 31 s"]

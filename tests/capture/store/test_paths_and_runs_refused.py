@@ -13,6 +13,7 @@ import pytest
 from tests.kit.durable_stores import SPEC, store_bytes, write_store
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.stores.claims import Claims, jobs_folder
 from vla_attention.schemas.stores.store_format import (
     STORE_VERSION,
     FormatTooNew,
@@ -20,6 +21,7 @@ from vla_attention.schemas.stores.store_format import (
     StoreError,
     StoreExists,
 )
+from vla_attention.schemas.stores.worker import this_worker
 from vla_attention.testing.stores import (
     denoise_times,
     episode_records,
@@ -76,6 +78,37 @@ def test_an_existing_store_is_refused_resumed_or_overwritten(tmp_path, uninterru
     write_store(path, mode="overwrite", spec=SPEC)
     assert store_bytes(path) == uninterrupted
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_run_begins_at_a_store_without_an_episode(tmp_path, uninterrupted):
+    path = tmp_path / "a.zarr"
+    for left in (
+        SPEC,
+        replace(SPEC, seed=5),
+    ):  # of the same run and of another one, each ended before its first episode
+        open_run(path, root_attributes(left), "new")
+        write_store(path, spec=SPEC)
+        assert store_bytes(path) == uninterrupted
+        shutil.rmtree(path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_store_whose_first_episode_is_being_recorded_is_not_taken(tmp_path, uninterrupted):
+    path, other = tmp_path / "a.zarr", root_attributes(replace(SPEC, seed=5))
+    store = open_run(path, root_attributes(SPEC), "new")
+    start, _ = episode_records(SPEC, 0, 0)
+    with (
+        store.episode(start, denoise_times(SPEC), 9),
+        pytest.raises(StoreExists, match=r"no episode yet, and another run is recording its first one.*--overwrite"),
+    ):
+        open_run(path, other, "new")
+    with Claims(path, this_worker()) as claims:
+        claims.acquire("task000_episode000")
+        with pytest.raises(StoreExists, match="another run is recording"):
+            open_run(path, other, "new")
+        write_store(path, spec=SPEC)  # another process of the same run
+    shutil.rmtree(jobs_folder(path))
+    assert store_bytes(path) == uninterrupted
 
 
 def test_overwriting_where_nothing_is(tmp_path, uninterrupted):

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from tests.kit.slow import slow_except
-from vla_attention.capture.store.episode_writer import EpisodeWriter, ReplanRecord, ReplanRefused
-from vla_attention.capture.store.recorded_rows import RecordedRows
+from vla_attention.capture.store.episode_writer import EpisodeWriter, ReplanRefused
+from vla_attention.capture.store.replan_records import RecordedRows, ReplanRecord
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.layout import Piece, Role

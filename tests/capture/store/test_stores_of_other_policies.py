@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from vla_attention.capture.store.disk_estimate import estimate_disk
-from vla_attention.capture.store.episode_writer import ReplanRecord, ReplanRefused
+from vla_attention.capture.store.episode_writer import ReplanRefused
+from vla_attention.capture.store.replan_records import ReplanRecord
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.layout import Role, SiteLayout, prompt_at
 from vla_attention.schemas.stores import episode_checks

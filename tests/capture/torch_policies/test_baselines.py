@@ -9,6 +9,7 @@ from torch import nn
 from torch.nn.attention.flex_attention import create_block_mask, flex_attention
 
 import vla_attention as va
+from tests.kit.slow import slow_except
 from tests.kit.small_torch_policy import HEADS, WIDTH, SmallPolicy, given, small_layout
 from tests.kit.small_torch_variants import (
     OneModulePolicy,
@@ -144,9 +145,18 @@ def record_masked(path, policy, **changes):
     return open_store(path).episodes[0]
 
 
-@pytest.mark.parametrize("queries", ["mean", "all"])
-@pytest.mark.parametrize("change", MASKS, ids=lambda change: change.__name__)
-@pytest.mark.parametrize("attend", [fused, by_hand, flex], ids=lambda attend: attend.__name__)
+WAYS = [
+    (attend, change, queries) for attend in (fused, by_hand, flex) for change in MASKS for queries in ("mean", "all")
+]
+#: Every mask, every way of attending and every way of storing queries, in pairs that show the most.
+FAST = [
+    *((fused, change, "all") for change in MASKS),
+    *((attend, by_step, queries) for attend in (by_hand, flex) for queries in ("mean", "all")),
+    (flex, by_head, "all"),
+]
+
+
+@pytest.mark.parametrize(("attend", "change", "queries"), slow_except(FAST, WAYS, slow=(), several=True))
 def test_every_query_s_own_keys_are_the_baseline(tmp_path, attend, change, queries):
     policy = MaskedPolicy(attend, change)
     assert zero_queries(policy) == LAYERS

@@ -8,7 +8,7 @@ import torch
 
 from tests.kit.small_torch_policy import SmallPolicy, given, small_layout
 from vla_attention.capture.torch_policies.record import record
-from vla_attention.capture.torch_policies.session import NothingRecorded, RecordingStopped
+from vla_attention.capture.torch_policies.recorded_episodes import NothingRecorded, RecordingStopped
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store

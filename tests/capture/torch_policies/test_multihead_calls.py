@@ -11,7 +11,7 @@ from torch import nn
 from tests.kit.attention_modules import Seen
 from tests.kit.examples import examples
 from vla_attention.capture.torch_policies import multihead_calls
-from vla_attention.capture.torch_policies.call_changes import ChangeRefused
+from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
 from vla_attention.capture.torch_policies.watch import seen_by_python, watch_attention
 
@@ -135,8 +135,9 @@ def test_a_call_with_keys_of_its_own_cannot_be_changed():
         policy(torch.randn(3, 1, 16), torch.randn(5, 1, 16))
 
 
-def test_the_fast_path_is_off_inside_and_as_before_afterwards():
-    """An encoder layer in eval mode calls nothing that can be seen on the fast path."""
+@pytest.mark.parametrize("every_function", [True, False])
+def test_the_fast_path_is_off_inside_and_as_before_afterwards(every_function):
+    """An encoder layer in eval mode calls nothing that can be seen on the fast path, which torch takes in no mode."""
     torch.manual_seed(0)
     policy = nn.TransformerEncoder(nn.TransformerEncoderLayer(16, 4, batch_first=True), 2).eval()
     hidden = torch.randn(2, 5, 16)
@@ -144,7 +145,7 @@ def test_the_fast_path_is_off_inside_and_as_before_afterwards():
         torch.backends.mha.set_fastpath_enabled(before)
         try:
             seen = Seen()
-            with torch.no_grad(), watch_attention(policy, seen):
+            with torch.no_grad(), watch_attention(policy, seen, every_function=every_function):
                 policy(hidden)
             assert [shape.module for shape in seen.shapes] == ["layers.0.self_attn", "layers.1.self_attn"]
             assert torch.backends.mha.get_fastpath_enabled() is before

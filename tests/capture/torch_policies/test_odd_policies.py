@@ -17,11 +17,12 @@ from torch import Tensor, nn
 from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.torch_policies.attention_calls import RowsRefused
-from vla_attention.capture.torch_policies.call_changes import ChangeRefused
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
+from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.policy_layout import CallRule, PolicyLayout, RecordedSite
 from vla_attention.capture.torch_policies.record import record
-from vla_attention.capture.torch_policies.session import RecordingStopped, WeightsChanged
+from vla_attention.capture.torch_policies.recorded_episodes import RecordingStopped
+from vla_attention.capture.torch_policies.session import WeightsChanged
 from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
 from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
 from vla_attention.schemas.errors import BadArgument, UserError

@@ -20,7 +20,7 @@ from vla_attention.capture.torch_policies import seen_functions
 from vla_attention.capture.torch_policies.attention_calls import CallShape
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.capture.torch_policies.policy_modules import find_policy
-from vla_attention.capture.torch_policies.softmax_calls import Softmaxes
+from vla_attention.capture.torch_policies.tensor_functions import TensorTable
 from vla_attention.capture.torch_policies.watch import watch_attention
 from vla_attention.schemas.stores.reader import open_store
 
@@ -184,10 +184,10 @@ def test_modes_of_the_policy_stay_as_they_are(place):
     assert not _get_current_function_mode_stack()
 
 
-def test_other_threads_are_seen_by_names_too_and_strangers_are_not():
+def test_what_other_threads_call_under_the_names_is_not_seen():
     policy, other, seen = small_policy(by_hand), small_policy(fused), Seen()
     with ThreadPoolExecutor(1) as pool, watch_attention(policy, seen, every_function=False):
-        pool.submit(policy, HIDDEN, MEMORY).result()
+        policy(HIDDEN, MEMORY)
         pool.submit(other, HIDDEN, MEMORY).result()
     assert [shape.module for shape in seen.shapes] == ["layers.0", "layers.1"]
     assert nothing_left()
@@ -277,12 +277,8 @@ def test_softmaxes_that_are_not_wanted_are_followed_only_while_it_is_unknown_wha
         return torch.einsum("bhgqk,bhkd->bhgqd", rows.unflatten(1, (4, 2)), value).flatten(1, 2)
 
     policy, followed = small_policy(grouped, heads=8, kv_heads=4), []
-    own = Softmaxes._follow
-    monkeypatch.setattr(
-        Softmaxes,
-        "_follow",
-        lambda self, tensor, *given, **more: followed.append(1) or own(self, tensor, *given, **more),
-    )
+    own = TensorTable.put
+    monkeypatch.setattr(TensorTable, "put", lambda *given: followed.append(1) or own(*given))
     hidden, memory = torch.randn(2, 5, 64), torch.randn(2, 7, 64)
     found, expected = find_policy(policy), policy(hidden, memory)
     counts, watchers = [], []

@@ -29,8 +29,9 @@ from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.capture.torch_policies.policy_layout import CallRule, LayoutForAnotherVersion, PromptText
 from vla_attention.capture.torch_policies.prompts import PromptDoesNotFit
 from vla_attention.capture.torch_policies.record import record
-from vla_attention.capture.torch_policies.session import NothingRecorded, RecordingStopped
+from vla_attention.capture.torch_policies.recorded_episodes import NothingRecorded, RecordingStopped
 from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
+from vla_attention.capture.torch_policies.watched_block import NotFollowed
 from vla_attention.schemas.errors import BadArgument, UnknownName, UserError
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.layout import Role
@@ -521,15 +522,26 @@ def test_a_compiled_policy_runs_eager_inside_of_the_block(tmp_path, policy):
     assert stored(tmp_path).episodes[0].attributes.num_replans == 1
 
 
-def test_a_policy_that_predicts_in_another_thread_is_recorded(tmp_path, policy):
+def test_an_episode_in_a_thread_of_a_server_is_recorded(tmp_path, policy):
     with start(tmp_path / "here", policy) as run:
         fill(run, policy)
     with ThreadPoolExecutor(1) as pool, start(tmp_path / "there", policy) as run:
-        other = type("Server", (), {"act": lambda self, **inputs: pool.submit(policy.act, **inputs).result()})()
-        fill(run, other)
+        pool.submit(fill, run, policy).result()
     here, there = (stored(tmp_path / name).episodes[0] for name in ("here", "there"))
     for name in here.attributes.arrays:
         np.testing.assert_array_equal(here.read(name), there.read(name))
+
+
+def test_a_call_of_another_thread_is_not_taken_for_the_block_s(tmp_path, policy):
+    """The policy answers from its queue, and meanwhile another client of a server has it compute."""
+    with ThreadPoolExecutor(1) as pool, start(tmp_path, policy) as run, pytest.raises(NotFollowed):  # noqa: PT012
+        one_call(run, policy, calls=1)
+        with run.episode(task_id=0, episode_index=1, instruction="pick the bowl") as episode:
+            with episode.replan(env_step=0):
+                policy.act(**given())
+            with episode.replan(env_step=5):
+                pool.submit(policy.act, **given()).result()
+    assert len(stored(tmp_path).episodes) == 1
 
 
 def test_two_policies_in_one_block_are_an_error(tmp_path, policy):

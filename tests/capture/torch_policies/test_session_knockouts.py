@@ -12,7 +12,6 @@ from tests.kit.small_torch_variants import TokenPolicy, token_layout
 from vla_attention.analyze.__main__ import main
 from vla_attention.capture.__main__ import main as vla_capture
 from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
-from vla_attention.capture.torch_policies.knockouts import CannotIntervene
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.resolve import EmptyGroup
@@ -128,22 +127,22 @@ def test_a_knockout_is_a_part_of_the_runs_configuration(tmp_path, capsys):
         ({"knockout_layers": [1]}, BadArgument, "need a knockout or keep"),
         (
             {"knockout": Interventions(keys=(KeyKnockout("word:bowl", queries="all"),))},
-            CannotIntervene,
+            BadArgument,
             "use the queries 'action'",
         ),
         (
             {"knockout": Interventions(attention=(AttentionUniform("word:bowl"),))},
-            CannotIntervene,
+            BadArgument,
             "a knockout or a factor",
         ),
         (
             {"knockout": Interventions(images=(ImageChange("front", "blank"),))},
-            CannotIntervene,
+            BadArgument,
             "camera 'front' blank: prompt, pictures and noise are given to the policy by your own code",
         ),
         (
             {"knockout": Interventions(keys=(KeyKnockout("word:bowl", random_seed=1),))},
-            CannotIntervene,
+            BadArgument,
             "name the keys of the control",
         ),
         ({"knockout": "role:value"}, EmptyGroup, "has no key at replan 0"),

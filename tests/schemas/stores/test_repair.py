@@ -22,15 +22,15 @@ from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main
 from vla_attention.capture.jobs.status import store_status
 from vla_attention.capture.published.evaluate import evaluate_attention_ratio
-from vla_attention.schemas.plurals import plural
+from vla_attention.schemas.errors import plural
 from vla_attention.schemas.stores import repair
 from vla_attention.schemas.stores.claims import Claims, holders
 from vla_attention.schemas.stores.damaged_episodes import DamagedEpisodesLeft
+from vla_attention.schemas.stores.durable_files import lock_for_writing
 from vla_attention.schemas.stores.partial_folders import process_tag
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.repair import damaged_folder, repair_store
 from vla_attention.schemas.stores.store_format import StoreError
-from vla_attention.schemas.stores.store_lock import lock_for_writing
 from vla_attention.schemas.stores.verify import verify_store
 from vla_attention.schemas.stores.worker import Worker, this_worker
 from vla_attention.testing.stores import StoreSpec, write_store
@@ -334,7 +334,7 @@ def test_the_other_suites_do_not_wait_for_a_repair(tmp_path, monkeypatch, capsys
         if settings.suite.name in ("libero_spatial", "libero_goal"):
             raise DamagedEpisodesLeft(f"damage in {settings.suite.name}.")
 
-    monkeypatch.setattr("vla_attention.capture.capture_run.run_capture", run_capture)
+    monkeypatch.setattr("vla_attention.capture.run.capture_run.run_capture", run_capture)
     arguments = [
         "--checkpoint",
         "untrained-tiny",

@@ -17,6 +17,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 from tests.kit.attacks import files_of, with_checksum
 from tests.kit.examples import examples
 from vla_attention.schemas.stores import shards
+from vla_attention.schemas.stores.array_metadata import describe_array
 from vla_attention.schemas.stores.byte_source import Folder
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.seal import seal_episode
@@ -53,7 +54,11 @@ def reader_of(folder: Path) -> ShardedLayers | None:
         assert found is not None
         return found
 
-    return ShardedLayers.of(json.loads((folder / "zarr.json").read_text()), shard)
+    try:
+        metadata = describe_array((folder / "zarr.json").read_bytes())
+    except CorruptEpisode:
+        return None
+    return ShardedLayers.of(metadata, shard)
 
 
 @settings(max_examples=examples(8), deadline=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
@@ -100,6 +105,14 @@ def test_other_layouts_are_not_claimed(tmp_path, changes):
     assert reader_of(tmp_path / "rows") is None
 
 
+@pytest.mark.parametrize("keys", [None, "default", {"name": "default", "configuration": None}, {"name": "other"}])
+def test_chunk_keys_that_nobody_writes_are_refused(tmp_path, keys):
+    write_array(tmp_path / "rows", np.zeros((4, 2, 1, 2, 1, 8), dtype=np.float32), 4)
+    document = json.loads((tmp_path / "rows" / "zarr.json").read_bytes()) | {"chunk_key_encoding": keys}
+    with pytest.raises(CorruptEpisode, match="chunk_key_encoding"):
+        describe_array(json.dumps(document).encode())
+
+
 def fail(file: str) -> SealedShard:
     raise AssertionError(file)
 
@@ -107,8 +120,8 @@ def fail(file: str) -> SealedShard:
 def test_other_layouts_are_read_with_zarr_python(tmp_path, monkeypatch):
     episode = open_store(write_store(tmp_path / "a.zarr")).episodes[0]
     expected = episode.read("joint/rows")
-    rows = episode.array("joint/rows")
-    assert isinstance(ShardedLayers.of(rows.metadata.to_dict(), fail), ShardedLayers)
+    metadata = describe_array((episode.folder / "joint/rows/zarr.json").read_bytes())
+    assert isinstance(ShardedLayers.of(metadata, fail), ShardedLayers)
     monkeypatch.setattr(ShardedLayers, "of", classmethod(lambda cls, metadata, shard_in: None))
     np.testing.assert_array_equal(episode.read_layer("joint/rows", 1, 0), expected[:, 1, 0])
 
@@ -230,6 +243,17 @@ def test_positions_that_cannot_be_are_refused(tmp_path, entries, problem):
         ),
     )
     with pytest.raises(CorruptEpisode, match=f"joint/rows of episode task000_episode000.*{problem}"):
+        open_store(tmp_path / "a.zarr").episodes[0].read_layer("joint/rows", 0, 0)
+
+
+def test_an_index_that_was_not_sealed_is_refused_although_its_checksum_fits(tmp_path):
+    episode = write_store(tmp_path / "a.zarr", tasks=(0,), episodes=1) / "episodes/task000_episode000"
+    (file,) = files_of(episode, "joint/rows")
+    content = file.read_bytes()
+    index = np.frombuffer(content[-68:-4], dtype="<u8").reshape(-1, 2).copy()
+    index[[0, 1]] = index[[1, 0]]
+    file.write_bytes(content[:-68] + with_checksum(index.tobytes()))
+    with pytest.raises(CorruptEpisode, match="its index was changed"):
         open_store(tmp_path / "a.zarr").episodes[0].read_layer("joint/rows", 0, 0)
 
 

@@ -10,12 +10,12 @@ import pytest
 
 pytest.importorskip("robosuite")
 
+from examples.cubes_policy.experts import expert_action, read_state
 from vla_attention.capture.environments.base import EnvironmentSettings, Observation
 from vla_attention.capture.environments.cubes.environment import CubesEnvironment
 from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS, CubeTask, Target, Verb
 from vla_attention.capture.environments.episode_protocol import CAMERAS, OPENPI, WAIT_ACTION, WAIT_STEPS
 from vla_attention.capture.environments.suites import find_suite, list_tasks
-from vla_attention.capture.small_policy.experts import expert_action, read_state
 from vla_attention.schemas.errors import BadArgument
 
 pytestmark = pytest.mark.simulator

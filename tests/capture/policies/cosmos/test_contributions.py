@@ -8,7 +8,7 @@ import torch
 from tests.kit.cosmos_helpers import GOLDEN, recorders_of
 from vla_attention.capture.policies.cosmos import dit
 from vla_attention.capture.policies.cosmos.case import read_case
-from vla_attention.capture.policies.cosmos.observer import CallObserver
+from vla_attention.capture.policies.cosmos.model import CallObserver
 from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
 from vla_attention.schemas.segments import segments_of
 

@@ -20,7 +20,7 @@ from vla_attention.capture.policies.cosmos.dit_weights import build_dit, dit_ten
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, random_dit_weights
 from vla_attention.capture.policies.cosmos.parity import EverythingObserver
 from vla_attention.capture.policies.cosmos.vae import expected_vae_shapes, infer_vae_config
-from vla_attention.capture.policies.strict_loading import check_shapes
+from vla_attention.capture.policies.weights import check_shapes
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,8 @@ from tests.kit.cosmos_checkpoint import WEIGHTS_NAME
 from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION
 from tests.kit.policy_inputs import make_observation
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnsupportedCheckpoint
-from vla_attention.capture.policies.cosmos.build import build_cosmos_policy
 from vla_attention.capture.policies.cosmos.embedded import random_policy
-from vla_attention.capture.policies.cosmos.loading import CosmosOptions, load_cosmos_policy
+from vla_attention.capture.policies.cosmos.loading import CosmosOptions, build_cosmos_policy, load_cosmos_policy
 from vla_attention.capture.policies.cosmos.locate import (
     EMBEDDINGS_NAME,
     POLICY_REPOSITORY,
@@ -24,8 +23,6 @@ from vla_attention.capture.policies.cosmos.locate import (
     VAE_NAME,
     VAE_REPOSITORY,
 )
-from vla_attention.capture.policies.cosmos.preprocess import StatisticsNotFound
-from vla_attention.capture.policies.cosmos.t5_pickle import EmbeddingsNotFound
 from vla_attention.capture.policies.hub import CheckpointUnavailable
 from vla_attention.capture.policies.identity import downloads_of
 from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
@@ -100,8 +97,8 @@ def test_an_instruction_without_embedding_names_the_near_ones(folder):
 @pytest.mark.parametrize(
     ("missing", "error", "message"),
     [
-        (STATISTICS_NAME, StatisticsNotFound, "--dataset-stats-path"),
-        (EMBEDDINGS_NAME, EmbeddingsNotFound, "--t5-text-embeddings-path"),
+        (STATISTICS_NAME, CheckpointNotFound, "--dataset-stats-path"),
+        (EMBEDDINGS_NAME, CheckpointNotFound, "--t5-text-embeddings-path"),
         (WEIGHTS_NAME, CheckpointNotFound, "has no .pt file"),
         (VAE_NAME, CheckpointNotFound, f"hf download {VAE_REPOSITORY} {VAE_NAME}.*--vae-path"),
     ],

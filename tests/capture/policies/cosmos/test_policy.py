@@ -12,11 +12,10 @@ import torch
 
 from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION, recorders_of
 from tests.kit.policy_inputs import KeepAll, assert_same_input, make_observation
-from vla_attention.capture.policies.cosmos.build import build_cosmos_policy
-from vla_attention.capture.policies.cosmos.calls import select_call
 from vla_attention.capture.policies.cosmos.config import LIBERO_FRAMES, CosmosConfig, FrameConfig
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, random_policy
-from vla_attention.capture.policies.cosmos.layout import cross_layout, self_layout
+from vla_attention.capture.policies.cosmos.latents import cross_layout, self_layout
+from vla_attention.capture.policies.cosmos.loading import build_cosmos_policy, select_call
 from vla_attention.capture.policies.policy import camera_grid
 from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
 from vla_attention.schemas.errors import BadArgument, MissingDependency, UnknownName

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from vla_attention.capture.policies.checkpoints import CheckpointMismatch
+from vla_attention.capture.policies.checkpoints import CheckpointMismatch, CheckpointNotFound, UnreadableCheckpoint
 from vla_attention.capture.policies.cosmos.config import VaeConfig
 from vla_attention.capture.policies.cosmos.embedded import BUILTIN_RANGES, builtin_statistics, random_vae_weights
 from vla_attention.capture.policies.cosmos.preprocess import (
-    BadStatistics,
-    StatisticsNotFound,
     crop_and_enlarge,
     crop_size,
     model_picture,
@@ -68,18 +66,18 @@ def test_bad_statistics_are_one_sentence(tmp_path, change, message):
     content = {**BUILTIN_RANGES, **change}
     path = tmp_path / "statistics.json"
     path.write_text(json.dumps({name: value for name, value in content.items() if value is not None}))
-    with pytest.raises(BadStatistics, match=message):
+    with pytest.raises(UnreadableCheckpoint, match=message):
         read_statistics(path)
 
 
 def test_missing_or_broken_statistics(tmp_path):
-    with pytest.raises(StatisticsNotFound, match="--dataset-stats-path"):
+    with pytest.raises(CheckpointNotFound, match="--dataset-stats-path"):
         read_statistics(tmp_path / "no.json")
     (tmp_path / "a.json").write_text("{")
-    with pytest.raises(BadStatistics, match="is not valid JSON"):
+    with pytest.raises(UnreadableCheckpoint, match="is not valid JSON"):
         read_statistics(tmp_path / "a.json")
     (tmp_path / "a.json").write_text("[]")
-    with pytest.raises(BadStatistics, match="holds a list"):
+    with pytest.raises(UnreadableCheckpoint, match="holds a list"):
         read_statistics(tmp_path / "a.json")
 
 

@@ -10,21 +10,11 @@ import pytest
 import torch
 
 from tests.kit.cosmos_helpers import INSTRUCTION
-from vla_attention.capture.policies.cosmos.t5_encoder import EncoderUnusable, T5Encoder
-from vla_attention.capture.policies.cosmos.t5_pickle import (
-    BadEmbeddings,
-    EmbeddingsNotFound,
-    TextEmbeddings,
-    read_embeddings,
-)
-from vla_attention.capture.policies.cosmos.tensor_files import (
-    RefusedPickle,
-    TensorFileNotFound,
-    UnreadableTensors,
-    read_tensors,
-)
-from vla_attention.capture.policies.cosmos.text import PieceTokenizer, PrecomputedText, SeededText, TokenizerUnusable
-from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER, UnreadableTokenizer
+from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
+from vla_attention.capture.policies.cosmos.t5_pickle import TextEmbeddings, read_embeddings
+from vla_attention.capture.policies.cosmos.tensor_files import RefusedPickle, read_tensors
+from vla_attention.capture.policies.cosmos.text import PieceTokenizer, PrecomputedText, SeededText, T5Encoder
+from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.schemas.errors import BadArgument, MissingDependency, UnknownName
 from vla_attention.schemas.groupings.words import words_of
 from vla_attention.schemas.layout import Role
@@ -95,24 +85,24 @@ def test_embeddings_are_read_as_saved(tmp_path):
     ],
 )
 def test_what_is_no_table_of_embeddings_is_refused(tmp_path, content, message):
-    with pytest.raises(BadEmbeddings, match=message):
+    with pytest.raises(UnreadableCheckpoint, match=message):
         read_embeddings(save(tmp_path / "text.pkl", content))
 
 
 def test_missing_and_damaged_files(tmp_path):
-    with pytest.raises(EmbeddingsNotFound, match="--t5-text-embeddings-path"):
+    with pytest.raises(CheckpointNotFound, match="--t5-text-embeddings-path"):
         read_embeddings(tmp_path / "no.pkl")
     path = save(tmp_path / "text.pkl", {"a": made_up(2)})
     path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(BadEmbeddings, match="cannot be read as text embeddings"):
+    with pytest.raises(UnreadableCheckpoint, match="cannot be read as text embeddings"):
         read_embeddings(path)
-    with pytest.raises(TensorFileNotFound):
+    with pytest.raises(CheckpointNotFound):
         read_tensors(tmp_path / "no.pt")
     (tmp_path / "bad.pt").write_bytes(b"nothing")
-    with pytest.raises(UnreadableTensors, match="damaged or no pickle"):
+    with pytest.raises(UnreadableCheckpoint, match="damaged or no pickle"):
         read_tensors(tmp_path / "bad.pt")
     torch.save([1], tmp_path / "bad.pt")
-    with pytest.raises(UnreadableTensors, match="holds no tensors by name, but list"):
+    with pytest.raises(UnreadableCheckpoint, match="holds no tensors by name, but list"):
         read_tensors(tmp_path / "bad.pt")
 
 
@@ -148,7 +138,7 @@ def test_with_a_tokenizer_words_have_positions():
     words = words_of(encoded.prompt)
     assert [word.text for word in words] == INSTRUCTION.split()
     assert sorted({key for word in words for key in word.keys}) == list(range(count))
-    with pytest.raises(TokenizerUnusable, match="1 real positions: it is another model's tokenizer"):
+    with pytest.raises(UnreadableCheckpoint, match="1 real positions: it is another model's tokenizer"):
         PrecomputedText(table, tokenizer).encode("wrong")
 
 
@@ -173,7 +163,7 @@ def test_no_text_is_all_null_unless_the_file_has_an_embedding_of_it():
 def test_zeros_between_real_positions_are_refused():
     holed = made_up(5)
     holed[:, 2] = 0
-    with pytest.raises(BadEmbeddings, match="zero positions between real ones"):
+    with pytest.raises(UnreadableCheckpoint, match="zero positions between real ones"):
         PrecomputedText(TextEmbeddings("x", {"a": holed}, "")).encode("a")
 
 
@@ -188,7 +178,7 @@ def test_made_up_embeddings_depend_on_the_words():
 
 def test_a_tokenizer_that_is_none(tmp_path):
     (tmp_path / "spiece.model").write_bytes(b"nothing")
-    with pytest.raises(UnreadableTokenizer, match="not a sentencepiece model"):
+    with pytest.raises(UnreadableCheckpoint, match="not a sentencepiece model"):
         PieceTokenizer(tmp_path / "spiece.model")
 
 
@@ -217,12 +207,12 @@ def test_what_the_file_lacks_is_encoded_once_and_what_it_has_is_not():
         encoded = text.encode("open the drawer")
     assert encoder.calls == 1
     assert encoded.embedding[0, :, 0].ne(0).sum() == len(encoded.prompt.pieces) + 1
-    with pytest.raises(TokenizerUnusable, match="--t5-tokenizer"):
+    with pytest.raises(UnreadableCheckpoint, match="--t5-tokenizer"):
         PrecomputedText(text.embeddings, None, encoder)
 
 
 def test_a_folder_without_t5_is_refused(tmp_path):
-    with pytest.raises(EncoderUnusable, match="There is no T5 encoder at"):
+    with pytest.raises(UnreadableCheckpoint, match="There is no T5 encoder at"):
         T5Encoder(tmp_path)
 
 

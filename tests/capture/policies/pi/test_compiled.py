@@ -49,16 +49,16 @@ def recording(**changes):
 INSTRUCTIONS = ("lift", "put the red cube on the plate beside the very small green cube")
 
 
-@pytest.mark.parametrize("instruction", INSTRUCTIONS)
 @pytest.mark.parametrize(
-    "changes",
+    ("changes", "instruction"),
     [
-        {},
-        {"queries": "all", "contributions": False},
-        {"queries": "steps"},
-        {"layers": (1,), "denoise_steps": (0, 1, 2)},
+        ({}, INSTRUCTIONS[0]),
+        ({}, INSTRUCTIONS[1]),
+        ({"queries": "all", "contributions": False}, INSTRUCTIONS[0]),
+        ({"queries": "steps"}, INSTRUCTIONS[0]),
+        ({"layers": (1,), "denoise_steps": (0, 1, 2)}, INSTRUCTIONS[1]),
     ],
-    ids=lambda changes: ",".join(changes) or "mean",
+    ids=["short", "long", "all", "steps", "layers"],
 )
 def test_compiled_steps_record_what_the_model_records(policy, compiled, changes, instruction):
     given = policy.prepare(make_observation(3), instruction)

@@ -13,7 +13,7 @@ from tests.kit.small_tokenizer import train_small_tokenizer
 from vla_attention.capture.policies.pi.case import read_config
 from vla_attention.capture.policies.pi.config import find_config
 from vla_attention.capture.policies.pi.data_set_robot import openpi_robot, untrained_robot
-from vla_attention.capture.policies.pi.lerobot_processing import lerobot_image
+from vla_attention.capture.policies.pi.lerobot import lerobot_image
 from vla_attention.capture.policies.pi.loading import CheckpointOptions, choose_config, load_pi_policy
 from vla_attention.capture.policies.robot import Robot, RobotData
 from vla_attention.schemas.errors import BadArgument

@@ -13,11 +13,11 @@ from tests.kit.pi_golden import GOLDEN
 from tests.kit.policy_inputs import assert_same_input, make_observation
 from tests.kit.small_tokenizer import train_small_tokenizer
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint, UnsupportedCheckpoint
+from vla_attention.capture.policies.pi.lerobot import lerobot_image
 from vla_attention.capture.policies.pi.lerobot_config import UnsupportedLerobotFeature, read_lerobot_config
 from vla_attention.capture.policies.pi.lerobot_pipeline import LerobotNormaliser, read_lerobot_pipeline
-from vla_attention.capture.policies.pi.lerobot_processing import lerobot_image
 from vla_attention.capture.policies.pi.loading import CheckpointOptions, load_pi_policy
-from vla_attention.capture.policies.pi.preprocess import UnusableNormStats, libero_state
+from vla_attention.capture.policies.pi.preprocess import libero_state
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, digitise_state
 from vla_attention.capture.policies.policy import Policy
 from vla_attention.schemas.errors import BadArgument, UserError
@@ -328,16 +328,16 @@ def test_missing_damaged_and_misshapen_statistics(checkpoint):
     key = "observation.state.q01" if config.pi05 else "observation.state.mean"
     tensors = load_file(state_file)
     save_file({**tensors, key: tensors[key][:7].clone()}, state_file)
-    with pytest.raises(UnusableNormStats, match=rf"{key}' .* shape \(7,\); 8 numbers are needed"):
+    with pytest.raises(UnreadableCheckpoint, match=rf"{key}' .* shape \(7,\); 8 numbers are needed"):
         read_lerobot_pipeline(checkpoint, config)
     save_file({name: tensor for name, tensor in tensors.items() if name != key}, state_file)
-    with pytest.raises(UnusableNormStats, match=f"lacks {key}"):
+    with pytest.raises(UnreadableCheckpoint, match=f"lacks {key}"):
         read_lerobot_pipeline(checkpoint, config)
     state_file.write_bytes(state_file.read_bytes()[:100])
     with pytest.raises(UnreadableCheckpoint, match="damaged"):
         read_lerobot_pipeline(checkpoint, config)
     state_file.unlink()
-    with pytest.raises(UnusableNormStats, match="not there"):
+    with pytest.raises(UnreadableCheckpoint, match="not there"):
         read_lerobot_pipeline(checkpoint, config)
     (checkpoint / "policy_postprocessor.json").unlink()
     with pytest.raises(UnsupportedCheckpoint, match=r"no policy_postprocessor\.json"):

@@ -21,7 +21,7 @@ from vla_attention.capture.policies.hub import (
     split_hub_name,
 )
 from vla_attention.capture.policies.identity import downloads_of
-from vla_attention.capture.policies.pi.build import build_pi_policy
+from vla_attention.capture.policies.pi.loading import build_pi_policy
 from vla_attention.capture.policies.pi.locate import (
     HUB_FILES,
     find_checkpoint,

@@ -10,8 +10,7 @@ from tests.kit.pi_golden import read_manifest, read_manifest_dtypes
 from tests.kit.policy_inputs import KeepAll
 from vla_attention.capture.policies.pi.config import find_config
 from vla_attention.capture.policies.pi.flow_time import denoise_times, embed_times
-from vla_attention.capture.policies.pi.model import PiModel
-from vla_attention.capture.policies.pi.model_weights import expected_shapes, model_from_state
+from vla_attention.capture.policies.pi.model import PiModel, expected_shapes, model_from_state
 from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
 
 LIMIT = 5e-5

@@ -16,7 +16,7 @@ from tests.kit.slow import slow_except
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint, UnsupportedCheckpoint
 from vla_attention.capture.policies.pi.config import GemmaConfig
 from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, random_weights
-from vla_attention.capture.policies.pi.jax_lora import merge_lora
+from vla_attention.capture.policies.pi.jax_weights import merge_lora
 from vla_attention.capture.policies.pi.loading import load_pi_model
 from vla_attention.capture.policies.pi.openpi_jax import OpenLeaf, list_leaves, load_openpi_jax
 from vla_attention.capture.policies.pi.preprocess import read_norm_stats

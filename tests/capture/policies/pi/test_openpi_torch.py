@@ -16,11 +16,10 @@ from vla_attention.capture.policies.checkpoints import CheckpointMismatch, Check
 from vla_attention.capture.policies.pi.case import read_config
 from vla_attention.capture.policies.pi.config import NAMED_CONFIGS, SiglipConfig, find_config, find_variant
 from vla_attention.capture.policies.pi.jax_weights import plan_leaves
-from vla_attention.capture.policies.pi.model import PiModel
-from vla_attention.capture.policies.pi.model_weights import expected_shapes
+from vla_attention.capture.policies.pi.model import PiModel, expected_shapes
 from vla_attention.capture.policies.pi.openpi_torch import load_openpi_torch, model_names
 from vla_attention.capture.policies.pi.sizes import infer_config
-from vla_attention.capture.policies.strict_loading import check_shapes
+from vla_attention.capture.policies.weights import check_shapes
 from vla_attention.schemas.errors import BadArgument, UnknownName, UserError
 
 STORED = GOLDEN / "pi05_batch2" / "checkpoint_openpi_torch"

@@ -12,6 +12,7 @@ from tests.kit.pi_golden import GOLDEN
 from tests.kit.policy_inputs import assert_same_input, make_observation
 from tests.kit.slow import slow_except
 from vla_attention.capture.environments.base import Observation
+from vla_attention.capture.policies.checkpoints import CheckpointNotFound
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.noise import initial_noise
 from vla_attention.capture.policies.pi.config import find_config
@@ -22,7 +23,7 @@ from vla_attention.capture.policies.pi.preprocess import model_image
 from vla_attention.capture.policies.pi.processing import OpenpiProcessing
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, check_vocabulary
 from vla_attention.capture.policies.policy import Policy
-from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER, TokenizerNotFound
+from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.capture.policies.weights import weights_digest
 from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
 from vla_attention.schemas.errors import BadArgument, UnknownName
@@ -271,5 +272,5 @@ def test_policy_from_a_checkpoint_folder(tmp_path, observation):
     assert policy.identity().untrained is False
     assert policy.name == "pi05"
     assert np.isfinite(policy.act(policy.prepare(observation, INSTRUCTION), 0)).all()
-    with pytest.raises(TokenizerNotFound):
+    with pytest.raises(CheckpointNotFound):
         load_pi_policy(tmp_path, tmp_path / "none.model", config=config)

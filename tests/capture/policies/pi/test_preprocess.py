@@ -7,11 +7,10 @@ import pytest
 from PIL import Image
 
 from tests.kit.pi_golden import GOLDEN
+from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
 from vla_attention.capture.policies.pi.preprocess import (
     NormStats,
-    NormStatsNotFound,
     Statistics,
-    UnusableNormStats,
     axis_angle,
     environment_actions,
     libero_state,
@@ -126,7 +125,7 @@ def test_image_tensor_spans_minus_one_to_one():
 
 
 def test_statistics_come_from_the_checkpoint_s_assets(tmp_path, stats):
-    with pytest.raises(NormStatsNotFound, match=r"no norm_stats\.json below"):
+    with pytest.raises(CheckpointNotFound, match=r"no norm_stats\.json below"):
         read_norm_stats(tmp_path)
     target = tmp_path / "assets" / "physical-intelligence" / "libero" / "norm_stats.json"
     target.parent.mkdir(parents=True)
@@ -135,7 +134,7 @@ def test_statistics_come_from_the_checkpoint_s_assets(tmp_path, stats):
     second = tmp_path / "assets" / "droid" / "norm_stats.json"
     second.parent.mkdir()
     second.write_text("{}")
-    with pytest.raises(UnusableNormStats, match="more than one"):
+    with pytest.raises(UnreadableCheckpoint, match="more than one"):
         read_norm_stats(tmp_path)
 
 
@@ -154,13 +153,13 @@ def test_damaged_statistics(tmp_path, content, message):
     target = tmp_path / "assets" / "x" / "norm_stats.json"
     target.parent.mkdir(parents=True)
     target.write_text(content)
-    with pytest.raises(UnusableNormStats, match=message) as caught:
+    with pytest.raises(UnreadableCheckpoint, match=message) as caught:
         read_norm_stats(tmp_path)
     assert isinstance(caught.value, UserError)
 
 
 def test_quantile_mode_without_quantiles():
-    with pytest.raises(UnusableNormStats, match="no q01 and q99"):
+    with pytest.raises(UnreadableCheckpoint, match="no q01 and q99"):
         Statistics(mean=np.zeros(1), std=np.ones(1)).normalise(np.zeros(1), "quantile")
 
 
@@ -176,7 +175,7 @@ def test_statistics_must_be_those_of_state_and_actions(stats):
         (14, 7, "'state' have 14 numbers; 8 are needed"),
         (8, 8, r"'actions' have 8 numbers; 7 are needed \(or 32, padded\)"),
     ):
-        with pytest.raises(UnusableNormStats, match=message):
+        with pytest.raises(UnreadableCheckpoint, match=message):
             NormStats(numbers(state), numbers(actions)).check("z-score", 8, 32)
-    with pytest.raises(UnusableNormStats, match="'state' lack q01"):
+    with pytest.raises(UnreadableCheckpoint, match="'state' lack q01"):
         NormStats(numbers(8), numbers(7)).check("quantile", 8, 32)

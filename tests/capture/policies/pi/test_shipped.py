@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from tests.kit.policy_inputs import make_observation
-from vla_attention.capture.policies.pi.build import build_pi_policy
+from vla_attention.capture.policies.pi.family import CUBES_POLICY, SHIPPED
+from vla_attention.capture.policies.pi.loading import build_pi_policy
 from vla_attention.capture.policies.pi.policy import PiPolicy
-from vla_attention.capture.policies.pi.shipped import CUBES_POLICY, SHIPPED
 from vla_attention.schemas.layout import Role
 
 FOLDER = SHIPPED[CUBES_POLICY]

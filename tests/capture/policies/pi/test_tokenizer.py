@@ -7,12 +7,9 @@ import numpy as np
 import pytest
 
 from tests.kit.pi_golden import GOLDEN
+from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, clean_instruction
-from vla_attention.capture.policies.sentencepiece_model import (
-    EMBEDDED_TOKENIZER,
-    TokenizerNotFound,
-    UnreadableTokenizer,
-)
+from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import Role
 
@@ -159,11 +156,11 @@ def test_an_empty_instruction_is_refused(tokenizer, instruction):
 
 
 def test_missing_and_damaged_files(tmp_path):
-    with pytest.raises(TokenizerNotFound, match=r"no tokenizer file.*paligemma_tokenizer\.model"):
+    with pytest.raises(CheckpointNotFound, match=r"no tokenizer file.*paligemma_tokenizer\.model"):
         PromptTokenizer(tmp_path / "tokenizer.model")
     for content in (b"", b"not a model", EMBEDDED_TOKENIZER.read_bytes()[:3000]):
         (tmp_path / "tokenizer.model").write_bytes(content)
-        with pytest.raises(UnreadableTokenizer, match="not a sentencepiece model"):
+        with pytest.raises(UnreadableCheckpoint, match="not a sentencepiece model"):
             PromptTokenizer(tmp_path / "tokenizer.model")
 
 

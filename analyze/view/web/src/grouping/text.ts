@@ -1,6 +1,6 @@
 /**
  * Text as Python counts and shows it: characters are code points, and what cannot be printed is an escape.
- * The same as schemas/errors.py and schemas/visible_text.py, so that a sentence is the same wherever it is read.
+ * The same as schemas/errors.py, so that a sentence is the same wherever it is read.
  */
 
 const NAME_CHARACTERS = 255;

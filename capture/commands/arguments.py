@@ -1,0 +1,337 @@
+"""The command-line arguments of `vla-capture` and of the published scripts' commands."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from vla_attention.capture.commands.parity_command import run_parity_command
+from vla_attention.capture.doctor.arguments import DOCTOR_EXAMPLES, add_doctor_arguments
+from vla_attention.capture.environments.suites import ALL_SUITES, STANDARD_SUITES, SUITES, find_suite, list_tasks
+from vla_attention.capture.interventions.arguments import add_intervention_arguments
+from vla_attention.capture.jobs.termination import Termination
+from vla_attention.capture.policies.families import policy_families
+from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
+from vla_attention.capture.policies.model_arguments import POLICY_THREADS
+from vla_attention.capture.replay.arguments import REPLAY_EXAMPLES, add_replay_arguments
+from vla_attention.capture.rerun.arguments import RERUN_EXAMPLES, add_rerun_arguments
+from vla_attention.capture.rollout.recording_arguments import add_recording_arguments
+from vla_attention.capture.run.command import run_capture_of_family
+from vla_attention.schemas.command_line import OneSentenceParser
+from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.stores import repair_command, verify_command
+from vla_attention.schemas.stores.repair_command import VERIFY_HELP
+from vla_attention.schemas.threads import add_threads
+
+_FURTHER_EXAMPLES = """\
+  vla-capture status runs/libero_10.zarr                     what is there, what is missing, who is writing
+  vla-capture repair runs/libero_10.zarr                     move damaged episodes aside; --resume records them again
+  vla-capture verify runs/libero_10.zarr                     read everything back and check it
+  vla-capture doctor                                         what this machine can do, and what is missing
+  vla-capture parity CASE                                    our numbers against a reference's, on your own checkpoint
+"""
+
+
+def build_parser(given: Sequence[str] = ()) -> argparse.ArgumentParser:
+    """Return the parser of `vla-capture`. In parsed arguments, `command` is the function to call.
+
+    given: what will be parsed; `rerun` takes the model options of the family whose store is among it.
+    """
+    families = policy_families()
+    examples = "".join(family.examples for family in families)
+    parser = OneSentenceParser(
+        prog="vla-capture",
+        description="Run a policy in simulation and record the attention rows of its action queries.",
+        epilog=f"examples:\n{examples}{_FURTHER_EXAMPLES}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(required=True, metavar="POLICY", parser_class=OneSentenceParser)
+    for family in families:
+        capture = commands.add_parser(
+            family.name,
+            help=family.title,
+            description=family.description,
+            epilog=f"examples:\n{family.examples}{_FURTHER_EXAMPLES}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        _add_capture_arguments(capture, family)
+        capture.set_defaults(command=run_capture_of_family, family=family)
+    parity = commands.add_parser(
+        "parity",
+        help="compare a policy with what a reference implementation computed",
+        description="Run a case folder (case.json, a checkpoint, inputs.npz, expected.npz) and print the largest "
+        "differences. Exit code 0: all within the limit, 1: beyond it, 2: the case cannot be used.",
+    )
+    _add_parity_arguments(parity, families)
+    repair = commands.add_parser(
+        "repair",
+        help="move damaged episodes of a store aside, so that --resume records them again",
+        description=repair_command.DESCRIPTION,
+        epilog=repair_command.EXAMPLES.replace("NAME", "vla-capture"),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    repair_command.add_repair_arguments(repair)
+    repair.set_defaults(command=_run_repair)
+    replay = commands.add_parser(
+        "replay",
+        help="make policy calls on the frames of a data set of a robot",
+        description="Feed the pictures, states and tasks of a LeRobotDataset (2.0, 2.1 or 3.0) to a policy, without a "
+        "simulator, and record its attention into a store like any other, beside the actions that the data set has. "
+        "See docs/data-sets.md.",
+        epilog=f"examples:\n{REPLAY_EXAMPLES}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_replay_arguments(replay, given if "replay" in given[:1] else ())
+    rerun = commands.add_parser(
+        "rerun",
+        help="make the policy calls of a store again, unchanged or with interventions",
+        description="Give the policy of a store the same pictures, state, prompt and noise again, without a simulator. "
+        "First the calls of one episode are made again unchanged, and their distance from the stored ones is printed. "
+        "With interventions, or with --store, the calls of all episodes go into a store like any other.",
+        epilog=f"examples:\n{RERUN_EXAMPLES}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_rerun_arguments(rerun, given if "rerun" in given[:1] else ())
+    status = commands.add_parser(
+        "status",
+        help="what a store holds, what is missing, and who is writing",
+        description="Episodes committed and expected per task, success, size, last writer, what is missing and what "
+        "is being written; which episodes are damaged and why. Reads only; works while captures run, and needs neither "
+        "torch nor a GPU.",
+    )
+    _add_status_arguments(status)
+    doctor = commands.add_parser(
+        "doctor",
+        help="what this machine can do for a run, and what is missing for it",
+        description="Takes the options of a capture and prints a line for everything that it needs: threads, memory, "
+        "GPU, drawing, simulator and assets, disk, checkpoint, precision, time and size, each with what to do. Exit "
+        "code 1 when something is missing. With --accept, ten episodes of a published checkpoint are held against its "
+        "published success rate.",
+        epilog=f"examples:\n{DOCTOR_EXAMPLES}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_doctor_arguments(doctor, given[1:] if "doctor" in given[:1] else (), _add_capture_arguments)
+    verify = commands.add_parser(
+        "verify",
+        help="read stores back and check every file, digest and row sum",
+        description=verify_command.DESCRIPTION,
+        epilog=verify_command.EXAMPLES.replace("NAME", "vla-capture"),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    verify_command.add_verify_arguments(verify)
+    verify.set_defaults(command=_run_verify)
+    tasks = commands.add_parser("tasks", help="the tasks of a suite", description="The tasks of a suite by their ids.")
+    tasks.add_argument("suite", metavar="SUITE", help="task suite")
+    tasks.add_argument("--array", action="store_true", help="only the range of ids, as sbatch --array takes it")
+    tasks.set_defaults(command=_run_tasks)
+    return parser
+
+
+def build_evaluate_parser(family: PolicyFamily, script: PublishedScript) -> argparse.ArgumentParser:
+    """Return the parser of a published script: the family's, with the script's defaults and cluster options."""
+    parser = OneSentenceParser(
+        prog=script.program,
+        description=f"{family.description} Then analyse, with the arguments of the published script. All layers are "
+        "recorded, so that other --layers need no second capture; an existing store is continued with what is missing.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    _add_capture_arguments(parser, family, script)
+    job = parser.add_argument_group("as a job of a cluster (see docs/cluster.md)")
+    job.add_argument(
+        "--stage",
+        choices=("capture", "analyze", "both"),
+        help="what to do (default: both; in an array job capture, as all of its tasks fill one store)",
+    )
+    job.add_argument(
+        "--array-index",
+        type=int,
+        metavar="N",
+        help="index in an array job: a task, counted through the suites of 'all'",
+    )
+    job.add_argument(
+        "--max-requeues",
+        type=int,
+        default=0,
+        metavar="N",
+        help="after SIGTERM put the SLURM job back into the queue, at most N times (default: 0)",
+    )
+    job.add_argument(
+        "--from-environment",
+        action="store_true",
+        help="also read the variables of scripts/run_attention_ratio*.sh (CHECKPOINT, TASK_SUITE, LAYERS ...); see "
+        "their heads",
+    )
+    parser.set_defaults(family=family, checkpoint=script.checkpoint, task_suite="libero_10", resume=True, store=None)
+    return parser
+
+
+def _add_capture_arguments(
+    parser: argparse.ArgumentParser, family: PolicyFamily, script: PublishedScript | None = None
+) -> None:
+    """Add all options of a capture with one policy family; `script`: of a published script instead."""
+    family.add_arguments(parser)
+    _add_evaluation_arguments(parser, family, script)
+    which = "block indices (default: all)"
+    if script:
+        which = f"layers to analyse; all are recorded (default: {' '.join(map(str, script.layers))})"
+    add_recording_arguments(parser, which + family.layers_note)
+    add_intervention_arguments(parser)
+    _add_output_arguments(parser, family, script)
+
+
+def _add_evaluation_arguments(
+    parser: argparse.ArgumentParser, family: PolicyFamily, script: PublishedScript | None
+) -> None:
+    group = parser.add_argument_group("evaluation")
+    names = ", ".join(suite.name for suite in SUITES)
+    which = f"one of {names} (default: {family.default_suite})"
+    if script:
+        which = f"one of {names}, or {ALL_SUITES} for {listing(STANDARD_SUITES)} (default: libero_10)"
+    group.add_argument("--task-suite", default=family.default_suite, metavar="SUITE", help=which)
+    group.add_argument(
+        "--task-id", type=int, nargs="+", metavar="N", help="one or several tasks (default: all tasks of the suite)"
+    )
+    group.add_argument("--num-episodes", type=int, default=5, metavar="N", help="episodes per task (default: 5)")
+    if len(family.protocols) > 1:
+        group.add_argument(
+            "--protocol",
+            choices=[protocol.name for protocol in family.protocols],
+            help="the published evaluation to follow: picture size, steps and seeding, see docs/protocol.md (default: "
+            "that of the checkpoint's format)",
+        )
+    seeds = ", ".join(f"{protocol.default_seed} for {protocol.name}" for protocol in family.protocols)
+    group.add_argument("--seed", type=int, metavar="N", help=f"{family.seed_of} (default: {seeds})")
+    group.add_argument(
+        "--replan-steps",
+        type=int,
+        metavar="N",
+        help=f"actions executed per policy call (default: {family.replan_default})",
+    )
+    group.add_argument(
+        "--max-steps",
+        type=int,
+        metavar="N",
+        help="steps after waiting (default: the published number of suite and protocol)",
+    )
+    group.add_argument(
+        "--num-envs",
+        type=int,
+        metavar="N",
+        help="simulators that run at a time, each in a process of its own; 1 simulates in the policy's process "
+        "(default: the cores that this process may use, at most 8, and 2 GB of memory each)",
+    )
+    group.add_argument(
+        "--policy-batch",
+        type=int,
+        metavar="N",
+        help="most policy calls of different simulators that are made as one batch; from 2 on, last bits of what is "
+        "computed change (default: 1 on a processor, on a GPU the number of simulators)",
+    )
+    group.add_argument(
+        "--libero-assets", type=Path, metavar="PATH", help="LIBERO asset folder (or set VLA_LIBERO_ASSETS)"
+    )
+
+
+def _add_output_arguments(
+    parser: argparse.ArgumentParser, family: PolicyFamily, script: PublishedScript | None
+) -> None:
+    group = parser.add_argument_group("output")
+    group.add_argument(
+        "--store",
+        type=Path,
+        metavar="NAME.zarr",
+        help=f"store to write (default: {family.store_prefix}SUITE.zarr in {'--output-dir' if script else 'runs'})",
+    )
+    analysis = "an analysis that runs afterwards"
+    if script:
+        analysis = f"the analysis; default: results/attention_ratio_{family.store_prefix}SUITE"
+    group.add_argument(
+        "--output-dir",
+        type=Path,
+        metavar="PATH",
+        help=f"folder for the store (unless --store is given) and for the results of {analysis}",
+    )
+    group.add_argument("--save-viz", action="store_true", help="analyse afterwards, with pictures of every episode")
+    group.add_argument(
+        "--budget",
+        metavar="SIZE",
+        help="most disk space of the store, such as 20GB: a few replans are tried, and what is recorded is the most "
+        "that fits; precision, denoise steps, layers and heads that are given stay as they are (docs/store.md)",
+    )
+    existing = group.add_mutually_exclusive_group()
+    resume = "continue an existing store with what is missing" + (" (default)" if script else "")
+    existing.add_argument("--resume", action="store_true", help=resume)
+    group.add_argument(
+        "--verify",
+        action="store_true",
+        help="with --resume: read every byte of the episodes that are there, instead of only seals, presence and sizes",
+    )
+    existing.add_argument("--overwrite", action="store_true", help="delete an existing store first")
+
+
+def _add_parity_arguments(parser: argparse.ArgumentParser, families: tuple[PolicyFamily, ...]) -> None:
+    cases = [family.parity for family in families if family.parity is not None]
+    formats = listing(name for case in cases for name in case.formats)
+    limit = listing(case.default_limit for case in cases if case.default_limit)
+    parser.add_argument("case", type=Path, metavar="CASE", help="case folder")
+    parser.add_argument("--format", metavar="NAME", help=f"{formats} (default: every format that the case carries)")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    parser.add_argument(
+        "--limit",
+        type=float,
+        metavar="X",
+        help=f"largest difference that passes (default: {limit})",
+    )
+    parser.add_argument("--device", default="cpu", help="auto, cpu (default), cuda, cuda:1 ...")
+    add_threads(parser, POLICY_THREADS)
+    parser.set_defaults(command=run_parity_command)
+
+
+def _add_status_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("stores", nargs="+", type=Path, metavar="STORE", help="one or several NAME.zarr")
+    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+    parser.add_argument(
+        "--expected",
+        type=int,
+        metavar="N",
+        help="episodes expected per task (default: what the runs that filled the store planned)",
+    )
+    parser.add_argument(
+        "--check", action="store_true", help="exit code 1 when an expected episode is missing, or one is damaged"
+    )
+    parser.add_argument("--verify", action="store_true", help=VERIFY_HELP)
+    parser.set_defaults(command=_run_status)
+
+
+def _run_status(arguments: argparse.Namespace, termination: Termination) -> int:
+    from vla_attention.capture.jobs.status import print_status
+
+    return print_status(
+        arguments.stores,
+        arguments.expected,
+        as_json=arguments.json,
+        check=arguments.check,
+        verify=arguments.verify,
+    )
+
+
+def _run_repair(arguments: argparse.Namespace, termination: Termination) -> int:
+    return repair_command.run_repair(arguments.stores, verify=arguments.verify, dry_run=arguments.dry_run)
+
+
+def _run_verify(arguments: argparse.Namespace, termination: Termination) -> int:
+    return verify_command.run_verify(arguments.stores, quick=arguments.quick, as_json=arguments.json)
+
+
+def _run_tasks(arguments: argparse.Namespace, termination: Termination) -> int:
+    """Print a line per task, or with `--array` the range of task ids, which needs no simulator (login nodes)."""
+    if arguments.array:
+        names = STANDARD_SUITES if arguments.suite == ALL_SUITES else (arguments.suite,)
+        print(f"0-{sum(find_suite(name).num_tasks for name in names) - 1}")
+        return 0
+    if arguments.suite == ALL_SUITES:
+        raise BadArgument(f"'{ALL_SUITES}' is for --array only; name one suite.")
+    for task in list_tasks(find_suite(arguments.suite)):
+        print(f"{task.task_id:>3}  {task.instruction}")
+    return 0

@@ -1,0 +1,154 @@
+"""What is recorded of each policy call: the settings of the options, the plan for a policy, and a store's root."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, cast
+from typing import Protocol as Interface
+
+from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.interventions import Interventions, RerunSource
+from vla_attention.schemas.layers import select_layers
+from vla_attention.schemas.layout import SiteLayout
+from vla_attention.schemas.precision import DEFAULT_MANTISSA_BITS, parse_precision
+from vla_attention.schemas.stores.store_format import (
+    FORMAT_NAME,
+    STORE_VERSION,
+    DataSetSource,
+    PolicyIdentity,
+    Protocol,
+    Recording,
+    RootAttributes,
+)
+
+if TYPE_CHECKING:
+    from vla_attention.capture.policies.policy import Policy
+
+#: The denoise steps that are recorded unless others are asked for.
+DEFAULT_STEPS = ("first", "last")
+
+
+@dataclass(frozen=True)
+class RecordingSettings:
+    """What is recorded of each policy call; None means everything."""
+
+    layers: tuple[int, ...] | None = None
+    denoise_steps: tuple[int | str, ...] = DEFAULT_STEPS
+    heads: tuple[int, ...] | None = None
+    queries: str = "mean"
+    mantissa_bits: int = DEFAULT_MANTISSA_BITS
+    frames: bool = True
+    contributions: bool = True
+
+
+def recording_settings(arguments: argparse.Namespace) -> RecordingSettings:
+    """Return what the options of `recording_arguments.py` say."""
+    return RecordingSettings(
+        layers=None if arguments.layers is None else tuple(arguments.layers),
+        denoise_steps=DEFAULT_STEPS if arguments.denoise_steps is None else tuple(arguments.denoise_steps),
+        heads=None if arguments.heads is None else tuple(arguments.heads),
+        queries=arguments.queries,
+        mantissa_bits=DEFAULT_MANTISSA_BITS if arguments.precision is None else parse_precision(arguments.precision),
+        frames=not arguments.no_frames,
+        contributions=arguments.contributions,
+    )
+
+
+class ModelSizes(Interface):
+    """How many layers, heads and denoise steps there are to record from; a policy or a layout."""
+
+    @property
+    def family(self) -> str:
+        """The policy's family, which decides how layers are numbered."""
+
+    @property
+    def num_layers(self) -> int:
+        """Number of blocks."""
+
+    @property
+    def num_heads(self) -> int:
+        """Number of heads of a block."""
+
+    @property
+    def num_denoise_steps(self) -> int:
+        """Number of denoise steps of a policy call."""
+
+
+def plan_recording(settings: RecordingSettings, policy: Policy) -> tuple[Recording, str | None]:
+    """Check the settings against the policy; also returns a line to print if layer numbers were translated."""
+    if len(set(settings.heads or ())) != len(settings.heads or ()):
+        raise BadArgument(f"Heads {listing(settings.heads or ())} name one of them twice.")
+    if settings.queries not in ("mean", "steps", "all"):
+        raise BadArgument(f"Cannot use --queries '{settings.queries}'; expected 'mean', 'steps' or 'all'.")
+    num_pools = len(policy.query_pools()) if settings.queries == "steps" else 0
+    return recording_of(settings, policy, policy.num_action_queries, num_pools)
+
+
+def recording_of(
+    settings: RecordingSettings, model: ModelSizes, num_action_queries: int, num_pools: int = 0
+) -> tuple[Recording, str | None]:
+    """Check layers, heads and denoise steps against the model.
+
+    num_action_queries, num_pools: of a policy call. Also returns a line to print if layer numbers were translated.
+    """
+    layers = select_layers(settings.layers, model.num_layers, model.family)
+    heads = tuple(range(model.num_heads)) if settings.heads is None else settings.heads
+    for head in heads:
+        if not 0 <= head < model.num_heads:
+            raise BadArgument(f"There is no head {head}; expected 0 to {model.num_heads - 1}.")
+    recording = Recording(
+        layers=tuple(sorted(set(layers.blocks))),
+        layer_labels=tuple(sorted(layers.labels, key=lambda label: (label % model.num_layers, label))),
+        denoise_steps=_denoise_steps(settings.denoise_steps, model.num_denoise_steps),
+        heads=tuple(sorted(set(heads))),
+        queries=cast(Literal["mean", "steps", "all"], settings.queries),
+        num_action_queries=num_action_queries,
+        num_pools=num_pools,
+        mantissa_bits=settings.mantissa_bits,
+        frames=settings.frames,
+        contributions=settings.contributions,
+    )
+    return recording, layers.note
+
+
+def _denoise_steps(words: Sequence[int | str], count: int) -> tuple[int, ...]:
+    named = {"first": (0,), "last": (count - 1,), "all": tuple(range(count))}
+    steps: set[int] = set()
+    for word in words:
+        if word in named:
+            steps.update(named[str(word)])
+        elif str(word).isdigit() and int(word) < count:
+            steps.add(int(word))
+        else:
+            raise BadArgument(
+                f"There is no denoise step {word!r}; expected numbers 0 to {count - 1}, 'first', 'last' or 'all'."
+            )
+    return tuple(sorted(steps))
+
+
+def root_attributes(
+    identity: PolicyIdentity,
+    sites: tuple[SiteLayout, ...],
+    protocol: Protocol,
+    recording: Recording,
+    machine: Mapping[str, str],
+    *,
+    interventions: Interventions | None = None,
+    rerun_of: RerunSource | None = None,
+    data_set: DataSetSource | None = None,
+) -> RootAttributes:
+    """Return what the root of a run's store says. machine: provenance of the process that makes it."""
+    return RootAttributes(
+        format=FORMAT_NAME,
+        store_version=STORE_VERSION,
+        policy=identity,
+        protocol=protocol,
+        recording=recording,
+        sites=sites,
+        provenance=dict(machine),
+        interventions=interventions or Interventions(),
+        rerun_of=rerun_of,
+        data_set=data_set,
+    )

@@ -1,0 +1,1 @@
+"""One capture run: its settings, its command, and the filling of a store."""

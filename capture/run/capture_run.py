@@ -1,0 +1,264 @@
+"""One capture run: fill a store with the episodes that the settings ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from vla_attention.capture.budget.budgeted_recording import Budget, BudgetedRecording, open_within_budget
+from vla_attention.capture.environments.base import EnvironmentSettings, Task, check_initial_state_index
+from vla_attention.capture.environments.episode_protocol import WAIT_STEPS, EvaluationProtocol
+from vla_attention.capture.environments.suites import list_tasks
+from vla_attention.capture.interventions.prompts import check_synonyms
+from vla_attention.capture.interventions.resolution import check_not_compiled, interventions_for
+from vla_attention.capture.interventions.run_changes import RunChanges
+from vla_attention.capture.jobs.termination import Termination
+from vla_attention.capture.jobs.worker_records import (
+    PlannedTask,
+    planned_tasks,
+    read_records,
+)
+from vla_attention.capture.machine.provenance import POLICY_BATCH, describe_machine
+from vla_attention.capture.policies.identity import announcement, downloads_of
+from vla_attention.capture.policies.policy import BatchPolicy, Policy, is_compiled, stored_picture_sizes
+from vla_attention.capture.rollout.episode import EpisodeRun, check_protocol, max_replans
+from vla_attention.capture.rollout.episode_faults import EpisodesMissing, Faults, describe_missing
+from vla_attention.capture.rollout.episode_loop import EpisodeJob, EpisodeLoop, EpisodeResult, OneByOneLoop
+from vla_attention.capture.rollout.pipeline import PipelinedLoop
+from vla_attention.capture.rollout.progress import say
+from vla_attention.capture.rollout.recording_plan import plan_recording, root_attributes
+from vla_attention.capture.rollout.simulator_source import SimulatorSource
+from vla_attention.capture.run.run_settings import RunSettings, default_num_envs, default_policy_batch
+from vla_attention.capture.store.disk_estimate import DiskEstimate, describe, estimate_disk
+from vla_attention.capture.store.store_writer import RunStore
+from vla_attention.schemas.errors import BadArgument, listing, plural
+from vla_attention.schemas.stores.damaged_episodes import DamagedEpisodesLeft, find_damaged, what_to_do
+from vla_attention.schemas.stores.store_format import (
+    PolicyIdentity,
+    Protocol,
+    RootAttributes,
+)
+
+_QUERIES = {"mean": "the mean over", "steps": "the action steps' means over", "all": "each of"}
+
+
+def plan_protocol(settings: RunSettings, evaluation: EvaluationProtocol, policy: Policy) -> Protocol:
+    """Return the protocol of a run: what the settings leave open is as in the published evaluation.
+
+    The number of executed actions is the policy's own, unless the evaluation is another ecosystem's and has a number.
+    """
+    replan_steps = policy.default_replan_steps
+    if evaluation != policy.default_protocol and evaluation.replan_steps is not None:
+        replan_steps = evaluation.replan_steps
+    suite = settings.suite
+    published_steps = evaluation.max_steps.get(suite.name, suite.max_steps)
+    return Protocol(
+        suite=suite.name,
+        seed=evaluation.default_seed if settings.seed is None else settings.seed,
+        wait_steps=WAIT_STEPS,
+        replan_steps=replan_steps if settings.replan_steps is None else settings.replan_steps,
+        max_steps=published_steps if settings.max_steps is None else settings.max_steps,
+        name=evaluation.name,
+        image_size=evaluation.image_size,
+    )
+
+
+@dataclass(frozen=True)
+class RunPlan:
+    """What a run of some settings is with a policy, before its store is opened.
+
+    tasks: of the suite. wanted: those of them that are run. note: a line to print if layer numbers were translated.
+    """
+
+    evaluation: EvaluationProtocol
+    tasks: tuple[Task, ...]
+    wanted: tuple[Task, ...]
+    changes: RunChanges
+    attributes: RootAttributes
+    note: str | None
+
+
+def plan_run(settings: RunSettings, policy: Policy, machine: Mapping[str, str]) -> RunPlan:
+    """Plan a run, and check the settings against the policy. machine: provenance of this process."""
+    evaluation = settings.protocol or policy.default_protocol
+    protocol = plan_protocol(settings, evaluation, policy)
+    check_protocol(protocol, policy)
+    recording, note = plan_recording(settings.recording, policy)
+    tasks = list_tasks(settings.suite)
+    wanted = tasks if settings.task_ids is None else tuple(tasks[number] for number in settings.task_ids)
+    changes = plan_changes(settings, policy, tasks)
+    attributes = root_attributes(
+        policy.identity(), policy.sites, protocol, recording, machine, interventions=changes.interventions
+    )
+    return RunPlan(evaluation, tasks, wanted, changes, attributes, note)
+
+
+def run_capture(
+    settings: RunSettings, policy: Policy, device: str, termination: Termination | None = None
+) -> list[EpisodeResult]:
+    """Record every missing episode of the settings, and print how many; returns the episodes that this process added.
+
+    Raises:
+        Terminated: SIGTERM was received; the episode in progress was dropped.
+        EpisodesMissing: episodes were dropped, each after a fault of its own; all others were recorded.
+        DamagedEpisodesLeft: all missing episodes were recorded, but the store holds damaged ones, which stay.
+    """
+    results, damaged, faults = _record_missing(settings, policy, device, termination or Termination())
+    missing = f", {len(faults.dropped)} missing" if faults.dropped else ""
+    solved = sum(bool(result.success) for result in results)
+    say(f"{plural(len(results), 'episode')} added, {solved} solved{missing}. Store: {settings.store}")
+    left = find_damaged(settings.store, damaged, settings.verify) if damaged else []
+    if left and faults.dropped:
+        raise EpisodesMissing(f"{describe_missing(faults.dropped)} {what_to_do(settings.store, left)}")
+    faults.raise_missing()
+    if left:
+        raise DamagedEpisodesLeft(what_to_do(settings.store, left))
+    return results
+
+
+def _record_missing(
+    settings: RunSettings, policy: Policy, device: str, termination: Termination
+) -> tuple[list[EpisodeResult], list[str], Faults]:
+    """Record what is missing; also returns the names of damaged episodes of the store, and the faults of this run."""
+    machine = describe_machine(device) | downloads_of(policy)
+    run_plan = plan_run(settings, policy, machine)
+    tasks, wanted, changes, attributes = run_plan.tasks, run_plan.wanted, run_plan.changes, run_plan.attributes
+    for task in wanted:
+        check_initial_state_index(task, settings.num_episodes - 1)
+    largest_batch = _policy_batch(settings, policy, device)
+    if run_plan.note:
+        say(run_plan.note)
+    environment_settings = EnvironmentSettings(run_plan.evaluation, settings.libero_assets)
+    budgeted = None
+    if settings.budget is not None:
+        planned = {task.task_id for task in wanted} | set(settings.array_task_ids)
+        budgeted = BudgetedRecording(
+            Budget(settings.budget, settings.fixed, len(planned) * settings.num_episodes),
+            policy,
+            wanted,
+            environment_settings,
+            plan_changes(settings, policy, tasks),
+            termination.check,
+        )
+    store, estimate = open_within_budget(settings.store, attributes, settings.mode, budgeted)
+    done = store.committed()
+    jobs = [
+        EpisodeJob(task, episode, attributes.protocol.max_steps, f"task {task.task_id} episode {episode}")
+        for task in sorted(wanted, key=lambda task: task.task_id)
+        for episode in range(settings.num_episodes)
+    ]
+    todo = [job for job in jobs if (job.task.task_id, job.episode_index) not in done]
+    names = {job.name for job in jobs}
+    damaged = find_damaged(store.path, names, settings.verify) if done else []
+    _announce(policy, store, len(names), len(todo), len(damaged), estimate)
+    for fault in damaged:
+        say(f"Not recorded again without vla-capture repair: {fault.describe()}")
+    damaged_names = [fault.name for fault in damaged]
+    expected = {task.task_id: task for task in (*wanted, *(tasks[index] for index in settings.array_task_ids))}
+    plan = tuple(
+        PlannedTask(task.task_id, task.name, task.instruction, settings.num_episodes)
+        for _, task in sorted(expected.items())
+    )
+    known = planned_tasks(read_records(store.path))
+    if not todo and all(task.task_id in known and known[task.task_id].wanted >= task.wanted for task in plan):
+        return [], damaged_names, Faults()
+    num_envs = min(settings.num_envs or default_num_envs(), len(todo))
+    batch = num_envs if largest_batch is None else min(largest_batch, num_envs)
+    if batch > 1:  # calls of a batch round differently, and which share one depends on the simulators' speed
+        machine = {**machine, POLICY_BATCH: str(batch)}
+    run = EpisodeRun(policy, store, machine, changes, termination.check)
+    loop: EpisodeLoop
+    if num_envs > 1:
+        batches = f" Policy calls in batches of at most {batch}; --policy-batch N changes it." if batch > 1 else ""
+        say(f"Simulators: {num_envs} processes; --num-envs N changes it.{batches}")
+        loop = PipelinedLoop(
+            store, plan, termination, "step", settings.suite, environment_settings, run, num_envs, batch
+        )
+    else:
+        source = SimulatorSource(settings.suite, environment_settings, run)
+        loop = OneByOneLoop(store, plan, termination, "step", source)
+    results = loop.record_all(todo)
+    if (empty := changes.describe_empty()) is not None:
+        say(empty)
+    return results, damaged_names, loop.faults
+
+
+def _policy_batch(settings: RunSettings, policy: Policy, device: str) -> int | None:
+    """Return the largest batch of policy calls, None for the number of simulators.
+
+    Raises:
+        BadArgument: `--policy-batch` asks for more than 1, and policy or interventions need single calls.
+    """
+    asked, single = settings.policy_batch, None
+    if not isinstance(policy, BatchPolicy):
+        single = f": policies of the kind {policy.family} make one call"
+    elif is_compiled(policy.identity()):
+        single = " with --compile, whose calls are made one by one"
+    elif settings.interventions.changes_attention:
+        single = " with interventions on attention, whose calls are made one by one"
+    if single is None:
+        return default_policy_batch(device) if asked is None else asked
+    if asked is not None and asked > 1:
+        raise BadArgument(f"Cannot use --policy-batch {asked}{single}; leave it out.")
+    return 1
+
+
+def plan_changes(settings: RunSettings, policy: Policy, tasks: Sequence[Task]) -> RunChanges:
+    """Return the run's interventions; what is known to be wrong with them is an error now, before the first episode."""
+    instructions = {task.task_id: task.instruction for task in tasks}
+    if settings.interventions.changes_attention:
+        check_not_compiled(policy.identity())
+    changes = RunChanges(interventions_for(settings.interventions, policy), instructions, settings.allow_empty)
+    if changes.interventions.prompt is not None:
+        check_synonyms(changes.interventions.prompt, instructions.values())
+    changes.check_names(policy.sites)
+    return changes
+
+
+def _checkpoint_line(identity: PolicyIdentity) -> str:
+    facts = identity.config
+    precision = f", {facts['dtype']}" if "dtype" in facts else ""
+    labels = {"normalisation": "normalisation", "prompt_format": "prompt"}
+    details = [f"{label} {facts[name]}" for name, label in labels.items() if name in facts]
+    details.append(f"cameras {listing(f'{camera.name} = {camera.source}' for camera in identity.cameras)}")
+    return (
+        f"Checkpoint: {identity.family} in format {identity.checkpoint_format}{precision}, configuration: "
+        f"{facts['configuration']}; {', '.join(details)}."
+    )
+
+
+def _announce(
+    policy: Policy,
+    store: RunStore,
+    num_wanted: int,
+    num_todo: int,
+    num_damaged: int,
+    measured: DiskEstimate | None = None,
+) -> None:
+    identity, recording, protocol = store.attributes.policy, store.attributes.recording, store.attributes.protocol
+    for line in announcement(identity):
+        say(line)
+    if not identity.untrained:
+        say(_checkpoint_line(identity))
+    say(
+        f"Protocol: {protocol.name} (docs/protocol.md), seed {protocol.seed}, pictures of {protocol.image_size} "
+        f"pixels, {protocol.wait_steps} waiting steps, at most {protocol.max_steps} steps after them."
+    )
+    if not store.attributes.interventions.is_none:
+        say(f"Interventions: {store.attributes.interventions.describe()}.")
+    say(f"A policy call gives {identity.action_horizon} actions, of which {protocol.replan_steps} are executed.")
+    say(
+        f"Recording {len(recording.layers)} layers, denoise steps {listing(recording.denoise_steps)}, "
+        f"{len(recording.heads)} heads, {_QUERIES[recording.queries]} {recording.num_action_queries} action queries, "
+        f"{', '.join(str(site.num_keys) for site in store.attributes.sites)} keys."
+    )
+    if measured is None:
+        pictures = stored_picture_sizes(policy, protocol.image_size)
+        bound = estimate_disk(recording, store.attributes.sites, pictures, max_replans(protocol), num_todo)
+    else:
+        bound = replace(measured, num_episodes=num_todo)
+    say(describe(bound, store.path))
+    if num_todo < num_wanted:
+        complete = num_wanted - num_todo - num_damaged
+        damaged = f" and {num_damaged} damaged" if num_damaged else ""
+        say(f"{complete} of {num_wanted} episodes are complete already{damaged}; {num_todo} to run.")

@@ -1,0 +1,74 @@
+"""`vla-capture FAMILY`: record a policy into a store, and analyse the store on request."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from vla_attention.capture.jobs.termination import Termination
+from vla_attention.capture.policies.family import PolicyFamily
+from vla_attention.schemas.threads import use_threads
+
+
+def run_capture_of_family(arguments: argparse.Namespace, termination: Termination) -> int:
+    """Run `vla-capture FAMILY` on parsed arguments; returns the exit code."""
+    threads = use_threads(arguments.threads)
+
+    from vla_attention.capture.environments.suites import check_installed
+    from vla_attention.capture.run.run_settings import run_settings
+    from vla_attention.capture.store.store_writer import refuse_recorded
+    from vla_attention.schemas.stores.store_place import check_writable
+
+    settings = run_settings(arguments)
+    # A missing simulator, an existing store or an unwritable place is an error now, before the minutes for loading a
+    # model and before anything is written.
+    check_installed(settings.suite, settings.libero_assets)
+    if settings.mode == "new":
+        refuse_recorded(settings.store)
+    check_writable(settings.store.parent, "--store")
+    if arguments.output_dir is not None:
+        check_writable(arguments.output_dir, "--output-dir")
+
+    from vla_attention.capture.machine.device import load_torch
+    from vla_attention.capture.rollout.progress import say
+    from vla_attention.capture.run.capture_run import run_capture
+
+    say(threads.describe())
+    device = load_torch(arguments.device, threads.number)
+    family: PolicyFamily = arguments.family
+    policy = family.build(arguments, device)
+    run_capture(settings, policy, device, termination)
+    if arguments.output_dir is None and not arguments.save_viz:
+        say(f"Next: vla-analyze {settings.store}")
+        return 0
+    return run_analysis(arguments, settings.store, arguments.output_dir)
+
+
+def run_analysis(arguments: argparse.Namespace, store: Path, output: Path | None, more: Sequence[str] = ()) -> int:
+    """Analyse a store with the default arguments of its policy family; returns the exit code of `vla-analyze`.
+
+    It is a process of its own: the two stages share a store, not code.
+
+    arguments: the parsed command line of the capture. more: further arguments for `vla-analyze`.
+    """
+    family: PolicyFamily = arguments.family
+    command = [sys.executable, "-m", "vla_attention.analyze", str(store)]
+    if output is not None:
+        command += ["--output", str(output)]
+    if arguments.save_viz:
+        command += ["--save-viz"]
+    process = subprocess.Popen([*command, *family.analysis_arguments(arguments), *more])
+    try:
+        return process.wait()
+    except KeyboardInterrupt:
+        # A terminal tells both processes, `kill` only this one. The analysis says that it was stopped.
+        process.send_signal(signal.SIGINT)
+        return process.wait()
+    except BaseException:
+        process.terminate()
+        process.wait()
+        raise

@@ -1,0 +1,84 @@
+"""What a store is given of a replan and of an episode. Needs numpy only: stores can be written without torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.layout import Prompt
+
+
+@dataclass(frozen=True)
+class RecordedRows:
+    """The rows of one site at one replan.
+
+    rows: (layer, denoise, head, query, key) float32, the axes in the order of the plan.
+    row_sum: (layer, denoise, head, query) float32, summed over keys in float64 from the rows as computed.
+    contribution: (layer, denoise, part, part) float32, or None when contributions are not recorded. Entry (i, j) is the
+        inner product of what parts i and j of the keys add to the residual stream, averaged over the action queries;
+        the last part is the block's whole attention update.
+    uniform: what uniform attention gives in the place of each row, (layer, denoise, head, query, key) float32, see
+        `schemas/groupings/key_counts.py`; an axis along which nothing changes may have length 1. None: every query sees
+        every key whose role is none of `UNSEEN_ROLES`.
+    """
+
+    rows: NDArray[np.float32]
+    row_sum: NDArray[np.float32]
+    contribution: NDArray[np.float32] | None = None
+    uniform: NDArray[np.float32] | None = None
+
+    @classmethod
+    def summed(
+        cls,
+        rows: NDArray[np.float32],
+        contribution: NDArray[np.float32] | None = None,
+        uniform: NDArray[np.float32] | None = None,
+    ) -> RecordedRows:
+        """Return recorded rows with their sums."""
+        return cls(rows, rows.sum(axis=-1, dtype=np.float64).astype(np.float32), contribution, uniform)
+
+
+@dataclass(frozen=True)
+class ReplanRecord:
+    """Everything stored about one replan.
+
+    `rows` and `key_role` are per site. `state` is (state_dim,), `actions` (horizon, action_dim) as given to the
+    environment, `frames` and `camera_frames` per policy camera (row, column, channel) uint8, `coverage` per policy
+    camera (patch, object) float32. `dataset_actions` (steps, action_dim) are those that a data set has from this replan
+    on, fewer at the end of its episode. `base_actions` (horizon, action_dim) are those that the base has for this call,
+    in a rerun. What is None is not known; all replans of an episode know the same. `constant_cameras`: cameras of the
+    simulator whose picture is of one colour.
+    """
+
+    env_step: int
+    noise_seed: int | None
+    rows: Mapping[str, RecordedRows]
+    key_role: Mapping[str, NDArray[np.uint8]]
+    prompt: Prompt
+    state: NDArray[np.float64] | None
+    actions: NDArray[np.float64] | None
+    frames: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    camera_frames: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
+    coverage: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    dataset_actions: NDArray[np.float64] | None = None
+    base_actions: NDArray[np.float64] | None = None
+    constant_cameras: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True)
+class EpisodeStart:
+    """The fields of `EpisodeAttributes` that are known before the first replan."""
+
+    task_id: int
+    task_name: str
+    instruction: str
+    episode_index: int
+    initial_state_index: int
+    initial_state_digest: str
+    objects: tuple[SceneObject, ...]
+    provenance: dict[str, str]
+    task_family: str = ""

@@ -1,0 +1,175 @@
+"""pi0, pi0.5 and pi0-FAST as other packages run them: openpi's PyTorch code, LeRobot, transformers 5.
+
+This project has the networks of pi0 and pi0.5 itself (`vla-capture pi`, which needs none of these packages); the
+layouts are for recording them where they run already: inside openpi's websocket server, inside lerobot-eval.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from vla_attention.capture.torch_policies.layouts.layout_building import (
+    KeyOrder,
+    camera_name,
+    find_policy,
+    inside,
+    rule_path,
+)
+from vla_attention.capture.torch_policies.policy_layout import CallRule, CameraPicture, PolicyLayout, PromptText
+from vla_attention.schemas.errors import BadArgument
+
+_OPENPI_CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")
+
+
+def pi0_pytorch(policy: object, *, cameras: Sequence[str] = (), num_steps: int = 0) -> PolicyLayout:
+    """Return the layout of a `PI0Pytorch` or `PI05Pytorch`, or of an object that holds one (openpi's `Policy`).
+
+    Site `joint`: each camera's patches, the prompt, the state (pi0; pi0.5 writes it into the prompt), the actions.
+
+    Args:
+        cameras: names of the pictures, in the policy's order; none: those of LeRobot's configuration, or openpi's.
+        num_steps: number of denoise steps; 0: that of LeRobot's configuration, or openpi's 10.
+
+    Raises:
+        NotThisPolicy: no such class.
+    """
+    path, module = find_policy(policy, ("PI0Pytorch", "PI05Pytorch"), "pi0_pytorch")
+    config, networks = module.config, module.paligemma_with_expert
+    vision, expert = networks.paligemma.config.vision_config, networks.gemma_expert.config
+    chunk = getattr(config, "chunk_size", 0) or config.action_horizon
+    prompt = getattr(config, "tokenizer_max_length", 0) or config.max_token_len
+    steps = num_steps or getattr(config, "num_inference_steps", 0) or 10
+    five = not hasattr(module, "state_proj")  # pi0.5 has no token of the state
+    features = getattr(config, "image_features", None) or {}
+    names = list(cameras) or [camera_name(feature) for feature in features] or list(_OPENPI_CAMERAS)
+    side = vision.image_size // vision.patch_size
+    keys = KeyOrder()
+    for camera in names:
+        keys.add_picture(camera, side, side, vision.image_size, vision.image_size)
+    keys.add("prompt", "text", prompt, "instruction")
+    keys.add("state", "state", int(not five), "state")
+    keys.add("actions", "action", chunk, "action")
+    decoder = "paligemma_with_expert.gemma_expert.model.layers"
+    site = keys.site(
+        "joint",
+        (-chunk, None),
+        projection=inside(path, f"{decoder}.{{block}}.self_attn.o_proj"),
+        variable="prompt",
+    )
+    embedding = inside(path, "paligemma_with_expert.paligemma.model.language_model.embed_tokens")
+    return PolicyLayout(
+        name="pi05_pytorch" if five else "pi0_pytorch",
+        family="pi0_pytorch",
+        sites=(site,),
+        rules=(
+            CallRule(rule_path(path, decoder.replace(".", r"\.") + r"\.(?P<block>\d+)\.self_attn"), "joint"),
+            CallRule(rule_path(path, r"paligemma_with_expert\.paligemma\..*"), None),
+        ),
+        num_layers=expert.num_hidden_layers,
+        num_heads=expert.num_attention_heads,
+        num_denoise_steps=steps,
+        denoise_times=tuple(1.0 - step / steps for step in range(steps)),
+        cameras=tuple(CameraPicture(camera, "pad") for camera in names),
+        text=PromptText(("prompt",), embedding, state_between=("State:", ";") if five else None),
+        action_horizon=chunk,
+        action_dim=getattr(config, "max_action_dim", 0) or config.action_dim,
+    )
+
+
+def pi0_fast(policy: object) -> PolicyLayout:
+    """Return the layout of LeRobot's `PI0FastPolicy`, or of an object that holds one.
+
+    Site `joint`: each camera's patches, the prompt (with its padding and a BOS that ends it), the tokens so far.
+    PaliGemma writes action tokens one after another; each token is one action query. The first token's query is the
+    last of the prefix (its closing BOS), the others' are the tokens before them. The policy always writes
+    `max_decoding_steps` tokens, with or without a cache of keys.
+
+    Raises:
+        NotThisPolicy: no PI0FastPolicy.
+    """
+    path, module = find_policy(policy, ("PI0FastPolicy",), "pi0_fast")
+    config = module.config
+    paligemma = module.model.paligemma_with_expert.paligemma
+    vision, text = paligemma.config.vision_config, paligemma.config.text_config
+    height, width = config.image_resolution
+    keys = KeyOrder()
+    cameras = [camera_name(feature) for feature in config.image_features]
+    for camera in cameras:
+        keys.add_picture(camera, height // vision.patch_size, width // vision.patch_size, height, width)
+    keys.add("prompt", "text", config.tokenizer_max_length + 1, "instruction")
+    keys.add_growing("action_tokens", config.max_decoding_steps - 1)
+    decoder = inside(path, "model.paligemma_with_expert.paligemma.model.language_model")
+    site = keys.site("joint", (-1, None), projection=f"{decoder}.layers.{{block}}.self_attn.o_proj", variable="prompt")
+    return PolicyLayout(
+        name="pi0_fast",
+        family="pi0_fast",
+        sites=(site,),
+        rules=(
+            CallRule(rule_path(decoder, r"layers\.(?P<block>\d+)\.self_attn"), "joint"),
+            CallRule(rule_path(path, r".*vision_tower\..*"), None),
+        ),
+        num_layers=text.num_hidden_layers,
+        num_heads=text.num_attention_heads,
+        cameras=tuple(CameraPicture(camera, "pad") for camera in cameras),
+        text=PromptText(("prompt",), f"{decoder}.embed_tokens", state_between=("State:", ";")),
+        action_horizon=config.n_action_steps,
+        action_dim=config.action_feature.shape[0],
+        autoregressive=True,
+        num_action_tokens=config.max_decoding_steps,
+        versions={"lerobot": ("0.4.",)},
+    )
+
+
+def pi0_transformers(
+    policy: object, *, cameras: Sequence[str] = ("base", "left_wrist", "right_wrist"), prompt_tokens: int = 48
+) -> PolicyLayout:
+    """Return the layout of a `PI0ForConditionalGeneration` (transformers 5), or of an object that holds one.
+
+    Site `joint`: each camera's patches, the prompt, the state, the action tokens.
+
+    Args:
+        cameras: names of the pictures of one call, in the order in which the processor is given them.
+        prompt_tokens: the longest prompt in tokens, without the placeholders for patches.
+
+    Raises:
+        NotThisPolicy: no PI0ForConditionalGeneration.
+    """
+    path, module = find_policy(policy, ("PI0ForConditionalGeneration",), "pi0_transformers")
+    if not cameras or prompt_tokens < 1:
+        raise BadArgument(f"pi0 needs at least one camera and one prompt token; got {list(cameras)}, {prompt_tokens}.")
+    config = module.config
+    vision, dit = config.vlm_config.vision_config, config.dit_config
+    side = vision.image_size // vision.patch_size
+    keys = KeyOrder()
+    for camera in cameras:
+        keys.add_picture(camera, side, side, vision.image_size, vision.image_size)
+    patches = keys.num_keys
+    keys.add("prompt", "text", prompt_tokens, "instruction")
+    keys.add("state", "state", 1, "state")
+    keys.add("actions", "action", config.chunk_size, "action")
+    steps = config.num_inference_steps
+    site = keys.site(
+        "joint",
+        (-config.chunk_size, None),
+        projection=inside(path, "model.dit.layers.{block}.self_attn.o_proj"),
+        variable="prompt",
+    )
+    return PolicyLayout(
+        name="pi0_transformers",
+        family="pi0_transformers",
+        sites=(site,),
+        rules=(
+            CallRule(rule_path(path, r"model\.dit\.layers\.(?P<block>\d+)\.self_attn"), "joint"),
+            CallRule(rule_path(path, r"model\.vlm\..*"), None),
+        ),
+        num_layers=dit.num_hidden_layers,
+        num_heads=dit.num_attention_heads,
+        num_denoise_steps=steps,
+        denoise_times=tuple(1.0 - step / steps for step in range(steps)),
+        cameras=tuple(CameraPicture(camera) for camera in cameras),
+        # The model replaces the placeholders for patches by 0 before it embeds the ids: their number tells them.
+        text=PromptText(("prompt",), inside(path, "model.vlm.language_model.embed_tokens"), skip_first=patches),
+        action_horizon=config.chunk_size,
+        action_dim=config.max_action_dim,
+        versions={"transformers": ("5.",)},
+    )

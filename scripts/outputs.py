@@ -1,0 +1,267 @@
+"""What every command writes and says on fixed inputs, and whether two checkouts give the same.
+
+    python scripts/outputs.py make FOLDER [--only TEXT]      with the checkout and the installation that run it
+    python scripts/outputs.py compare BEFORE AFTER           exit code 1 and a list where they differ
+
+Inputs: the golden stores of both versions, the example stores, a capture of the suite `cubes` by the policy that comes
+along, one of Cosmos, one of LIBERO (where VLA_LIBERO_ASSETS names its assets), a policy recorded from its user's own
+code, a data set made here, and the published results files of the tests. A change that is to alter no number and no
+sentence is made between two calls of `make`.
+
+Compared are bytes; of PNG files pixels; of JSON and of stores' attributes everything but `VARIES`; of texts everything
+but durations, megabytes of memory and free disk. `EXPECTED` lists the files that a change may alter, with its reason.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+#: Names of JSON members that say when, where and with what a file was made, or digest what does.
+VARIES = {
+    "provenance", "created", "generated", "began", "at", "last_at", "date", "time", "tag", "process", "process_start",
+    "process_space", "host", "store_bytes", "bytes", "mtime", "digest", "seconds", "sha256", "size", "crc32c",
+}  # fmt: skip
+#: Pattern of a file's path below the folder -> why it may differ. Committed before the change that it is about.
+EXPECTED: dict[str, str] = {
+    "small_policy": "its commands left the wheel: `python -m examples.cubes_policy` in a checkout; none is called here",
+}
+
+TWO_TASKS = ("--task-id", "0", "4", "--num-episodes", "1", "--max-steps", "15", "--num-envs", "1", "--threads", "1")
+#: Of each golden and example store.
+QUESTIONS = {
+    "ratios": (),
+    "cameras": ("--grouping", "cameras"),
+    "words": ("words",),
+    "objects": ("objects",),
+    "heads": ("heads",),
+    "time": ("time",),
+    "groups": ("groups",),
+    "overlay": ("overlay",),
+    "report": ("report",),
+    "export": ("export", "--csv"),
+    "verify": ("verify",),
+}
+
+
+def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
+    """Names and words of all calls, in the order in which they are made; each may read what an earlier one wrote."""
+    cubes = "stores/cubes.zarr"
+    yield "capture_cubes", ["vla-capture", "pi", *TWO_TASKS, "--store", cubes]
+    yield "capture_resume", ["vla-capture", "pi", *TWO_TASKS, "--store", cubes, "--resume"]
+    yield "capture_exists", ["vla-capture", "pi", *TWO_TASKS, "--store", cubes]
+    yield "capture_two_simulators", [
+        "vla-capture", "pi", *TWO_TASKS[:-4], "--num-envs", "2", "--policy-batch", "1", "--threads", "1",
+        "--store", "stores/two.zarr",
+    ]  # fmt: skip
+    yield "capture_task", ["vla-capture", "pi", "--task-id", "1", *TWO_TASKS[3:], "--store", "stores/task.zarr"]
+    budget = ["--budget", "3MB", "--store", "stores/budget.zarr"]
+    yield "capture_budget", ["vla-capture", "pi", *TWO_TASKS, *budget]
+    yield "capture_cosmos", [
+        "vla-capture", "cosmos", "--task-suite", "robosuite", "--task-id", "0", "--num-episodes", "1", "--max-steps",
+        "6", "--threads", "1", "--num-envs", "1", "--store", "stores/cosmos.zarr",
+    ]  # fmt: skip
+    yield "capture_knockout", [
+        "vla-capture", "pi", *TWO_TASKS, "--knockout", "word:cube", "--prompt", "text:touch the blue cube",
+        "--store", "stores/changed.zarr",
+    ]  # fmt: skip
+    if os.environ.get("VLA_LIBERO_ASSETS"):
+        yield "capture_libero", [
+            "vla-capture", "pi", "--checkpoint", "untrained-tiny", "--task-suite", "libero_spatial", "--task-id", "0",
+            "--num-episodes", "1", "--max-steps", "10", "--threads", "1", "--num-envs", "1",
+            "--store", "stores/libero.zarr",
+        ]  # fmt: skip
+    rerun = ["vla-capture", "rerun", cubes, "--check", "1", "--threads", "1"]
+    yield "rerun", [*rerun, "--noise-seed", "3", "--store", "stores/noise.zarr"]
+    yield "rerun_knockout", [*rerun, "--knockout", "role:instruction", "--store", "stores/unread.zarr"]
+    yield "rerun_series", [*rerun, "--series", "default", "--words", "--output-dir", "stores/series"]
+    replay = ["vla-capture", "replay", "data", "--checkpoint", "untrained-tiny", "--threads", "1", "--every", "3"]
+    replay += ["--camera", "base_0_rgb=front", "--camera", "left_wrist_0_rgb=none"]
+    yield "replay", [*replay, "--store", "stores/replay.zarr"]
+    yield "status", ["vla-capture", "status", cubes]
+    yield "status_json", ["vla-capture", "status", cubes, "--json"]
+    yield "tasks", ["vla-capture", "tasks", "cubes"]
+    yield "capture_verify", ["vla-capture", "verify", cubes]
+    yield "capture_repair", ["vla-capture", "repair", cubes]
+    yield "doctor", ["vla-capture", "doctor", "--no-trial", "--store", cubes, "--threads", "1"]
+    for place in _stores(folder):
+        kind = place.removeprefix("stores/").replace("/", "_").removesuffix(".zarr")
+        for name, words in QUESTIONS.items():
+            output = [] if name == "verify" else ["--output", f"results/{kind}_{name}"]
+            before = [] if not words or words[0].startswith("--") else [words[0]]
+            yield f"{kind}_{name}", ["vla-analyze", *before, place, *words[len(before) :], *output]
+    example = "stores/example"
+    base = f"{example}/cubes.zarr"
+    reruns = sorted(str(path.relative_to(folder)) for path in (folder / example / "cubes_reruns").glob("*.zarr"))
+    yield "compare", ["vla-analyze", "compare", base, f"{example}/cubes_one_colour.zarr", "--output", "results/compare"]
+    yield "effects", ["vla-analyze", "effects", base, *reruns, "--output", "results/effects"]
+    yield "effects_series", ["vla-analyze", "effects", cubes, "stores/series", "--output", "results/effects_series"]
+    yield "report_effects", [
+        "vla-analyze", "report", base, "--effects", *reruns, "--output", "results/report_effects"
+    ]  # fmt: skip
+    yield "deviation", ["vla-analyze", "deviation", "stores/replay.zarr", "--output", "results/deviation"]
+    yield "own_groups", [
+        "vla-analyze", base, "--group", "colour=word:red,word:green,word:blue", "--group", "seen=role:image", "--ratio",
+        "seen/colour", "--output", "results/own_groups",
+    ]  # fmt: skip
+    yield "export_parquet", [
+        "vla-analyze", "export", base, "--parquet", "--netcdf", "--rows", "--output", "results/export_parquet"
+    ]  # fmt: skip
+    yield "copy", ["vla-analyze", "copy", base, "stores/copied.zarr", "--without", "frames"]
+    yield "pack", ["vla-analyze", "copy", cubes, "stores/packed.zarr", "--packed"]
+    yield "merge", ["vla-analyze", "merge", "stores/packed.zarr", "stores/task.zarr", "-o", "stores/merged.zarr"]
+    yield "merge_refused", ["vla-analyze", "merge", cubes, "stores/two.zarr", "-o", "stores/refused.zarr"]
+    for name, words in {
+        "no_store": ("nowhere.zarr",),
+        "unknown_group": (base, "--group", "a=word:zebra"),
+        "unknown_layer": (base, "--layers", "77"),
+        "unknown_command": ("rations", base),
+    }.items():
+        yield name, ["vla-analyze", *words]
+    for program in ("vla-capture", "vla-analyze"):
+        yield f"{program}_help", [program, "--help"]
+    for name in _commands_of("analyze"):
+        yield f"analyze_{name}_help", ["vla-analyze", name, "--help"]
+    for name in ("pi", "cosmos", "rerun", "replay", "status", "doctor", "tasks", "parity", "repair", "verify"):
+        yield f"capture_{name}_help", ["vla-capture", name, "--help"]
+
+
+def _commands_of(stage: str) -> list[str]:
+    assert stage == "analyze"
+    from vla_attention.analyze.commands import COMMANDS
+
+    return list(COMMANDS)
+
+
+def _stores(folder: Path) -> list[str]:
+    """Golden and example stores, the run of cubes, and one recorded by a policy's user."""
+    golden = sorted(str(path.relative_to(folder)) for path in (folder / "stores/golden").glob("*/*.zarr"))
+    own = ["stores/cubes.zarr", "stores/cosmos.zarr", "stores/recorded.zarr", "stores/replay.zarr"]
+    libero = ["stores/libero.zarr"] if os.environ.get("VLA_LIBERO_ASSETS") else []
+    return [*golden, "stores/example/cubes.zarr", *own, *libero]
+
+
+def make(folder: Path, only: str) -> int:
+    """Run all commands below a new folder."""
+    folder.mkdir(parents=True)
+    stores = folder / "stores"
+    for version in ("version1", "version2"):
+        for store in sorted((ROOT / "tests/golden/stores" / version).glob("*.zarr")):
+            shutil.copytree(store, stores / "golden" / version / store.name)
+    shutil.copytree(ROOT / "vla_attention/example_stores", stores / "example", ignore=shutil.ignore_patterns("*.py*"))
+    subprocess.run([sys.executable, __file__, "--inputs", str(folder)], check=True)
+    environment = os.environ | {
+        "OMP_NUM_THREADS": "1", "VLA_CACHE": "off", "SOURCE_DATE_EPOCH": "0", "COLUMNS": "120", "NO_COLOR": "1",
+        "MPLBACKEND": "agg", "PYTHONHASHSEED": "0",
+    }  # fmt: skip
+    modules = {"vla-capture": "vla_attention.capture", "vla-analyze": "vla_attention.analyze"}
+    (folder / "said").mkdir()
+    for name, (program, *words) in commands(folder):
+        if only not in name:
+            continue
+        call = [sys.executable, "-m", modules[program], *words]
+        done = subprocess.run(call, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+        said = f"$ {program} {' '.join(words)}\n{done.stdout}\n--- stderr\n{done.stderr}\n--- exit {done.returncode}\n"
+        (folder / "said" / f"{name}.txt").write_text(said)
+        print(f"{done.returncode} {name}", flush=True)
+    return 0
+
+
+def make_inputs(folder: Path) -> None:
+    """Write what the commands read and none writes, in a process of its own: it loads torch and the tests' kit."""
+    os.chdir(folder)
+    from tests.golden.make_stores import _record
+    from tests.kit.lerobot_data_sets import made_up_episodes, write_data_set
+
+    _record(Path("stores/recorded.zarr"))
+    write_data_set(Path("data"), "v2.1", made_up_episodes(state=8, action=7))
+
+
+_DURATION = re.compile(
+    r"\b\d+(?:\.\d+)?(?:e-?\d+)? ?(?:s|min|ms|h)\b|\b\d\d:\d\d:\d\d\b|\d+(?:\.\d+)? [GMk]B (?:free|available)"
+)
+
+
+def _plain(value: Any) -> Any:
+    """A JSON value without what varies between two runs."""
+    if isinstance(value, dict):
+        return {name: _plain(member) for name, member in value.items() if name not in VARIES}
+    if isinstance(value, list):
+        return [_plain(member) for member in value]
+    return value
+
+
+def _content(path: Path, folder: Path) -> object:
+    """What is compared of a file."""
+    content = path.read_bytes()
+    if path.suffix == ".png":
+        from PIL import Image
+
+        with Image.open(path, formats=["PNG"]) as image:
+            return image.size, image.mode, image.tobytes()
+    if path.suffix == ".json":
+        return _plain(json.loads(content))
+    if path.suffix in (".txt", ".html", ".csv"):
+        return _DURATION.sub("DURATION", content.decode().replace(str(folder.resolve()), "FOLDER"))
+    return content
+
+
+def compare(before: Path, after: Path) -> int:
+    """Print what differs; 1 where anything does that is not expected."""
+    files = [
+        {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file() and ".jobs/" not in str(path)}
+        for folder in (before, after)
+    ]
+    wrong = [f"only before: {name}" for name in sorted(files[0] - files[1])]
+    wrong += [f"only after: {name}" for name in sorted(files[1] - files[0])]
+    for name in sorted(files[0] & files[1]):
+        one, other = _content(before / name, before), _content(after / name, after)
+        if one != other:
+            wrong.append(f"differs: {name}{_first_difference(one, other)}")
+    expected = [line for line in wrong if any(re.search(pattern, line) for pattern in EXPECTED)]
+    for line in wrong:
+        print("expected," if line in expected else "", line)
+    print(f"{len(files[0] | files[1])} files, {len(wrong)} differ, {len(expected)} of them as expected.")
+    return int(len(wrong) > len(expected))
+
+
+def _first_difference(one: object, other: object) -> str:
+    if isinstance(one, dict | list) and isinstance(other, type(one)):
+        one, other = (json.dumps(value, indent=0, sort_keys=True) for value in (one, other))
+    if isinstance(one, str) and isinstance(other, str):
+        pairs = zip(one.splitlines(), other.splitlines(), strict=False)
+        first = next(((a, b) for a, b in pairs if a != b), ("", "a line more or less"))
+        return f"\n    {first[0][:160]}\n    {first[1][:160]}"
+    return ""
+
+
+def main() -> int:
+    """Run the command line; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parsers = parser.add_subparsers(dest="act", required=True)
+    making = parsers.add_parser("make")
+    making.add_argument("folder", type=Path)
+    making.add_argument("--only", default="", metavar="TEXT", help="commands whose name has this text")
+    comparing = parsers.add_parser("compare")
+    comparing.add_argument("before", type=Path)
+    comparing.add_argument("after", type=Path)
+    given = parser.parse_args()
+    return make(given.folder.resolve(), given.only) if given.act == "make" else compare(given.before, given.after)
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--inputs"]:
+        make_inputs(Path(sys.argv[2]))
+    else:
+        sys.exit(main())

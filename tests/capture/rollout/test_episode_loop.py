@@ -1,0 +1,166 @@
+"""The loop over episodes, with a source that is made up: what other processes have, faults, and the worker's record."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from vla_attention.capture.environments.base import Task
+from vla_attention.capture.jobs.termination import Terminated, Termination
+from vla_attention.capture.jobs.worker_records import PlannedTask, RecordWriter, planned_tasks, read_records
+from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
+from vla_attention.capture.rollout.episode_loop import (
+    EpisodeJob,
+    EpisodeResult,
+    EpisodeSource,
+    OneByOneLoop,
+    StepReport,
+    plan_of,
+)
+from vla_attention.capture.rollout.progress import Unit
+from vla_attention.capture.rollout.simulation import SimulationFailed
+from vla_attention.capture.store.store_writer import RunStore, open_run, remove_without_episodes
+from vla_attention.schemas.stores.claims import Claims, holders
+from vla_attention.schemas.stores.worker import this_worker
+from vla_attention.testing.stores import StoreSpec, root_attributes, write_episode
+
+SPEC = StoreSpec(tasks=(0, 1), episodes=3, replans=1, layers=(0,), heads=(0,), frames=False)
+TASKS = [Task("made_up", number, f"task_{number}", f"lift cube {number}", 0) for number in range(2)]
+JOBS = [EpisodeJob(task, index, 4, f"task {task.task_id} episode {index}") for task in TASKS for index in range(2)]
+
+
+class MadeUpSource(EpisodeSource):
+    """Writes made-up episodes. before: called before each is written, with its name."""
+
+    def __init__(self, store: RunStore, before: Callable[[str], object] = lambda name: None) -> None:
+        self.store, self.before = store, before
+        self.tried: list[str] = []
+
+    def begin(self, job: EpisodeJob) -> str | None:
+        return f"{job.name} begins" if job is JOBS[0] else None
+
+    def record(self, job: EpisodeJob, report: StepReport) -> EpisodeResult:
+        self.tried.append(job.name)
+        report(2, 1)
+        self.before(job.name)
+        folder = write_episode(self.store, SPEC, job.task.task_id, job.episode_index)
+        return EpisodeResult(job.task.task_id, job.episode_index, True, 4, 1, folder)
+
+    def close(self) -> None:
+        self.tried.append("closed")
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> RunStore:
+    return open_run(tmp_path / "a.zarr", root_attributes(SPEC), "new", durable=False)
+
+
+def loop_of(store: RunStore, source: MadeUpSource, unit: Unit = "step") -> OneByOneLoop:
+    return OneByOneLoop(store, plan_of(JOBS), Termination(), unit, source)
+
+
+def test_every_episode_is_recorded_and_noted(store: RunStore, capsys: pytest.CaptureFixture[str]) -> None:
+    source = MadeUpSource(store)
+    results = loop_of(store, source).record_all(JOBS)
+    names = [job.name for job in JOBS]
+    assert [result.folder.name for result in results] == names
+    assert source.tried == [*names, "closed"]
+    (record,) = read_records(store.path)
+    assert (record.state, [commit.episode for commit in record.committed]) == ("finished", names)
+    assert holders(store.path) == []
+    said = capsys.readouterr().out
+    assert said.count(f"{names[0]} begins") == 1
+    assert said.count("success after 4 steps, 1 replans") == 4
+
+
+def test_outcomes_are_told_where_an_environment_ran(store: RunStore, capsys: pytest.CaptureFixture[str]) -> None:
+    loop_of(store, MadeUpSource(store), "call").record_all(JOBS)
+    assert "success" not in capsys.readouterr().out
+
+
+def test_what_another_process_commits_before_our_claim_is_not_recorded(store: RunStore, monkeypatch) -> None:
+    acquire = Claims.acquire
+
+    def late(claims: Claims, episode: str) -> object:
+        if episode == JOBS[1].name:  # between our look and our claim
+            write_episode(store, SPEC, 0, 1)
+        return acquire(claims, episode)
+
+    monkeypatch.setattr(Claims, "acquire", late)
+    source = MadeUpSource(store)
+    results = loop_of(store, source).record_all(JOBS)
+    assert JOBS[1].name not in source.tried
+    assert len(results) == 3
+    assert holders(store.path) == []
+
+
+def test_what_another_process_commits_meanwhile_is_refused(store: RunStore, capsys) -> None:
+    source = MadeUpSource(store, lambda name: name == JOBS[2].name and write_episode(store, SPEC, 1, 0))
+    loop = loop_of(store, source)
+    assert len(loop.record_all(JOBS)) == 3
+    assert loop.faults.dropped == {}
+    assert "This process's copy was dropped." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("error", "tries"),
+    [
+        (SimulationFailed("it broke."), 2),
+        (NumbersNotFinite("NaN.", passing=True), 2),
+        (NumbersNotFinite("NaN.", passing=False), 1),
+    ],
+)
+def test_a_fault_costs_its_episode(store: RunStore, capsys, error: Exception, tries: int) -> None:
+    def fail(name: str) -> None:
+        if name == JOBS[1].name:
+            assert [holder.episode for holder in holders(store.path)] == [name]
+            raise error
+
+    source = MadeUpSource(store, fail)
+    loop = loop_of(store, source)
+    assert len(loop.record_all(JOBS)) == 3
+    assert source.tried.count(JOBS[1].name) == tries
+    assert loop.faults.dropped == {JOBS[1].name: str(error)}
+    (record,) = read_records(store.path)
+    assert (record.state, [drop.episode for drop in record.dropped]) == ("failed", [JOBS[1].name])
+    said = capsys.readouterr().out
+    assert said.count("The episode begins again.") == tries - 1
+    assert said.count("The episode is left out, and the run goes on.") == 1
+    assert holders(store.path) == []
+
+
+def test_sigterm_drops_one_episode_and_says_what_is_missing(store: RunStore, capsys) -> None:
+    def stop(name: str) -> None:
+        if name == JOBS[1].name:
+            raise Terminated
+
+    source = MadeUpSource(store, stop)
+    with pytest.raises(Terminated):
+        loop_of(store, source, "call").record_all(JOBS)
+    assert source.tried[-1] == "closed"
+    said = capsys.readouterr().out
+    assert f"Stopped by SIGTERM: dropped {JOBS[1].name} at call 2; committed 1 episode ({JOBS[0].name}); 3 of" in said
+    assert [record.state for record in read_records(store.path)] == ["stopped"]
+    assert holders(store.path) == []
+
+
+def test_plans_of_workers_are_joined(store: RunStore) -> None:
+    assert plan_of(JOBS) == tuple(PlannedTask(task.task_id, task.name, task.instruction, 2) for task in TASKS)
+    some = EpisodeJob(TASKS[1], 7, 4, "")
+    (planned,) = plan_of([some])
+    assert (planned.episodes, planned.indices) == (1, (7,))
+    for jobs in (JOBS, [some]):
+        RecordWriter(store.path, this_worker(), plan_of(jobs))
+    joined = planned_tasks(read_records(store.path))
+    assert {number: sorted(task.wanted) for number, task in joined.items()} == {0: [0, 1], 1: [0, 1, 7]}
+
+
+def test_a_store_without_an_episode_goes_unless_somebody_records_into_it(store: RunStore) -> None:
+    with Claims(store.path, this_worker()) as claims:
+        claims.acquire(JOBS[0].name)
+        remove_without_episodes(store.path)
+        assert store.path.exists()
+    remove_without_episodes(store.path)
+    assert not store.path.exists()

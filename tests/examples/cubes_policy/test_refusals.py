@@ -1,0 +1,41 @@
+"""What `demonstrate`, `train` and `export` refuse: one sentence and exit code 2, before anything is made."""
+
+from __future__ import annotations
+
+import pytest
+
+from examples.cubes_policy.__main__ import main
+from vla_attention.testing import write_store
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["demonstrate", "a_file"], "Cannot make the folder 'a_file' for the demonstrations (File exists)"),
+        (["demonstrate", "new", "--seed", "-1"], "--seed is -1; it must be at least 0"),
+        (["demonstrate", "new", "--parts", "0"], "expected at least 1"),
+        (["train", "new", "out", "--seed", "-1"], "seed is -1; it must be at least 0"),
+        (["train", "new", "out", "--tasks", "0"], "--tasks 0; expected 1 to"),
+        (["train", "new", "out", "--tasks", "99"], "--tasks 99; expected 1 to"),
+        (["train", "new", "out", "--new-demonstrations"], "give --resume too"),
+        (["train", "FOLDER", "a_file"], "Cannot make the folder 'a_file' for the training"),
+        (["export", "new", "out"], "'new' has no checkpoint.pt"),
+    ],
+)
+def test_a_mistake_is_one_sentence(given, said, folder, tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a_file").write_text("text")
+    assert main([str(folder) if word == "FOLDER" else word for word in given]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a_file"]
+
+
+def test_nothing_is_written_into_a_store(folder, tmp_path, capsys) -> None:
+    inside = write_store(tmp_path / "a.zarr") / "output"
+    evaluate = ["evaluate", "expert", "--output"]
+    for given in (["demonstrate"], ["train", str(folder)], evaluate):
+        assert main([*given, str(inside)]) == 2
+        assert "is inside of the store" in capsys.readouterr().err
+        assert not inside.exists()

@@ -1,0 +1,223 @@
+from __future__ import annotations
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from examples.cubes_policy.__main__ import main
+from examples.cubes_policy.batches import number_ids
+from examples.cubes_policy.dataset import read_demonstrations
+from examples.cubes_policy.export import export
+from examples.cubes_policy.network import CAMERAS, initial_model, small_config
+from examples.cubes_policy.objectives import Heads, losses
+from examples.cubes_policy.training import (
+    TrainingSettings,
+    UnusableTraining,
+    learning_rate,
+    train,
+)
+from examples.cubes_policy.training_pass import _RmsNorm, encode, velocities
+from tests.examples.cubes_policy.test_dataset import make_batches
+from tests.hostile_checkpoints.hostile_files import TRACE, executing_pickle, pipe, torch_zip
+from tests.kit.made_up_demonstrations import INSTRUCTIONS, write_demonstrations
+from vla_attention.capture.policies.pi.flow_time import denoise_times
+from vla_attention.capture.policies.pi.gemma import RMSNorm
+from vla_attention.capture.policies.pi.loading import build_pi_policy
+from vla_attention.schemas.errors import BadArgument
+
+SETTINGS = TrainingSettings(steps=8, batch_size=4, log_every=2, evaluate_every=4)
+
+
+def quiet(line: str) -> None:
+    """Say nothing."""
+
+
+@pytest.fixture(scope="module")
+def whole(demonstrations, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    return train(demonstrations, INSTRUCTIONS, folder, SETTINGS, say=quiet), folder
+
+
+@pytest.fixture(scope="module")
+def model(tokenizer):
+    return initial_model(small_config(tokenizer.vocab_size), number_ids(tokenizer).tolist(), 0)
+
+
+def test_the_model_has_less_than_five_million_parameters(model):
+    assert sum(parameter.numel() for parameter in model.parameters()) < 2_000_000
+
+
+def test_initial_norms_do_nothing_and_gates_are_open(model):
+    norm = model.paligemma_with_expert.gemma_expert.model.blocks[0].input_layernorm
+    x, condition = torch.randn(1, 3, 96), torch.randn(1, 96)
+    normed, gate = norm(x, condition)
+    torch.testing.assert_close(normed, x * torch.rsqrt(x.square().mean(-1, keepdim=True) + 1e-6))
+    assert (gate == 1).all()
+
+
+def test_the_training_pass_is_the_pass_of_inference(model, demonstrations, tokenizer):
+    batch = make_batches(demonstrations, tokenizer, batch_size=3).draw(0)
+    with torch.no_grad():
+        prefix = encode(model, batch)
+        x = batch.noise[:, 0]
+        for time in denoise_times(2):
+            velocity = velocities(model, prefix, x[:, None], torch.full((3, 1), float(time)))
+            x = x - velocity[:, 0] / 2
+    expected = model.sample_actions(
+        images=batch.images,
+        image_masks={camera: torch.ones(3, dtype=torch.bool) for camera in CAMERAS},
+        tokens=batch.tokens,
+        token_mask=batch.token_mask,
+        state=torch.zeros(3, 8),
+        noise=batch.noise[:, 0],
+        num_steps=2,
+    )
+    torch.testing.assert_close(x, expected, atol=1e-5, rtol=1e-5)
+
+
+def test_pairs_do_not_see_each_other(model, demonstrations, tokenizer):
+    batch = make_batches(demonstrations, tokenizer, batch_size=2).draw(0)
+    with torch.no_grad():
+        prefix = encode(model, batch)
+        together = velocities(model, prefix, batch.noise, batch.times)
+        alone = velocities(model, prefix, batch.noise[:, 2:3], batch.times[:, 2:3])
+    torch.testing.assert_close(together[:, 2:3], alone, atol=1e-5, rtol=1e-5)
+
+
+def test_the_short_gradient_of_the_norm_is_that_of_the_norm():
+    torch.manual_seed(0)
+    x, norm = torch.randn(2, 5, 16, dtype=torch.float64), RMSNorm(16)
+    torch.nn.init.normal_(norm.weight)
+    weight = norm.weight.detach().double()
+    assert torch.autograd.gradcheck(_RmsNorm.apply, (x.requires_grad_(), weight.requires_grad_()))
+    torch.testing.assert_close(_RmsNorm.apply(x.float(), norm.weight), norm(x.float(), None)[0])
+
+
+def test_every_part_of_the_model_gets_a_gradient(model, demonstrations, tokenizer):
+    heads = Heads(128, 0)
+    parts = losses(model, heads, make_batches(demonstrations, tokenizer, batch_size=4).draw(0))
+    sum(parts.values()).backward()
+    # The last block of the language model only gives keys and values.
+    last = "language_model.layers.3."
+    unused = (".q_proj", ".o_proj", ".mlp.", "post_attention_layernorm")
+    for name, parameter in model.named_parameters():
+        idle = "language_model.norm" in name or (last in name and any(part in name for part in unused))
+        assert (parameter.grad is None) == idle, name
+    model.zero_grad()
+
+
+@pytest.mark.slow
+def test_the_loss_falls(demonstrations, tmp_path):
+    settings = TrainingSettings(steps=40, batch_size=8, log_every=10, evaluate_every=40)
+    train(demonstrations, INSTRUCTIONS, tmp_path, settings, say=quiet)
+    with (tmp_path / "log.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["step"]) for row in rows] == [10, 20, 30, 40]
+    assert float(rows[-1]["train_flow"]) < 0.6 * float(rows[0]["train_flow"])
+    assert float(rows[-1]["held_out_total"]) > 0
+    assert (tmp_path / "loss.png").stat().st_size > 10_000
+
+
+def test_a_training_that_was_stopped_goes_on_the_same(demonstrations, whole, tmp_path):
+    expected, folder = whole
+    said: list[str] = []
+    train(demonstrations, INSTRUCTIONS, tmp_path, SETTINGS, stop_at=3, say=said.append)
+    assert said[0].startswith("trains ")  # at once, not with the first line of losses
+    assert f"samples to step {SETTINGS.steps}" in said[0]
+    found = train(demonstrations, INSTRUCTIONS, tmp_path, SETTINGS, resume=True, say=quiet)
+    for name, tensor in expected.average.state_dict().items():
+        torch.testing.assert_close(found.average.state_dict()[name], tensor, rtol=0, atol=1e-6)
+    with (folder / "log.csv").open() as one, (tmp_path / "log.csv").open() as other:
+        last_of_one, last_of_other = list(csv.DictReader(one))[-1], list(csv.DictReader(other))[-1]
+    assert last_of_one["held_out_total"] == last_of_other["held_out_total"]
+
+
+@pytest.mark.slow
+def test_the_number_of_steps_may_change_on_the_way(demonstrations, tmp_path):
+    train(demonstrations, INSTRUCTIONS, tmp_path, SETTINGS, stop_at=3, say=quiet)
+    shorter = TrainingSettings(steps=5, batch_size=4, log_every=2, evaluate_every=4)
+    found = train(demonstrations, INSTRUCTIONS, tmp_path, shorter, resume=True, say=quiet)
+    assert found.step == 5
+    assert json.loads((tmp_path / "settings.json").read_text())["schedule"] == [[0, 8], [3, 5]]
+
+
+@pytest.mark.slow
+def test_demonstrations_may_be_added_on_the_way(demonstrations, tmp_path):
+    few = write_demonstrations(tmp_path / "few", scenes=6, seed=1)
+    train(read_demonstrations(few), INSTRUCTIONS, tmp_path / "t", SETTINGS, stop_at=3, say=quiet)
+    before = json.loads((tmp_path / "t" / "settings.json").read_text())["training"]
+    with pytest.raises(UnusableTraining, match="--new-demonstrations"):
+        train(demonstrations, INSTRUCTIONS, tmp_path / "t", SETTINGS, resume=True, say=quiet)
+    added = {"resume": True, "new_demonstrations": True, "say": quiet}
+    train(demonstrations, INSTRUCTIONS, tmp_path / "t", SETTINGS, stop_at=5, **added)
+    train(demonstrations, INSTRUCTIONS, tmp_path / "t", SETTINGS, resume=True, say=quiet)
+    after = json.loads((tmp_path / "t" / "settings.json").read_text())["training"]
+    assert after["state"] == before["state"]
+    earlier = {name: before[name] for name in ("demonstrations", "samples")}
+    assert after["earlier"] == [{**earlier, "until_step": 3}]
+
+
+def test_a_folder_in_use_and_other_settings_are_refused(demonstrations, whole):
+    _, folder = whole
+    with pytest.raises(BadArgument, match="already has a training"):
+        train(demonstrations, INSTRUCTIONS, folder, SETTINGS, say=quiet)
+    other = TrainingSettings(steps=8, batch_size=4, seed=1)
+    with pytest.raises(UnusableTraining, match="seed was 0"):
+        train(demonstrations, INSTRUCTIONS, folder, other, resume=True, say=quiet)
+
+
+def test_a_checkpoint_that_executes_or_is_damaged_is_refused(tmp_path):
+    for content, said in (
+        (executing_pickle(tmp_path), r"asks for posix\.system; nothing of it was executed"),
+        (b"\x80\x02}.", "is no checkpoint of a training"),
+        (b"\x80", "was refused: it is damaged"),
+    ):
+        torch_zip(tmp_path / "checkpoint.pt", content)
+        with pytest.raises(UnusableTraining, match=said):
+            export(tmp_path, tmp_path / "out", "name")
+    pipe(tmp_path / "checkpoint.pt")
+    with pytest.raises(UnusableTraining, match=r"no checkpoint|FIFO"):
+        export(tmp_path, tmp_path / "out", "name")
+    assert not (tmp_path / TRACE).exists()
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_rate_warms_up_and_falls():
+    rates = [learning_rate(step, 1000) for step in range(1000)]
+    assert rates[0] == pytest.approx(2e-5)
+    assert max(rates) == pytest.approx(1e-3)
+    assert rates[-1] == pytest.approx(3e-5, rel=0.01)
+    assert np.all(np.diff(rates[60:]) < 0)
+
+
+def test_an_exported_policy_runs_like_any_checkpoint(demonstrations, whole, tmp_path):
+    training, folder = whole
+    card = export(folder, tmp_path / "mark_0", "my_policy")
+    assert card["steps"] == 8
+    policy = build_pi_policy(str(tmp_path / "mark_0"), tokenizer=None, device="cpu")
+    assert policy.name == "my_policy"
+    assert not policy.identity().untrained
+    assert policy.model.config == small_config(policy.tokenizer.vocab_size)
+    for name, tensor in policy.model.state_dict().items():
+        torch.testing.assert_close(
+            tensor, training.average.state_dict()[name].to(torch.bfloat16).float(), rtol=0, atol=0
+        )
+    sample = demonstrations.samples.state[5].astype(np.float64)
+    facts = json.loads((folder / "settings.json").read_text())["training"]["state"]
+    low, high = np.array(facts["q01"]), np.array(facts["q99"])
+    np.testing.assert_allclose(
+        policy.processing.normalise_state(sample), (sample - low) / (high - low) * 2 - 1, rtol=1e-4
+    )
+    actions = np.random.default_rng(0).uniform(-1, 1, (10, 8))
+    np.testing.assert_allclose(policy.processing.environment_actions(actions, sample), actions[:, :7], atol=1e-6)
+    with pytest.raises(BadArgument, match="exists already"):
+        export(folder, tmp_path / "mark_0", "again")
+
+
+@pytest.mark.parametrize("number", ["0", "24", "-1"])
+def test_a_number_of_tasks_that_does_not_exist_is_refused(tmp_path, capsys, number):
+    assert main(["train", str(tmp_path), str(tmp_path / "out"), "--tasks", number]) == 2
+    assert f"Cannot use --tasks {number}; expected 1 to 23." in capsys.readouterr().err
