@@ -59,15 +59,46 @@ def test_a_rerun_waits_for_what_another_process_has_claimed(pi_store, tmp_path, 
     assert names(store) == EPISODES
 
 
+#: A rerun that makes the calls of its first episode when another process has committed the three others of the store.
+WAITS = """
+import sys, time
+from pathlib import Path
+from vla_attention.capture.__main__ import main
+from vla_attention.capture.rerun.rerun_store import StoredCallsSource
+
+record, begun = StoredCallsSource.record, Path(sys.argv[1])
+
+def wait_and_record(self, job, report):
+    if not begun.exists():
+        begun.touch()
+        until = time.monotonic() + 120
+        while len(list((self.store.path / "episodes").glob("task*"))) < 3 and time.monotonic() < until:
+            time.sleep(0.05)
+    return record(self, job, report)
+
+StoredCallsSource.record = wait_and_record
+sys.exit(main(sys.argv[2:]))
+"""
+
+
 @pytest.mark.slow
 def test_two_processes_share_the_episodes_of_a_series(pi_store, tmp_path):
     """Every episode of every store is recorded once, by one of them, and both end when all is there."""
     folder = tmp_path / "series"
     grouping = tmp_path / "upper.toml"
     grouping.write_text('[groups]\nupper = "patch:base_0_rgb[0:1,0:2]"\nrest = "*"\n')
-    command = [sys.executable, "-m", "vla_attention.capture", "rerun", str(pi_store), "--series", str(grouping)]
-    command += ["--output-dir", str(folder), "--check", "0", "--threads", "1"]
-    processes = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) for _ in range(2)]
+    begun = tmp_path / "begun"
+    words = ["rerun", str(pi_store), "--series", str(grouping)]
+    words += ["--output-dir", str(folder), "--check", "0", "--threads", "1"]
+    commands = (
+        [sys.executable, "-c", WAITS, str(begun), *words],
+        [sys.executable, "-m", "vla_attention.capture", *words],
+    )
+    processes = []
+    for command in commands:
+        processes.append(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT))
+        while not begun.exists() and processes[0].poll() is None:
+            time.sleep(0.05)
     said = [process.communicate()[0] for process in processes]
     assert [process.returncode for process in processes] == [0, 0], said
     stores = sorted(folder.glob("*.zarr"))
