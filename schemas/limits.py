@@ -66,6 +66,9 @@ AXIS = 10_000
 QUERIES = 100_000
 #: Places of a replan: layers x denoise steps x heads x queries. Cosmos with all queries has 450,000.
 PLACES = 10_000_000
+#: Conditions whose effects an episode has, and their entries: one for each replan and condition.
+CONDITIONS = 10_000
+EFFECT_ENTRIES = 1_000_000
 #: Queries x keys of a growing span, for which version 1 counts each key in float64.
 GROWING_CELLS = 1_000_000
 #: Replans of an episode: fourteen hours at 20 calls a second.

@@ -18,15 +18,16 @@ if TYPE_CHECKING:
 _EXAMPLES = """examples:
   vla-analyze copy libero_10.zarr                               how large each part is
   vla-analyze copy libero_10.zarr slim.zarr --without frames
-  vla-analyze copy libero_10.zarr slim.zarr --without frames objects contributions
+  vla-analyze copy libero_10.zarr slim.zarr --without frames objects contributions effects
   vla-analyze copy libero_10.zarr slim.zarr --without frames    again: adds what was captured meanwhile
   vla-analyze copy libero_10.zarr packed.zarr --packed          one file an episode
   vla-analyze copy libero_10.zarr packed.zarr --packed --push hf://datasets/ORG/NAME/libero_10.zarr
   vla-analyze copy hf://datasets/ORG/NAME/libero_10.zarr here.zarr
 
 frames: the cameras' pictures (overlays and reruns need them). objects: what each patch shows (object: groups need it).
-contributions: norms of what keys add. Rows, and everything else that groupings of keys, words, cameras and
-roles need, are always copied. The copy passes verify, and its provenance names the omitted parts.
+contributions: norms of what keys add. effects: changes of the action without an item. Rows, and everything else that
+groupings of keys, words, cameras and roles need, are always copied. The copy passes verify, and its provenance names the
+omitted parts.
 """
 
 
@@ -41,7 +42,11 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("store", type=store_place, metavar="STORE", help="NAME.zarr, or its address")
     parser.add_argument("target", type=Path, nargs="?", metavar="DEST", help="where the copy goes, NAME.zarr")
     parser.add_argument(
-        "--without", nargs="+", default=[], metavar="PART", help="frames, objects, contributions (default: copy all)"
+        "--without",
+        nargs="+",
+        default=[],
+        metavar="PART",
+        help="frames, objects, contributions, effects (default: copy all)",
     )
     parser.add_argument(
         "--packed",

@@ -47,11 +47,13 @@ class Part:
     pattern: str
 
 
+EFFECTS = "effects"
 #: The parts that may be omitted. Rows, atoms, roles and the small arrays are always copied.
 PARTS: dict[str, Part] = {
     "frames": Part("the cameras' pictures; overlays and reruns need them", r"^(camera_)?frames/"),
     "objects": Part("what each patch shows; object: groups need it", r"^objects/"),
     "contributions": Part("value-weighted contributions; their norms need them", r"/contribution(/|$)"),
+    EFFECTS: Part("changes of the action without an item; effects needs them", r"^effects/|/cut(/|$)"),
 }
 REST = "rest"
 #: What a copy's provenance calls the address on the hub that it was copied from, with its commit.
@@ -256,7 +258,7 @@ def _root_document(store: Store, without: tuple[str, ...]) -> bytes:
 
 def _leave_out(recording: dict[str, Any], provenance: dict[str, str], without: Sequence[str], run: str) -> None:
     """State in a root that a copy has no such parts, and of which run it is."""
-    recording.update({name: False for name in without if name in recording})
+    recording.update({name: None if name == EFFECTS else False for name in without if name in recording})
     before = provenance.get("copied_without", "").split(", ")
     provenance["copied_without"] = ", ".join(name for name in PARTS if name in without or name in before)
     # A copy of a copy names the store that was captured, not the copy.
@@ -280,6 +282,8 @@ def _without_arrays(document: bytes, without: tuple[str, ...]) -> bytes:
     changed = json.loads(document)
     arrays = changed["attributes"]["arrays"]
     changed["attributes"]["arrays"] = {name: arrays[name] for name in arrays if _part_of(name) not in without}
+    if EFFECTS in without and "effects" in changed["attributes"]:
+        changed["attributes"]["effects"] = None
     return json.dumps(changed, indent=2).encode()
 
 

@@ -8,10 +8,12 @@ from typing import Any
 from vla_attention.analyze.effects.conditions import FLOORS, Kind
 from vla_attention.analyze.effects.effect_study import EffectStudy
 from vla_attention.analyze.effects.group_rows import GroupRow, group_rows, readers_of
+from vla_attention.analyze.effects.item_rows import ItemRow, item_rows, ratio_of_effects
 from vla_attention.analyze.ratios.answer import ratio_sentence
 from vla_attention.analyze.show.findings import findings
 from vla_attention.analyze.show.numbers import format_number, row_interval
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
+from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.interventions import readers
 from vla_attention.schemas.stores.store_format import CALLERS_MODULES
 
@@ -30,21 +32,123 @@ def answer_lines(study: EffectStudy) -> list[str]:
     """The sentences, each to be wrapped by itself."""
     if not study.conditions:
         return ["No rerun was given, only rollouts: there are no effects on single actions."]
+    if study.is_recorded and (items := item_rows(study)):
+        return item_lines(study, items)
     grouping, rows = study.analysis.grouping, group_rows(study)
     # Where a site has one of the modalities only (Cosmos), the grouping has no ratio.
     sides = _MODALITIES if grouping.ratio is None else (*grouping.ratio.numerator, *grouping.ratio.denominator)
     lines = [noise_sentence(study)]
     lines += [side_sentence(row) for name in sides for row in rows if row.name == name]
     lines.append(for_whom(rows))
-    if study.analysis.headline is not None:
-        measured, every = study.measured[0], study.analysis.overall["num_episodes"]
-        where = "the same replans"
-        if measured < every:
-            where = f"all {every} episodes of the base, of which effects were measured in {measured}"
-        sentence = ratio_sentence(study.analysis.headline)
-        lines.append(f"Attention in {where}: {sentence[:1].lower()}{sentence[1:]}")
+    lines += attention_line(study)
     lines.append(beyond(study, "minus_noise", "an effect beyond the noise"))
     return lines
+
+
+def item_lines(study: EffectStudy, items: Sequence[ItemRow]) -> list[str]:
+    """The sentences about effects that were recorded: which word decides, by which way, and how much pictures do."""
+    words = [item for item in items if item.kind == "word"]
+    lines = [_deciding(words)] if words else []
+    lines += [_unlike_attention(words)] if words else []
+    ratio = ratio_of_effects(study)
+    if ratio is not None and ratio["ratio"] is not None:
+        lines.append(
+            f"Without all pictures the action changes {format_number(ratio['ratio'])}{_interval(ratio, 'ratio')} times "
+            f"as much as without all text ({format_number(ratio['visual'])} and {format_number(ratio['linguistic'])})."
+        )
+    lines += attention_line(study)
+    lines.append(noise_sentence(study))
+    q_values = [1.0 if item.strongest["minus_noise"] <= 0 else item.strongest["minus_noise_q"] for item in items]
+    names = [item.name for item in items]
+    lines.append(findings(q_values, names, "item", "an effect beyond the noise", _SENTENCES))
+    return [line for line in lines if line]
+
+
+def _deciding(words: Sequence[ItemRow]) -> str:
+    """The word with the largest effect, and by which way the words with large effects reach the action."""
+    first = words[0]
+    said = f"{first.name} does most of {plural(len(words), 'word')}: without it the action changes by "
+    said += f"{_effect(first.strongest)} of its spread."
+    large = [word for word in words if _at_least_half(word.strongest["effect"], first.strongest["effect"])]
+    own = [word for word in large if _at_least_half(word.effect("direct"), word.effect("total"))]
+    others = [word for word in large if word not in own and word.effect("direct") is not None]
+    through = [word for word in others if _at_least_half(word.effect("pictures"), word.effect("total"))]
+    parts = [f"the action queries read {_names(own)} themselves"] if own else []
+    if through:
+        parts.append(
+            f"{_names(through)} {_reach(through)} the action through the pictures, which have read {_it(through)}"
+        )
+    if rest := [word for word in others if word not in through]:
+        parts.append(f"{_names(rest)} {_reach(rest)} the action through other tokens")
+    if others:
+        amounts = sorted(word.effect("direct") or 0.0 for word in others)
+        span = format_number(amounts[0]) + (f" to {format_number(amounts[-1])}" if len(amounts) > 1 else "")
+        parts.append(
+            f"hidden from the action queries alone, {'that' if len(others) == 1 else 'these'} would change it by {span}"
+        )
+    text = "; ".join(parts)
+    return f"{said} {text[:1].upper()}{text[1:]}." if text else said
+
+
+def _at_least_half(part: float | None, whole: float | None) -> bool:
+    return part is not None and whole is not None and part >= whole / 2
+
+
+def _names(words: Sequence[ItemRow]) -> str:
+    return listing([word.name for word in words], 8)
+
+
+def _reach(words: Sequence[ItemRow]) -> str:
+    return "reaches" if len(words) == 1 else "reach"
+
+
+def _it(words: Sequence[ItemRow]) -> str:
+    return "it" if len(words) == 1 else "them" if words else ""
+
+
+def _effect(row: dict[str, Any]) -> str:
+    return f"{format_number(row['effect'])}{_interval(row, 'effect')}"
+
+
+def _unlike_attention(words: Sequence[ItemRow]) -> str:
+    """Words whose attention says something else than their effect."""
+    silent = [
+        f"{word.name} ({format_number(row['lift'])})"
+        for word in words
+        if (row := word.strongest)["lift"] is not None and row["lift"] < 1 and _shown(row, "minus_noise")
+    ]
+    idle = [
+        f"{word.name} ({format_number(row['lift'])})"
+        for word in words
+        if (row := word.strongest)["lift"] is not None
+        and row["lift"] > 1
+        and row["minus_noise_q"] is not None
+        and not _shown(row, "minus_noise")
+    ]
+    parts = []
+    if silent:
+        parts.append(f"Less attention than uniform, and an effect beyond the noise: {listing(silent, 6)}.")
+    if idle:
+        parts.append(f"More attention than uniform, and no effect shown beyond the noise: {listing(idle, 6)}.")
+    return f"{' '.join(parts)} (In brackets: lift.)" if parts else ""
+
+
+def _shown(row: dict[str, Any], floor: str) -> bool:
+    """Whether an effect is shown to exceed its floor."""
+    q = row[f"{floor}_q"]
+    return bool(row[floor] is not None and row[floor] > 0 and q is not None and q <= NAMED_AT / _SENTENCES)
+
+
+def attention_line(study: EffectStudy) -> list[str]:
+    """The ratio of the base's attention, to stand beside the effects."""
+    if study.analysis.headline is None:
+        return []
+    measured, every = study.measured[0], study.analysis.overall["num_episodes"]
+    where = "the same replans"
+    if measured < every:
+        where = f"all {every} episodes of the base, of which effects were measured in {measured}"
+    sentence = ratio_sentence(study.analysis.headline)
+    return [f"Attention in {where}: {sentence[:1].lower()}{sentence[1:]}"]
 
 
 def noise_sentence(study: EffectStudy) -> str:

@@ -10,6 +10,7 @@ from vla_attention.schemas.command_line import command_parser
 from vla_attention.schemas.stores.store_url import store_place
 
 _EXAMPLES = """examples:
+  vla-analyze effects runs/cubes.zarr
   vla-analyze effects runs/cubes.zarr reruns/cubes
   vla-analyze effects runs/cubes.zarr reruns/without_visual.zarr reruns/noise.zarr --layers 0 1 2
   vla-analyze effects runs/cubes.zarr rollouts/without_language.zarr --intervals these-tasks
@@ -31,10 +32,11 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("base", type=store_place, metavar="BASE", help="the store whose policy calls were run again")
     parser.add_argument(
         "reruns",
-        nargs="+",
+        nargs="*",
         type=store_place,
         metavar="RERUN",
-        help="stores of vla-capture rerun BASE, rollouts with interventions, or folders of them",
+        help="stores of vla-capture rerun BASE, rollouts with interventions, or folders of them; without "
+        "one, the effects that BASE holds (vla-capture --effects)",
     )
     add_grouping(parser)
     selection = add_selection(parser)

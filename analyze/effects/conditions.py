@@ -54,11 +54,15 @@ class GroupOfKeys:
 
 @dataclass(frozen=True)
 class Condition:
-    """A run with interventions: its name in tables, its store, and what it changed."""
+    """A run with interventions: its name in tables, its store, and what it changed.
+
+    `recorded`: no run of its own, but an effect that the base measured beside its calls; the store is the base.
+    """
 
     name: str
     store: Store
     interventions: Interventions
+    recorded: bool = False
 
     @property
     def kind(self) -> Kind:

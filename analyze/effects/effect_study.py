@@ -6,7 +6,7 @@ that of another noise seed and with that of equally many random keys.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
@@ -30,6 +30,7 @@ from vla_attention.analyze.effects.paired_replans import (
     Pairing,
     actions_of,
     changes_of,
+    changes_recorded,
     mean_over_phases,
     pair_episodes,
     stores_executed,
@@ -54,6 +55,9 @@ from vla_attention.schemas.stores.store_format import CorruptEpisode
 from vla_attention.schemas.stores.store_url import StorePlace
 
 _LIMITS = {"effect": POSITIVE, "effect_chunk": POSITIVE, "angle": POSITIVE, "gripper_flips": SHARE}
+#: Change of an unchanged call among those made together that float32 explains, in spreads; bfloat16 leaves .02 to .05.
+_MOST_ROUNDING = 1e-3
+_Row = dict[str, object]
 _NAMES = ("condition", "kind", "group", "selector")
 _ID: dict[str, Any] = {"suite": pl.String, "task_id": pl.Int64, "instruction": pl.String, "episode_index": pl.Int64}
 _EPISODE_SCHEMA: dict[str, Any] = {
@@ -113,6 +117,11 @@ class EffectStudy:
         return rollout_summary(self.rollout_episodes, self.question.sampling)
 
     @property
+    def is_recorded(self) -> bool:
+        """Whether the effects are those that the base measured beside its calls."""
+        return any(condition.recorded for condition in self.conditions)
+
+    @property
     def measured(self) -> tuple[int, int]:
         """The numbers of episodes and tasks in which any effect was measured: a rerun may have a part of the base's."""
         whole = self.episodes.select("suite", "task_id", "episode_index").unique()
@@ -161,11 +170,14 @@ def study_of(analysis: Analysis, opened: BaseAndReruns, dimensions: Sequence[int
         notes.append("The base does not store how many steps of a chunk were executed: effects are over whole chunks.")
     groups = [condition.group for condition in opened.reruns if condition.group is not None]
     attention = group_attention(question, groups, everything) if groups else {}
-    measured = [(pairing, _episodes_of(pairing, spread, attention)) for pairing in pairings]
+    measured = _measured(pairings, members, spread, attention)
     left_out = _left_out([pairing for pairing, rows in measured if not rows.height])
     if left_out and not any(rows.height for _, rows in measured) and not opened.rollouts:
         raise BadArgument(f"No rerun of {opened.base.path} can be compared: {' '.join(left_out)}")
     notes += left_out
+    drifts = _drifts(pairings, spread)
+    unlike = (Kind.NOTHING, True)
+    measured = [(one, rows) for one, rows in measured if (one.condition.kind, one.condition.recorded) != unlike]
     pairings = [pairing for pairing, rows in measured if rows.height]
     opened = replace(opened, reruns=tuple(pairing.condition for pairing in pairings))
     episodes = pl.concat([pl.DataFrame(schema=_EPISODE_SCHEMA), *(rows for _, rows in measured)])
@@ -180,7 +192,7 @@ def study_of(analysis: Analysis, opened: BaseAndReruns, dimensions: Sequence[int
         rollout_episodes=pl.concat([table for table, _ in rollouts])
         if rollouts
         else pl.DataFrame(schema=ROLLOUT_COLUMNS),
-        notes=(*notes, *_notes(pairings, attention), *_drifts(pairings, spread), *unpaired),
+        notes=(*notes, *_notes(pairings, attention), *drifts, *unpaired),
     )
 
 
@@ -247,7 +259,10 @@ def _spread(
         for member in members:
             try:
                 if member.name in repeated:
-                    pairs.append((member.actions, actions_of(member, repeated[member.name], condition)))
+                    others = actions_of(member, repeated[member.name], condition)
+                    measured = np.isfinite(others).all(axis=(1, 2))
+                    if measured.any():
+                        pairs.append((member.actions[measured], others[measured]))
             except CorruptEpisode:
                 if not settings.skip_corrupt:
                     raise
@@ -256,34 +271,59 @@ def _spread(
     return with_noise(spread, noise_of(pairs, spread.spread), leave_out=dimensions is None)
 
 
-def _episodes_of(pairing: Pairing, spread: ActionSpread, attention: dict[Any, GroupAttention]) -> pl.DataFrame:
-    """The rows of one condition, without floors."""
-    condition = pairing.condition
-    group = condition.group
-    known = attention[group].values if group is not None else {}
-    fixed = {
-        "condition": condition.name,
-        "kind": condition.kind.value,
-        "group": None if group is None else condition.group_name,
-        "selector": None if group is None else group.text,
-    }
+def _measured(
+    pairings: Sequence[Pairing],
+    members: Sequence[BaseEpisode],
+    spread: ActionSpread,
+    attention: dict[Any, GroupAttention],
+) -> list[tuple[Pairing, pl.DataFrame]]:
+    """The rows of each condition, without floors: those of reruns by rerun, the recorded ones by episode."""
+    rows: dict[str, list[_Row]] = {pairing.condition.name: [] for pairing in pairings}
 
-    measure = partial(_rows_of_pair, condition=condition, spread=spread, fixed=fixed)
-    given = [(base, rerun, known.get(base.name)) for base, rerun in pairing.pairs]
-    rows = [row for part in map_episodes(measure, given) for row in part]
-    return pl.DataFrame(rows, schema=_EPISODE_SCHEMA)
+    def attention_to(condition: Condition, base: BaseEpisode) -> NDArray[np.float64] | None:
+        return None if condition.group is None else attention[condition.group].values.get(base.name)
+
+    for condition, pairs in ((one.condition, one.pairs) for one in pairings if not one.condition.recorded):
+        measure = partial(_rows_of_pair, condition=condition, spread=spread)
+        given = [(base, rerun, attention_to(condition, base)) for base, rerun in pairs]
+        rows[condition.name] += [row for part in map_episodes(measure, given) for row in part]
+    recorded = [pairing.condition for pairing in pairings if pairing.condition.recorded]
+    if recorded:
+        of_episode = partial(_rows_of_recorded, conditions=recorded, spread=spread)
+        members_given = [(base, [attention_to(condition, base) for condition in recorded]) for base in members]
+        for part in map_episodes(of_episode, members_given):
+            for condition, some in zip(recorded, part, strict=True):
+                rows[condition.name] += some
+    return [(one, pl.DataFrame(rows[one.condition.name], schema=_EPISODE_SCHEMA)) for one in pairings]
+
+
+def _rows_of_recorded(
+    given: tuple[BaseEpisode, list[NDArray[np.float64] | None]], conditions: Sequence[Condition], spread: ActionSpread
+) -> list[list[_Row]]:
+    """The rows of one episode for each recorded condition."""
+    base, attention = given
+    changes = changes_recorded(base)
+    return [
+        _rows_of_pair((base, base.item.episode, of_group), condition, spread, changes)
+        for condition, of_group in zip(conditions, attention, strict=True)
+    ]
 
 
 def _rows_of_pair(
     given: tuple[BaseEpisode, StoredEpisode, NDArray[np.float64] | None],
     condition: Condition,
     spread: ActionSpread,
-    fixed: Mapping[str, str | None],
-) -> list[dict[str, object]]:
-    """The rows of one episode: of the base, its rerun, and the base's attention (replan, measure) to the group."""
+    recorded: NDArray[np.float64] | None = None,
+) -> list[_Row]:
+    """The rows of one episode: of the base, its rerun, and the base's attention (replan, measure) to the group.
+
+    recorded: the changes that were recorded beside the base's calls, for a recorded condition.
+    """
     base, rerun, attention = given
-    changes = changes_of(base, actions_of(base, rerun, condition), spread)
-    has_keys = _has_keys(attention, len(changes), condition.kind)
+    group = condition.group
+    actions = actions_of(base, rerun, condition, recorded)
+    changes = changes_of(base, actions, spread)
+    has_keys = _has_keys(attention, len(changes), condition.kind) & np.isfinite(actions).all(axis=(1, 2))
     if not has_keys.any():
         return []
     changes[~has_keys] = np.nan
@@ -296,7 +336,10 @@ def _rows_of_pair(
         "task_id": attributes.task_id,
         "instruction": visible(attributes.instruction),
         "episode_index": attributes.episode_index,
-        **fixed,
+        "condition": condition.name,
+        "kind": condition.kind.value,
+        "group": None if group is None else condition.group_name,
+        "selector": None if group is None else group.text,
         "num_replans": int(has_keys.sum()),
     }
     return [{**named, **row} for row in mean_over_phases(base, values)]
@@ -322,6 +365,8 @@ def _notes(pairings: Sequence[Pairing], attention: dict[Any, GroupAttention]) ->
     names: dict[str, list[str]] = {}
     for pairing in pairings:
         condition, gaps = pairing.condition, []
+        if condition.recorded:  # what an episode has no word or object for was not measured there
+            continue
         known = attention[condition.group].values if condition.group is not None else {}
         empty = [name for name in pairing.missing if name in known and not _has_keys(known[name]).all()]
         kept = replace(pairing, missing=tuple(name for name in pairing.missing if name not in empty))
@@ -352,10 +397,11 @@ def _drifts(pairings: Sequence[Pairing], spread: ActionSpread) -> list[str]:
         largest, where = 0.0, ""
         for base, rerun in pairing.pairs:
             changes = changes_of(base, actions_of(base, rerun, pairing.condition), spread)
-            chunks = changes[:, CHANGES.index("effect_chunk")]
+            chunks = np.nan_to_num(changes[:, CHANGES.index("effect_chunk")])
             if chunks.max() > largest:
                 largest, where = float(chunks.max()), f"replan {int(chunks.argmax())} of {base.name}"
-        if largest:
+        # Calls made together differ by rounding from the call that the robot executed.
+        if largest > (_MOST_ROUNDING if pairing.condition.recorded else 0.0):
             notes.append(
                 f"{pairing.condition.name} changes nothing, and its actions are not those of the base: they differ by "
                 f"up to {format_number(largest)} of their spread ({where}). Effects that are not far above that are "
@@ -375,7 +421,10 @@ def with_floors(episodes: pl.DataFrame, conditions: Sequence[Condition]) -> pl.D
     controls = []
     for condition in conditions:
         names = [other.name for other in conditions if other.is_control_of(condition)]
-        controlled = episodes.filter(pl.col("condition").is_in(names)).group_by(place).agg(effect.alias("random"))
+        among = episodes.filter(pl.col("condition").is_in(names))
+        if not names and condition.recorded and condition.kind == Kind.WITHOUT:
+            among = _nearest_controls(episodes, condition, conditions, place)
+        controlled = among.group_by(place).agg(effect.alias("random"))
         controls.append(controlled.with_columns(pl.lit(condition.name).alias("condition")))
     empty = pl.DataFrame(
         schema={name: episodes.schema[name] for name in place} | {"random": pl.Float64, "condition": pl.String}
@@ -391,6 +440,29 @@ def with_floors(episodes: pl.DataFrame, conditions: Sequence[Condition]) -> pl.D
             minus_random=pl.when(~floor).then(pl.col("effect") - pl.col("random")),
         )
     )
+
+
+def _nearest_controls(
+    episodes: pl.DataFrame, condition: Condition, conditions: Sequence[Condition], place: Sequence[str]
+) -> pl.DataFrame:
+    """The rows of the random keys whose number is nearest to that of a recorded condition, in each episode and phase.
+
+    A run that records effects draws random keys for one word and for the whole instruction, not for every item.
+    """
+    readers = [(one.queries, one.query_selector) for one in condition.interventions.keys]
+    names = [
+        other.name
+        for other in conditions
+        if other.kind == Kind.RANDOM
+        and [(one.queries, one.query_selector) for one in other.interventions.keys] == readers
+    ]
+    keys = episodes.filter(pl.col("condition") == condition.name).select(*place, pl.col("keys").alias("_keys"))
+    among = episodes.filter(pl.col("condition").is_in(names)).join(keys, on=place, how="inner")
+    distance = (pl.col("keys") - pl.col("_keys")).abs()
+    # A few random keys are no floor for a whole picture.
+    near = among.filter(pl.col("keys") >= pl.col("_keys") / 2)
+    nearest = near.filter(distance == distance.min().over(place))
+    return nearest.select(episodes.columns)
 
 
 def summary_of(episodes: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:

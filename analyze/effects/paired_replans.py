@@ -21,6 +21,7 @@ from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.time.alignment import episode_timing, on_episode_time
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
+from vla_attention.schemas.stores.store_format import CHANGE
 
 Array = NDArray[np.float64]
 
@@ -119,6 +120,9 @@ def pair_episodes(condition: Condition, base: Sequence[BaseEpisode], all_names: 
     Raises:
         BadArgument: the rerun holds none of the base's episodes, selected or not.
     """
+    if condition.recorded:
+        having = [one for one in base if _was_measured(one.item.episode, condition)]
+        return Pairing(condition, tuple((one, one.item.episode) for one in having), (), ())
     reruns = {episode.name: episode for episode in condition.store.episodes}
     pairs = tuple((one, reruns[one.name]) for one in base if one.name in reruns)
     if not any(name in reruns for name in all_names):
@@ -130,14 +134,45 @@ def pair_episodes(condition: Condition, base: Sequence[BaseEpisode], all_names: 
     return Pairing(condition, pairs, missing, tuple(name for name in reruns if name not in all_names))
 
 
-def actions_of(base: BaseEpisode, rerun: StoredEpisode, condition: Condition) -> Array:
-    """Actions (replan, step, dimension) of an episode of a condition.
+def _was_measured(episode: StoredEpisode, condition: Condition) -> bool:
+    effects = episode.attributes.effects
+    return effects is not None and condition.interventions in effects.conditions
+
+
+def actions_of(base: BaseEpisode, rerun: StoredEpisode, condition: Condition, changes: Array | None = None) -> Array:
+    """Actions (replan, step, dimension) of an episode of a condition; NaN where a recorded one was not measured.
+
+    changes: of all recorded conditions, if they have been read (`changes_recorded`).
 
     Raises:
         StoreError: the rerun is of other policy calls than the base, see `same_calls.check_same_calls`.
     """
+    if condition.recorded:
+        return _recorded_actions(base, condition, changes_recorded(base) if changes is None else changes)
     check_same_calls(base.item.store, base.item.episode, condition.store, rerun)
     actions: Array = rerun.read("actions").astype(np.float64)
+    return actions
+
+
+def changes_recorded(base: BaseEpisode) -> Array:
+    """The changes that were measured beside an episode's calls, (entry, step, dimension), in normalised units."""
+    episode = base.item.episode
+    values: Array = episode.read(CHANGE) if episode.has(CHANGE) else np.zeros((0, *base.actions.shape[1:]))
+    return values
+
+
+def _recorded_actions(base: BaseEpisode, condition: Condition, changes: Array) -> Array:
+    """What the base's calls give under a condition whose effect was measured beside them."""
+    actions = np.full_like(base.actions, np.nan)
+    effects = base.item.episode.attributes.effects
+    if effects is None or condition.interventions not in effects.conditions:
+        return actions
+    number = effects.conditions.index(condition.interventions)
+    entries = np.flatnonzero(np.array(effects.condition) == number)
+    if entries.size:
+        replans = np.array(effects.replan)[entries]
+        change = changes[entries].astype(np.float64) * np.array(effects.units)
+        actions[replans] = base.actions[replans] + change
     return actions
 
 

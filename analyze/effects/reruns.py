@@ -8,6 +8,7 @@ from pathlib import Path
 
 from vla_attention.analyze.effects.conditions import Condition
 from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX, StoreNotFound
@@ -43,10 +44,14 @@ def open_reruns(base: Store, given: Sequence[StorePlace]) -> BaseAndReruns:
         StoreNotFound, StoreError: see `vla_attention.schemas.stores.reader.open_store`.
     """
     if not given:
-        raise BadArgument(
-            f"No rerun of {base.path} was given; expected stores, or a folder of vla-capture rerun {base.path} "
-            "--series default."
-        )
+        recorded = recorded_conditions(base)
+        if not recorded:
+            raise BadArgument(
+                f"{base.path} holds no effects, and no rerun of it was given; make a store with them with vla-capture "
+                f"rerun {base.path} --effects text,cameras, or give reruns, for instance the folder of vla-capture "
+                f"rerun {base.path} --series default."
+            )
+        return BaseAndReruns(base, recorded, (), ())
     reruns, rollouts, notes = [], [], []
     for path, named in _paths(given):
         other = open_store(path)
@@ -74,6 +79,18 @@ def open_reruns(base: Store, given: Sequence[StorePlace]) -> BaseAndReruns:
         for name, other in zip(names, [*reruns, *rollouts], strict=True)
     ]
     return BaseAndReruns(base, tuple(conditions[: len(reruns)]), tuple(conditions[len(reruns) :]), tuple(notes))
+
+
+def recorded_conditions(base: Store) -> tuple[Condition, ...]:
+    """The conditions whose effects a store measured beside its calls, in the order of its episodes."""
+    if base.attributes.recording.effects is None:
+        return ()
+    conditions: dict[str, Interventions] = {}
+    for episode in base.episodes:
+        if (effects := episode.attributes.effects) is not None:
+            for one in effects.conditions:
+                conditions.setdefault(one.name, one)
+    return tuple(Condition(visible(name), base, one, recorded=True) for name, one in conditions.items())
 
 
 def _what_fits(base: StorePlace) -> str:

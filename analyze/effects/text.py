@@ -6,12 +6,14 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import polars as pl
 
 from vla_attention.analyze.effects.action_changes import MOSTLY_NOISE
 from vla_attention.analyze.effects.answer import answer_lines, beyond
 from vla_attention.analyze.effects.conditions import FLOORS, Condition, Kind
 from vla_attention.analyze.effects.effect_study import EffectStudy
 from vla_attention.analyze.effects.group_rows import GroupRow, group_rows
+from vla_attention.analyze.effects.item_rows import READERS, ItemRow, Reader, item_rows
 from vla_attention.analyze.effects.paired_replans import ALL, PHASES, stores_executed
 from vla_attention.analyze.show.answer import Section
 from vla_attention.analyze.show.findings import few_families_note
@@ -41,6 +43,15 @@ _EFFECT_NOTE = (
 )
 
 
+_READER_NAMES: dict[Reader, str] = {"total": "all", "direct": "action", "pictures": "pictures", "text": "text"}
+_ITEM_NOTE = (
+    "Effect: root mean square change of the {which} actions, each dimension in its standard deviation in the base, "
+    "when no query reads the item (all), or these alone do not: the action queries, the pictures, the text. "
+    "direct/all: the share of the effect that is the action queries' own. x noise: times that of another noise seed; "
+    "random: of random keys of about the same number. lift: the base's."
+)
+
+
 def counted_actions(study: EffectStudy) -> str:
     """Which actions of a chunk effects are about, as an adjective."""
     return "executed" if stores_executed(study.given.base) else "chunk's"
@@ -48,7 +59,8 @@ def counted_actions(study: EffectStudy) -> str:
 
 def effects_sections(study: EffectStudy) -> list[Section]:
     """The whole answer."""
-    sections = [*_header(study), *_groups(study), *_left_out(study), *_others(study), *_rollouts(study), _notes(study)]
+    groups = _items(study) if study.is_recorded else _groups(study)
+    sections = [*_header(study), *groups, *_left_out(study), *_others(study), *_rollouts(study), _notes(study)]
     if study.conditions:
         sections += [*_floors(study), _every(study), _phases(study), *_tasks(study)]
         sections += [_dimensions(study), _attention_notes(study)]
@@ -97,6 +109,40 @@ def _groups(study: EffectStudy) -> list[Section]:
     note = _EFFECT_NOTE.format(which=counted_actions(study))
     about = f"{interval_note(DEFAULT_LEVEL, study.question.units.words)} Effects do not add up."
     return [Section([table, note, about], "WITHOUT IT, AND WITH IT ALONE  effect on the action")] if table.rows else []
+
+
+def item_table(study: EffectStudy) -> Table:
+    """Every item that was cut off for several readers: attention, and the effect by who no longer reads it."""
+    items = item_rows(study)
+    shown = [reader for reader in READERS if any(reader in item.by_reader for item in items)]
+
+    def of(reader: Reader) -> Column:
+        return number(_READER_NAMES[reader], lambda item: item.effect(reader))
+
+    def strongest(name: str) -> Callable[[ItemRow], float | None]:
+        return lambda item: item.strongest[name]
+
+    columns = [
+        texts("item", lambda item: broken(item.name, 24), left=True),
+        number("keys", strongest("keys")),
+        number("lift", strongest("lift"), "lift"),
+        of(shown[0]) if shown else number("effect", strongest("effect")),
+        interval("effect", INTERVAL, of=lambda item: item.strongest),
+        *map(of, shown[1:]),
+        percent("direct/all", lambda item: item.direct_share, decimals=0),
+        number("x noise", strongest("over_noise"), "times the noise"),
+        number("random", strongest("random"), "random keys"),
+    ]
+    return Table(columns, items)
+
+
+def _items(study: EffectStudy) -> list[Section]:
+    table = item_table(study)
+    if not table.rows:
+        return _groups(study)
+    note = _ITEM_NOTE.format(which=counted_actions(study))
+    about = f"{interval_note(DEFAULT_LEVEL, study.question.units.words)} Effects do not add up."
+    return [Section([table, note, about], "WITHOUT IT  effect on the action, by who no longer reads it")]
 
 
 def _condition(width: int) -> Column:
@@ -262,7 +308,12 @@ def _left_out(study: EffectStudy) -> list[Section]:
 
 
 def _notes(study: EffectStudy) -> Section:
-    few = few_families_note(study.summary.filter(scope="all", phase=ALL), "condition", study.question.units)
+    rows = study.summary.filter(scope="all", phase=ALL)
+    if study.is_recorded:
+        rows = rows.filter(pl.col("condition").is_in([item.strongest["condition"] for item in item_rows(study)]))
+        few = few_families_note(rows, "group", study.question.units)
+    else:
+        few = few_families_note(rows, "condition", study.question.units)
     return Section([note_lines([*study.notes, *([few] if few else [])])])
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from vla_attention.capture.budget.budget import Choice, Fixed, choose_recording, recordings_by_size
 from vla_attention.capture.budget.trial import run_trial, spread
+from vla_attention.capture.effects.measurement import EffectMeasurement
 from vla_attention.capture.environments.base import EnvironmentSettings, Task
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.policies.policy import Policy
@@ -42,6 +43,7 @@ class BudgetedRecording:
     settings: EnvironmentSettings
     changes: RunChanges
     check: StopCheck
+    effects: EffectMeasurement | None = None
 
     def candidates(self, asked: Recording) -> tuple[Recording, ...]:
         """Return the recordings to choose from, the largest first."""
@@ -56,7 +58,7 @@ class BudgetedRecording:
         candidates = self.candidates(attributes.recording)
         largest = replace(attributes, recording=candidates[0])
         samples = [
-            run_trial(self.policy, largest, task, self.settings, self.changes, self.check).sample
+            run_trial(self.policy, largest, task, self.settings, self.changes, self.check, effects=self.effects).sample
             for task in spread(self.tasks, TRIED_TASKS)
         ]
         replans = max_replans(attributes.protocol)

@@ -13,6 +13,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.capture.effects.measurement import EffectMeasurement
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, StepResult, Task
 from vla_attention.capture.environments.suites import find_suite, make_environment
 from vla_attention.capture.interventions.run_changes import RunChanges
@@ -36,8 +37,8 @@ _MOST_BYTES = 1 << 30
 class Trial:
     """What the first replans of one episode were like.
 
-    policy_seconds, step_seconds: medians of a policy call with its recording, and of a step of the simulator with its
-    share of drawing. start_seconds: making the environment, its reset and the waiting steps.
+    policy_seconds, step_seconds: medians of a policy call with its recording and its effects, and of a step of the
+    simulator with its share of drawing. start_seconds: making the environment, its reset and the waiting steps.
     """
 
     sample: SampleOfReplans
@@ -65,11 +66,12 @@ def run_trial(
     *,
     environment: Environment | None = None,
     most_replans: int = TRIAL_REPLANS,
+    effects: EffectMeasurement | None = None,
 ) -> Trial:
     """Run the first replans of a task's first episode in an environment of its own; nothing of them is stored.
 
     attributes: of the run; its recording should have all that a smaller one may be chosen from. environment: instead
-    of the suite's own.
+    of the suite's own. effects: measures those of the run, where it has some.
     """
     protocol = attributes.protocol
     replans = max(FEWEST_REPLANS, min(most_replans, _MOST_BYTES // _bytes_of_rows(attributes)))
@@ -78,7 +80,7 @@ def run_trial(
     begun = time.perf_counter()
     simulator = environment or make_environment(find_suite(protocol.suite), task.task_id, settings)
     try:
-        run = EpisodeRun(cast(Policy, timed), cast(RunStore, kept), {}, changes, check)
+        run = EpisodeRun(cast(Policy, timed), cast(RunStore, kept), {}, changes, check, effects=effects)
         record_episode(run, cast(Environment, _NeverSolved(simulator)), task, 0)
     finally:
         simulator.close()
@@ -87,6 +89,8 @@ def run_trial(
     # The first call loads what later ones find loaded; medians leave it out.
     of_replans = np.diff(kept.times)
     of_calls = median(call.seconds for call in timed.calls)
+    if effects is not None:
+        of_calls += median(effects.seconds) / effects.planned.every
     return Trial(
         sample=SampleOfReplans(attributes, kept.start, kept.denoise_times, kept.records),
         policy_seconds=of_calls,

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from vla_attention.capture.commands.parity_command import run_parity_command
 from vla_attention.capture.doctor.arguments import DOCTOR_EXAMPLES, add_doctor_arguments
+from vla_attention.capture.effects.arguments import add_effect_arguments
 from vla_attention.capture.environments.suites import ALL_SUITES, STANDARD_SUITES, SUITES, find_suite, list_tasks
 from vla_attention.capture.interventions.arguments import add_intervention_arguments
 from vla_attention.capture.jobs.termination import Termination
@@ -176,6 +177,7 @@ def _add_capture_arguments(
     if script:
         which = f"layers to analyse; all are recorded (default: {' '.join(map(str, script.layers))})"
     add_recording_arguments(parser, which + family.layers_note)
+    add_effect_arguments(parser)
     add_intervention_arguments(parser)
     _add_output_arguments(parser, family, script)
 

@@ -240,7 +240,7 @@ def _plan(settings: RunSettings, policy: Policy, device: str, termination: Termi
         check_same_run(settings.store, existing, replace(attributes, recording=same))
     environment = EnvironmentSettings(plan.evaluation, settings.libero_assets)
     trials = [
-        run_trial(policy, tried, task, environment, plan.changes, termination.check)
+        run_trial(policy, tried, task, environment, plan.changes, termination.check, effects=plan.effects)
         for task in spread(plan.wanted, TRIED_TASKS if settings.budget is not None else 1)
     ]
     return _PlannedRun(attributes, len(plan.wanted), trials)

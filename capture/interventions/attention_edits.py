@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vla_attention.capture.recording.attention import MASKED_LOGIT, AttentionEditor, LogitChange
+from vla_attention.capture.recording.attention import MASKED_LOGIT, FactorEditor, LogitChange
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Queries
 
@@ -74,8 +74,8 @@ class _Operands:
     members: Tensor | None = None
 
 
-@dataclass
-class SiteEditor(AttentionEditor):
+@dataclass(eq=False)
+class SiteEditor(FactorEditor):
     """Applies the edits of one site during one replan, one after the other. Every replan needs a new one.
 
     The changes that it returns may write to the logits that they are given.
@@ -104,14 +104,8 @@ class SiteEditor(AttentionEditor):
 
         def operands(number: int, logits: Tensor) -> _Operands:
             heads, count, keys = logits.shape[1:]
-            edit, is_action = self.edits[number], np.zeros(count, dtype=bool)
-            is_action[action_queries] = True
-            stays = np.zeros((count, keys), dtype=bool)
-            if edit.queries == "action":
-                stays[~is_action] = True
-            elif own_keys is not None:
-                stays[np.arange(count), np.arange(own_keys.start, own_keys.stop)] = ~is_action
-            return _operands_of(edit, edit.values, stays, heads, logits.device)
+            stays = _stays_at_step(self.edits[number], count, action_queries, own_keys, keys)
+            return _operands_of(self.edits[number], self.edits[number].values, stays, heads, logits.device)
 
         return self._change(numbers, ("step", kind), operands, where)
 
@@ -123,12 +117,33 @@ class SiteEditor(AttentionEditor):
 
         def operands(number: int, logits: Tensor) -> _Operands:
             edit, keys = self.edits[number], tokens.cpu().numpy()
-            stays = np.eye(len(keys), dtype=bool)
-            if edit.readers is not None:
-                stays[~edit.readers[keys]] = True
-            return _operands_of(edit, edit.values[keys], stays, logits.shape[1], logits.device)
+            return _operands_of(edit, edit.values[keys], _stays_in_prefix(edit, keys), logits.shape[1], logits.device)
 
         return self._change(numbers, ("prefix", len(tokens)), operands, f"the prefix's layer {layer}")
+
+    def prefix_factors(self, tokens: NDArray[np.int64]) -> NDArray[np.float64] | None:
+        """See `FactorEditor`."""
+        edits = [edit for edit in self._everywhere() if edit.queries != "action"]
+        factors = [np.where(_stays_in_prefix(edit, tokens), 1.0, edit.values[tokens]) for edit in edits]
+        return np.prod(factors, axis=0) if factors else None
+
+    def step_factors(
+        self, queries: int, action_queries: slice, own_keys: slice | None, num_keys: int
+    ) -> NDArray[np.float64] | None:
+        """See `FactorEditor`."""
+        edits = [edit for edit in self._everywhere() if edit.queries != "prefix"]
+        factors = [
+            np.where(_stays_at_step(edit, queries, action_queries, own_keys, num_keys), 1.0, edit.values)
+            for edit in edits
+        ]
+        return np.prod(factors, axis=0) if factors else None
+
+    def _everywhere(self) -> list[SiteEdit]:
+        """The edits, if all are factors at every layer, head and denoise step."""
+        for edit in self.edits:
+            if edit.kind != "factor" or any((edit.layers, edit.heads, edit.denoise_steps)):
+                raise ValueError(f"{edit.group}: no factor that is the same at all layers, heads and denoise steps")
+        return [edit for edit in self.edits if not edit.changes_nothing]
 
     def _at_layer(self, layer: int) -> list[tuple[int, SiteEdit]]:
         return [
@@ -161,6 +176,28 @@ class SiteEditor(AttentionEditor):
                 f"An intervention leaves a query without any key at site '{self.site}', {where}, head {head}, query "
                 f"{query}: {groups}. Take a smaller group, a weight below 1, or fewer heads or layers."
             )
+
+
+def _stays_at_step(
+    edit: SiteEdit, count: int, action_queries: slice, own_keys: slice | None, num_keys: int
+) -> NDArray[np.bool_]:
+    """Return where an edit changes nothing in a call of a denoise step, (query, key)."""
+    is_action = np.zeros(count, dtype=bool)
+    is_action[action_queries] = True
+    stays = np.zeros((count, num_keys), dtype=bool)
+    if edit.queries == "action":
+        stays[~is_action] = True
+    elif own_keys is not None:
+        stays[np.arange(count), np.arange(own_keys.start, own_keys.stop)] = ~is_action
+    return stays
+
+
+def _stays_in_prefix(edit: SiteEdit, tokens: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return where an edit changes nothing in the prefix, (query, key); both are the tokens."""
+    stays = np.eye(len(tokens), dtype=bool)
+    if edit.readers is not None:
+        stays[~edit.readers[tokens]] = True
+    return stays
 
 
 def _operands_of(

@@ -43,6 +43,12 @@ def condition_name(interventions: Interventions) -> str:
     return f"{name[: _LONGEST - _DIGEST - 1]}_{digest}"
 
 
+def knockout_of_group(kind: str, group: str, knockout: KeyKnockout) -> Interventions:
+    """Return a condition such as `without_word_red_queries_all`: its name says for whom the keys are cut."""
+    of_queries = plain(queries_suffix(knockout.queries, knockout.query_selector))
+    return Interventions("_".join(part for part in (kind, group, of_queries) if part), keys=(knockout,))
+
+
 def plain(text: str) -> str:
     """Return a selector, or a part of a name, as letters, digits, `_` and `.`."""
     for operator, word in _OPERATORS:

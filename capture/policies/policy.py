@@ -19,7 +19,7 @@ from vla_attention.capture.environments.base import (
     camera_frame as camera_frame,
 )  # policies and their users import it here
 from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
-from vla_attention.capture.recording.attention import AttentionEditor, RowCollector
+from vla_attention.capture.recording.attention import AttentionEditor, FactorEditor, RowCollector
 from vla_attention.schemas.errors import unknown_name
 from vla_attention.schemas.layout import PatchGrid, Prompt, SiteLayout
 from vla_attention.schemas.stores.store_format import PolicyCameraView, PolicyIdentity
@@ -171,6 +171,37 @@ class BatchPolicy(Protocol):
         recorders: Sequence[Mapping[str, RowCollector]],
     ) -> list[NDArray[np.float64]]:
         """Return what `act` gives for each input, its noise and its recorders; equal but for rounding."""
+
+
+@dataclass(frozen=True)
+class CallVariant:
+    """A policy call that differs from another one in its input, its noise, or the attention of some queries.
+
+    editors: of each site whose attention changes.
+    """
+
+    policy_input: PolicyInput
+    noise_seed: int
+    editors: Mapping[str, FactorEditor] = field(default_factory=dict)
+
+
+@runtime_checkable
+class VariantPolicy(Protocol):
+    """A policy that makes variants of one call together, for less than a call each."""
+
+    def act_variants(self, variants: Sequence[CallVariant], num_steps: int, batch: int) -> list[NDArray[np.float64]]:
+        """Return what `act` gives for each variant, equal but for rounding.
+
+        num_steps: denoise steps. batch: variants that are made at a time, at most.
+        """
+
+
+@runtime_checkable
+class UnitsPolicy(Protocol):
+    """A policy that says what a unit of its normalised actions is."""
+
+    def action_units(self) -> NDArray[np.float64]:
+        """Return how far 1 of the model's normalised actions moves the robot, (action dim,), in the robot's units."""
 
 
 def stored_picture_sizes(policy: Policy, image_size: int) -> list[int]:

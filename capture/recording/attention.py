@@ -10,8 +10,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
 import torch
 import torch.nn.functional as F
+from numpy.typing import NDArray
 from torch import Tensor
 
 from vla_attention.capture.recording.contributions import Projection
@@ -163,6 +165,24 @@ class AttentionEditor(Protocol):
         tokens: the keys of the site that these tokens are at the denoise steps, (token,) int64.
         """
         ...
+
+
+class FactorEditor(AttentionEditor, Protocol):
+    """An editor that multiplies weights before normalising, the same at all layers, heads and denoise steps."""
+
+    def prefix_factors(self, tokens: NDArray[np.int64]) -> NDArray[np.float64] | None:
+        """Return the factors (query, key) in a call before the first denoise step; None where nothing changes.
+
+        tokens: the keys that the tokens are, (token,); they are the queries, too.
+        """
+
+    def step_factors(
+        self, queries: int, action_queries: slice, own_keys: slice | None, num_keys: int
+    ) -> NDArray[np.float64] | None:
+        """Return the factors (query, key) in a call of a denoise step; None where nothing changes.
+
+        queries: their number. action_queries, own_keys: as of `AttentionEditor.step_change`. num_keys: of the site.
+        """
 
 
 @dataclass(frozen=True)

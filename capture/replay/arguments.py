@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from vla_attention.capture.effects.arguments import add_effect_arguments
 from vla_attention.capture.interventions.arguments import add_intervention_arguments
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import policy_families
@@ -49,6 +50,8 @@ def add_replay_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) 
     _add_frame_arguments(parser, "as the file says, else 1" if of_file else family.replan_default)
     if of_file:
         _add_change_arguments(parser)
+    if not of_file:
+        add_effect_arguments(parser)
     add_recording_arguments(parser, f"block indices (default: all){'' if of_file else family.layers_note}")
     _add_output_arguments(parser)
     parser.set_defaults(command=_run)

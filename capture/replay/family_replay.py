@@ -14,6 +14,8 @@ from typing import Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.capture.effects.measurement import EffectMeasurement, EpisodeEffectsMeasured, measurement_of
+from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.machine.provenance import describe_machine
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.identity import downloads_of
@@ -66,6 +68,7 @@ class Replay:
     seed: int
     instruction: str | None
     machine: Mapping[str, str]
+    effects: EffectMeasurement | None = None
 
 
 def replay_episode(replay: Replay, job: EpisodeJob, episode: DataSetEpisode, before_call: BeforeCall) -> Path:
@@ -81,11 +84,12 @@ def replay_episode(replay: Replay, job: EpisodeJob, episode: DataSetEpisode, bef
     digest = hashlib.sha256(np.ascontiguousarray(state[0]).tobytes()).hexdigest()
     start = episode_start(job.task, job.episode_index, replay.machine, state_digest=digest, objects=())
     denoise_times = policy.denoise_times()[list(recording.denoise_steps)]
+    effects = None if replay.effects is None else replay.effects.begin()
     with replay.store.episode(start, np.asarray(denoise_times), job.size) as writer:
         cameras = tuple(policy.robot.cameras.values())
         for frame in episode.frames(replay.every, cameras):
             before_call(len(writer.records))
-            _append_call(replay, writer, frame, job.task.task_id, state[frame.index], actions)
+            _append_call(replay, writer, frame, job.task.task_id, state[frame.index], actions, effects)
         return writer.commit(success_of(episode), episode.length)
 
 
@@ -96,6 +100,7 @@ def _append_call(
     task_id: int,
     state: NDArray[np.float64],
     actions: NDArray[np.float64] | None,
+    effects: EpisodeEffectsMeasured | None,
 ) -> None:
     policy, recording = replay.policy, replay.store.attributes.recording
     instruction = frame.instruction if replay.instruction is None else replay.instruction
@@ -103,6 +108,7 @@ def _append_call(
     seed = policy.replan_noise_seed(replay.seed, task_id, frame.episode, len(writer.records))
     where = f"replan {len(writer.records)} (frame {frame.index}) of {writer.what}"
     call = record_call(policy, policy_input, seed, recording, where)
+    context = CallContext(task_id, frame.episode, len(writer.records))
     writer.append(
         replan_record(
             policy_input,
@@ -110,6 +116,7 @@ def _append_call(
             recording,
             env_step=frame.index,
             noise_seed=seed,
+            effects=None if effects is None else effects.measure(policy_input, seed, call.actions, context),
             dataset_actions=None if actions is None else actions[frame.index : frame.index + policy.action_horizon],
         )
     )
@@ -122,7 +129,7 @@ def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: 
     policy = cast(RobotPolicy, family.build(arguments, device))
     robot = policy.robot
     plan.data.check_files(plan.wanted, tuple(robot.cameras.values()))
-    recording, note = plan_recording(recording_settings(arguments), policy)
+    recording, note = plan_recording(recording_settings(arguments), policy, plan.seed)
     if note:
         say(note)
     every = plan.every or policy.default_replan_steps
@@ -139,7 +146,9 @@ def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: 
     masked = [camera for camera in policy.sites[0].cameras if camera not in robot.cameras]
     if masked:
         say(f"Black and masked: {listing(masked)}.")
-    replay = Replay(policy, store, every, plan.seed, plan.instruction, attributes.provenance)
+    # A data set knows no families of tasks, so there are no words to exchange.
+    effects = measurement_of(recording.effects, policy, [], say)
+    replay = Replay(policy, store, every, plan.seed, plan.instruction, attributes.provenance, effects)
     return len(record_episodes(plan, store, todo, every, partial(replay_episode, replay)))
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vla_attention.capture.effects.arguments import add_effect_arguments
 from vla_attention.capture.interventions.arguments import add_intervention_arguments
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import family_of_kind
@@ -43,6 +44,7 @@ def add_rerun_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -
     _add_series_arguments(parser)
     _add_selection_arguments(parser)
     add_recording_arguments(parser, "block indices", rerun=True)
+    add_effect_arguments(parser)
     if root is not None:
         _take_recording_of(root, parser)
     _add_output_arguments(parser)

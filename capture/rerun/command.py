@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from vla_attention.capture.effects.arguments import NO_EFFECTS
+from vla_attention.capture.effects.conditions import refuse_both
 from vla_attention.capture.interventions.resolution import check_not_compiled, check_places, interventions_for
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.machine.device import load_torch
@@ -60,6 +62,8 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
         say(line)
     rerun = _prepare(arguments, base, threads, termination)
     interventions = interventions_for(interventions, rerun.policy)
+    if rerun.recording.effects is not None:
+        refuse_both(interventions)
     rerun.check(arguments.check)
     if target is None:
         return 0
@@ -87,8 +91,10 @@ def _target(arguments: argparse.Namespace, base: Store, interventions: Intervent
     """Return the store to write; None if only the check was asked for."""
     if arguments.store is not None:
         target = Path(arguments.store)
-    elif interventions.is_none:
+    elif interventions.is_none and arguments.effects == NO_EFFECTS:
         return None
+    elif interventions.is_none:
+        target = local_path(base.path).with_name(f"{base.path.stem}_effects{STORE_SUFFIX}")
     else:
         target = local_path(base.path).with_name(f"{base.path.stem}_{file_part(interventions.name)}{STORE_SUFFIX}")
     if target.resolve() == base.path.resolve():
@@ -105,7 +111,7 @@ def _prepare(arguments: argparse.Namespace, base: Store, threads: Threads, termi
     identity = policy.identity()
     check_same_policy(base, identity, policy.sites)
     check_has_inputs(base, policy)
-    recording, note = plan_recording(recording_settings(arguments), policy)
+    recording, note = plan_recording(recording_settings(arguments), policy, base.attributes.protocol.seed)
     if note:
         say(note)
     say(f"Policy: {identity.name} ({identity.checkpoint_format}: {identity.checkpoint}), weights as in {base.path}.")

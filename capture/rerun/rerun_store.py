@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vla_attention.capture.effects.measurement import EffectMeasurement, measurement_of
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.policy import Policy, stored_picture_sizes
@@ -64,7 +65,8 @@ def job_of(base: Store, episode: StoredEpisode) -> EpisodeJob:
 class StoredCallsSource(EpisodeSource):
     """The policy calls of a store's episodes, made again.
 
-    episodes: by their names. machine: provenance that is stored with every episode.
+    episodes: by their names. machine: provenance that is stored with every episode. effects: what measures the effects
+    of calls; None where they are not recorded.
     """
 
     repeater: Repeater
@@ -72,6 +74,7 @@ class StoredCallsSource(EpisodeSource):
     episodes: Mapping[str, StoredEpisode]
     machine: Mapping[str, str]
     termination: Termination
+    effects: EffectMeasurement | None = None
 
     def record(self, job: EpisodeJob, report: StepReport) -> EpisodeResult:
         """Rerun an episode and commit it.
@@ -90,19 +93,26 @@ class StoredCallsSource(EpisodeSource):
             objects=attributes.objects,
             state_index=attributes.initial_state_index,
         )
+        effects = None if self.effects is None else self.effects.begin()
         denoise_times = repeater.policy.denoise_times()[list(recording.denoise_steps)]
         with self.store.episode(start, np.asarray(denoise_times), calls.num_replans) as writer:
             for replan in range(calls.num_replans):
                 self.termination.check()
                 with _reading_the_base():
                     policy_input = repeater.prepare(calls, replan)
+                call, seed = repeater.call(calls, replan, policy_input), repeater.noise_seed(calls, replan)
+                measured = None
+                if effects is not None:
+                    context = calls.context(replan, repeater.instructions)
+                    measured = effects.measure(policy_input, seed, call.actions, context)
                 writer.append(
                     replan_record(
                         policy_input,
-                        repeater.call(calls, replan, policy_input),
+                        call,
                         recording,
                         env_step=int(calls.env_step[replan]),
-                        noise_seed=repeater.noise_seed(calls, replan),
+                        noise_seed=seed,
+                        effects=measured,
                         coverage=calls.coverage_of(replan),
                         dataset_actions=calls.dataset_actions_of(replan),
                         base_actions=None if self.store.attributes.interventions.is_none else calls.actions[replan],
@@ -222,7 +232,10 @@ class Rerun:
         repeater = self.unchanged
         if not interventions.is_none:
             repeater = Repeater(self.policy, self.recording, interventions, self.instructions, allow_empty)
-        source = StoredCallsSource(repeater, store, episodes, self.machine, self.termination)
+        tasks = {episode.attributes.task_id: episode.attributes for episode in self.base.episodes}
+        families = [(number, of.instruction, of.task_family) for number, of in tasks.items()]
+        effects = measurement_of(self.recording.effects, self.policy, families, say)
+        source = StoredCallsSource(repeater, store, episodes, self.machine, self.termination, effects)
         loop = OneByOneLoop(store, plan_of(jobs), self.termination, "call", source)
         try:
             loop.record_all(todo)

@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.capture.effects.arguments import NO_EFFECTS
 from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
-from vla_attention.capture.interventions.condition_name import plain
+from vla_attention.capture.interventions.condition_name import knockout_of_group
 from vla_attention.capture.interventions.resolution import (
     TooFewKeys,
     check_places,
@@ -31,7 +32,7 @@ from vla_attention.schemas.groupings.builtin_groupings import find_grouping
 from vla_attention.schemas.groupings.grouping import REST
 from vla_attention.schemas.groupings.selector_weights import selector_weights
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
-from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange, queries_suffix, readers
+from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange, readers
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.reader import Store
@@ -120,11 +121,12 @@ def plan_series(
                 "in which some replan has no key of it."
             )
         knockout = replace(given, keep=False, random_seed=None)
-        conditions.append(_condition("without", name, knockout, keys.episodes))
-        conditions.append(_condition("only", name, replace(knockout, keep=True), keys.episodes))
+        conditions.append(SeriesCondition(knockout_of_group("without", name, knockout), keys.episodes))
+        alone = knockout_of_group("only", name, replace(knockout, keep=True))
+        conditions.append(SeriesCondition(alone, keys.episodes))
         if keys.with_control:
-            random = replace(knockout, random_seed=given.random_seed or 0)
-            conditions.append(_condition("random", name, random, keys.with_control))
+            random = knockout_of_group("random", name, replace(knockout, random_seed=given.random_seed or 0))
+            conditions.append(SeriesCondition(random, keys.with_control))
         if keys.with_control != keys.episodes:
             notes.append(
                 f"Group '{name}' has a random control in {len(keys.with_control)} of {len(keys.episodes)} episodes: in "
@@ -144,13 +146,6 @@ def _for_whom(template: KeyKnockout, words: KeyKnockout | None) -> str:
         f"Keys of words are cut for {of_words}, those of other groups for {of_groups}; --knockout-queries chooses one "
         "for both."
     )
-
-
-def _condition(kind: str, group: str, knockout: KeyKnockout, episodes: frozenset[str]) -> SeriesCondition:
-    """A condition whose name says for whom the keys are cut, as that of a single rerun does."""
-    of_queries = plain(queries_suffix(knockout.queries, knockout.query_selector))
-    name = "_".join(part for part in (kind, group, of_queries) if part)
-    return SeriesCondition(Interventions(name, keys=(knockout,)), episodes)
 
 
 def _groups_of(grouping: str, vocabularies: Mapping[str, Vocabulary]) -> dict[str, str]:
@@ -276,6 +271,7 @@ def _refuse_own_interventions(arguments: argparse.Namespace) -> None:
         ("--name", arguments.name),
         ("--store", arguments.store),
         ("--overwrite", arguments.overwrite),
+        ("--effects", arguments.effects != NO_EFFECTS),
     ):
         if given:
             raise BadArgument(

@@ -12,6 +12,7 @@ from typing import Protocol as Interface
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.capture.effects.measurement import EffectMeasurement, EpisodeEffectsMeasured
 from vla_attention.capture.environments.base import Environment, Task
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
 from vla_attention.capture.interventions.run_changes import RunChanges
@@ -50,7 +51,8 @@ class EpisodeRun:
 
     machine: provenance that is stored with every episode. changes: the run's interventions; without any, nothing.
     check: called before every environment step and policy call; an exception that it raises drops the episode.
-    observed: what is checked of the simulator's pictures and states before every policy call.
+    observed: what is checked of the simulator's pictures and states before every policy call. effects: what measures
+    the effects of calls; None where they are not recorded.
     """
 
     policy: Policy
@@ -59,6 +61,7 @@ class EpisodeRun:
     changes: RunChanges = field(default_factory=lambda: RunChanges(Interventions(), {}))
     check: StopCheck = lambda: None
     observed: ObservationChecks = field(default_factory=ObservationChecks)
+    effects: EffectMeasurement | None = None
 
 
 class ReplanWriter(Interface):
@@ -108,6 +111,11 @@ class EpisodeRecording:
     step: int = field(default=0, init=False)
     num_replans: int = field(default=0, init=False)
     success: bool = field(default=False, init=False)
+    _effects: EpisodeEffectsMeasured | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        """Begin measuring effects, where the run does."""
+        self._effects = None if self.run.effects is None else self.run.effects.begin()
 
     @property
     def ended(self) -> bool:
@@ -136,6 +144,7 @@ class EpisodeRecording:
         return PreparedCall(
             env_step=env_step,
             where=where,
+            context=context,
             policy_input=policy_input,
             noise_seed=policy.replan_noise_seed(noise, start.task_id, start.episode_index, replan),
             coverage=seen.coverage,
@@ -144,9 +153,13 @@ class EpisodeRecording:
         )
 
     def keep(self, prepared: PreparedCall, call: RecordedCall, writer: ReplanWriter) -> None:
-        """Store a policy call that has been made."""
+        """Store a policy call that has been made, with its effects. A simulator elsewhere goes on meanwhile."""
         recording = self.run.store.attributes.recording
         self.num_replans += 1
+        effects = None
+        if self._effects is not None:
+            given = prepared.policy_input
+            effects = self._effects.measure(given, prepared.noise_seed, call.actions, prepared.context)
         writer.append(
             replan_record(
                 prepared.policy_input,
@@ -155,6 +168,7 @@ class EpisodeRecording:
                 env_step=prepared.env_step,
                 noise_seed=prepared.noise_seed,
                 coverage=prepared.coverage,
+                effects=effects,
                 constant_cameras=prepared.constant_cameras,
             )
         )

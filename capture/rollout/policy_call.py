@@ -9,11 +9,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.policies.policy import BatchPolicy, Policy, PolicyInput
 from vla_attention.capture.recording.attention import AttentionEditor
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite, all_finite, describe_origin
 from vla_attention.capture.recording.recorder import make_recorders
-from vla_attention.capture.store.replan_records import RecordedRows, ReplanRecord
+from vla_attention.capture.store.replan_records import RecordedRows, ReplanEffects, ReplanRecord
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.stores.store_format import Recording
 
@@ -61,6 +62,7 @@ def replan_record(
     dataset_actions: NDArray[np.float64] | None = None,
     base_actions: NDArray[np.float64] | None = None,
     constant_cameras: frozenset[str] = frozenset(),
+    effects: ReplanEffects | None = None,
 ) -> ReplanRecord:
     """Return what is stored of a policy call; see `ReplanRecord`."""
     return ReplanRecord(
@@ -77,6 +79,7 @@ def replan_record(
         dataset_actions=dataset_actions,
         base_actions=base_actions,
         constant_cameras=constant_cameras,
+        effects=effects,
     )
 
 
@@ -85,11 +88,13 @@ class PreparedCall:
     """A policy call before it is made.
 
     where: replan, environment step and episode, for messages. coverage: policy camera -> (patch, object) float32.
-    editors: the editor of each site whose attention changes. constant_cameras: those whose picture shows nothing.
+    editors: the editor of each site whose attention changes. context: its place in the run, and the scene.
+    constant_cameras: those whose picture shows nothing.
     """
 
     env_step: int
     where: str
+    context: CallContext
     policy_input: PolicyInput
     noise_seed: int
     coverage: Mapping[str, NDArray[np.float32]]

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, cast
 from typing import Protocol as Interface
 
+from vla_attention.capture.effects.arguments import EffectSettings, effect_settings
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.layers import select_layers
@@ -41,6 +42,7 @@ class RecordingSettings:
     mantissa_bits: int = DEFAULT_MANTISSA_BITS
     frames: bool = True
     contributions: bool = True
+    effects: EffectSettings | None = None
 
 
 def recording_settings(arguments: argparse.Namespace) -> RecordingSettings:
@@ -53,6 +55,7 @@ def recording_settings(arguments: argparse.Namespace) -> RecordingSettings:
         mantissa_bits=DEFAULT_MANTISSA_BITS if arguments.precision is None else parse_precision(arguments.precision),
         frames=not arguments.no_frames,
         contributions=arguments.contributions,
+        effects=effect_settings(arguments),
     )
 
 
@@ -76,14 +79,22 @@ class ModelSizes(Interface):
         """Number of denoise steps of a policy call."""
 
 
-def plan_recording(settings: RecordingSettings, policy: Policy) -> tuple[Recording, str | None]:
-    """Check the settings against the policy; also returns a line to print if layer numbers were translated."""
+def plan_recording(settings: RecordingSettings, policy: Policy, seed: int) -> tuple[Recording, str | None]:
+    """Check the settings against the policy; also returns a line to print if layer numbers were translated.
+
+    seed: of the run's noise.
+    """
     if len(set(settings.heads or ())) != len(settings.heads or ()):
         raise BadArgument(f"Heads {listing(settings.heads or ())} name one of them twice.")
     if settings.queries not in ("mean", "steps", "all"):
         raise BadArgument(f"Cannot use --queries '{settings.queries}'; expected 'mean', 'steps' or 'all'.")
     num_pools = len(policy.query_pools()) if settings.queries == "steps" else 0
-    return recording_of(settings, policy, policy.num_action_queries, num_pools)
+    recording, note = recording_of(settings, policy, policy.num_action_queries, num_pools)
+    if settings.effects is None:
+        return recording, note
+    from vla_attention.capture.effects.conditions import planned_effects
+
+    return replace(recording, effects=planned_effects(settings.effects, policy, seed)), note
 
 
 def recording_of(

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from vla_attention.capture.budget.budgeted_recording import Budget, BudgetedRecording, open_within_budget
+from vla_attention.capture.effects.conditions import describe_effects, refuse_both
+from vla_attention.capture.effects.measurement import EffectMeasurement, measurement_of
 from vla_attention.capture.environments.base import EnvironmentSettings, Task, check_initial_state_index
 from vla_attention.capture.environments.episode_protocol import WAIT_STEPS, EvaluationProtocol
 from vla_attention.capture.environments.suites import list_tasks
@@ -68,6 +70,7 @@ class RunPlan:
     """What a run of some settings is with a policy, before its store is opened.
 
     tasks: of the suite. wanted: those of them that are run. note: a line to print if layer numbers were translated.
+    effects: what measures the effects of calls, if the run does.
     """
 
     evaluation: EvaluationProtocol
@@ -76,6 +79,7 @@ class RunPlan:
     changes: RunChanges
     attributes: RootAttributes
     note: str | None
+    effects: EffectMeasurement | None = None
 
 
 def plan_run(settings: RunSettings, policy: Policy, machine: Mapping[str, str]) -> RunPlan:
@@ -83,14 +87,18 @@ def plan_run(settings: RunSettings, policy: Policy, machine: Mapping[str, str]) 
     evaluation = settings.protocol or policy.default_protocol
     protocol = plan_protocol(settings, evaluation, policy)
     check_protocol(protocol, policy)
-    recording, note = plan_recording(settings.recording, policy)
+    recording, note = plan_recording(settings.recording, policy, protocol.seed)
     tasks = list_tasks(settings.suite)
     wanted = tasks if settings.task_ids is None else tuple(tasks[number] for number in settings.task_ids)
     changes = plan_changes(settings, policy, tasks)
+    if recording.effects is not None:
+        refuse_both(changes.interventions)
     attributes = root_attributes(
         policy.identity(), policy.sites, protocol, recording, machine, interventions=changes.interventions
     )
-    return RunPlan(evaluation, tasks, wanted, changes, attributes, note)
+    families = [(task.task_id, task.instruction, task.task_family) for task in tasks]
+    effects = measurement_of(recording.effects, policy, families, say)
+    return RunPlan(evaluation, tasks, wanted, changes, attributes, note, effects)
 
 
 def run_capture(
@@ -139,6 +147,7 @@ def _record_missing(
             environment_settings,
             plan_changes(settings, policy, tasks),
             termination.check,
+            run_plan.effects,
         )
     store, estimate = open_within_budget(settings.store, attributes, settings.mode, budgeted)
     done = store.committed()
@@ -166,7 +175,7 @@ def _record_missing(
     batch = num_envs if largest_batch is None else min(largest_batch, num_envs)
     if batch > 1:  # calls of a batch round differently, and which share one depends on the simulators' speed
         machine = {**machine, POLICY_BATCH: str(batch)}
-    run = EpisodeRun(policy, store, machine, changes, termination.check)
+    run = EpisodeRun(policy, store, machine, changes, termination.check, effects=run_plan.effects)
     loop: EpisodeLoop
     if num_envs > 1:
         batches = f" Policy calls in batches of at most {batch}; --policy-batch N changes it." if batch > 1 else ""
@@ -252,6 +261,8 @@ def _announce(
         f"{len(recording.heads)} heads, {_QUERIES[recording.queries]} {recording.num_action_queries} action queries, "
         f"{', '.join(str(site.num_keys) for site in store.attributes.sites)} keys."
     )
+    if recording.effects is not None:
+        say(describe_effects(recording.effects))
     if measured is None:
         pictures = stored_picture_sizes(policy, protocol.image_size)
         bound = estimate_disk(recording, store.attributes.sites, pictures, max_replans(protocol), num_todo)

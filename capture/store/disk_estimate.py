@@ -24,6 +24,7 @@ from vla_attention.capture.store.codecs import TARGET_CHUNK_BYTES
 from vla_attention.capture.store.replan_records import EpisodeStart, RecordedRows, ReplanRecord
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.command_line import format_bytes
+from vla_attention.schemas.effects import EffectsRecorded
 from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX, Recording, RootAttributes
@@ -44,6 +45,10 @@ _COVERAGE_BYTES_PER_PATCH = 8
 _USUAL = (0.2, 0.5)
 #: State, actions and numbers of a replan.
 _SMALL_PER_REPLAN = 8_000
+#: Words of an instruction, exchanges of them, or objects of a scene, whose effects are measured; LIBERO has up to 20.
+_MOST_ITEMS = 25
+#: Numbers of an action: arms have 7, two arms 14.
+_ACTION_DIMENSIONS = 14
 #: Metadata and small arrays of one episode: some fifty files and folders, each at least one block of the file system.
 EPISODE_OVERHEAD = 300_000
 
@@ -82,6 +87,8 @@ def estimate_disk(
     """Estimate a run's size; `picture_sizes` are the decoded bytes of each stored camera picture."""
     # A picture may be noise; those that simulators draw take about a third of this.
     total = float(_SMALL_PER_REPLAN) + (_INCOMPRESSIBLE * sum(picture_sizes) if recording.frames else 0)
+    if recording.effects is not None:
+        total += _bytes_of_effects(recording.effects, recording.num_action_queries, sites)
     for site in sites:
         of_site = recording.of_site(site)
         chunks = len(of_site.layers) * len(of_site.denoise_steps)
@@ -95,6 +102,16 @@ def estimate_disk(
         total += sum(_BYTES_PER_PIECE * span.num_keys for span in site.spans if span.kind == "text")
         total += sum(_COVERAGE_BYTES_PER_PATCH * span.num_keys for span in site.spans if span.camera is not None)
     return DiskEstimate(int(total), replans, episodes)
+
+
+def _bytes_of_effects(effects: EffectsRecorded, horizon: int, sites: Sequence[SiteLayout]) -> float:
+    """Bytes of the effects of one replan, with `_MOST_ITEMS` of each kind."""
+    cameras = sum(span.camera is not None for site in sites for span in site.spans)
+    tokens = sum(span.num_keys for site in sites for span in site.spans if span.kind == "text")
+    counts = {"text": _MOST_ITEMS, "cameras": 2 + 2 * cameras, "objects": _MOST_ITEMS, "tokens": tokens}
+    entries = len(effects.readers) * sum(counts[item] for item in effects.items) + _MOST_ITEMS
+    of_entry = 4 * horizon * _ACTION_DIMENSIONS * _INCOMPRESSIBLE + sum(site.num_keys for site in sites) / 8
+    return entries * of_entry / effects.every
 
 
 def free_bytes(path: Path) -> int:

@@ -12,9 +12,10 @@ import zarr
 from numpy.typing import NDArray
 
 from vla_attention.capture.store.codecs import write_whole
-from vla_attention.capture.store.replan_records import EpisodeStart, ReplanRecord
+from vla_attention.capture.store.replan_records import EpisodeStart, ReplanEffects, ReplanRecord
 from vla_attention.capture.store.site_writer import SiteWriter
 from vla_attention.capture.store.store_root import check_same_run, read_existing_root
+from vla_attention.schemas.effects import EpisodeEffects
 from vla_attention.schemas.errors import UserError, listing
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import Prompt, prompt_at
@@ -22,6 +23,8 @@ from vla_attention.schemas.stores.content_rules import (
     camera_picture_problems,
     counter_problems,
     coverage_problems,
+    cut_problems,
+    effect_problems,
     picture_problems,
     piece_role_problems,
     prompt_problems,
@@ -34,6 +37,8 @@ from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.root import read_run
 from vla_attention.schemas.stores.seal import seal_episode
 from vla_attention.schemas.stores.store_format import (
+    CHANGE,
+    CUT,
     EPISODES_GROUP,
     ArrayRecord,
     CorruptEpisode,
@@ -142,9 +147,32 @@ class EpisodeWriter:
             yield from camera_picture_problems(sites, camera, frame.shape, frame.dtype)
         for camera, coverage in record.coverage.items():
             yield from coverage_problems(sites, camera, coverage[None], len(self.start.objects), replan)
+        yield from self._effect_problems(record.effects, replan)
         steps = [*(earlier.env_step for earlier in self.records[-1:]), record.env_step]
         seeds = [] if record.noise_seed is None else [record.noise_seed]
         yield from counter_problems(np.array(steps), np.array(seeds, dtype=np.int64))
+
+    def _effect_problems(self, given: ReplanEffects | None, replan: int) -> Iterator[str]:
+        """Effects at the replans that the run says, of the conditions that the episode has."""
+        planned = self.run.recording.effects
+        wanted = planned is not None and replan % planned.every == 0
+        if wanted is not (given is not None):
+            yield f"it has {'no ' if wanted else ''}effects, other than the run says"
+        if given is None:
+            return
+        first = next((earlier.effects for earlier in self.records if earlier.effects is not None), given)
+        if (given.conditions, given.units) != (first.conditions, first.units):
+            yield "its effects are of other conditions, or in other units, than those of the replans before it"
+        horizon = self.run.policy.action_horizon
+        shapes: dict[str, tuple[NDArray[np.float32], tuple[int, ...]]]
+        shapes = {CHANGE: (given.change, (horizon, len(given.units)))}
+        shapes |= {f"{name}/{CUT}": (given.cut[name], (site.layout.num_keys,)) for name, site in self.sites.items()}
+        for name, (values, rest) in shapes.items():
+            expected = (len(given.measured), *rest)
+            if (values.shape, values.dtype) != (expected, np.dtype(np.float32)):
+                yield f"{name} has the shape {values.shape} and type {values.dtype}; expected {expected} and float32"
+            else:
+                yield from (effect_problems if name == CHANGE else cut_problems)(name, values)
 
     def _misfits(self, record: ReplanRecord) -> Iterator[str]:
         """Where a replan differs in form from the first one, so that their arrays could not be stacked."""
@@ -206,6 +234,7 @@ class EpisodeWriter:
             noise_seed=tuple(int(record.noise_seed) for record in records if record.noise_seed is not None),
             dataset_action_count=tuple(len(r.dataset_actions) for r in records if r.dataset_actions is not None),
             denoise_time=tuple(float(time) for time in self.denoise_times),
+            effects=self._effects(),
         )
 
     def _check_store(self) -> None:
@@ -241,6 +270,7 @@ class EpisodeWriter:
             actions = [given for record in records if (given := getattr(record, name)) is not None]
             if actions:
                 self.write(name, np.stack(actions), ("replan", "horizon", "action_dim"))
+        self._write_effects()
         self._write_dataset_actions([r.dataset_actions for r in records if r.dataset_actions is not None])
         for camera in records[0].frames:
             frames = np.stack([record.frames[camera] for record in records])
@@ -251,6 +281,29 @@ class EpisodeWriter:
         for camera in records[0].coverage:
             coverage = np.stack([record.coverage[camera] for record in records])
             self.write(f"objects/{camera}", coverage, ("replan", "patch", "object"))
+
+    def _effects(self) -> EpisodeEffects | None:
+        """What the arrays of effects are of."""
+        if self.run.recording.effects is None:
+            return None
+        measured = [(replan, of) for replan, record in enumerate(self.records) if (of := record.effects) is not None]
+        first = measured[0][1]
+        entries = [(replan, number) for replan, of in measured for number in of.measured]
+        return EpisodeEffects(
+            first.conditions,
+            first.units,
+            tuple(replan for replan, _ in entries),
+            tuple(number for _, number in entries),
+        )
+
+    def _write_effects(self) -> None:
+        measured = [record.effects for record in self.records if record.effects is not None]
+        if not any(of.measured for of in measured):
+            return
+        self.write(CHANGE, np.concatenate([of.change for of in measured]), ("entry", "horizon", "action_dim"))
+        for site in self.run.sites:
+            cut = np.concatenate([of.cut[site.name] for of in measured])
+            self.write(f"{site.name}/{CUT}", cut, ("entry", "key"))
 
     def _write_dataset_actions(self, actions: Sequence[NDArray[np.float64]]) -> None:
         if not actions:

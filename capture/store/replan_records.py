@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.layout import Prompt
 
 
@@ -43,6 +44,22 @@ class RecordedRows:
 
 
 @dataclass(frozen=True)
+class ReplanEffects:
+    """The effects of one replan.
+
+    conditions: of the episode, the same at all its replans. units: see `EpisodeEffects`. measured: the numbers of the
+    conditions that were measured, ascending. change: (measured, horizon, action dim) float32, actions under the
+    condition minus actions, in `units`. cut: site -> (measured, key) float32, the weights of the keys that were cut.
+    """
+
+    conditions: tuple[Interventions, ...]
+    units: tuple[float, ...]
+    measured: tuple[int, ...]
+    change: NDArray[np.float32]
+    cut: Mapping[str, NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
 class ReplanRecord:
     """Everything stored about one replan.
 
@@ -51,7 +68,7 @@ class ReplanRecord:
     camera (patch, object) float32. `dataset_actions` (steps, action_dim) are those that a data set has from this replan
     on, fewer at the end of its episode. `base_actions` (horizon, action_dim) are those that the base has for this call,
     in a rerun. What is None is not known; all replans of an episode know the same. `constant_cameras`: cameras of the
-    simulator whose picture is of one colour.
+    simulator whose picture is of one colour. `effects`: None where they are not measured at this replan.
     """
 
     env_step: int
@@ -67,6 +84,7 @@ class ReplanRecord:
     dataset_actions: NDArray[np.float64] | None = None
     base_actions: NDArray[np.float64] | None = None
     constant_cameras: frozenset[str] = frozenset()
+    effects: ReplanEffects | None = None
 
 
 @dataclass(frozen=True)

@@ -336,6 +336,23 @@ def coverage_problems(
         )
 
 
+def effect_problems(name: str, change: NDArray[np.float32], first_entry: int = 0) -> Iterator[str]:
+    """Changes of actions (entry, horizon, action dim): finite."""
+    bad = ~np.isfinite(change)
+    if bad.any():
+        entry = first_entry + int(np.argwhere(bad)[0][0])
+        yield f"{name} holds numbers that are NaN or infinite, the first in entry {entry}"
+
+
+def cut_problems(name: str, cut: NDArray[np.float32], first_entry: int = 0) -> Iterator[str]:
+    """Weights of the keys that were cut off (entry, key): 0 to 1."""
+    inside = (cut >= 0) & (cut <= 1)
+    if not inside.all():
+        entry, key = np.argwhere(~inside)[0]
+        given = cut[entry, key]
+        yield f"{name} gives key {key} the weight {given:.4g} in entry {first_entry + int(entry)}; expected 0 to 1"
+
+
 def _grids(sites: Sequence[SiteLayout]) -> dict[str, Any]:
     """The patch grid of each camera."""
     return {span.camera: span.grid for site in sites for span in site.spans if span.camera and span.grid}

@@ -18,6 +18,8 @@ from vla_attention.schemas.stores.content_rules import (
     camera_picture_problems,
     counter_problems,
     coverage_problems,
+    cut_problems,
+    effect_problems,
     gram_problems,
     picture_problems,
     piece_role_problems,
@@ -35,6 +37,8 @@ from vla_attention.schemas.stores.episode_shapes import expected_shapes, shape_p
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.root import group_attributes
 from vla_attention.schemas.stores.store_format import (
+    CHANGE,
+    CUT,
     NUMBERS,
     CorruptEpisode,
     Problem,
@@ -110,6 +114,10 @@ def _array_problems(root: RootAttributes, episode: StoredEpisode, name: str, sha
             problems += row_sum_problems(name, values, recording, first)
         elif kind == "uniform":
             problems += uniform_problems(name, values, first)
+        elif name == CHANGE:
+            problems += effect_problems(name, values, first)
+        elif kind == CUT:
+            problems += cut_problems(name, values, first)
         elif kind == "contribution":
             problems += gram_problems(name, values, recording, first)
     if digest.hexdigest() != sha256:

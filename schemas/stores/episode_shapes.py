@@ -10,6 +10,8 @@ from collections.abc import Iterator
 
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.store_format import (
+    CHANGE,
+    CUT,
     NUMBERS,
     EpisodeAttributes,
     RootAttributes,
@@ -27,6 +29,10 @@ def expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dict
     shapes |= dict.fromkeys(("env_step", "prompt_index"), (replans,))
     if not root.protocol.of_other_loop:
         shapes |= dict.fromkeys(("noise_seed", "state", "actions"), (replans,))
+    if attributes.effects is not None and attributes.effects.replan:
+        entries = len(attributes.effects.replan)
+        shapes[CHANGE] = (entries, root.policy.action_horizon, len(attributes.effects.units))
+        shapes |= {f"{site.name}/{CUT}": (entries, site.num_keys) for site in root.sites}
     if "dataset_actions" in attributes.arrays:
         shapes["dataset_action_count"] = (replans,)
     for site in root.sites:
@@ -77,5 +83,10 @@ def misfits(root: RootAttributes, attributes: EpisodeAttributes) -> Iterator[str
                 shapes[f"objects/{span.camera}"] = (replans, span.num_keys, len(attributes.objects))
     for name, shape in listed.items():
         yield from shape_problems(name, shape, shapes.get(name, (replans,)))
+    effects = attributes.effects
+    if (effects is None) is not (root.recording.effects is None):
+        yield f"it has {'no ' if effects is None else ''}effects, other than its run"
+    if effects is not None and max(effects.replan, default=0) >= replans:
+        yield f"its effects are of replan {max(effects.replan)}, and it has {replans}"
     if not all(0 <= number < len(attributes.prompts) for number in attributes.prompt_index):
         yield "prompt_index names prompts that the attributes do not have"

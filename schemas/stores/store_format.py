@@ -19,6 +19,8 @@ NAME.zarr/                            attributes: `RootAttributes`
     frames/<camera>                   (replan, row, column, channel) uint8, as the model sees it
     camera_frames/<camera>            the same, as the camera gave it; only where `frames` is a rounded model input
     objects/<camera>                  (replan, patch, object) float32
+    effects/change                    (entry, horizon, action_dim) float32; only where effects were measured
+    joint/cut                         (entry, key) float32, the weight of each key that an effect is without
     seal/                             attributes: `EpisodeSeal` (`seal_content.py`), which binds all of the above
 """
 
@@ -28,6 +30,7 @@ import re
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
+from vla_attention.schemas.effects import EffectsRecorded, EpisodeEffects
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import Interventions, RerunSource
@@ -71,6 +74,10 @@ NUMBERS = {
     "dataset_action_count": "int32",
     "denoise_time": "float32",
 }
+
+#: Changes of actions under the conditions of `EpisodeEffects`; below each site, the weights of the keys cut for them.
+CHANGE = "effects/change"
+CUT = "cut"
 
 #: The group of an episode whose attributes are an `EpisodeSeal`.
 SEAL_GROUP = "seal"
@@ -125,7 +132,7 @@ class Recording:
     reference's recorded-call numbers were used; a block that was given both ways has two). `queries` is `mean` (over
     the action queries), `steps` (`num_pools` weighted means of them, one per action step or per step and dimension) or
     `all`. `mantissa_bits` is the precision of the rows (23 = exact). `contributions`: the Gram matrix of value-weighted
-    contributions, mean over the action queries, is recorded too.
+    contributions, mean over the action queries, is recorded too. `effects`: which are measured; None: none.
     """
 
     layers: tuple[int, ...]
@@ -138,6 +145,7 @@ class Recording:
     frames: bool = True
     contributions: bool = False
     num_pools: int = 0
+    effects: EffectsRecorded | None = None
 
     def __post_init__(self) -> None:
         """Check the numbers: arrays have axes of these lengths."""
@@ -381,7 +389,8 @@ class EpisodeAttributes:
     the one that solved the task; 0 where it is not known. The instruction and the prompts are any text; what is shown
     of them is made `safe_text.visible`.
 
-    `task_family`: what tasks of one sentence template share; empty where nobody knows it, and in version 1.
+    `task_family`: what tasks of one sentence template share; empty where nobody knows it, and in version 1. `effects`:
+    what the arrays of effects are of; None where none were measured.
 
     `NUMBERS` are of each replan, and the noise level or flow time of each recorded denoise step; `env_step` counts the
     waiting steps too, `prompt_index` is the number of a prompt, `dataset_action_count` how many of `dataset_actions`
@@ -408,6 +417,7 @@ class EpisodeAttributes:
     dataset_action_count: tuple[int, ...] = ()
     denoise_time: tuple[float, ...] = ()
     task_family: str = ""
+    effects: EpisodeEffects | None = None
 
     def __post_init__(self) -> None:
         """Check the task's name, the names of arrays, which are paths, and the lengths."""

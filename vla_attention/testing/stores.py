@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.store.episode_writer import EpisodeWriter
-from vla_attention.capture.store.replan_records import EpisodeStart, RecordedRows, ReplanRecord
+from vla_attention.capture.store.replan_records import EpisodeStart, RecordedRows, ReplanEffects, ReplanRecord
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run
+from vla_attention.schemas.effects import EffectsRecorded
 from vla_attention.schemas.groupings.key_counts import uniform_of_roles
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
-from vla_attention.schemas.interventions import Interventions, RerunSource
-from vla_attention.schemas.layout import SiteLayout
+from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange, RerunSource
+from vla_attention.schemas.layout import Role, SiteLayout
 from vla_attention.schemas.precision import round_mantissa
 from vla_attention.schemas.segments import segment_members, segments_of
 from vla_attention.schemas.stores.digest import with_digest
@@ -49,6 +50,8 @@ PlantUniform = Callable[[EpisodeTokens, tuple[int, int, int, int]], NDArray[np.f
 PlantCoverage = Callable[[int, int, EpisodeTokens], Mapping[str, NDArray[np.float32]]]
 #: Task, episode and number of replans to actions (replan, horizon, action_dim).
 PlantActions = Callable[[int, int, int], NDArray[np.float64]]
+#: Task, episode, replan and the episode's tokens to the effects of the replan; see `small_effects`.
+PlantEffects = Callable[[int, int, int, EpisodeTokens], ReplanEffects]
 #: Task and episode to the outcome.
 PlantSuccess = Callable[[int, int], bool]
 
@@ -94,6 +97,7 @@ class StoreSpec:
     plant_coverage: PlantCoverage | None = None
     plant_actions: PlantActions | None = None
     plant_success: PlantSuccess | None = None
+    plant_effects: PlantEffects | None = None
 
     @property
     def layout(self) -> SiteLayout:
@@ -204,6 +208,9 @@ def root_attributes(spec: StoreSpec) -> RootAttributes:
             mantissa_bits=spec.mantissa_bits,
             frames=spec.frames,
             contributions=spec.contributions,
+            effects=None
+            if spec.plant_effects is None
+            else EffectsRecorded(("text",), ("all", "action"), every=1, denoise_steps=1, seed=1),
         ),
         sites=(spec.layout,),
         provenance={"numpy": np.__version__},
@@ -262,6 +269,7 @@ def episode_records(spec: StoreSpec, task: int, episode: int) -> tuple[EpisodeSt
                 actions=drawn if actions is None else actions[replan],
                 frames=frames if spec.frames else {},
                 coverage=coverage if spec.coverage else {},
+                effects=None if spec.plant_effects is None else spec.plant_effects(task, episode, replan, tokens),
             )
         )
     start = EpisodeStart(
@@ -276,6 +284,26 @@ def episode_records(spec: StoreSpec, task: int, episode: int) -> tuple[EpisodeSt
         task_family=spec.task_families.get(task, ""),
     )
     return start, records
+
+
+#: The conditions of `small_effects`.
+SMALL_CONDITIONS = (
+    Interventions("unchanged"),
+    Interventions("noise", noise=NoiseChange(1)),
+    Interventions("without_instruction_queries_all", keys=(KeyKnockout("role:instruction", queries="all"),)),
+    Interventions("without_instruction", keys=(KeyKnockout("role:instruction"),)),
+    Interventions("random_instruction", keys=(KeyKnockout("role:instruction", random_seed=1),)),
+)
+
+
+def small_effects(task: int, episode: int, replan: int, tokens: EpisodeTokens) -> ReplanEffects:
+    """`PlantEffects` of random changes under `SMALL_CONDITIONS`; replans of odd numbers lack the last one."""
+    measured = tuple(range(len(SMALL_CONDITIONS) - replan % 2))
+    change = np.random.default_rng([task, episode, replan]).normal(size=(len(measured), 5, 7))
+    change[0] = 0.0
+    cut = np.zeros((len(measured), tokens.layout.num_keys), np.float32)
+    cut[2:] = tokens.key_role[replan] == Role.INSTRUCTION
+    return ReplanEffects(SMALL_CONDITIONS, (2.0,) * 7, measured, change.astype(np.float32), {"joint": cut})
 
 
 def every_key_seen(tokens: EpisodeTokens, _cells: tuple[int, int, int, int]) -> NDArray[np.float64]:
@@ -312,6 +340,10 @@ def expected_arrays(spec: StoreSpec, task: int, episode: int) -> dict[str, NDArr
         "state": np.stack([record.state for record in records if record.state is not None]),
         "actions": np.stack([record.actions for record in records if record.actions is not None]),
     }
+    effects = [record.effects for record in records if record.effects is not None]
+    if effects:
+        arrays["effects/change"] = np.concatenate([of.change for of in effects])
+        arrays["joint/cut"] = np.concatenate([of.cut["joint"] for of in effects])
     for camera in records[0].frames:
         arrays[f"frames/{camera}"] = np.stack([record.frames[camera] for record in records])
     for camera in records[0].coverage:

@@ -187,6 +187,13 @@ class CosmosPolicy:
         """Return the action chunk (horizon, 7) for the environment; it does not depend on the recorders."""
         return self.predict(policy_input, noise_seed, recorders, editors).actions
 
+    def action_units(self) -> NDArray[np.float64]:
+        """Return how far 1 of the model's normalised actions moves the robot, (action dim,), in the robot's units."""
+        size = self.config.action_dim
+        low, high = self.statistics.environment_actions(np.stack([np.zeros(size), np.ones(size)]))
+        units: NDArray[np.float64] = high - low
+        return units
+
     def predict(
         self,
         policy_input: PolicyInput,

@@ -7,7 +7,7 @@ suffix pass (state and noisy actions through the expert) for each denoise step. 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -160,17 +160,33 @@ class PiModel(nn.Module):
         A masked camera is encoded too and has its keys. Text is scaled by sqrt(width), images are not.
         """
         cameras = self.config.cameras
-        batch = tokens.shape[0]
         # All cameras share the encoder: one pass over (camera · batch) images.
-        encoded = self._inner.vision_tower(torch.cat([images[camera] for camera in cameras]))
-        projected = self._inner.multi_modal_projector(encoded).to(self.dtype)
-        patches = torch.unflatten(projected, 0, (len(cameras), batch))
-        text = self._vlm.embed(tokens)
-        valid = [image_masks[camera][:, None].expand(batch, self.config.siglip.num_tokens) for camera in cameras]
-        return torch.cat([*patches.unbind(0), text], dim=1), torch.cat([*valid, token_mask], dim=1)
+        projected = self.project_pictures(torch.cat([images[camera] for camera in cameras]))
+        patches = torch.unflatten(projected, 0, (len(cameras), tokens.shape[0]))
+        return self.embed_projected(patches.unbind(0), tokens), self.prefix_valid(image_masks, token_mask)
+
+    def project_pictures(self, pictures: Tensor) -> Tensor:
+        """Return the patches (picture, patch, width) of pictures (picture, 3, height, width)."""
+        projected: Tensor = self._inner.multi_modal_projector(self._inner.vision_tower(pictures)).to(self.dtype)
+        return projected
+
+    def embed_projected(self, patches: Sequence[Tensor], tokens: Tensor) -> Tensor:
+        """Return the prefix (batch, prefix key, width) of each camera's patches and the tokens (batch, text)."""
+        return torch.cat([*patches, self._vlm.embed(tokens)], dim=1)
+
+    def prefix_valid(self, image_masks: Mapping[str, Tensor], token_mask: Tensor) -> Tensor:
+        """Return which keys of the prefix are valid, (batch, prefix key) bool."""
+        patches = self.config.siglip.num_tokens
+        valid = [image_masks[camera][:, None].expand(-1, patches) for camera in self.config.cameras]
+        return torch.cat([*valid, token_mask], dim=1)
 
     def encode_prefix(
-        self, embedded: Tensor, valid: Tensor, editor: AttentionEditor | None = None, tokens: Tensor | None = None
+        self,
+        embedded: Tensor,
+        valid: Tensor,
+        editor: AttentionEditor | None = None,
+        tokens: Tensor | None = None,
+        allowed: Tensor | None = None,
     ) -> Prefix:
         """Run images and text through the vision-language model once; all keys are cached, also the invalid ones.
 
@@ -179,8 +195,9 @@ class PiModel(nn.Module):
         in LIBERO. Their cached keys are zeros; no query attends to them.
 
         editor: changes the attention of every block but the last, where no token of the prefix reads; blocks that it
-        does not change use torch's fused attention. tokens: the keys that the embedded tokens are, (prefix key,); None
-        counts them from 0.
+        does not change use torch's fused attention. tokens: the keys that the embedded tokens are, (prefix key,), if
+        all of them are valid; None counts them from 0. allowed: (batch, prefix key, prefix key) bool, for tokens that
+        are all valid: which keys each token may read; None: all.
         """
         device = embedded.device
         if embedded.shape[0] == 1 and not bool(valid.all()):
@@ -189,7 +206,9 @@ class PiModel(nn.Module):
             dense = self.encode_prefix(embedded[:, places], valid[:, real], editor, real)
             return Prefix(tuple(entry.spread(places, valid.shape[1]) for entry in dense.cache), valid)
         rotation = Rotation.at((valid.cumsum(dim=1) - 1).to(device), self.config.paligemma.head_dim)
-        mask = None if embedded.shape[0] == 1 else valid[:, None, :].to(device)
+        mask = allowed
+        if embedded.shape[0] > 1 and tokens is None:
+            mask = valid[:, None, :].to(device)
         x = embedded
         cache = []
         *earlier, last = self._vlm.blocks
@@ -216,7 +235,7 @@ class PiModel(nn.Module):
         tokens = self.action_time_mlp_out(F.silu(self.action_time_mlp_in(mixed)))
         return torch.cat([self.state_proj(state)[:, None], tokens], dim=1), None
 
-    def _suffix_mask(self, prefix_valid: Tensor) -> Tensor:
+    def suffix_mask(self, prefix_valid: Tensor) -> Tensor:
         """Return (batch, suffix query, key) bool: all attend to the prefix; pi0's state token not to the actions."""
         batch, queries = prefix_valid.shape[0], self.config.suffix_len
         among = torch.ones(queries, queries, dtype=torch.bool, device=prefix_valid.device)
@@ -262,7 +281,7 @@ class PiModel(nn.Module):
         denoising = Denoising(
             state,
             Rotation.at(positions, config.action_expert.head_dim),
-            self._suffix_mask(valid),
+            self.suffix_mask(valid),
             prefix.cache,
             pieces_of_keys(config, prefix.valid, noise.device),
         )

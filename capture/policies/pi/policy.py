@@ -15,13 +15,14 @@ from torch import Tensor
 from vla_attention.capture.environments.base import Observation
 from vla_attention.capture.policies.identity import PolicySource, describe_policy
 from vla_attention.capture.policies.noise import initial_noise, noise_seed
+from vla_attention.capture.policies.pi.call_variants import ModelCall, sample_variants
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.flow_time import denoise_times
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.preprocess import libero_state, pad_to
 from vla_attention.capture.policies.pi.processing import Processing, image_tensor
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, TokenizedPrompt, check_vocabulary
-from vla_attention.capture.policies.policy import GivenInputs, PolicyInput, camera_frame
+from vla_attention.capture.policies.policy import CallVariant, GivenInputs, PolicyInput, camera_frame
 from vla_attention.capture.policies.weights import dtype_name, weights_digest
 from vla_attention.capture.recording.attention import AttentionEditor, BatchCollector, RowCollector
 from vla_attention.schemas.errors import BadArgument
@@ -265,6 +266,32 @@ class PiPolicy:
             self.processing.environment_actions(actions, each.state)
             for actions, each in zip(sampled, policy_inputs, strict=True)
         ]
+
+    def act_variants(self, variants: Sequence[CallVariant], num_steps: int, batch: int) -> list[NDArray[np.float64]]:
+        """Make variants of one call together; see `VariantPolicy`."""
+        config, site = self.model.config, self.sites[0].name
+        shape = (1, config.action_horizon, config.action_dim)
+        calls = [
+            ModelCall(
+                each.policy_input.tensors,
+                torch.from_numpy(initial_noise(each.noise_seed, shape)).to(self.model.device),
+                each.editors.get(site),
+            )
+            for each in variants
+        ]
+        sampled = sample_variants(self.model, calls, num_steps, batch).cpu().numpy()
+        return [
+            self.processing.environment_actions(actions, each.policy_input.state)
+            for actions, each in zip(sampled, variants, strict=True)
+        ]
+
+    def action_units(self) -> NDArray[np.float64]:
+        """Return how far 1 of the model's normalised actions moves the robot, (action dim,), in the robot's units."""
+        at_rest = np.zeros((2, self.model.config.action_dim))
+        at_rest[1] = 1.0
+        low, high = self.processing.environment_actions(at_rest, np.zeros(self.robot.state_dim))
+        units: NDArray[np.float64] = high - low
+        return units
 
     def _sample(
         self,

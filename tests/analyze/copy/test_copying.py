@@ -17,9 +17,11 @@ from vla_attention.schemas.stores.durable_files import lock_for_writing
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode, RunMismatch, StoreError
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import StoreSpec, reseal, write_store
+from vla_attention.testing.stores import StoreSpec, reseal, small_effects, write_store
 
-SPEC = StoreSpec(tasks=(0,), episodes=2, replans=2, layers=(0,), heads=(0,), contributions=True)
+SPEC = StoreSpec(
+    tasks=(0,), episodes=2, replans=2, layers=(0,), heads=(0,), contributions=True, plant_effects=small_effects
+)
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +33,7 @@ def all_bytes(folder: Path) -> dict[str, bytes]:
     return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
 
 
-@pytest.mark.parametrize("without", [(), ("frames",), ("contributions",), ("contributions", "frames", "objects")])
+@pytest.mark.parametrize("without", [(), ("frames",), ("contributions",), ("effects",), tuple(PARTS)])
 def test_a_copy_verifies_and_holds_the_same_numbers(original, tmp_path, without):
     before = all_bytes(original)
     store = open_store(original)
@@ -47,12 +49,13 @@ def test_a_copy_verifies_and_holds_the_same_numbers(original, tmp_path, without)
             if ("frames" in without and name.startswith("frames/"))
             or ("objects" in without and name.startswith("objects/"))
             or ("contributions" in without and name == "joint/contribution")
+            or ("effects" in without and name in ("effects/change", "joint/cut"))
         }
         assert left == expected
         for name in mine.attributes.arrays:
             assert np.array_equal(mine.read(name), theirs.read(name), equal_nan=True), name
         folders = {entry.name for entry in mine.folder.iterdir()}
-        assert folders.isdisjoint(set(without) & {"frames", "objects"})
+        assert folders.isdisjoint(set(without) & {"effects", "frames", "objects"})
     assert list(tmp_path.iterdir()) == [tmp_path / "b.zarr"]
     assert all_bytes(original) == before
     sizes = part_sizes(store)

@@ -1,0 +1,1 @@
+"""Effects measured beside attention: each policy call made again without a word, a part of the prompt, a picture."""

@@ -1,0 +1,194 @@
+"""Which conditions the effects of an episode are measured under: each is what one rerun would change."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+from vla_attention.capture.effects.arguments import EffectSettings
+from vla_attention.capture.interventions.condition_name import condition_name, knockout_of_group
+from vla_attention.capture.policies.policy import Policy, PolicyInput, UnitsPolicy, VariantPolicy, is_compiled
+from vla_attention.schemas.effects import EffectReaders, EffectsRecorded
+from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.groupings.selector_weights import selector_weights
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
+from vla_attention.schemas.groupings.words import Word, split_words, words_of
+from vla_attention.schemas.interventions import (
+    ImageChange,
+    Interventions,
+    KeyKnockout,
+    NoiseChange,
+    PromptChange,
+    Queries,
+)
+
+#: Whose attention a reader is, as of `KeyKnockout`.
+_READERS: dict[EffectReaders, tuple[Queries, str]] = {
+    "all": ("all", ""),
+    "action": ("action", ""),
+    "pictures": ("prefix", "role:image"),
+    "text": ("prefix", "role:bos | role:template | role:instruction | role:state"),
+}
+#: The parts of a prompt, and all of it but the state's digits, as in the grouping `default`.
+_PARTS = ("bos", "template", "instruction", "state")
+_LINGUISTIC = "role:bos | role:template | role:instruction | role:text"
+#: The call made again among the changed ones, without a change.
+UNCHANGED = Interventions("unchanged")
+
+
+def check_effects(planned: EffectsRecorded, policy: Policy) -> None:
+    """Raise `BadArgument` if the policy has no effects that can be measured like this."""
+    if is_compiled(policy.identity()):
+        raise BadArgument(
+            "Cannot measure effects with compiled denoise steps (--compile), which no change of attention reaches; "
+            "capture without --compile, or measure the effects of the stored calls with vla-capture rerun --effects."
+        )
+    if not isinstance(policy, UnitsPolicy):
+        raise BadArgument(f"Cannot measure effects of {policy.family}: it does not say what a unit of its actions is.")
+    if planned.denoise_steps < policy.num_denoise_steps and not isinstance(policy, VariantPolicy):
+        raise BadArgument(f"Cannot use --effects-steps with {policy.family}, whose calls are made again one by one.")
+    if planned.denoise_steps > policy.num_denoise_steps:
+        raise BadArgument(
+            f"Cannot use --effects-steps {planned.denoise_steps}; {policy.name} has {policy.num_denoise_steps} denoise "
+            "steps."
+        )
+    for reader in planned.readers:
+        if _READERS[reader][0] == "prefix" and not policy.has_prefix:
+            raise BadArgument(
+                f"Cannot measure effects by the reader '{reader}': {policy.name} has no prefix, in which pictures and "
+                "prompt read each other before the denoise steps; use --effects-readers all action."
+            )
+
+
+def planned_effects(settings: EffectSettings | None, policy: Policy, seed: int) -> EffectsRecorded | None:
+    """Return which effects a run measures; seed: of its noise. Raises `BadArgument` for what the policy has not."""
+    if settings is None:
+        return None
+    steps = policy.num_denoise_steps if settings.denoise_steps is None else settings.denoise_steps
+    planned = EffectsRecorded(settings.items, settings.readers, settings.every, steps, seed + 1)
+    check_effects(planned, policy)
+    return planned
+
+
+def describe_effects(planned: EffectsRecorded) -> str:
+    """Return the line that is printed before a run."""
+    readers = {"all": "for all queries", "action": "for the action queries", "pictures": "by the pictures"}
+    by = listing((readers | {"text": "by the prompt"})[reader] for reader in planned.readers)
+    often = "every replan" if planned.every == 1 else f"every {planned.every}th replan"
+    return f"Effects of {listing(planned.items)}, {by}, at {often} (docs/effects.md)."
+
+
+def refuse_both(interventions: Interventions) -> None:
+    """Raise `BadArgument` if a run that measures effects changes attention by itself."""
+    if interventions.changes_attention:
+        raise BadArgument(
+            "Cannot measure effects beside interventions on attention: a call would have both. Leave out --effects, or "
+            "the interventions; changes of prompt, pictures and noise go together with effects."
+        )
+
+
+def conditions_of(
+    planned: EffectsRecorded,
+    policy: Policy,
+    policy_input: PolicyInput,
+    tokens: Mapping[str, EpisodeTokens],
+    vocabularies: Mapping[str, Vocabulary],
+    siblings: Sequence[str],
+) -> tuple[Interventions, ...]:
+    """Return the conditions of an episode, from its first call: the unchanged call, other noise, then every item.
+
+    tokens, vocabularies: by site. siblings: the instructions of the other tasks of the task's family.
+    """
+    words = words_of(policy_input.prompt)
+    groups = dict(_groups(planned, policy, tokens, vocabularies, words))
+    # Calls that are made one by one are the same to the bit: only a batch needs the unchanged one among them.
+    conditions = [UNCHANGED] if isinstance(policy, VariantPolicy) else []
+    conditions.append(Interventions("noise", noise=NoiseChange(planned.seed)))
+    for reader in planned.readers:
+        queries, query_selector = _READERS[reader]
+        for name, (selector, with_alone) in groups.items():
+            knockout = KeyKnockout(selector, queries=queries, query_selector=query_selector)
+            conditions.append(knockout_of_group("without", name, knockout))
+            if with_alone and queries != "prefix":
+                conditions.append(knockout_of_group("only", name, replace(knockout, keep=True)))
+        for name in _controlled(planned, words):
+            random = KeyKnockout(
+                groups[name][0], queries=queries, query_selector=query_selector, random_seed=planned.seed
+            )
+            conditions.append(knockout_of_group("random", name, random))
+    if "text" in planned.items:
+        conditions += [_named(Interventions(prompt=change)) for change in exchanges(words, siblings)]
+    if "cameras" in planned.items:
+        conditions += [_named(Interventions(images=(ImageChange(camera, "blank"),))) for camera in policy_input.frames]
+    return tuple(conditions)
+
+
+def _named(interventions: Interventions) -> Interventions:
+    return replace(interventions, name=condition_name(interventions))
+
+
+def _groups(
+    planned: EffectsRecorded,
+    policy: Policy,
+    tokens: Mapping[str, EpisodeTokens],
+    vocabularies: Mapping[str, Vocabulary],
+    words: Sequence[Word],
+) -> Iterator[tuple[str, tuple[str, bool]]]:
+    """Groups of keys by name: a selector, and whether everything but the group is cut off, too."""
+
+    def has_keys(selector: str) -> bool:
+        weights = selector_weights(selector, tokens, vocabularies)
+        return any((group[0] * tokens[site].valid[0]).any() for site, group in weights.items())
+
+    if "text" in planned.items:
+        yield "linguistic", (_LINGUISTIC, True)
+        yield from ((part, (f"role:{part}", False)) for part in _PARTS if has_keys(f"role:{part}"))
+        yield from ((_word_name(text), (f'word:"{text}"', False)) for text in dict.fromkeys(_texts(words)))
+    if "tokens" in planned.items:
+        of_words = {key for word in words for key in word.keys}
+        for site, of_site in tokens.items():
+            if of_site.prompts:
+                prompt_keys = [piece.key for piece in of_site.prompts[0].pieces if piece.key not in of_words]
+                yield from ((f"{site}_key_{key}", (f"keys:{key}-{key}", False)) for key in prompt_keys)
+    if "cameras" in planned.items:
+        yield "visual", ("role:image", True)
+        cameras = [camera.name for camera in policy.cameras]
+        yield from ((f"camera_{name}", (f"camera:{name}", False)) for name in cameras)
+    if "objects" in planned.items:
+        names = dict.fromkeys(name for vocabulary in vocabularies.values() for name in vocabulary.objects)
+        yield from ((f"object_{name}", (f'object:"{name}"', False)) for name in names)
+
+
+def _texts(words: Sequence[Word]) -> list[str]:
+    return [word.text.casefold() for word in words]
+
+
+def _word_name(text: str) -> str:
+    return f"word_{text}"
+
+
+def _controlled(planned: EffectsRecorded, words: Sequence[Word]) -> list[str]:
+    """The groups that random keys are drawn for: the word with the most keys, and the whole instruction."""
+    if "text" not in planned.items or not words:
+        return []
+    counts: dict[str, int] = {}
+    for word in words:
+        name = _word_name(word.text.casefold())
+        counts[name] = counts.get(name, 0) + len(word.keys)
+    return [max(counts, key=lambda name: counts[name]), "instruction"]
+
+
+def exchanges(words: Sequence[Word], siblings: Sequence[str]) -> list[PromptChange]:
+    """Return the exchange of each word for every other word that stands in its place in a sibling's instruction.
+
+    Siblings with another number of words have no such places.
+    """
+    mine = _texts(words)
+    changes: dict[tuple[str, str], PromptChange] = {}
+    for sibling in siblings:
+        theirs = [sibling[start:stop].casefold() for start, stop in split_words(sibling)]
+        if len(theirs) == len(mine):
+            for word, other in zip(mine, theirs, strict=True):
+                if word != other:
+                    changes.setdefault((word, other), PromptChange("synonyms", synonyms={word: other}))
+    return [changes[pair] for pair in sorted(changes)]

@@ -1,0 +1,237 @@
+"""Measuring the effects of policy calls: each call is made again under every condition of its episode."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from vla_attention.capture.effects.conditions import UNCHANGED, conditions_of
+from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys, SiteEditor
+from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
+from vla_attention.capture.interventions.resolution import (
+    ReplanPlace,
+    TooFewKeys,
+    make_editors,
+    run_vocabularies,
+    site_tokens,
+)
+from vla_attention.capture.policies.policy import CallVariant, Policy, PolicyInput, UnitsPolicy, VariantPolicy
+from vla_attention.capture.store.replan_records import ReplanEffects
+from vla_attention.schemas.effects import EffectsRecorded
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
+from vla_attention.schemas.interventions import Interventions
+
+#: Calls that are made at a time, at most; more gain nothing, and a family takes fewer where its model is large.
+MOST_CALLS = 32
+#: Largest difference, in normalised actions, of the unchanged call from the same call among the changed ones. A model
+#: in float32 leaves 1e-6. Beyond it something else than rounding differs, and the effects of the replan are refused.
+MOST_DIFFERENCE = 1e-4
+
+
+@dataclass
+class EffectMeasurement:
+    """What all episodes of a process have in common.
+
+    Attributes:
+        policy, planned: which effects are measured of which policy.
+        siblings: by task id, the instructions of the other tasks of its family, whose words are exchanged for its own.
+        say: takes a line for the person at the terminal; each is said once.
+    """
+
+    policy: Policy
+    planned: EffectsRecorded
+    siblings: Mapping[int, Sequence[str]]
+    say: Callable[[str], None]
+    #: What each replan with effects took.
+    seconds: list[float] = field(default_factory=list, init=False)
+    _batch: int = field(default=MOST_CALLS, init=False)
+    _said: set[str] = field(default_factory=set, init=False)
+
+    def begin(self) -> EpisodeEffectsMeasured:
+        """Return what measures one episode."""
+        return EpisodeEffectsMeasured(self)
+
+    @cached_property
+    def units(self) -> NDArray[np.float64]:
+        """How far 1 of the normalised actions moves the robot, (action dim,); 1 for what the policy never moves."""
+        units = cast(UnitsPolicy, self.policy).action_units()
+        return np.where(units == 0, 1.0, units)
+
+    @cached_property
+    def is_float32(self) -> bool:
+        """Whether the model computes in float32."""
+        return str(self.policy.identity().config.get("dtype", "float32")) == "float32"
+
+    def say_once(self, line: str) -> None:
+        """Say a line, unless it was said before."""
+        if line not in self._said:
+            self._said.add(line)
+            self.say(line)
+
+    def actions_of(self, variants: Mapping[int, CallVariant]) -> dict[int, NDArray[np.float64]]:
+        """Return the actions (horizon, action dim) of variants by their numbers; what cannot be made is left out."""
+        policy = self.policy
+        if not isinstance(policy, VariantPolicy):
+            made = {number: self._single(variant) for number, variant in variants.items()}
+            return {number: actions for number, actions in made.items() if actions is not None}
+        while True:
+            try:
+                together = policy.act_variants(list(variants.values()), self.planned.denoise_steps, self._batch)
+                return dict(zip(variants, together, strict=True))
+            except torch.OutOfMemoryError:
+                if self._batch == 1:
+                    self.say_once("The memory does not suffice for the effects of a single call: they are left out.")
+                    return {}
+            self._batch //= 2
+            torch.cuda.empty_cache()
+            self.say_once(f"The memory does not suffice for so many calls at a time: {self._batch} from here on.")
+
+    def _single(self, variant: CallVariant) -> NDArray[np.float64] | None:
+        """Return the actions of a variant by a call of its own; None where it leaves a query without any key."""
+        try:
+            return self.policy.act(variant.policy_input, variant.noise_seed, None, variant.editors or None)
+        except QueryWithoutKeys as error:
+            self.say_once(f"Left out of the effects: {error}")
+            return None
+
+
+def siblings_of(tasks: Iterable[tuple[int, str, str]]) -> dict[int, tuple[str, ...]]:
+    """Return the instructions of the other tasks of each task's family; tasks: number, instruction and family."""
+    known = list(tasks)
+    return {
+        number: tuple(dict.fromkeys(text for other, text, its in known if its == family != "" and other != number))
+        for number, _, family in known
+    }
+
+
+def measurement_of(
+    planned: EffectsRecorded | None, policy: Policy, tasks: Iterable[tuple[int, str, str]], say: Callable[[str], None]
+) -> EffectMeasurement | None:
+    """Return what measures a run's effects, None for none; tasks: number, instruction and family."""
+    return None if planned is None else EffectMeasurement(policy, planned, siblings_of(tasks), say)
+
+
+@dataclass
+class EpisodeEffectsMeasured:
+    """Measures the effects of the calls of one episode, whose conditions are those of its first call."""
+
+    run: EffectMeasurement
+    conditions: tuple[Interventions, ...] | None = None
+
+    def measure(
+        self, policy_input: PolicyInput, noise_seed: int, actions: NDArray[np.float64], context: CallContext
+    ) -> ReplanEffects | None:
+        """Return the effects of a call, or None if they are not measured at its replan.
+
+        actions: (horizon, action dim) that the call gave.
+        """
+        policy, planned, begun = self.run.policy, self.run.planned, time.perf_counter()
+        if context.replan % planned.every:
+            return None
+        tokens = site_tokens(
+            policy.sites, policy_input.key_role, policy_input.prompt, context.objects, context.coverage
+        )
+        vocabularies = run_vocabularies(policy.sites, [policy_input.prompt.instruction_text], context.objects)
+        if self.conditions is None:
+            siblings = self.run.siblings.get(context.task_id, ())
+            self.conditions = conditions_of(planned, policy, policy_input, tokens, vocabularies, siblings)
+            if "text" in planned.items and not any(condition.prompt for condition in self.conditions):
+                self.run.say_once("No other task of a family has other words in the same places: none is exchanged.")
+        variants: dict[int, CallVariant] = {}
+        for number, condition in enumerate(self.conditions):
+            variant = self._variant(condition, policy_input, noise_seed, context, tokens, vocabularies)
+            if variant is not None:
+                variants[number] = variant
+        made = self.run.actions_of(variants)
+        if planned.denoise_steps < policy.num_denoise_steps:
+            # Fewer steps change the actions by themselves: the same call with as many steps is what effects are of.
+            unchanged = self.conditions.index(UNCHANGED)
+            actions = made.pop(unchanged, actions)
+        changes = {number: ((given - actions) / self.run.units).astype(np.float32) for number, given in made.items()}
+        measured = self._refused_if_unlike(changes, context)
+        cut = {
+            site.name: np.stack([_cut(variants[number], site.name, site.num_keys) for number in measured])
+            if measured
+            else np.zeros((0, site.num_keys), np.float32)
+            for site in policy.sites
+        }
+        change = (
+            np.stack([changes[number] for number in measured])
+            if measured
+            else np.zeros((0, *actions.shape), np.float32)
+        )
+        self.run.seconds.append(time.perf_counter() - begun)
+        return ReplanEffects(
+            self.conditions, tuple(float(unit) for unit in self.run.units), tuple(measured), change, cut
+        )
+
+    def _variant(
+        self,
+        condition: Interventions,
+        policy_input: PolicyInput,
+        noise_seed: int,
+        context: CallContext,
+        tokens: Mapping[str, EpisodeTokens],
+        vocabularies: Mapping[str, Vocabulary],
+    ) -> CallVariant | None:
+        """Return the call under a condition; None where there is nothing to change."""
+        policy, editors = self.run.policy, dict[str, SiteEditor]()
+        if condition.keys:
+            place = ReplanPlace(context.task_id, context.episode_index, context.replan)
+            try:
+                editors = make_editors(condition, tokens, vocabularies, place)
+            except TooFewKeys:
+                return None
+            if not editors:
+                return None
+        if condition.changes_input:
+            changed = changed_inputs(policy_input.given, condition, policy.sites, context)
+            exchanged = policy.prepare_again(changed)
+            if any((exchanged.key_role[site] != roles).any() for site, roles in policy_input.key_role.items()):
+                self.run.say_once(
+                    f"'{condition.name}' is not measured where the prompt would have another number of tokens."
+                )
+                return None
+            policy_input = exchanged
+        if condition.noise is not None:
+            noise_seed = policy.replan_noise_seed(
+                condition.noise.seed, context.task_id, context.episode_index, context.replan
+            )
+        return CallVariant(policy_input, noise_seed, editors)
+
+    def _refused_if_unlike(self, changes: Mapping[int, NDArray[np.float32]], context: CallContext) -> list[int]:
+        """Return the numbers of the conditions whose changes are kept, ascending."""
+        assert self.conditions is not None
+        finite = [number for number, change in changes.items() if np.isfinite(change).all()]
+        if len(finite) < len(changes):
+            names = ", ".join(self.conditions[number].name for number in changes if number not in finite)
+            self.run.say_once(f"The actions are NaN or infinite under {names}: left out.")
+        unchanged = next((number for number in finite if self.conditions[number] == UNCHANGED), None)
+        if unchanged is None or not self.run.is_float32:
+            return finite
+        difference = float(np.abs(changes[unchanged]).max(initial=0.0))
+        if difference <= MOST_DIFFERENCE:
+            return finite
+        self.run.say_once(
+            f"The effects of replan {context.replan} of task {context.task_id} episode {context.episode_index} are "
+            f"refused: among the changed calls the unchanged one differs by {difference:.2g} of normalised actions, "
+            f"allowed is {MOST_DIFFERENCE:g}."
+        )
+        return [unchanged]
+
+
+def _cut(variant: CallVariant, site: str, num_keys: int) -> NDArray[np.float32]:
+    """Return the weight of each key of a site that is cut off, (key,)."""
+    editor = variant.editors.get(site)
+    if editor is None:
+        return np.zeros(num_keys, np.float32)
+    factors = np.prod([edit.values for edit in cast(SiteEditor, editor).edits], axis=0)
+    cut: NDArray[np.float32] = (1.0 - factors).astype(np.float32)
+    return cut

@@ -1,0 +1,232 @@
+"""Variants of one policy call, made together: keys that are knocked out, other prompts and pictures, another noise.
+
+What variants share is computed once: pictures that are the same, and the prefix of all variants that change nothing in
+it. Keys that no query sees are left out before the variants become a batch, in which they would all be computed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from vla_attention.capture.policies.pi.flow_time import denoise_times, embed_times
+from vla_attention.capture.policies.pi.gemma import KeysValues, Rotation
+from vla_attention.capture.policies.pi.model import Denoising, PiModel
+from vla_attention.capture.recording.attention import FactorEditor, LogitChange
+
+#: Bytes of the logits of one block that a batch may have: beyond it, larger batches gain nothing.
+_MOST_LOGITS = 1 << 28
+
+
+@dataclass(frozen=True)
+class ModelCall:
+    """One variant for the model: its inputs by name, batch 1, noise (1, horizon, action dim), and the editor."""
+
+    tensors: Mapping[str, Tensor]
+    noise: Tensor
+    editor: FactorEditor | None
+
+
+@dataclass(frozen=True)
+class _Prefix:
+    """What the prefix pass of a variant is made of: the number of its input, and the editor that changes the pass."""
+
+    number: int
+    editor: FactorEditor | None
+
+
+@torch.no_grad()
+def sample_variants(model: PiModel, calls: Sequence[ModelCall], num_steps: int, batch: int) -> Tensor:
+    """Return the actions (call, horizon, action dim) float32, still normalised.
+
+    num_steps: denoise steps. batch: calls that are made at a time, at most.
+    """
+    inputs = _Inputs(model)
+    numbers = [inputs.number(call.tensors) for call in calls]
+    keys = np.arange(model.config.prefix_len)
+    prefixes = [
+        _Prefix(number, call.editor if call.editor and call.editor.prefix_factors(keys) is not None else None)
+        for number, call in zip(numbers, calls, strict=True)
+    ]
+    actions: list[Tensor | None] = [None] * len(calls)
+    for valid in dict.fromkeys(inputs.valid[number] for number in numbers):
+        of_mask = [i for i, number in enumerate(numbers) if inputs.valid[number] == valid]
+        # Calls with a prefix of their own first: in the batches after them, all share one.
+        ordered = sorted(of_mask, key=lambda i: (prefixes[i].editor is None, prefixes[i].number))
+        group = _Group(model, inputs, np.flatnonzero(valid), num_steps)
+        size = min(batch, group.most_calls)
+        for first in range(0, len(ordered), size):
+            chosen = ordered[first : first + size]
+            made = group.sample([calls[i] for i in chosen], [prefixes[i] for i in chosen])
+            for i, one in zip(chosen, made, strict=True):
+                actions[i] = one
+    return torch.stack([one for one in actions if one is not None])
+
+
+class _Inputs:
+    """The different inputs of calls, embedded, each once; pictures and prompts that are the same are one."""
+
+    def __init__(self, model: PiModel) -> None:
+        self.model = model
+        self.embedded: list[Tensor] = []
+        self.states: list[Tensor] = []
+        #: Which keys of the prefix are valid, (prefix key,) as a tuple: inputs that agree in it make batches.
+        self.valid: list[tuple[bool, ...]] = []
+        self._known: list[Mapping[str, Tensor]] = []
+        self._pictures: list[tuple[Tensor, Tensor]] = []
+
+    def number(self, tensors: Mapping[str, Tensor]) -> int:
+        """Return the number of an input; embeds it the first time."""
+        for number, known in enumerate(self._known):
+            if known is tensors or all(torch.equal(known[name], values) for name, values in tensors.items()):
+                return number
+        cameras = self.model.config.cameras
+        pictures = [self._picture(tensors[f"image:{camera}"]) for camera in cameras]
+        self.embedded.append(self.model.embed_projected(pictures, tensors["tokens"]))
+        masks = {camera: tensors[f"image_mask:{camera}"] for camera in cameras}
+        self.valid.append(tuple(self.model.prefix_valid(masks, tensors["token_mask"])[0].tolist()))
+        self.states.append(tensors["state"])
+        self._known.append(tensors)
+        return len(self._known) - 1
+
+    def _picture(self, picture: Tensor) -> Tensor:
+        for known, projected in self._pictures:
+            if known is picture or torch.equal(known, picture):
+                return projected
+        projected = self.model.project_pictures(picture)
+        self._pictures.append((picture, projected))
+        return projected
+
+
+class _Group:
+    """Calls whose inputs have the same valid keys; `real` are these keys of the prefix."""
+
+    def __init__(self, model: PiModel, inputs: _Inputs, real: NDArray[np.int64], num_steps: int) -> None:
+        config = model.config
+        self.model, self.inputs, self.real, self.num_steps = model, inputs, real, num_steps
+        self.places = torch.from_numpy(real).to(model.device)
+        #: The keys of a denoise step: those of the prefix, then those of the suffix's own tokens.
+        self.keys = np.concatenate([real, np.arange(config.prefix_len, config.prefix_len + config.suffix_len)])
+        self.own_keys = slice(config.prefix_len, config.prefix_len + config.suffix_len)
+        self.action_queries = slice(config.first_action_query, config.suffix_len)
+        self.unchanged: dict[int, tuple[KeysValues, ...]] = {}
+        positions = torch.tensor([[len(real)]], device=model.device) + torch.arange(
+            config.suffix_len, device=model.device
+        )
+        self.rotation = Rotation.at(positions, config.action_expert.head_dim)
+        self.waves = embed_times(
+            denoise_times(num_steps, config.time_convention),
+            config.action_expert.width,
+            config.time_convention,
+            min_period=config.min_period,
+            max_period=config.max_period,
+        ).to(model.device)
+
+    @property
+    def most_calls(self) -> int:
+        """Calls whose logits of one prefix block take `_MOST_LOGITS`."""
+        of_call = 4 * self.model.config.paligemma.num_heads * len(self.real) ** 2
+        return max(1, _MOST_LOGITS // of_call)
+
+    def sample(self, calls: Sequence[ModelCall], prefixes: Sequence[_Prefix]) -> Tensor:
+        """Make the calls as one batch; returns (call, horizon, action dim)."""
+        model = self.model
+        state = torch.cat([self.inputs.states[prefix.number] for prefix in prefixes])
+        mask = model.suffix_mask(torch.ones(1, len(self.real), dtype=torch.bool, device=model.device))
+        changed = _Changed.by([self._step_factors(call.editor) for call in calls], model.device)
+        if changed.allowed is not None:
+            mask = mask & changed.allowed
+        denoising = Denoising(state, self.rotation, mask, self._cache(prefixes), None)
+        x = torch.cat([call.noise for call in calls])
+        for step, waves in enumerate(self.waves):
+            x = x + (-1.0 / self.num_steps) * model.velocity(x, step, waves, denoising, None, changed.editor)
+        return x
+
+    def _step_factors(self, editor: FactorEditor | None) -> NDArray[np.float64] | None:
+        if editor is None:
+            return None
+        config = self.model.config
+        factors = editor.step_factors(config.suffix_len, self.action_queries, self.own_keys, self.own_keys.stop)
+        return None if factors is None else factors[:, self.keys]
+
+    def _cache(self, prefixes: Sequence[_Prefix]) -> tuple[KeysValues, ...]:
+        """Return the keys and values of the prefix of each call, by block."""
+        different = list(dict.fromkeys(prefixes))
+        new = [prefix for prefix in different if prefix.editor is not None or prefix.number not in self.unchanged]
+        blocks = self._encoded(new) if new else ()
+        for place, prefix in enumerate(new):
+            if prefix.editor is None:
+                self.unchanged[prefix.number] = tuple(_one(entry, place) for entry in blocks)
+        if len(different) == 1 and different[0].editor is None:
+            return tuple(_expanded(entry, len(prefixes)) for entry in self.unchanged[different[0].number])
+        known = [prefix for prefix in different if prefix not in new]
+        caches = ([blocks] if blocks else []) + [self.unchanged[prefix.number] for prefix in known]
+        order = {prefix: place for place, prefix in enumerate([*new, *known])}
+        places = torch.tensor([order[prefix] for prefix in prefixes], device=self.model.device)
+        return tuple(
+            KeysValues(
+                torch.cat([entry.keys for entry in entries])[places],
+                torch.cat([entry.values for entry in entries])[places],
+            )
+            for entries in zip(*caches, strict=True)
+        )
+
+    def _encoded(self, prefixes: Sequence[_Prefix]) -> tuple[KeysValues, ...]:
+        embedded = torch.cat([self.inputs.embedded[prefix.number][:, self.places] for prefix in prefixes])
+        factors = [None if prefix.editor is None else prefix.editor.prefix_factors(self.real) for prefix in prefixes]
+        changed = _Changed.by(factors, self.model.device)
+        valid = torch.ones(embedded.shape[:2], dtype=torch.bool)
+        tokens = torch.from_numpy(self.real)
+        return self.model.encode_prefix(embedded, valid, changed.editor, tokens, changed.allowed).cache
+
+
+def _one(entry: KeysValues, place: int) -> KeysValues:
+    return KeysValues(entry.keys[place : place + 1], entry.values[place : place + 1])
+
+
+def _expanded(entry: KeysValues, count: int) -> KeysValues:
+    return KeysValues(entry.keys.expand(count, -1, -1, -1), entry.values.expand(count, -1, -1, -1))
+
+
+@dataclass(frozen=True)
+class _Changed:
+    """What changes the attention of a batch: keys that may not be read, (call, query, key), and factors of the others.
+
+    None where there is nothing of it. Keys that are cut as a whole need no logits, so that fused attention can be used.
+    """
+
+    allowed: Tensor | None
+    editor: _Everywhere | None
+
+    @classmethod
+    def by(cls, factors: Sequence[NDArray[np.float64] | None], device: torch.device) -> _Changed:
+        """Return it for factors (query, key) of each call, None where one changes nothing."""
+        shape = next((given.shape for given in factors if given is not None), None)
+        if shape is None:
+            return cls(None, None)
+        stacked = np.stack([np.ones(shape) if given is None else given for given in factors])
+        left = np.where(stacked > 0, stacked, 1.0)
+        bias = torch.from_numpy(np.log(left).astype(np.float32)).to(device)[:, None] if (left != 1).any() else None
+        return cls(torch.from_numpy(stacked > 0).to(device), None if bias is None else _Everywhere(bias.add))
+
+
+@dataclass(frozen=True)
+class _Everywhere:
+    """An editor with one change for all blocks, of a batch of prefix passes or of denoise steps."""
+
+    change: LogitChange
+
+    def step_change(
+        self, layer: int, denoise_step: int, action_queries: slice, own_keys: slice | None
+    ) -> LogitChange | None:
+        """Return the change."""
+        return self.change
+
+    def prefix_change(self, layer: int, tokens: Tensor) -> LogitChange | None:
+        """Return the change."""
+        return self.change

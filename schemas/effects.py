@@ -1,0 +1,72 @@
+"""Effects that a run measures at its policy calls: how the action changes without a word, a part, a picture.
+
+Each is what a rerun with one intervention would have given. The call is made again with keys that are cut off, with
+another word, picture or noise; the robot executes the unchanged call. `docs/effects.md` has the definitions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.limit_checks import check_at_most
+from vla_attention.schemas.limits import AXIS, CONDITIONS, EFFECT_ENTRIES, REPLANS
+
+#: What is taken away, one at a time. `text`: every word of the instruction, every part of the prompt, and all of it.
+#: `cameras`: every camera's picture, and all of them. `objects`: the patches of every object. `tokens`: every key of
+#: the prompt that is no piece of a word.
+EffectItems = Literal["text", "cameras", "objects", "tokens"]
+#: Whose queries no longer read it. `all`: nobody reads it. `action`: the action queries alone. `pictures`, `text`: the
+#: tokens of pictures, or of the prompt, before the denoise steps.
+EffectReaders = Literal["all", "action", "pictures", "text"]
+
+
+@dataclass(frozen=True)
+class EffectsRecorded:
+    """Which effects a run measures.
+
+    `every`: at every so many replans, from the first on. `denoise_steps`: network evaluations of a changed call.
+    `seed`: of the random keys, and of the other noise.
+    """
+
+    items: tuple[EffectItems, ...]
+    readers: tuple[EffectReaders, ...]
+    every: int
+    denoise_steps: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        """Check that something is measured, and the numbers."""
+        if not self.items or not self.readers:
+            raise BadArgument("Effects without an item or without a reader: nothing would be measured.")
+        check_at_most("The number of replans from one with effects to the next", self.every, REPLANS, least=1)
+        check_at_most("The number of denoise steps of effects", self.denoise_steps, AXIS, least=1)
+        if self.seed < 0:
+            raise BadArgument(f"The seed of effects is {self.seed}; expected 0 or more.")
+
+
+@dataclass(frozen=True)
+class EpisodeEffects:
+    """The effects of one episode: what its arrays `effects/change` and `SITE/cut` are of.
+
+    Entry i of these arrays is of replan `replan[i]` under `conditions[condition[i]]`. A replan without an entry of a
+    condition was not measured under it: the word is not in its prompt, the object is out of view, the replan was
+    skipped, or its calls were refused. `units`: how far a change of 1 moves the robot, by dimension of the action.
+    """
+
+    conditions: tuple[Interventions, ...]
+    units: tuple[float, ...]
+    replan: tuple[int, ...]
+    condition: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        """Check that the entries are of conditions that there are, in order, each once."""
+        check_at_most("The number of conditions of effects", len(self.conditions), CONDITIONS)
+        check_at_most("The number of measured effects", len(self.replan), EFFECT_ENTRIES)
+        entries = list(zip(self.replan, self.condition, strict=False))
+        if len(self.replan) != len(self.condition) or entries != sorted(set(entries)):
+            raise BadArgument("The entries of effects are not in order, or name a replan and a condition twice.")
+        if not all(0 <= number < len(self.conditions) for number in self.condition) or min(self.replan, default=0) < 0:
+            raise BadArgument("The entries of effects name a replan or a condition that does not exist.")
