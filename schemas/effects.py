@@ -65,8 +65,8 @@ class EpisodeEffects:
         """Check that the entries are of conditions that there are, in order, each once."""
         check_at_most("The number of conditions of effects", len(self.conditions), CONDITIONS)
         check_at_most("The number of measured effects", len(self.replan), EFFECT_ENTRIES)
+        if not all(0 <= number < len(self.conditions) for number in self.condition) or min(self.replan, default=0) < 0:
+            raise BadArgument("The entries of effects name a replan or a condition that does not exist.")
         entries = list(zip(self.replan, self.condition, strict=False))
         if len(self.replan) != len(self.condition) or entries != sorted(set(entries)):
             raise BadArgument("The entries of effects are not in order, or name a replan and a condition twice.")
-        if not all(0 <= number < len(self.conditions) for number in self.condition) or min(self.replan, default=0) < 0:
-            raise BadArgument("The entries of effects name a replan or a condition that does not exist.")

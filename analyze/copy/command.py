@@ -26,8 +26,8 @@ _EXAMPLES = """examples:
 
 frames: the cameras' pictures (overlays and reruns need them). objects: what each patch shows (object: groups need it).
 contributions: norms of what keys add. effects: changes of the action without an item. Rows, and everything else that
-groupings of keys, words, cameras and roles need, are always copied. The copy passes verify, and its provenance names the
-omitted parts.
+groupings of keys, words, cameras and roles need, are always copied. The copy passes verify, and its provenance names
+the omitted parts.
 """
 
 

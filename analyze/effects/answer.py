@@ -58,9 +58,11 @@ def item_lines(study: EffectStudy, items: Sequence[ItemRow]) -> list[str]:
         )
     lines += attention_line(study)
     lines.append(noise_sentence(study))
-    q_values = [1.0 if item.strongest["minus_noise"] <= 0 else item.strongest["minus_noise_q"] for item in items]
-    names = [item.name for item in items]
-    lines.append(findings(q_values, names, "item", "an effect beyond the noise", _SENTENCES))
+    known = [item for item in items if item.strongest["minus_noise"] is not None]
+    if known:
+        q_values = [1.0 if item.strongest["minus_noise"] <= 0 else item.strongest["minus_noise_q"] for item in known]
+        names = [item.name for item in known]
+        lines.append(findings(q_values, names, "item", "an effect beyond the noise", _SENTENCES))
     return [line for line in lines if line]
 
 
@@ -75,17 +77,15 @@ def _deciding(words: Sequence[ItemRow]) -> str:
     through = [word for word in others if _at_least_half(word.effect("pictures"), word.effect("total"))]
     parts = [f"the action queries read {_names(own)} themselves"] if own else []
     if through:
-        parts.append(
-            f"{_names(through)} {_reach(through)} the action through the pictures, which have read {_it(through)}"
-        )
+        them = "it" if len(through) == 1 else "them"
+        parts.append(f"{_names(through)} {_reach(through)} the action through the pictures, which have read {them}")
     if rest := [word for word in others if word not in through]:
         parts.append(f"{_names(rest)} {_reach(rest)} the action through other tokens")
     if others:
         amounts = sorted(word.effect("direct") or 0.0 for word in others)
         span = format_number(amounts[0]) + (f" to {format_number(amounts[-1])}" if len(amounts) > 1 else "")
-        parts.append(
-            f"hidden from the action queries alone, {'that' if len(others) == 1 else 'these'} would change it by {span}"
-        )
+        these = "that one changes" if len(others) == 1 else "these change"
+        parts.append(f"hidden from the action queries alone, {these} it by {span}")
     text = "; ".join(parts)
     return f"{said} {text[:1].upper()}{text[1:]}." if text else said
 
@@ -100,10 +100,6 @@ def _names(words: Sequence[ItemRow]) -> str:
 
 def _reach(words: Sequence[ItemRow]) -> str:
     return "reaches" if len(words) == 1 else "reach"
-
-
-def _it(words: Sequence[ItemRow]) -> str:
-    return "it" if len(words) == 1 else "them" if words else ""
 
 
 def _effect(row: dict[str, Any]) -> str:

@@ -33,7 +33,7 @@ from vla_attention.schemas.stores.content_rules import (
 )
 from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.episode_files import files_of_no_array
-from vla_attention.schemas.stores.episode_shapes import expected_shapes, shape_problems
+from vla_attention.schemas.stores.episode_shapes import effect_misfits, expected_shapes, shape_problems
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.root import group_attributes
 from vla_attention.schemas.stores.store_format import (
@@ -69,6 +69,7 @@ def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[P
         yield from map(Problem, wrong)
         if not wrong and name not in numbers:
             yield from _guarded(_array_problems(root, episode, name, attributes.arrays[name].sha256))
+    yield from map(Problem, effect_misfits(root, attributes))
     for check in (_axis_problems, _token_problems, _camera_problems, _counter_problems):
         yield from _guarded(check(root, episode))
 

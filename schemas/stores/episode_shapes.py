@@ -67,6 +67,25 @@ def shape_problems(name: str, shape: tuple[int, ...], expected: tuple[int, ...])
         yield f"{name} has the shape {shape}; expected {expected}"
 
 
+def effect_misfits(root: RootAttributes, attributes: EpisodeAttributes) -> Iterator[str]:
+    """What of an episode's effects does not belong to its run, as sentences without a full stop."""
+    effects, planned = attributes.effects, root.recording.effects
+    if (effects is None) is not (planned is None):
+        yield f"it has {'no ' if effects is None else ''}effects, other than its run"
+    if effects is None or planned is None:
+        return
+    actions = attributes.arrays.get("actions")
+    if actions is not None and actions.shape[-1] != len(effects.units):
+        yield f"its effects have units of {len(effects.units)} dimensions of the action, which has {actions.shape[-1]}"
+    for replan in dict.fromkeys(effects.replan):
+        if replan >= attributes.num_replans or replan % planned.every:
+            yield (
+                f"its effects are of replan {replan}; expected every {planned.every} of its {attributes.num_replans} "
+                "replans, from 0 on"
+            )
+            return
+
+
 def misfits(root: RootAttributes, attributes: EpisodeAttributes) -> Iterator[str]:
     """What of an episode's attributes does not belong to its run, as sentences without a full stop. Reads no array."""
     replans = attributes.num_replans
@@ -83,10 +102,6 @@ def misfits(root: RootAttributes, attributes: EpisodeAttributes) -> Iterator[str
                 shapes[f"objects/{span.camera}"] = (replans, span.num_keys, len(attributes.objects))
     for name, shape in listed.items():
         yield from shape_problems(name, shape, shapes.get(name, (replans,)))
-    effects = attributes.effects
-    if (effects is None) is not (root.recording.effects is None):
-        yield f"it has {'no ' if effects is None else ''}effects, other than its run"
-    if effects is not None and max(effects.replan, default=0) >= replans:
-        yield f"its effects are of replan {max(effects.replan)}, and it has {replans}"
+    yield from effect_misfits(root, attributes)
     if not all(0 <= number < len(attributes.prompts) for number in attributes.prompt_index):
         yield "prompt_index names prompts that the attributes do not have"

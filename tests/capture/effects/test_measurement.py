@@ -1,0 +1,264 @@
+"""Effects are what single calls give: each condition is made again by itself, through `act` and its editors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from tests.capture.interventions.test_interventions_on_policies import policy_named
+from tests.kit.cosmos_helpers import INSTRUCTION
+from tests.kit.policy_inputs import make_observation
+from vla_attention.capture.effects.arguments import EffectSettings
+from vla_attention.capture.effects.conditions import UNCHANGED, exchanges, planned_effects, refuse_both
+from vla_attention.capture.effects.measurement import EffectMeasurement, siblings_of
+from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
+from vla_attention.capture.interventions.resolution import (
+    ReplanPlace,
+    interventions_for,
+    make_editors,
+    run_vocabularies,
+    site_tokens,
+)
+from vla_attention.capture.policies.policy import CallVariant
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.groupings.words import words_of
+from vla_attention.schemas.interventions import Interventions, KeyKnockout, PromptChange
+
+TEXT = "put the red bowl on the plate"
+SIBLINGS = {0: ("put the blue bowl on the plate", "put the red cup on the stove", "open the drawer")}
+OBJECTS = (SceneObject("red_cube", "object", of_interest=True), SceneObject("table", "background", of_interest=False))
+
+
+def measurement(policy, items=("text", "cameras"), readers=("all", "action"), **settings) -> EffectMeasurement:
+    planned = planned_effects(EffectSettings(items, readers, **settings), policy, seed=3)
+    said: list[str] = []
+    made = EffectMeasurement(policy, planned, SIBLINGS, said.append)
+    made.lines = said
+    return made
+
+
+def coverage_of(policy) -> dict[str, np.ndarray]:
+    """Red cube on parts of some patches, the table everywhere else."""
+    coverage = {}
+    for camera in policy.cameras:
+        patches = next(s.camera_span(camera.name).num_keys for s in policy.sites if camera.name in s.cameras)
+        red = np.random.default_rng(patches).choice([0.0, 0.25, 1.0], patches)
+        coverage[camera.name] = np.stack([red, 1 - red], axis=1).astype(np.float32)
+    return coverage
+
+
+def call_of(policy, replan: int = 0):
+    given = policy.prepare(make_observation(0), TEXT)
+    context = CallContext(0, 2, replan, objects=OBJECTS, coverage=coverage_of(policy))
+    return given, context, policy.act(given, 11)
+
+
+def by_hand(policy, condition: Interventions, given, context) -> np.ndarray | None:
+    """Actions of one call under a condition, by the ways of a rerun; None where the condition changes nothing."""
+    tokens = site_tokens(policy.sites, given.key_role, given.prompt, context.objects, context.coverage)
+    editors = None
+    if condition.keys:
+        placed = interventions_for(condition, policy)
+        place = ReplanPlace(context.task_id, context.episode_index, context.replan)
+        names = run_vocabularies(policy.sites, [TEXT], context.objects)
+        editors = make_editors(placed, tokens, names, place)
+        if not editors:
+            return None
+    if condition.changes_input:
+        given = policy.prepare_again(changed_inputs(given.given, condition, policy.sites, context))
+    seed = 11
+    if condition.noise is not None:
+        seed = policy.replan_noise_seed(condition.noise.seed, context.task_id, context.episode_index, context.replan)
+    return policy.act(given, seed, None, editors)
+
+
+def lengths_differ(policy, given, condition, context) -> bool:
+    changed = policy.prepare_again(changed_inputs(given.given, condition, policy.sites, context))
+    return len(changed.prompt.pieces) != len(given.prompt.pieces)
+
+
+@pytest.mark.parametrize("name", ["pi05", "pi0"])
+def test_every_effect_is_that_of_a_single_call(name):
+    policy = policy_named(name)
+    run = measurement(policy, ("text", "cameras", "objects", "tokens"), ("all", "action", "pictures", "text"))
+    given, context, actions = call_of(policy)
+    effects = run.begin().measure(given, 11, actions, context)
+    names = [condition.name for condition in effects.conditions]
+    assert len(set(names)) == len(names)
+    # A prompt with another number of tokens is not exchanged, and nothing else is left out.
+    left = [effects.conditions[number] for number in set(range(len(names))) - set(effects.measured)]
+    assert all(condition.prompt and lengths_differ(policy, given, condition, context) for condition in left)
+    assert {condition.name for condition in left} == {name for name in names if any(name in s for s in run.lines)}
+    for number, change in zip(effects.measured, effects.change, strict=True):
+        expected = by_hand(policy, effects.conditions[number], given, context) - actions
+        np.testing.assert_allclose(change * effects.units, expected, atol=1e-5, err_msg=names[number])
+    by_name = {names[n]: change for n, change in zip(effects.measured, effects.change, strict=True)}
+    for name, reader in (("red", "_queries_all"), ("bowl", "")):
+        assert np.abs(by_name[f"without_word_{name}{reader}"]).max() > 1e-4
+    assert np.abs(by_name["unchanged"]).max() < 1e-5
+    assert {"prompt_synonyms_red_blue", "prompt_synonyms_bowl_cup", "prompt_synonyms_plate_stove"} <= set(names)
+
+
+def test_what_is_cut_is_stored_for_each_entry():
+    policy = policy_named("pi05")
+    given, context, actions = call_of(policy)
+    effects = measurement(policy, ("text", "objects")).begin().measure(given, 11, actions, context)
+    cut = {effects.conditions[n].name: row for n, row in zip(effects.measured, effects.cut["joint"], strict=True)}
+    (red,) = [word for word in words_of(given.prompt) if word.text == "red"]
+    assert np.flatnonzero(cut["without_word_red"]).tolist() == list(red.keys)
+    assert not cut["unchanged"].any()
+    assert not cut["noise"].any()
+    span = policy.sites[0].camera_span(policy.cameras[0].name)
+    np.testing.assert_array_equal(
+        cut["without_object_red_cube"][span.start : span.stop], context.coverage[policy.cameras[0].name][:, 0]
+    )
+    words = [row for name, row in cut.items() if name.startswith("without_word")]
+    largest = max(int(row.sum()) for row in words)
+    assert cut[next(name for name in cut if name.startswith("random_word"))].sum() == largest
+
+
+def test_a_batch_of_any_size_gives_the_same(monkeypatch):
+    policy = policy_named("pi05")
+    given, context, actions = call_of(policy)
+    whole = measurement(policy).begin().measure(given, 11, actions, context)
+    one_by_one = measurement(policy)
+    one_by_one._batch = 1
+    np.testing.assert_allclose(one_by_one.begin().measure(given, 11, actions, context).change, whole.change, atol=1e-5)
+
+
+def test_replans_between_are_not_measured():
+    policy = policy_named("pi05")
+    episode = measurement(policy, every=2).begin()
+    for replan, wanted in ((0, True), (1, False), (2, True)):
+        given, context, actions = call_of(policy, replan)
+        assert (episode.measure(given, 11, actions, context) is not None) is wanted
+
+
+def test_fewer_steps_are_compared_with_as_many():
+    """With fewer steps every action is another: the effect is that of the item alone."""
+    policy = policy_named("pi05")
+    given, context, actions = call_of(policy)
+    few = measurement(policy, denoise_steps=1).begin().measure(given, 11, actions, context)
+    names = [few.conditions[number].name for number in few.measured]
+    assert "unchanged" not in names
+    (one,) = policy.act_variants([CallVariant(given, 11)], 1, 8)
+    changed = by_hand_in_one_step(policy, given, context)
+    expected = (changed - one) / np.array(few.units)
+    np.testing.assert_allclose(few.change[names.index("without_word_red_queries_all")], expected, atol=1e-5)
+
+
+def by_hand_in_one_step(policy, given, context):
+    """One Euler step of the model itself, with the prefix's editor."""
+    condition = Interventions(keys=(KeyKnockout('word:"red"', queries="all"),))
+    tokens = site_tokens(policy.sites, given.key_role, given.prompt, (), {})
+    editors = make_editors(condition, tokens, run_vocabularies(policy.sites, [TEXT], ()), ReplanPlace(0, 2, 0))
+    steps = policy.model.config.num_denoise_steps
+    object.__setattr__(policy.model.config, "num_denoise_steps", 1)
+    try:
+        return policy.act(given, 11, None, editors)
+    finally:
+        object.__setattr__(policy.model.config, "num_denoise_steps", steps)
+
+
+def test_cosmos_is_called_once_for_each_condition():
+    policy = policy_named("cosmos")
+    given = policy.prepare(make_observation(0), INSTRUCTION)
+    context = CallContext(0, 2, 0)
+    actions = policy.act(given, 11)
+    run = EffectMeasurement(policy, planned_effects(EffectSettings(("text", "cameras")), policy, 3), {}, print)
+    effects = run.begin().measure(given, 11, actions, context)
+    assert UNCHANGED not in effects.conditions
+    assert set(effects.cut) == {site.name for site in policy.sites}
+    for number, change in zip(effects.measured, effects.change, strict=True):
+        condition = effects.conditions[number]
+        tokens = site_tokens(policy.sites, given.key_role, given.prompt, (), {})
+        names = run_vocabularies(policy.sites, [given.prompt.instruction_text], ())
+        editors = make_editors(condition, tokens, names, ReplanPlace(0, 2, 0)) if condition.keys else None
+        inputs = given
+        if condition.changes_input:
+            inputs = policy.prepare_again(changed_inputs(given.given, condition, policy.sites, context))
+        seed = 11 if condition.noise is None else policy.replan_noise_seed(condition.noise.seed, 0, 2, 0)
+        expected = policy.act(inputs, seed, None, editors) - actions
+        np.testing.assert_allclose(change * effects.units, expected, atol=1e-6, err_msg=condition.name)
+
+
+def test_a_call_among_the_others_that_differs_is_refused(monkeypatch):
+    policy = policy_named("pi05")
+    given, context, actions = call_of(policy)
+    run = measurement(policy)
+    effects = run.begin().measure(given, 11, actions + 1e-3 * run.units, context)
+    assert [effects.conditions[number] for number in effects.measured] == [UNCHANGED]
+    np.testing.assert_allclose(effects.change, -1e-3, rtol=0.02)
+    assert any("refused" in line for line in run.lines)
+
+
+def test_memory_that_does_not_suffice_makes_batches_smaller(monkeypatch):
+    policy = policy_named("pi05")
+    given, context, actions = call_of(policy)
+    make, sizes = type(policy).act_variants, []
+
+    def as_if_small(self, variants, num_steps, batch):
+        sizes.append(batch)
+        if batch > most:
+            raise torch.OutOfMemoryError("out of memory")
+        return make(self, variants, num_steps, batch)
+
+    monkeypatch.setattr(type(policy), "act_variants", as_if_small)
+    most, run = 8, measurement(policy)
+    assert len(run.begin().measure(given, 11, actions, context).measured) > 1
+    assert sizes == [32, 16, 8]
+    run.begin().measure(given, 11, actions, context)
+    assert sizes == [32, 16, 8, 8]
+    most, run = 0, measurement(policy)
+    assert run.begin().measure(given, 11, actions, context).measured == ()
+    assert "The memory does not suffice for the effects of a single call: they are left out." in run.lines
+
+
+def test_numbers_that_are_not_finite_are_left_out(monkeypatch):
+    policy = policy_named("pi05")
+    given, context, actions = call_of(policy)
+    make = type(policy).act_variants
+
+    def spoiled(self, variants, num_steps, batch):
+        made = make(self, variants, num_steps, batch)
+        made[3] = made[3] * np.nan
+        return made
+
+    monkeypatch.setattr(type(policy), "act_variants", spoiled)
+    run = measurement(policy)
+    effects = run.begin().measure(given, 11, actions, context)
+    assert 3 not in effects.measured
+    whole = measurement(policy)
+    monkeypatch.undo()
+    assert {*effects.measured, 3} == set(whole.begin().measure(given, 11, actions, context).measured)
+    assert any(effects.conditions[3].name in line for line in run.lines)
+
+
+def test_words_are_exchanged_for_those_in_their_places():
+    prompt = policy_named("pi05").prepare(make_observation(0), TEXT).prompt
+    found = exchanges(words_of(prompt), SIBLINGS[0])
+    assert found == [
+        PromptChange("synonyms", synonyms={"bowl": "cup"}),
+        PromptChange("synonyms", synonyms={"plate": "stove"}),
+        PromptChange("synonyms", synonyms={"red": "blue"}),
+    ]
+
+
+def test_siblings_are_of_one_family():
+    tasks = [(0, "a", "one"), (1, "b", "one"), (2, "c", ""), (3, "d", ""), (4, "a", "one")]
+    assert siblings_of(tasks) == {0: ("b", "a"), 1: ("a",), 2: (), 3: (), 4: ("a", "b")}
+
+
+def test_what_a_policy_has_not_is_refused():
+    policy = policy_named("pi05")
+    with pytest.raises(BadArgument, match="denoise steps"):
+        planned_effects(EffectSettings(("text",), denoise_steps=99), policy, 0)
+    with pytest.raises(BadArgument, match="no prefix"):
+        planned_effects(EffectSettings(("text",), ("pictures",)), policy_named("cosmos"), 0)
+    with pytest.raises(BadArgument, match="one by one"):
+        planned_effects(EffectSettings(("text",), denoise_steps=1), policy_named("cosmos"), 0)
+    with pytest.raises(BadArgument, match="beside interventions"):
+        refuse_both(Interventions(keys=(KeyKnockout("role:image"),)))
+    refuse_both(Interventions(prompt=PromptChange("empty")))

@@ -1,0 +1,187 @@
+"""Stores with effects: the same run as without, the same numbers as reruns, and nothing missing in silence."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from tests.capture.rerun.conftest import capture
+from tests.capture.rerun.conftest import pi_store as pi_store
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.analyze.effects.effect_study import study_effects
+from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.capture.__main__ import main
+from vla_attention.schemas.stores.reader import Store, open_store
+from vla_attention.schemas.stores.verify import verify_store
+from vla_attention.testing.stores import reseal
+
+EFFECTS = ("--effects", "text,cameras", "--effects-readers", "all", "action", "pictures", "text")
+
+
+@pytest.fixture(scope="module")
+def with_effects(tmp_path_factory) -> Path:
+    return capture(tmp_path_factory.mktemp("effects") / "pi.zarr", "pi", *EFFECTS)
+
+
+def changes(store: Store, condition: str) -> dict[str, np.ndarray]:
+    """Episode -> changes of the environment's actions (replan, horizon, action dim) under a condition."""
+    found = {}
+    for episode in store.episodes:
+        effects = episode.attributes.effects
+        (number,) = [i for i, one in enumerate(effects.conditions) if one.name == condition] or [-1]
+        entries = np.flatnonzero(np.array(effects.condition) == number)
+        if entries.size:
+            assert [effects.replan[entry] for entry in entries] == list(range(episode.attributes.num_replans))
+            found[episode.name] = episode.read("effects/change")[entries] * np.array(effects.units)
+    return found
+
+
+def test_the_robot_executes_what_it_would_without_them(pi_store, with_effects):
+    plain, other = open_store(pi_store), open_store(with_effects)
+    assert verify_store(other) == []
+    for mine, theirs in zip(plain.episodes, other.episodes, strict=True):
+        for name in mine.attributes.arrays:
+            assert mine.attributes.arrays[name] == theirs.attributes.arrays[name], name
+        assert set(theirs.attributes.arrays) - set(mine.attributes.arrays) == {"effects/change", "joint/cut"}
+
+
+@pytest.mark.parametrize(
+    ("condition", "words"),
+    [
+        ("without_word_cube_queries_all", ["--knockout", 'word:"cube"', "--knockout-queries", "all"]),
+        ("without_word_cube", ["--knockout", 'word:"cube"']),
+        ("only_visual", ["--keep", "role:image"]),
+        ("without_camera_base_0_rgb_queries_all", ["--knockout", "camera:base_0_rgb", "--knockout-queries", "all"]),
+        (
+            "without_instruction_queries_prefix_of_role_image",
+            ["--knockout", "role:instruction", "--knockout-queries", "prefix:role:image"],
+        ),
+        ("base_0_rgb_blank", ["--image", "base_0_rgb=blank"]),
+    ],
+)
+def test_a_rerun_of_one_condition_gives_the_same(with_effects, tmp_path, condition, words):
+    target = tmp_path / "one.zarr"
+    assert main(["rerun", str(with_effects), "--store", str(target), "--check", "0", *words]) == 0
+    recorded = changes(open_store(with_effects), condition)
+    rerun = open_store(target)
+    assert set(recorded) == {episode.name for episode in rerun.episodes}
+    for episode in rerun.episodes:
+        expected = episode.read("actions") - episode.read("base_actions")
+        np.testing.assert_allclose(recorded[episode.name], expected, atol=1e-5)
+
+
+def test_effects_of_the_store_are_those_of_its_reruns(with_effects, tmp_path):
+    """The command's numbers: from what was recorded, and from reruns of some of its conditions."""
+    folder = tmp_path / "reruns"
+    for queries in ("all", "action"):
+        for word in ("cube", "red"):
+            target = folder / f"{word}_{queries}.zarr"
+            options = ["--knockout", f'word:"{word}"', "--knockout-queries", queries, "--task-id", "0"]
+            assert main(["rerun", str(with_effects), "--store", str(target), "--check", "0", *options]) == 0
+    seed = str(open_store(with_effects).attributes.recording.effects.seed)
+    noise = ["rerun", str(with_effects), "--store", str(folder / "n.zarr"), "--check", "0", "--noise-seed", seed]
+    assert main(noise) == 0
+    settings = AnalysisSettings(tasks=(0,))
+    recorded = study_effects(with_effects, [], settings, dimensions=range(7)).summary
+    rerun = study_effects(with_effects, [folder], settings, dimensions=range(7)).summary
+    columns = ["effect", "effect_chunk", "angle", "mass", "lift", "keys", "noise", "minus_noise", "num_episodes"]
+    for suffix in ("", "_queries_all"):
+        for word in ("cube", "red"):
+            pair = [
+                table.filter(scope="all", condition=name).select("phase", *columns)
+                for table, name in (
+                    (recorded, f"without_word_{word}{suffix}"),
+                    (rerun, f"without_word_{word}{suffix}"),
+                )
+            ]
+            assert pair[0].height == 4
+            assert pair[0]["phase"].to_list() == pair[1]["phase"].to_list()
+            for column in columns:
+                mine, theirs = (part[column].to_numpy() for part in pair)
+                np.testing.assert_allclose(mine, theirs, rtol=1e-3, atol=1e-5, err_msg=column)
+
+
+def test_the_command_says_which_word_does_most_and_by_which_way(with_effects, tmp_path, capsys):
+    assert analyze(["effects", str(with_effects), "--output", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert "does most of" in said
+    assert "WITHOUT IT" in said
+    table = pl.read_parquet(tmp_path / "effects_summary.parquet").filter(scope="all", phase="all")
+    words = table.filter(pl.col("condition").str.contains("^without_word_.*_queries_all$"))
+    first = words.sort("effect", descending=True)["group"][0].removeprefix("word_")
+    assert f"'{first}' does most of {words.height} words" in said.replace("\n", " ")
+
+
+def test_a_store_without_effects_says_how_to_get_them(pi_store, capsys):
+    assert analyze(["effects", str(pi_store)]) == 2
+    assert "vla-capture rerun" in capsys.readouterr().err
+
+
+def test_a_rerun_adds_effects_to_stored_calls(pi_store, with_effects, tmp_path, capsys):
+    target = tmp_path / "later.zarr"
+    assert main(["rerun", str(pi_store), "--check", "0", "--store", str(target), *EFFECTS]) == 0
+    assert "0 episodes added" not in capsys.readouterr().out
+    later, now = open_store(target), open_store(with_effects)
+    assert verify_store(later) == []
+    for name in ("without_word_cube_queries_all", "noise", "only_linguistic"):
+        mine, theirs = changes(later, name), changes(now, name)
+        assert set(mine) == set(theirs)
+        for episode in mine:
+            np.testing.assert_allclose(mine[episode], theirs[episode], atol=1e-6)
+
+
+def test_resume_continues_and_another_choice_is_another_run(with_effects, tmp_path, capsys):
+    path = capture(tmp_path / "pi.zarr", "pi", *EFFECTS)
+    words = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", "0", "1"]
+    words += ["--num-episodes", "2", "--max-steps", "12", "--store", str(path), "--resume"]
+    assert main([*words, *EFFECTS]) == 0
+    assert main([*words, "--effects", "text"]) == 2
+    assert "recording.effects" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--effects", "text", "--knockout", "role:image"], "beside interventions on attention"),
+        (["--effects", "text", "--effects-steps", "99"], "denoise steps"),
+        (["--effects", "words"], "--effects has no 'words'"),
+    ],
+)
+def test_what_is_refused_before_the_first_episode(tmp_path, capsys, options, sentence):
+    words = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", "0"]
+    assert main([*words, "--store", str(tmp_path / "a.zarr"), *options]) == 2
+    assert sentence in capsys.readouterr().err
+    assert not (tmp_path / "a.zarr").exists()
+
+
+def damaged(path: Path, edit) -> list[str]:
+    """What verify says of a store whose first episode's attributes were changed and sealed anew."""
+    folder = sorted((path / "episodes").iterdir())[1]
+    document = json.loads((folder / "zarr.json").read_text())
+    edit(document["attributes"])
+    (folder / "zarr.json").write_text(json.dumps(document))
+    reseal(folder)
+    return [str(fault) for fault in verify_store(open_store(path))]
+
+
+@pytest.mark.parametrize(
+    ("edit", "said"),
+    [
+        (lambda attributes: attributes.update(effects=None), "it has no effects, other than its run"),
+        (lambda attributes: attributes["effects"]["replan"].__setitem__(-1, 99), "effects are of replan 99"),
+        (lambda attributes: attributes["effects"]["condition"].__setitem__(0, 5000), "does not exist"),
+        (lambda attributes: attributes["effects"]["replan"].append(1), "not in order"),
+        (lambda attributes: attributes["effects"]["units"].append(1.0), "units of 8 dimensions"),
+    ],
+)
+def test_verify_finds_effects_that_do_not_fit(with_effects, tmp_path, edit, said):
+
+    copy = tmp_path / "copy.zarr"
+    shutil.copytree(with_effects, copy)
+    faults = damaged(copy, edit)
+    assert any(said in fault for fault in faults), faults
