@@ -330,7 +330,7 @@ class OpenStores:
 
     def effects(
         self,
-        reruns: str | Path | Sequence[str | Path],
+        reruns: str | Path | Sequence[str | Path] = (),
         table: Literal["summary", "episodes", "rollouts", "rollout_episodes"] = "summary",
         dimensions: Sequence[int] | None = None,
         **settings: Unpack[SettingKeywords],
@@ -338,6 +338,7 @@ class OpenStores:
         """How much actions change in reruns of this store, beside its attention, noise and random keys.
 
         `reruns`: stores of `vla-capture rerun`, rollouts with interventions, or folders of them; this is their base.
+        Without any, the effects that were measured beside its own calls (`vla-capture --effects`).
         `dimensions`: those of the action that are compared. "rollouts" compares success and number of steps.
 
         >>> effects = va.open(store).effects(rerun)

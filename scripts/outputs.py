@@ -108,7 +108,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
     yield "effects", ["vla-analyze", "effects", base, *reruns, "--output", "results/effects"]
     yield "effects_series", ["vla-analyze", "effects", cubes, "stores/series", "--output", "results/effects_series"]
     yield "report_effects", [
-        "vla-analyze", "report", base, "--effects", *reruns, "--output", "results/report_effects"
+        "vla-analyze", "report", base, "--reruns", *reruns, "--output", "results/report_effects"
     ]  # fmt: skip
     yield "deviation", ["vla-analyze", "deviation", "stores/replay.zarr", "--output", "results/deviation"]
     yield "own_groups", [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,10 +11,12 @@ import polars as pl
 from vla_attention.analyze.effects.action_changes import MOSTLY_NOISE
 from vla_attention.analyze.effects.answer import answer_lines, beyond
 from vla_attention.analyze.effects.conditions import FLOORS, Condition, Kind
-from vla_attention.analyze.effects.effect_study import EffectStudy
+from vla_attention.analyze.effects.effect_study import EffectStudy, study_effects
 from vla_attention.analyze.effects.group_rows import GroupRow, group_rows
 from vla_attention.analyze.effects.item_rows import READERS, ItemRow, Reader, item_rows
 from vla_attention.analyze.effects.paired_replans import ALL, PHASES, stores_executed
+from vla_attention.analyze.effects.reruns import recorded_conditions
+from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.show.answer import Section
 from vla_attention.analyze.show.findings import few_families_note
 from vla_attention.analyze.show.headings import interval_note, note_lines, wrap
@@ -34,6 +36,7 @@ from vla_attention.analyze.show.tables import (
     words,
 )
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
+from vla_attention.schemas.stores.reader import Store
 
 #: Conditions beside each other in the table of tasks.
 _MOST_IN_TASKS = 4
@@ -111,9 +114,22 @@ def _groups(study: EffectStudy) -> list[Section]:
     return [Section([table, note, about], "WITHOUT IT, AND WITH IT ALONE  effect on the action")] if table.rows else []
 
 
-def item_table(study: EffectStudy) -> Table:
-    """Every item that was cut off for several readers: attention, and the effect by who no longer reads it."""
-    items = item_rows(study)
+def recorded_sections(stores: Sequence[Store], settings: AnalysisSettings, kind: str) -> list[Section]:
+    """The effects of a kind of item (`word`, `object`) that a store measured beside its calls; nothing without any."""
+    if len(stores) != 1 or not recorded_conditions(stores[0]):
+        return []
+    study = study_effects(stores[0].path, [], settings)
+    table = item_table(study, kind)
+    note = f"{_ITEM_NOTE.format(which=counted_actions(study))} More: vla-analyze effects {stores[0].path}"
+    return [Section([table, note], "WITHOUT IT  effect on the action, by who no longer reads it")] if table.rows else []
+
+
+def item_table(study: EffectStudy, kind: str | None = None) -> Table:
+    """Every item that was cut off for several readers: attention, and the effect by who no longer reads it.
+
+    kind: only those with such a selector.
+    """
+    items = [item for item in item_rows(study) if kind in (None, item.kind)]
     shown = [reader for reader in READERS if any(reader in item.by_reader for item in items)]
 
     def of(reader: Reader) -> Column:

@@ -73,14 +73,16 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure the objects; print them, write tables and pictures."""
+    from vla_attention.analyze.effects.text import recorded_sections
     from vla_attention.analyze.objects.object_settings import ObjectSettings
     from vla_attention.analyze.objects.object_study import study_objects
     from vla_attention.analyze.objects.text import objects_sections
     from vla_attention.analyze.show.answer import Answer
 
+    stores, settings = stores_of(arguments), settings_of(arguments)
     study = study_objects(
-        stores_of(arguments),
-        settings_of(arguments),
+        stores,
+        settings,
         ObjectSettings(
             percentiles=ObjectSettings.percentiles if arguments.percentiles is None else tuple(arguments.percentiles),
             mask_coverage=arguments.mask_coverage,
@@ -98,5 +100,6 @@ def run(arguments: argparse.Namespace) -> int:
 
         return [*plot_object_shares(study, folder), *(plot_object_iou(study, folder) if not arguments.no_iou else [])]
 
-    answer = Answer(objects_sections(study), study.files(), draw)
+    sections = [*objects_sections(study), *recorded_sections(stores, settings, "object")]
+    answer = Answer(sections, study.files(), draw)
     return show(answer, output_folder(arguments, "objects"), arguments)

@@ -13,7 +13,7 @@ _EXAMPLES = """examples:
   vla-analyze report runs/libero_10.zarr --grouping instruction --layers 9 13 17 --output paper/report.html
   vla-analyze report runs/a.zarr runs/b.zarr --episodes 8 --replans 10 --output results/both
   vla-analyze report runs/cosmos.zarr --site self
-  vla-analyze report runs/cubes.zarr --effects reruns/cubes
+  vla-analyze report runs/cubes.zarr --reruns reruns/cubes
 
 The file needs no network and nothing beside it: open it with a double click, mail it, print it.
 """
@@ -47,12 +47,14 @@ def build_parser() -> argparse.ArgumentParser:
         help="replans of each, at most (default: %(default)s)",
     )
     content.add_argument(
+        "--reruns",
         "--effects",
         type=Path,
         nargs="+",
         default=[],
         metavar="RERUN",
-        help="reruns of the store with interventions (vla-capture rerun), or folders of them",
+        help="reruns of the store with interventions (vla-capture rerun), or folders of them; without one, the effects "
+        "that the store holds",
     )
     content.add_argument("--quick", action="store_true", help="leave out what reads every row: sinks, words, objects")
     output = parser.add_argument_group("output")
@@ -74,7 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
     from vla_attention.analyze.show.browser import open_page
     from vla_attention.analyze.show.numbers import plural
 
-    settings = ReportSettings(arguments.episodes, arguments.replans, not arguments.quick, tuple(arguments.effects))
+    settings = ReportSettings(arguments.episodes, arguments.replans, not arguments.quick, tuple(arguments.reruns))
     path = report_file(arguments.output or Path("results") / arguments.stores[0].stem)
     question = question_of(arguments)
     write_report(question, path, settings)

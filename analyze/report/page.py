@@ -101,7 +101,7 @@ def _section_makers(
     makers: list[Callable[[], Section | None]] = [
         lambda: headline_section(analysis, notes),
         lambda: caveat_section(notes),
-        lambda: effect_section(analysis, settings.effects, folder),
+        lambda: effect_section(analysis, settings.reruns, folder),
         lambda: deviation_section(analysis, folder),
         lambda: task_section(analysis, folder),
         lambda: layer_section(analysis, folder),

@@ -14,10 +14,11 @@ from vla_attention.analyze.deviation.plot_deviation import plot_deviation
 from vla_attention.analyze.deviation.text import answer, correlation_sentence, dimension_table
 from vla_attention.analyze.effects.answer import answer_lines
 from vla_attention.analyze.effects.effect_study import study_of
+from vla_attention.analyze.effects.group_rows import group_rows
 from vla_attention.analyze.effects.plot_attention_and_effect import plot_attention_and_effect
 from vla_attention.analyze.effects.plot_effects import plot_effects
-from vla_attention.analyze.effects.reruns import open_reruns
-from vla_attention.analyze.effects.text import counted_actions, group_table
+from vla_attention.analyze.effects.reruns import open_reruns, recorded_conditions
+from vla_attention.analyze.effects.text import counted_actions, group_table, item_table
 from vla_attention.analyze.heads.text import sink_table
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.sink_kinds import SMALL_VALUES
@@ -152,17 +153,17 @@ def _named(rows: Sequence[dict[str, Any]], measure: str) -> str:
 
 
 def effect_section(analysis: Analysis, given: Sequence[Path], folder: Path) -> Section | None:
-    """Effects of the reruns that were given; None without any.
+    """Effects of the reruns that were given, else those that the store holds; None where there are none.
 
     Raises:
         BadArgument: the page is about several stores, or `effects.reruns.open_reruns` refuses a rerun.
     """
-    if not given:
-        return None
     stores = analysis.question.stores
+    if not given and not (len(stores) == 1 and recorded_conditions(stores[0])):
+        return None
     if len(stores) > 1:
         raise BadArgument(
-            f"--effects goes with one store, and the report is about {len(stores)}; make a report for each."
+            f"--reruns goes with one store, and the report is about {len(stores)}; make a report for each."
         )
     study = study_of(analysis, open_reruns(stores[0], given))
     parts: list[Part] = [
@@ -170,8 +171,12 @@ def effect_section(analysis: Analysis, given: Sequence[Path], folder: Path) -> S
         *(Paragraph(line) for line in answer_lines(study) if line),
     ]
     table = group_table(study, "Groups without which, and with which alone")
+    if study.is_recorded:
+        items = item_table(study)
+        table = replace(items, caption="Each without which, by who no longer reads it") if items.rows else table
     if study.conditions:
-        told = [f"{row.label} {format_number(row.without['effect'])}" for row in table.rows if row.without is not None]
+        rows = [(row.label, row.without) for row in group_rows(study) if row.without is not None]
+        told = [f"{label} {format_number(without['effect'])}" for label, without in rows]
         alternative = f"Points with intervals: effects without each group: {', '.join(told[:12]) or 'none'}."
         parts.append(drawn(lambda where: plot_effects(study, where), folder, alternative, "Effects on the action."))
     if table.rows:

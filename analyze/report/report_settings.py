@@ -16,7 +16,7 @@ class ReportSettings:
         episodes: number of episodes with overlays.
         replans: number of replans of each, at most.
         rows: include sinks, words and objects, which need every row to be read.
-        effects: reruns of the store, or folders of them (`effects.reruns`).
+        reruns: reruns of the store, or folders of them (`effects.reruns`).
 
     Raises `BadArgument` for fewer than 0 episodes or 1 replan.
     """
@@ -24,7 +24,7 @@ class ReportSettings:
     episodes: int = 4
     replans: int = 24
     rows: bool = True
-    effects: tuple[Path, ...] = ()
+    reruns: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
         if self.episodes < 0 or self.replans < 1:

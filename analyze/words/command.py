@@ -50,11 +50,14 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure the words; print them, write the table and the picture."""
+    from vla_attention.analyze.effects.text import recorded_sections
     from vla_attention.analyze.show.answer import Answer
     from vla_attention.analyze.words.text import words_sections
     from vla_attention.analyze.words.word_study import study_words
 
-    study = study_words(stores_of(arguments), settings_of(arguments), arguments.task)
+    stores, settings = stores_of(arguments), settings_of(arguments)
+    study = study_words(stores, settings, arguments.task)
+    sections = [*words_sections(study), *recorded_sections(stores, settings, "word")]
 
     def draw(folder: Path) -> list[Path]:
         from vla_attention.analyze.words.plot_word_bars import plot_word_bars
@@ -62,4 +65,4 @@ def run(arguments: argparse.Namespace) -> int:
         return plot_word_bars(study.summary, folder, study.layer, study.instruction)
 
     folder = output_folder(arguments, "words" if arguments.task is None else f"words_task{arguments.task:03d}")
-    return show(Answer(words_sections(study), study.files(), draw), folder, arguments)
+    return show(Answer(sections, study.files(), draw), folder, arguments)

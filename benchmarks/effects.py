@@ -1,0 +1,125 @@
+"""What effects cost: the calls that are made again at a replan, in policy calls, and what they take on disk.
+
+Usage: python benchmarks/effects.py [--rounds 7] [--calls 4] [--threads 1]
+
+Stored calls of the example store of `pi05_cubes`, one of each of its episodes, are made as they are and with effects,
+taking turns; a number is a median over rounds of the seconds divided by those of the plain calls of the same round.
+`rank`: Spearman's correlation of the words' and parts' effects with those of all denoise steps, over all calls.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import measurement
+from measurement import Table, fix_threads, measured, ratios, write_rows
+
+#: Name of a row -> items, readers, denoise steps (None: all), and the conditions that are kept (None: all).
+KINDS: dict[str, tuple[tuple[str, ...], tuple[str, ...], int | None, int | None]] = {
+    "1 item, nobody reads it": (("text",), ("all",), None, 1),
+    "5 items": (("text",), ("all",), None, 5),
+    "14 items": (("text", "cameras"), ("all",), None, 14),
+    "text,cameras": (("text", "cameras"), ("all", "action"), None, None),
+    "text,cameras, no exchanges": (("text", "cameras"), ("all", "action"), None, -1),
+    "text,cameras, all four readers": (("text", "cameras"), ("all", "action", "pictures", "text"), None, None),
+    "text,cameras, 5 of 10 denoise steps": (("text", "cameras"), ("all", "action"), 5, None),
+    "text,cameras, 2 of 10 denoise steps": (("text", "cameras"), ("all", "action"), 2, None),
+}
+
+
+def main() -> None:
+    """Measure, and write the rows."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--calls", type=int, default=4)
+    parser.add_argument("--threads", type=int, default=1)
+    arguments = parser.parse_args()
+    fix_threads(arguments.threads)
+    write_rows("effects", {"cost": cost_table(arguments.rounds, arguments.calls, arguments.threads)})
+
+
+def cost_table(rounds: int, number: int, threads: int) -> Table:
+    """A row for each of `KINDS`."""
+    import numpy as np
+    import torch
+    from scipy.stats import spearmanr
+
+    from vla_attention.capture.effects.arguments import EffectSettings
+    from vla_attention.capture.effects.conditions import UNCHANGED, planned_effects
+    from vla_attention.capture.effects.measurement import EffectMeasurement, siblings_of
+    from vla_attention.capture.policies.families import default_family
+    from vla_attention.capture.rerun.stored_calls import Repeater, read_calls
+    from vla_attention.schemas.stores.reader import open_store
+
+    torch.set_num_threads(threads)
+    family, options = default_family(), argparse.ArgumentParser()
+    family.add_arguments(options)
+    policy = family.build(options.parse_args([]), "cpu")
+    store = open_store(measurement.ROOT / "vla_attention" / "example_stores" / "cubes.zarr")
+    tasks = {episode.attributes.task_id: episode.attributes for episode in store.episodes}
+    instructions = {number: task.instruction for number, task in tasks.items()}
+    families = siblings_of((number, task.instruction, task.task_family) for number, task in tasks.items())
+    repeater = Repeater(policy, store.attributes.recording, instructions=instructions)
+    calls = []
+    for episode in store.episodes[:number]:
+        stored = read_calls(episode)
+        given, seed = repeater.prepare(stored, 1), repeater.noise_seed(stored, 1)
+        calls.append((given, seed, policy.act(given, seed), stored.context(1, instructions)))
+
+    def measure(kind: str):
+        items, readers, steps, kept = KINDS[kind]
+        planned = planned_effects(EffectSettings(items, readers, 1, steps), policy, 7)
+        run = EffectMeasurement(policy, planned, families, lambda line: None)
+        for given, seed, actions, context in calls:
+            episode = run.begin()
+            if kept is not None:
+                whole = run.begin()
+                whole.measure(given, seed, actions, context)
+                wanted = [one for one in whole.conditions or () if one.keys and one.keys[0].random_seed is None]
+                plain = [one for one in whole.conditions or () if not one.changes_input]
+                episode.conditions = tuple(plain) if kept < 0 else (UNCHANGED, *wanted[:kept])
+            yield given, seed, actions, context, episode
+
+    prepared = {kind: list(measure(kind)) for kind in KINDS}
+    seconds: dict[str, list[float]] = {kind: [] for kind in ("plain", *KINDS)}
+    results = {}
+    for _ in range(rounds):
+        began = time.perf_counter()
+        for given, seed, _, _ in calls:
+            policy.act(given, seed)
+        seconds["plain"].append(time.perf_counter() - began)
+        for kind, members in prepared.items():
+            began = time.perf_counter()
+            results[kind] = [
+                episode.measure(given, seed, actions, context) for given, seed, actions, context, episode in members
+            ]
+            seconds[kind].append(time.perf_counter() - began)
+
+    def norms(kind: str) -> dict[tuple[int, str], float]:
+        return {
+            (call, effects.conditions[number].name): float(np.sqrt((change[:5] ** 2).mean()))
+            for call, effects in enumerate(results[kind])
+            for number, change in zip(effects.measured, effects.change, strict=True)
+            if effects.conditions[number].keys
+        }
+
+    whole, rows = norms("text,cameras"), []
+    for kind in KINDS:
+        own = norms(kind)
+        both = [name for name in whole if name in own]
+        rank = spearmanr([whole[name] for name in both], [own[name] for name in both])[0] if len(both) > 2 else None
+        rows.append(
+            {
+                "what": kind,
+                "conditions": round(float(np.mean([len(effects.measured) for effects in results[kind]]))),
+                "calls": measured(ratios(seconds[kind], seconds["plain"])),
+                "rank": "-" if "denoise" not in kind or rank is None else f"{rank:.3f}",
+            }
+        )
+    columns = {"what": "effects", "conditions": "conditions", "calls": "policy calls", "rank": "rank correlation"}
+    return Table(columns, rows)
+
+
+if __name__ == "__main__":
+    main()
