@@ -9,6 +9,7 @@ from typing import Any
 from vla_attention.analyze.effects.conditions import Condition, Kind
 from vla_attention.analyze.effects.effect_study import EffectStudy
 from vla_attention.analyze.effects.group_attention import MEASURES
+from vla_attention.analyze.effects.item_rows import Reader, item_name, reader_of
 
 
 @dataclass(frozen=True)
@@ -33,10 +34,16 @@ class GroupRow:
 
 
 def group_rows(study: EffectStudy) -> list[GroupRow]:
-    """One row per group that was knocked out or kept: those of the grouping in its order, then the others by effect."""
+    """One row per group that was knocked out or kept: those of the grouping in its order, then the others by effect.
+
+    Of recorded effects, only those of the widest reader: nobody reads the group, or the action queries do not.
+    """
     rows = []
-    alone = study.of_kind(Kind.ONLY)
-    for condition in study.of_kind(Kind.WITHOUT):
+    alone, without = study.of_kind(Kind.ONLY), study.of_kind(Kind.WITHOUT)
+    if study.is_recorded:  # of several readers, the widest: `item_rows` has the others
+        widest: Reader = "total" if any(reader_of(one) == "total" for one in without) else "direct"
+        alone, without = ([one for one in some if reader_of(one) == widest] for some in (alone, without))
+    for condition in without:
         reverse = next((other for other in alone if other.is_reverse_of(condition)), None)
         rows.append(_row(study, condition, condition, reverse))
         alone = [other for other in alone if other is not reverse]
@@ -53,7 +60,7 @@ def readers_of(rows: Sequence[GroupRow]) -> list[str]:
 
 def _labels(rows: Sequence[GroupRow]) -> list[str]:
     alike = len(readers_of(rows)) < 2
-    labels = [row.name if alike else f"{row.name} (for {row.condition.readers})" for row in rows]
+    labels = [row.label if alike else f"{row.label} (for {row.condition.readers})" for row in rows]
     return [
         label if labels.count(label) == 1 else f"{label} ({row.condition.name})"
         for label, row in zip(labels, rows, strict=True)
@@ -69,4 +76,5 @@ def _row(study: EffectStudy, condition: Condition, without: Condition | None, on
     rows = [None if one is None else study.of(one) for one in (without, only)]
     known = next(row for row in rows if row is not None)
     attention = {name: known[name] for name in MEASURES}
-    return GroupRow(condition.group_name, condition.group_name, condition, rows[0], rows[1], attention)
+    label = item_name(condition) if condition.recorded else condition.group_name
+    return GroupRow(condition.group_name, label, condition, rows[0], rows[1], attention)

@@ -16,6 +16,7 @@ from vla_attention.analyze.statistics.episode_intervals import means_of_all_and_
 from vla_attention.analyze.statistics.intervals import POSITIVE
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
+from vla_attention.schemas.safe_text import visible
 
 #: Who no longer reads an item. `total`: nobody reads it. `direct`: the action queries alone do not.
 Reader = Literal["total", "direct", "pictures", "text"]
@@ -60,13 +61,15 @@ def reader_of(condition: Condition) -> Reader | None:
 def item_rows(study: EffectStudy) -> list[ItemRow]:
     """A row for every group of keys that was cut off for two readers or more, the largest effect first."""
     by_name: dict[str, dict[Reader, dict[str, Any]]] = {}
-    kinds: dict[str, str] = {}
+    named: dict[str, Condition] = {}
     for condition in study.of_kind(Kind.WITHOUT):
         reader = reader_of(condition)
         if reader is not None:
             by_name.setdefault(condition.group_name, {})[reader] = study.of(condition)
-            kinds[condition.group_name] = _kind(condition)
-    rows = [ItemRow(_called(name, kinds[name]), kinds[name], rows) for name, rows in by_name.items() if len(rows) > 1]
+            named[condition.group_name] = condition
+    rows = [
+        ItemRow(item_name(named[name]), _kind(named[name]), rows) for name, rows in by_name.items() if len(rows) > 1
+    ]
     rows = [row for row in rows if {"total", "direct"} & set(row.by_reader)]
     return sorted(rows, key=lambda row: -(row.strongest["effect"] or 0.0))
 
@@ -82,10 +85,22 @@ def _kind(condition: Condition) -> str:
     return atoms[0].kind if len(atoms) == 1 else ""
 
 
-def _called(name: str, kind: str) -> str:
-    """`'red'` for a word's group, `agentview` for a camera's: the name without the kind that series put before it."""
+def item_name(condition: Condition) -> str:
+    """`'red'` for a word's group, `agentview` for a camera's: the name without the kind that stands before it."""
+    kind, name = _kind(condition), condition.group_name
     bare = name.removeprefix(f"{kind}_") if kind else name
     return f"'{bare}'" if kind == "word" else bare
+
+
+def change_name(condition: Condition) -> str:
+    """A short name of a change of words or pictures that was recorded; that of the condition for everything else."""
+    given = condition.interventions
+    if not condition.recorded:
+        return condition.name
+    if given.prompt is not None and given.prompt.kind == "synonyms":
+        return visible(", ".join(f"'{word}' as '{other}'" for word, other in given.prompt.synonyms.items()))
+    blank = [change.camera for change in given.images if change.kind == "blank"]
+    return visible(f"{blank[0]} grey") if len(blank) == len(given.images) == 1 else condition.name
 
 
 def ratio_of_effects(study: EffectStudy) -> dict[str, Any] | None:

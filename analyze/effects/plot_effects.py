@@ -13,6 +13,7 @@ import polars as pl
 from vla_attention.analyze.effects.conditions import Condition, Kind
 from vla_attention.analyze.effects.effect_study import EffectStudy
 from vla_attention.analyze.effects.group_rows import group_rows
+from vla_attention.analyze.effects.item_rows import change_name, item_rows, reader_of
 from vla_attention.analyze.show.numbers import format_number, interval_name, of_tasks, row_interval
 from vla_attention.analyze.show.plot_axes import legend_above, note_at_row, ratio_axis, uniform_line
 from vla_attention.analyze.show.plot_colours import NOTE_COLOR, STRIPE_COLOR
@@ -28,12 +29,13 @@ STEM = "effects_by_condition"
 #: Colour, marker and filling of each kind of point: told apart without colour, too.
 _STYLES: dict[str, dict[str, Any]] = {
     "without": {"color": "#D55E00", "marker": "o", "label": "without it"},
+    "direct": {"color": "#CC79A7", "marker": "v", "label": "for the action queries"},
     "only": {"color": "#0072B2", "marker": "s", "markerfacecolor": "white", "label": "with it alone"},
     "random": {"color": "#4D4D4D", "marker": "x", "label": "random keys, as many"},
     "other": {"color": "#009E73", "marker": "D", "label": "other change"},
 }
 #: Points of one row stand a little apart.
-_OFFSETS = {"without": -0.16, "only": 0.16, "random": 0.0, "other": 0.0}
+_OFFSETS = {"without": -0.16, "direct": 0.0, "only": 0.16, "random": 0.0, "other": 0.0}
 _NOISE_COLOR = "#C9B8D8"
 #: Rows in the picture; the tables have all.
 _MOST = 40
@@ -93,15 +95,18 @@ def _title(figure: Figure, study: EffectStudy, num_rows: int) -> None:
 
 def _rows(study: EffectStudy) -> list[_Row]:
     rows = []
+    direct = {item.name: item.by_reader.get("direct") for item in item_rows(study)} if study.is_recorded else {}
     for group in group_rows(study):
         points = {"without": group.without, "only": group.only, "random": _random_of(study, group.condition)}
+        if reader_of(group.condition) == "total":
+            points["direct"] = direct.get(group.label)
         known = next(row for row in (group.without, group.only) if row is not None)
         rows.append(_Row(broken(group.label, 30), {k: row for k, row in points.items() if row is not None}, known))
     floor = (Kind.WITHOUT, Kind.ONLY, Kind.RANDOM, Kind.NOISE)
     for condition in study.conditions:
         if condition.kind not in floor:
             row = study.of(condition)
-            rows.append(_Row(broken(condition.name, 30), {"other": row}, row))
+            rows.append(_Row(broken(change_name(condition), 30), {"other": row}, row))
     return rows
 
 
@@ -151,7 +156,8 @@ def _legend(axes: Axes, kinds: set[str], with_noise: bool) -> None:
     handles: list[Any] = [Line2D([], [], linestyle="none", **style) for kind, style in _STYLES.items() if kind in kinds]
     if with_noise:
         handles.append(Patch(color=_NOISE_COLOR, alpha=0.55, label="another noise seed"))
-    legend_above(axes, len(handles), handles, columnspacing=1.2, handletextpad=0.3)
+    columns = len(handles) if len(handles) < 6 else 3  # in two rows: a wide legend would squeeze the panels
+    legend_above(axes, columns, handles, columnspacing=1.2, handletextpad=0.3)
 
 
 def _lift_panel(axes: Axes, rows: list[_Row]) -> None:
