@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,12 @@ import pytest
 
 from tests.capture.rerun.conftest import capture
 from tests.capture.rerun.conftest import pi_store as pi_store
+from tests.kit.still_scene import StillScene
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.effects.effect_study import study_effects
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.capture.__main__ import main
+from vla_attention.capture.store.disk_estimate import estimate_disk
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.verify import verify_store
 from vla_attention.testing.stores import reseal
@@ -115,6 +118,31 @@ def test_the_command_says_which_word_does_most_and_by_which_way(with_effects, tm
     words = table.filter(pl.col("condition").str.contains("^without_word_.*_queries_all$"))
     first = words.sort("effect", descending=True)["group"][0].removeprefix("word_")
     assert f"'{first}' does most of {words.height} words" in said.replace("\n", " ")
+
+
+def test_the_disk_estimate_knows_them(with_effects):
+    store = open_store(with_effects)
+    root, pictures = store.attributes, [64 * 64 * 3] * 2
+    with_them = estimate_disk(root.recording, root.sites, pictures, 3, 4)
+    without = estimate_disk(replace(root.recording, effects=None), root.sites, pictures, 3, 4)
+    names = ("effects/change", "joint/cut")
+    written = sum(
+        record.size
+        for episode in store.episodes
+        for file, record in episode.files.records.items()
+        if file.startswith(names)
+    )
+    assert written < with_them.total_bytes - without.total_bytes < 10 * written
+
+
+def test_a_budget_counts_them(tmp_path, monkeypatch, capsys):
+    still = "vla_attention.capture.budget.trial.make_environment"
+    monkeypatch.setattr(still, lambda suite, task_id, settings: StillScene())
+    words = ("--budget", "3MB", *EFFECTS)
+    store = open_store(capture(tmp_path / "pi.zarr", "pi", *words))
+    assert "measured" in capsys.readouterr().out
+    assert store.attributes.recording.effects is not None
+    assert sum(file.stat().st_size for file in (tmp_path / "pi.zarr").rglob("*") if file.is_file()) < 3_000_000
 
 
 def test_a_store_without_effects_says_how_to_get_them(pi_store, capsys):

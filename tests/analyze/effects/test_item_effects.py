@@ -1,0 +1,142 @@
+"""Recorded effects with planted sizes: means by hand, who reads an item, floors, and what the first lines say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+import pytest
+
+from vla_attention.analyze.effects.answer import item_lines
+from vla_attention.analyze.effects.effect_study import study_effects
+from vla_attention.analyze.effects.item_rows import item_rows, ratio_of_effects
+from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.capture.interventions.condition_name import knockout_of_group
+from vla_attention.capture.store.replan_records import ReplanEffects
+from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange
+from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.tokens import INSTRUCTIONS
+
+READERS = {"total": ("all", ""), "direct": ("action", ""), "pictures": ("prefix", "role:image")}
+WORDS = tuple(dict.fromkeys(word for text in INSTRUCTIONS for word in text.split()))
+FIRST = INSTRUCTIONS[0].split()[0]
+#: Item -> its selector, and the size of its change by reader.
+ITEMS = {
+    "visual": ("role:image", {"total": 2.0, "direct": 1.5, "pictures": 0.5}),
+    "linguistic": ("role:instruction | role:template", {"total": 1.0, "direct": 0.2, "pictures": 0.8}),
+    **{
+        f"word_{word}": (
+            f'word:"{word}"',
+            {"total": 0.9 / (1 + i), "direct": 0.01 + 0.1 * i, "pictures": 0.7 / (1 + i)},
+        )
+        for i, word in enumerate(WORDS)
+    },
+}
+NOISE, RANDOM = 0.05, 0.02
+
+
+def conditions() -> dict[Interventions | str, tuple[Interventions, float]]:
+    planted = {"unchanged": (Interventions("unchanged"), 0.0)}
+    planted["noise"] = (Interventions("noise", noise=NoiseChange(1)), NOISE)
+    for name, (selector, sizes) in ITEMS.items():
+        for reader, (queries, readers) in READERS.items():
+            one = KeyKnockout(selector, queries=queries, query_selector=readers)
+            made = knockout_of_group("without", name, one)
+            planted[made.name] = (made, sizes[reader])
+    for queries, readers in READERS.values():
+        one = KeyKnockout(f'word:"{FIRST}"', queries=queries, query_selector=readers, random_seed=1)
+        made = knockout_of_group("random", f"word_{FIRST}", one)
+        planted[made.name] = (made, RANDOM)
+    return planted
+
+
+def effects_of(task: int, episode: int, replan: int, tokens) -> ReplanEffects:
+    """Every dimension changes by the size, in the sign of a coin; words of other instructions have no entry."""
+    known = INSTRUCTIONS[task % len(INSTRUCTIONS)].split()
+    all_of = conditions()
+    measured, changes = [], []
+    for number, (name, (_, size)) in enumerate(all_of.items()):
+        word = name.split("word_")[-1].split("_queries")[0] if "word_" in name else known[0]
+        if word in known:
+            measured.append(number)
+            signs = np.random.default_rng([task, episode, replan, number]).choice([-1.0, 1.0], (5, 7))
+            changes.append(size * signs)
+    cut = np.zeros((len(measured), tokens.layout.num_keys), np.float32)
+    listed = tuple(one for one, _ in all_of.values())
+    change = np.array(changes, np.float32)
+    return ReplanEffects(listed, (3.0,) * 7, tuple(measured), change, {"joint": cut})
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    spec = StoreSpec(tasks=(0, 1, 2), episodes=4, replans=4, plant_effects=effects_of)
+    return write_store(tmp_path_factory.mktemp("items") / "a.zarr", spec=spec)
+
+
+@pytest.fixture(scope="module")
+def study(store):
+    return study_effects(store, [], AnalysisSettings(intervals="these-tasks"))
+
+
+def test_the_effect_is_the_planted_size_in_units_of_the_spread(study):
+    spread = study.spread
+    assert spread.used.all()
+    for name, (_, sizes) in ITEMS.items():
+        (row,) = [row for row in item_rows(study) if row.by_reader["total"]["group"] == name]
+        for reader, size in sizes.items():
+            expected = np.sqrt(np.mean((3.0 * size / spread.spread) ** 2))
+            assert row.effect(reader) == pytest.approx(expected, rel=1e-6), (name, reader)
+        assert row.direct_share == pytest.approx(sizes["direct"] / sizes["total"], rel=1e-6)
+
+
+def test_items_are_in_the_order_of_their_total_effects(study):
+    names = [row.name for row in item_rows(study)]
+    assert names[:3] == ["visual", "linguistic", f"'{WORDS[0]}'"]
+    assert {row.kind for row in item_rows(study)} == {"role", "", "word"}
+
+
+def test_words_count_in_the_episodes_that_have_them(study):
+    rows = study.summary.filter(scope="all", phase="all")
+    for word in WORDS:
+        having = sum(word in text.split() for text in INSTRUCTIONS)
+        (row,) = rows.filter(condition=f"without_word_{word}_queries_all").to_dicts()
+        assert row["num_episodes"] == 4 * having
+
+
+def test_the_ratio_of_effects_is_that_of_the_sides(study):
+    ratio = ratio_of_effects(study)
+    assert ratio["ratio"] == pytest.approx(2.0, rel=1e-6)
+    assert ratio["num_episodes"] == 12
+
+
+def test_each_word_has_the_random_keys_of_the_nearest_number_of_its_reader(study):
+    rows = study.summary.filter(scope="all", phase="all", kind="without")
+    floor = np.sqrt(np.mean((3.0 * RANDOM / study.spread.spread) ** 2))
+    words = rows.filter(pl.col("condition").str.starts_with(f"without_word_{FIRST}"))
+    assert words.height == len(READERS)
+    assert words["random"].to_list() == pytest.approx([floor] * len(READERS), rel=1e-6)
+    # A few random keys are no floor for a picture.
+    assert rows.filter(pl.col("group") == "visual")["random"].to_list() == [None] * len(READERS)
+
+
+def test_the_first_lines_say_which_word_decides_and_by_which_way(study):
+    said = " ".join(item_lines(study, item_rows(study)))
+    first, second = WORDS[0], WORDS[1]
+    assert f"'{first}' does most of {len(WORDS)} words: without it the action changes by" in said
+    assert f"'{first}', '{second}' reach the action through the pictures, which have read them" in said
+    assert "Without all pictures the action changes 2 times as much as without all text" in said
+
+
+def test_the_unchanged_call_is_told_of_when_it_is_not_the_same(store, tmp_path):
+    def drifting(task, episode, replan, tokens):
+        given = effects_of(task, episode, replan, tokens)
+        change = given.change.copy()
+        change[0] = 0.1
+        return replace(given, change=change)
+
+    path = write_store(tmp_path / "b.zarr", tasks=(0,), episodes=2, replans=3, plant_effects=drifting)
+    told = study_effects(path, [], AnalysisSettings())
+    assert any(note.startswith("unchanged changes nothing") for note in told.notes)
+    assert not any("unchanged" in note for note in study_effects(store, [], AnalysisSettings()).notes)
+    assert "unchanged" not in {condition.name for condition in told.conditions}
