@@ -26,11 +26,14 @@ from vla_attention.analyze.api import OpenStores
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.seal import SEAL_FILE
+from vla_attention.schemas.stores.store_format import CHANGE, CUT
 from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
-from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.stores import StoreSpec, small_effects, write_store
 
 #: Small enough that every analysis takes some hundredths of a second.
-SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, layers=(0, 2), heads=(0, 1), contributions=True)
+SPEC = StoreSpec(
+    tasks=(0, 1), episodes=2, replans=2, layers=(0, 2), heads=(0, 1), contributions=True, plant_effects=small_effects
+)
 _EPISODE = re.compile(r"episodes/(?:task\d+_\d+/)?(?P<episode>task\d+_episode\d+)(?:\.zip|/(?P<inner>.*))")
 
 
@@ -65,6 +68,7 @@ KINDS: tuple[FileKind, ...] = (
     FileKind("roles of keys", _IN_EPISODE + r"[^/]+/key_role/.*", ("spans", "words")),
     FileKind("contributions", _IN_EPISODE + r"[^/]+/contribution/.*", ("contributions",)),
     FileKind("state and actions", _IN_EPISODE + r"(state|actions|dataset_actions)/.*", ("time", "rest")),
+    FileKind("effects", _IN_EPISODE + r"(effects|[^/]+/cut)/.*", ("rest",)),
     FileKind("pictures", _IN_EPISODE + r"(camera_)?frames/.*", ("rest",)),
     FileKind("coverage by objects", _IN_EPISODE + r"objects/.*", ("objects",)),
 )
@@ -81,7 +85,9 @@ def _rest(run: OpenStores, site: str) -> dict[str, Any]:
         for store in run.stores
         for episode in store.episodes
         for name in episode.attributes.arrays
-        if name in ("state", "actions", "dataset_actions") or name.startswith(("frames/", "camera_frames/"))
+        if name in ("state", "actions", "dataset_actions", CHANGE)
+        or name.startswith(("frames/", "camera_frames/"))
+        or name.endswith(f"/{CUT}")
     }
 
 

@@ -44,10 +44,19 @@ from vla_attention.schemas.stores.seal import SEAL_FILE, read_seal
 from vla_attention.schemas.stores.seal_content import FileRecord
 from vla_attention.schemas.stores.shards import SealedShard, ShardedLayers, index_size
 from vla_attention.schemas.stores.zip_members import ZipMembers
-from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.stores import StoreSpec, small_effects, write_store
 from vla_attention.testing.tokens import small_tokens
 
-SPEC = StoreSpec(tasks=(0,), episodes=1, replans=3, layers=(0, 2), heads=(0,), coverage=False, frames=False)
+SPEC = StoreSpec(
+    tasks=(0,),
+    episodes=1,
+    replans=3,
+    layers=(0, 2),
+    heads=(0,),
+    coverage=False,
+    frames=False,
+    plant_effects=small_effects,
+)
 _ROWS = "joint/rows"
 _TABLE = "data/chunk-000/episode_000000.parquet"
 #: A pattern of bytes that no decoded chunk has; what was there before must never pass for attention.
