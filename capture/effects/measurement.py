@@ -25,8 +25,10 @@ from vla_attention.capture.interventions.resolution import (
 from vla_attention.capture.policies.policy import CallVariant, Policy, PolicyInput, UnitsPolicy, VariantPolicy
 from vla_attention.capture.store.replan_records import ReplanEffects
 from vla_attention.schemas.effects import EffectsRecorded
+from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
 from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.stores.store_format import episode_name
 
 #: Calls that are made at a time, at most; more gain nothing, and a family takes fewer where its model is large.
 MOST_CALLS = 32
@@ -49,6 +51,8 @@ class EffectMeasurement:
     planned: EffectsRecorded
     siblings: Mapping[int, Sequence[str]]
     say: Callable[[str], None]
+    #: Replans whose effects were refused.
+    refused: int = field(default=0, init=False)
     #: What each replan with effects took.
     seconds: list[float] = field(default_factory=list, init=False)
     _batch: int = field(default=MOST_CALLS, init=False)
@@ -193,7 +197,11 @@ class EpisodeEffectsMeasured:
                 return None
         if condition.changes_input:
             changed = changed_inputs(policy_input.given, condition, policy.sites, context)
-            exchanged = policy.prepare_again(changed)
+            try:
+                exchanged = policy.prepare_again(changed)
+            except UserError as error:  # a prompt that the policy has no encoding of
+                self.run.say_once(f"'{condition.name}' is left out of the effects: {error}")
+                return None
             if any((exchanged.key_role[site] != roles).any() for site, roles in policy_input.key_role.items()):
                 self.run.say_once(
                     f"'{condition.name}' is not measured where the prompt would have another number of tokens."
@@ -219,11 +227,13 @@ class EpisodeEffectsMeasured:
         difference = float(np.abs(changes[unchanged]).max(initial=0.0))
         if difference <= MOST_DIFFERENCE:
             return finite
-        self.run.say_once(
-            f"The effects of replan {context.replan} of task {context.task_id} episode {context.episode_index} are "
-            f"refused: among the changed calls the unchanged one differs by {difference:.2g} of normalised actions, "
-            f"allowed is {MOST_DIFFERENCE:g}."
-        )
+        if not self.run.refused:
+            self.run.say(
+                f"The effects of replan {context.replan} of {episode_name(context.task_id, context.episode_index)} are "
+                f"refused: among the changed calls the unchanged one differs by {difference:.2g} of normalised "
+                f"actions, allowed is {MOST_DIFFERENCE:g}. Of further ones the store alone says so."
+            )
+        self.run.refused += 1
         return [unchanged]
 
 

@@ -246,6 +246,25 @@ def test_words_are_exchanged_for_those_in_their_places():
     ]
 
 
+def test_a_prompt_that_the_policy_cannot_read_is_left_out(monkeypatch):
+    policy = policy_named("pi05")
+    given, context, actions = call_of(policy)
+    again = type(policy).prepare_again
+
+    def knows_its_own(self, changed):
+        if "blue" in changed.instruction:
+            raise BadArgument("There is no text embedding of this instruction.")
+        return again(self, changed)
+
+    monkeypatch.setattr(type(policy), "prepare_again", knows_its_own)
+    run = measurement(policy)
+    effects = run.begin().measure(given, 11, actions, context)
+    names = {effects.conditions[number].name for number in effects.measured}
+    assert "prompt_synonyms_red_blue" not in names
+    assert "without_word_red" in names
+    assert any("no text embedding" in line for line in run.lines)
+
+
 def test_siblings_are_of_one_family():
     tasks = [(0, "a", "one"), (1, "b", "one"), (2, "c", ""), (3, "d", ""), (4, "a", "one")]
     assert siblings_of(tasks) == {0: ("b", "a"), 1: ("a",), 2: (), 3: (), 4: ("a", "b")}
