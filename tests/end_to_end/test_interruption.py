@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -32,8 +33,14 @@ NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2")
 
 def test_sigterm_drops_the_episode_in_flight_and_resuming_completes_the_store(tmp_path):
     store = tmp_path / "a.zarr"
-    arguments = [*DUMMY, "--num-episodes", "2", "--max-steps", "32", "--store", str(store)]
+    arguments = [*DUMMY, "--num-episodes", "3", "--max-steps", "32", "--store", str(store)]
     log = tmp_path / "log"
+
+    def in_a_later_episode() -> bool:
+        names = [holder.episode for holder in holders(store)]
+        partial = list((tmp_path / "a.zarr.partial").glob("task*"))
+        return len(names) == len(partial) == 1 and partial[0].name.startswith(f"{names[0]}-") and names[0][-1] != "0"
+
     with log.open("w") as out:
         process = subprocess.Popen(
             [sys.executable, "-m", "vla_attention.capture", *arguments],
@@ -42,22 +49,27 @@ def test_sigterm_drops_the_episode_in_flight_and_resuming_completes_the_store(tm
             env=os.environ | {"MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl"), "SLURM_JOB_ID": ""},
         )
         until = time.monotonic() + 120
-        while not list((tmp_path / "a.zarr.partial").glob("task000_episode001-*")):
+        while not in_a_later_episode():
             assert process.poll() is None, log.read_text()
             assert time.monotonic() < until, log.read_text()
             time.sleep(0.02)
-        assert [holder.episode for holder in holders(store)] == ["task000_episode001"]
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == EXIT_TERMINATED, log.read_text()
     printed = log.read_text()
-    assert "Stopped by SIGTERM: dropped task000_episode001 at step" in printed
-    assert "committed 1 episode (task000_episode000); 1 of this process's 2 are missing" in printed
+    dropped = re.search(r"Stopped by SIGTERM: dropped task000_episode00([12]) at step", printed)
+    assert dropped, printed
+    number = int(dropped[1])  # on a busy machine the signal may come an episode later
+    committed = {
+        1: "committed 1 episode (task000_episode000); 2 of this process's 3 are missing",
+        2: "committed 2 episodes (task000_episode000, task000_episode001); 1 of this process's 3 are missing",
+    }
+    assert committed[number] in printed
     assert "Traceback" not in printed
     assert "\r" not in printed  # no progress bar in a file
     assert not (tmp_path / "a.zarr.partial").exists()
     assert holders(store) == []
     (task,) = store_status(store).tasks
-    assert (task.committed, task.expected, task.missing) == (1, 2, (1,))
+    assert (task.committed, task.expected, task.missing) == (number, 3, tuple(range(number, 3)))
     assert f"process {process.pid}" in task.last_by
 
     assert capture([*arguments, "--resume"]) == 0

@@ -62,6 +62,7 @@ def test_a_hostile_data_set_is_refused_with_a_sentence(results, name):
     assert len(said) < 15_000
     assert result["episodes"] == 0
     # The model is built for those whose pictures are wrong; the time for it is that of a data set that is replayed.
+    # A processor that others use too takes longer for the same work, so that a refusal may take a few times as long.
     usual = min(results[good]["processor_seconds"] for good in GOOD)
-    assert result["processor_seconds"] < usual + MOST_SECONDS
+    assert result["processor_seconds"] < 3 * usual + MOST_SECONDS
     assert result["bytes"] < MOST_BYTES

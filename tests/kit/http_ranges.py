@@ -98,8 +98,9 @@ def serve(folder: Path) -> Iterator[Served]:
             self.send_header("Content-Length", str(len(content if served.announce else changed)))
             self.end_headers()
             if self.command == "GET":
-                self.wfile.write(changed)
+                # Counted first: a test may look as soon as it has the answer.
                 served.sent[path] = served.sent.get(path, 0) + len(changed)
+                self.wfile.write(changed)
             if served.announce and len(changed) != len(content):
                 self.close_connection = True
 

@@ -70,6 +70,13 @@ def view(browser, server) -> Iterator[Watched]:
         assert watched.requests_beside(server.link) == []
 
 
+def wait_for_ratios(view: Watched, episodes: int) -> None:
+    """Wait until the list shows a ratio of every episode: it asks for them beside what the page shows."""
+    view.page.wait_for_function(
+        "all => document.querySelectorAll('.episodes li .ratio:not([data-ratio=\"\"])').length === all", arg=episodes
+    )
+
+
 def masses(store: Path, replan: int, **cell: int) -> dict[str, float]:
     """Python's masses of the groups in the first episode, means over the layers, denoise steps and heads of a cell."""
     steps = va.open(store).masses("steps", per_head=True, tasks=0).filter(episode_index=0, replan=replan)
@@ -196,6 +203,7 @@ def test_it_plays_to_the_end(view, server):
 def test_the_list_has_pythons_ratios_and_is_searched(view, server, store):
     assert server.stores[0].summary.wait() is None
     view.open(server.link)
+    wait_for_ratios(view, 4)
     assert view.page.locator(".episodes li").count() == 4
     expected = va.open(store).ratios("episodes").filter(layer="layers_avg").sort("task_id", "episode_index")
     for i, row in enumerate(expected.iter_rows(named=True)):
@@ -320,6 +328,7 @@ def test_texts_of_a_store_are_text(browser, tmp_path):
     with served(store, summaries=True) as running, watched_page(browser) as watched:
         running.stores[0].summary.wait()
         watched.open(running.link)
+        wait_for_ratios(watched, 1)
         assert watched.complaints == []
         assert watched.requests_beside(running.link) == []
         assert watched.page.locator("img, iframe, object, embed, script:not([src])").count() == 0

@@ -423,11 +423,11 @@ def test_simulators_that_share_a_task_of_libero_give_the_published_episodes(libe
 class Run:
     """A capture with two simulators in a process of its own, and what the operating system knows of it."""
 
-    def __init__(self, folder: Path, max_steps: int) -> None:
+    def __init__(self, folder: Path, max_steps: int, episodes: int = 3) -> None:
         self.store, self.log, self.temporary = folder / "a.zarr", folder / "log", folder / "temporary"
         self.temporary.mkdir()
-        words = ["--task-suite", "robosuite", "--task-id", "0", "--num-episodes", "3", "--num-envs", "2"]
-        words = [*TINY[:-1], str(max_steps), *words, "--store", str(self.store)]
+        words = [*TINY[:-1], str(max_steps), "--task-suite", "robosuite", "--task-id", "0", "--num-envs", "2"]
+        words += ["--num-episodes", str(episodes), "--store", str(self.store)]
         with self.log.open("w") as out:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "vla_attention.capture", *words],
@@ -466,7 +466,7 @@ def _is_simulator(number: str | int) -> bool:
     ("number", "code"), [(signal.SIGTERM, EXIT_TERMINATED), (signal.SIGINT, 130), (signal.SIGKILL, -9)]
 )
 def test_a_stopped_capture_leaves_no_half_episode_and_no_process(number, code, tmp_path):
-    run = Run(tmp_path, max_steps=400)
+    run = Run(tmp_path, max_steps=100_000)  # no episode ends before the signal
     run.wait_until(run.both_are_in_an_episode)
     children = run.simulators()
     assert len(children) == 2
@@ -491,7 +491,7 @@ def test_a_stopped_capture_leaves_no_half_episode_and_no_process(number, code, t
 
 @pytest.mark.simulator
 def test_a_killed_simulator_is_replaced(tmp_path):
-    run = Run(tmp_path, max_steps=40)
+    run = Run(tmp_path, max_steps=16, episodes=8)  # whenever the kill comes, the simulator has an episode to begin
     run.wait_until(run.both_are_in_an_episode)
     victim = run.simulators()[0]
     folders = list(run.temporary.glob("vla-simulator-*"))

@@ -41,11 +41,14 @@ def test_a_stopped_analysis_says_it_once(tmp_path, monkeypatch, capfd, number, c
     monkeypatch.setattr(command, "sys", SimpleNamespace(executable=str(program)))
     arguments = SimpleNamespace(family=SimpleNamespace(analysis_arguments=lambda given: []), save_viz=False)
 
-    waits, wait = threading.Event(), subprocess.Popen.wait
+    waits = threading.Event()
 
     def waiting(process: subprocess.Popen, timeout: float | None = None) -> int:
+        """Wait in short steps: a signal right before one long wait would be handled only after it."""
         waits.set()
-        return wait(process, timeout)
+        while process.poll() is None:
+            time.sleep(0.01)
+        return process.returncode
 
     monkeypatch.setattr(subprocess.Popen, "wait", waiting)
 

@@ -70,7 +70,7 @@ def test_a_silent_holder_is_replaced_and_its_partial_episode_removed(tmp_path):
     others = [mine.replace(*change) for change in changes]
     for folder in (mine, *others):
         (tmp_path / "a.zarr.partial" / folder).mkdir(parents=True)
-    age(tmp_path, 299)
+    age(tmp_path, 240)
     assert second.acquire(NAME) is not None
     age(tmp_path, 301)
     assert second.acquire(NAME) is None

@@ -1,10 +1,9 @@
 """The embedded policy: it is reproducible, has the reference's layout, and its attention has structure."""
 
-import time
-
 import numpy as np
 import pytest
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 from tests.kit.policy_inputs import make_observation
 from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, build_random_model, builtin_stats
@@ -16,6 +15,8 @@ from vla_attention.schemas.layout import Role
 INSTRUCTION = "put the black bowl on the plate"
 #: of EMBEDDED_CONFIG with seed 0; after a change, earlier stores cannot be compared with new ones
 DIGEST = "52e970b88c6dc94d0d9dbf2bd2c15b2c836c48cbd384238e8482666954ed798b"
+#: Floating point operations of a replan in products of matrices; they took 0.4 s and 15 ms of one processor.
+OPERATIONS = {"embedded": 5_037_842_432, "dummy": 3_768_960}
 
 
 def record(policy, observation, instruction=INSTRUCTION, seed=0):
@@ -84,12 +85,12 @@ def test_actions_stay_near_the_built_in_ranges(embedded, observation):
     assert np.abs((chunks - middle) / half).mean() < 1.5
 
 
-@pytest.mark.parametrize("name", ["embedded", "dummy"])
+@pytest.mark.parametrize("name", OPERATIONS)
 def test_a_replan_is_quick(request, observation, name):
+    """Operations are counted: the time for them depends on the machine and on what else it does."""
     policy = request.getfixturevalue(name)
     given = policy.prepare(observation, INSTRUCTION)
-    policy.act(given, 0)
-    start = time.process_time()
-    policy.act(given, 0)
-    # processor time of one thread, which a busy machine does not change much: 0.4 s and 15 ms were measured
-    assert time.process_time() - start < (1.5 if name == "embedded" else 0.2)
+    with FlopCounterMode(display=False) as counter:
+        policy.act(given, 0)
+    # The lower limit shows that the counter sees them.
+    assert 0.8 * OPERATIONS[name] < counter.get_total_flops() < 1.2 * OPERATIONS[name]
