@@ -208,9 +208,9 @@ def test_memory_that_does_not_suffice_makes_batches_smaller(monkeypatch):
     monkeypatch.setattr(type(policy), "act_variants", as_if_small)
     most, run = 8, measurement(policy)
     assert len(run.begin().measure(given, 11, actions, context).measured) > 1
-    assert sizes == [32, 16, 8]
+    assert sizes == [64, 32, 16, 8]
     run.begin().measure(given, 11, actions, context)
-    assert sizes == [32, 16, 8, 8]
+    assert sizes == [64, 32, 16, 8, 8]
     most, run = 0, measurement(policy)
     assert run.begin().measure(given, 11, actions, context).measured == ()
     assert "The memory does not suffice for the effects of a single call: they are left out." in run.lines
