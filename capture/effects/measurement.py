@@ -30,8 +30,8 @@ from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.stores.store_format import episode_name
 
-#: Calls that are made at a time, at most; a family takes fewer where its model is large. With 32 effects take 8 % longer,
-#: with 8 a third.
+#: Calls that are made at a time, at most; a family takes fewer where its model is large. With 32, effects take 8 %
+#: longer, with 8 a third.
 MOST_CALLS = 64
 #: Largest difference, in normalised actions, of the unchanged call from the same call among the changed ones. A model
 #: in float32 leaves 1e-6. Beyond it something else than rounding differs, and the effects of the replan are refused.
