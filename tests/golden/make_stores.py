@@ -36,6 +36,9 @@ def make_stores(folder: Path) -> None:
     copy_store(open_store(folder / "joint.zarr"), folder / "packed.zarr", (), packed=True)
     changes = ("--check", "0", "--knockout", "camera:base_0_rgb")
     _run("rerun", str(folder / "joint.zarr"), *changes, "--store", str(folder / "rerun.zarr"))
+    effects = ("--effects", "text,objects", "--effects-readers", "all", "action", "pictures", "text", "--check", "0")
+    little = ("--layers", "0", "--denoise-steps", "last", "--no-frames", "--no-contributions")
+    _run("rerun", str(folder / "joint.zarr"), *effects, *little, "--store", str(folder / "effects.zarr"))
     (masks,) = (case for case in TABLE["stored"] if case["name"] == "masks differ along every axis")
     write_case(folder / "masks.zarr", masks, masks["weights"])
     for name in STORES[STORE_VERSION]:

@@ -18,7 +18,8 @@ FOLDER = GOLDEN / "stores" / "version1"
 #: rerun: the policy calls of `joint` without one of its cameras.
 NAMES = ("joint", "cosmos", "library", "packed", "rerun")
 #: By version. masks: queries, layers, heads, denoise steps and replans see different keys, which version 1 cannot say.
-STORES = {1: NAMES, 2: (*NAMES, "masks")}
+#: effects: the policy calls of `joint` again, with the effects of words and objects for all four readers.
+STORES = {1: NAMES, 2: (*NAMES, "masks", "effects")}
 GOLDEN_STORES = [(version, name) for version, names in STORES.items() for name in names]
 
 
@@ -42,6 +43,9 @@ def numbers_of(path: Path) -> dict[str, pl.DataFrame]:
             f"{site.name}_masses": run.masses("replans", **asked),
             f"{site.name}_heads": run.heads(**asked),
         }
+    if run.stores[0].attributes.recording.effects is not None:
+        kept = ["task_id", "episode_index", "condition", "num_replans", "effect", "effect_chunk", "keys", "lift"]
+        tables["effects"] = run.effects(table="episodes").filter(pl.col("phase") == "all").select(kept)
     return {name: table for name, table in tables.items() if table.width}
 
 
