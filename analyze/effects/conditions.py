@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Literal
 
+from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, queries_suffix, readers
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store
@@ -28,6 +31,11 @@ class Kind(StrEnum):
 _PREFIXES = ("without_", "only_", "random_")
 #: Kinds that others are measured against.
 FLOORS = (Kind.NOISE, Kind.RANDOM)
+
+
+#: Who no longer reads an item. `total`: nobody reads it. `direct`: the action queries alone do not.
+Reader = Literal["total", "direct", "pictures", "text"]
+READERS: tuple[Reader, ...] = ("total", "direct", "pictures", "text")
 
 
 @dataclass(frozen=True)
@@ -117,6 +125,45 @@ class Condition:
         return {self.kind, other.kind} == {Kind.WITHOUT, Kind.ONLY} and (
             _not_kept(self.interventions) == _not_kept(other.interventions)
         )
+
+
+def reader_of(condition: Condition) -> Reader | None:
+    """Who no longer reads the keys of a condition; None where it is nobody, or somebody else."""
+    if len(condition.interventions.keys) != 1:
+        return None
+    knockout = condition.interventions.keys[0]
+    if knockout.queries == "prefix":
+        return "pictures" if knockout.query_selector == "role:image" else "text" if knockout.query_selector else None
+    return "total" if knockout.queries == "all" else "direct"
+
+
+def selector_kind(condition: Condition) -> str:
+    """The kind of the one selector that a condition's group is made of: `word`, `camera`; empty for a composed one."""
+    if condition.group is None:
+        return ""
+    try:
+        atoms = [atom for text in condition.group.selectors for atom in atoms_of(parse_selector(text))]
+    except UserError:
+        return ""
+    return atoms[0].kind if len(atoms) == 1 else ""
+
+
+def item_name(condition: Condition) -> str:
+    """`'red'` for a word's group, `agentview` for a camera's: the name without the kind that stands before it."""
+    kind, name = selector_kind(condition), condition.group_name
+    bare = name.removeprefix(f"{kind}_") if kind else name
+    return f"'{bare}'" if kind == "word" else bare
+
+
+def change_name(condition: Condition) -> str:
+    """A short name of a change of words or pictures that was recorded; that of the condition for everything else."""
+    given = condition.interventions
+    if not condition.recorded:
+        return condition.name
+    if given.prompt is not None and given.prompt.kind == "synonyms":
+        return visible(", ".join(f"'{word}' as '{other}'" for word, other in given.prompt.synonyms.items()))
+    blank = [change.camera for change in given.images if change.kind == "blank"]
+    return visible(f"{blank[0]} grey") if len(blank) == len(given.images) == 1 else condition.name
 
 
 def kind_of(interventions: Interventions) -> Kind:

@@ -7,7 +7,7 @@ that of another noise seed and with that of equally many random keys.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -38,6 +38,7 @@ from vla_attention.analyze.effects.paired_replans import (
 from vla_attention.analyze.effects.reruns import BaseAndReruns, open_reruns
 from vla_attention.analyze.effects.rollouts import ROLLOUT_COLUMNS, rollout_pairs, rollout_summary
 from vla_attention.analyze.effects.same_calls import held_by_one
+from vla_attention.analyze.effects.sums import sums_of_groups
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
@@ -86,6 +87,7 @@ class EffectStudy:
             other instructions, are left out, and episodes of which nothing is left.
         rollout_episodes: one row per (condition, pair of rollouts), see `rollouts.rollout_pairs`.
         notes: what was left out, and what is not there.
+        sums: of recorded effects, for groups that were not measured together; see `sums.sums_of_groups`.
     """
 
     analysis: Analysis
@@ -95,6 +97,7 @@ class EffectStudy:
     episodes: pl.DataFrame
     rollout_episodes: pl.DataFrame
     notes: tuple[str, ...]
+    sums: pl.DataFrame = field(default_factory=pl.DataFrame)
 
     @property
     def question(self) -> Question:
@@ -193,6 +196,7 @@ def study_of(analysis: Analysis, opened: BaseAndReruns, dimensions: Sequence[int
         if rollouts
         else pl.DataFrame(schema=ROLLOUT_COLUMNS),
         notes=(*notes, *_notes(pairings, attention), *drifts, *unpaired),
+        sums=sums_of_groups(question, members, spread, opened.reruns),
     )
 
 

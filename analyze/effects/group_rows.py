@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from vla_attention.analyze.effects.conditions import Condition, Kind
+from vla_attention.analyze.effects.conditions import Condition, Kind, Reader, item_name, reader_of
 from vla_attention.analyze.effects.effect_study import EffectStudy
 from vla_attention.analyze.effects.group_attention import MEASURES
-from vla_attention.analyze.effects.item_rows import Reader, item_name, reader_of
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.effects.conditions import Condition, Kind
+from vla_attention.analyze.effects.conditions import Condition, Kind, change_name, reader_of
 from vla_attention.analyze.effects.effect_study import EffectStudy
 from vla_attention.analyze.effects.group_rows import group_rows
-from vla_attention.analyze.effects.item_rows import change_name, item_rows, reader_of
+from vla_attention.analyze.effects.item_rows import item_rows
 from vla_attention.analyze.show.numbers import format_number, interval_name, of_tasks, row_interval
 from vla_attention.analyze.show.plot_axes import legend_above, note_at_row, ratio_axis, uniform_line
 from vla_attention.analyze.show.plot_colours import NOTE_COLOR, STRIPE_COLOR

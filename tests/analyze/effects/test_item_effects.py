@@ -14,7 +14,9 @@ from vla_attention.analyze.effects.item_rows import item_rows, ratio_of_effects
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.capture.interventions.condition_name import knockout_of_group
 from vla_attention.capture.store.replan_records import ReplanEffects
+from vla_attention.schemas.groupings.words import words_of
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange
+from vla_attention.schemas.layout import Role
 from vla_attention.testing.stores import StoreSpec, write_store
 from vla_attention.testing.tokens import INSTRUCTIONS
 
@@ -62,7 +64,16 @@ def effects_of(task: int, episode: int, replan: int, tokens) -> ReplanEffects:
             measured.append(number)
             signs = np.random.default_rng([task, episode, replan, number]).choice([-1.0, 1.0], (5, 7))
             changes.append(size * signs)
+    roles = tokens.key_role[replan]
+    keys_of = {"visual": roles == Role.IMAGE, "linguistic": np.isin(roles, [Role.INSTRUCTION, Role.TEMPLATE])}
+    for word in words_of(tokens.prompts[tokens.prompt_index[replan]]):
+        of_word = keys_of.setdefault(f"word_{word.text}", np.zeros(len(roles), dtype=bool))
+        of_word[list(word.keys)] = True
     cut = np.zeros((len(measured), tokens.layout.num_keys), np.float32)
+    for row, number in zip(cut, measured, strict=True):
+        name = list(all_of)[number]
+        if name.startswith("without_"):
+            row[:] = keys_of[name.removeprefix("without_").split("_queries")[0]]
     listed = tuple(one for one, _ in all_of.values())
     change = np.array(changes, np.float32)
     return ReplanEffects(listed, (3.0,) * 7, tuple(measured), change, {"joint": cut})
@@ -140,3 +151,37 @@ def test_the_unchanged_call_is_told_of_when_it_is_not_the_same(store, tmp_path):
     assert any(note.startswith("unchanged changes nothing") for note in told.notes)
     assert not any("unchanged" in note for note in study_effects(store, [], AnalysisSettings()).notes)
     assert "unchanged" not in {condition.name for condition in told.conditions}
+
+
+def test_a_group_that_was_not_measured_has_the_sums_of_its_words(store):
+    first, second = INSTRUCTIONS[0].split()[0], INSTRUCTIONS[0].split()[2]
+    groups = (f"two=word:{first} | word:{second}", f"one=word:{INSTRUCTIONS[0].split()[-1]}", "rest=*")
+    study = study_effects(store, [], AnalysisSettings(groups=groups, ratio="two/one"))
+    spread = study.spread.spread
+    assert set(study.sums["group"]) == {"two"}
+    total = study.sums.filter(reader="total")
+    assert set(total["num_items"]) == {2.0}
+    names = list(conditions())
+    for row in total.to_dicts():
+        episode = (row["task_id"], row["episode_index"])
+        numbers = [names.index(f"without_word_{word}_queries_all") for word in (first, second)]
+        drawn = [
+            [
+                ITEMS[f"word_{word}"][1]["total"]
+                * np.random.default_rng([*episode, replan, number]).choice([-1.0, 1.0], (5, 7))
+                for word, number in zip((first, second), numbers, strict=True)
+            ]
+            for replan in range(4)
+        ]
+        sizes = 3.0 * np.array(drawn) / spread
+        together = np.sqrt((sizes.sum(axis=1) ** 2).mean(axis=(1, 2))).mean()
+        apart = np.sqrt((sizes**2).mean(axis=(2, 3))).sum(axis=1).mean()
+        # The last chunk of an episode of an odd number is executed but for its last step.
+        assert row["size_of_sum"] == pytest.approx(together, rel=0.05)
+        assert row["sum_of_sizes"] == pytest.approx(apart, rel=1e-6)
+    assert total.height == 4
+
+
+def test_no_group_of_half_words_has_sums(store):
+    groups = (f"part=word:{FIRST} | role:template", "v=role:image", "rest=*")
+    assert study_effects(store, [], AnalysisSettings(groups=groups, ratio="v/part")).sums.is_empty()
