@@ -270,8 +270,12 @@ def test_siblings_are_of_one_family():
     assert siblings_of(tasks) == {0: ("b", "a"), 1: ("a",), 2: (), 3: (), 4: ("a", "b")}
 
 
-def test_what_a_policy_has_not_is_refused():
+def test_what_a_policy_has_not_is_refused(monkeypatch):
     policy = policy_named("pi05")
+    with monkeypatch.context() as patch:
+        patch.setattr(policy.model, "compiled_steps", object())
+        with pytest.raises(BadArgument, match="with compiled denoise steps"):
+            planned_effects(EffectSettings(("text",)), policy, 0)
     with pytest.raises(BadArgument, match="denoise steps"):
         planned_effects(EffectSettings(("text",), denoise_steps=99), policy, 0)
     with pytest.raises(BadArgument, match="no prefix"):
