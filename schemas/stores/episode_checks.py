@@ -168,7 +168,7 @@ def _token_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[st
         roles = episode.read(f"{site.name}/key_role")
         yield from role_problems(site, roles)
         of_site = [prompt_at(root.sites, site, prompt) for prompt in prompts]
-        for replan, number in enumerate(index):
+        for replan, number in enumerate(index[: len(roles)]):  # another length is named with the shapes
             yield from piece_role_problems(site, roles[replan], of_site[number], replan, only_site=only_site)
 
 
