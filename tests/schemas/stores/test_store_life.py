@@ -7,7 +7,7 @@ import os
 import shutil
 import zipfile
 from collections.abc import Callable
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import pytest
@@ -179,7 +179,11 @@ class StoreLife(RuleBasedStateMachine):
         opened = open_store(self.folder / store)
         found = {episode.name for episode in opened.episodes if episode_report(opened, episode, quick=quick).problems}
         assert found == {episode_name(0, number) for number in self.damaged(store, quick)}
-        assert store_faults(opened) == []
+        # A copy that died between a zip and its index left one that no index lists.
+        zips = {path.relative_to(self.folder / store).as_posix() for path in (self.folder / store).rglob("*.zip")}
+        listed = {episode_name(0, number) for number in self.model[store]}
+        unlisted = {path for path in zips if PurePosixPath(path).stem not in listed}
+        assert {fault.where for fault in store_faults(opened)} == unlisted
 
     @rule(data=st.data(), verify=st.booleans())
     def repair(self, data: st.DataObject, verify: bool) -> None:
