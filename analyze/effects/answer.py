@@ -69,11 +69,17 @@ def item_lines(study: EffectStudy, items: Sequence[ItemRow]) -> list[str]:
 def _deciding(words: Sequence[ItemRow]) -> str:
     """The word with the largest effect, and by which way the words with large effects reach the action."""
     first = words[0]
-    said = f"{first.name} does most of {plural(len(words), 'word')}: without it the action changes by "
+    total = "total" in first.by_reader
+    said = f"{first.name} has the largest effect of {plural(len(words), 'word')}: "
+    said += f"{'without it' if total else 'hidden from the action queries,'} the action changes by "
     said += f"{_effect(first.strongest)} of its spread."
     large = [word for word in words if _at_least_half(word.strongest["effect"], first.strongest["effect"])]
+    large = [word for word in large if (word.strongest["minus_noise"] or 0.0) > 0]
+    if not large:
+        return f"{said} Another noise seed changes it as much."
+    large = [word for word in large if {"total", "direct"} <= set(word.by_reader)]
     own = [word for word in large if _at_least_half(word.effect("direct"), word.effect("total"))]
-    others = [word for word in large if word not in own and word.effect("direct") is not None]
+    others = [word for word in large if word not in own]
     through = [word for word in others if _at_least_half(word.effect("pictures"), word.effect("total"))]
     parts = [f"the action queries read {_names(own)} themselves"] if own else []
     if through:

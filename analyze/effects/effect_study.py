@@ -174,13 +174,16 @@ def study_of(analysis: Analysis, opened: BaseAndReruns, dimensions: Sequence[int
     groups = [condition.group for condition in opened.reruns if condition.group is not None]
     attention = group_attention(question, groups, everything) if groups else {}
     measured = _measured(pairings, members, spread, attention)
-    left_out = _left_out([pairing for pairing, rows in measured if not rows.height])
-    if left_out and not any(rows.height for _, rows in measured) and not opened.rollouts:
-        raise BadArgument(f"No rerun of {opened.base.path} can be compared: {' '.join(left_out)}")
-    notes += left_out
     drifts = _drifts(pairings, spread)
     unlike = (Kind.NOTHING, True)
     measured = [(one, rows) for one, rows in measured if (one.condition.kind, one.condition.recorded) != unlike]
+    left_out = _left_out([pairing for pairing, rows in measured if not rows.height])
+    if not any(rows.height for _, rows in measured) and not opened.rollouts:
+        if any(pairing.condition.recorded for pairing in pairings):
+            said = " ".join(drifts) or "None was measured in a selected replan."
+            raise BadArgument(f"No effect that {opened.base.path} holds can be shown. {said}")
+        raise BadArgument(f"No rerun of {opened.base.path} can be compared: {' '.join(left_out)}")
+    notes += left_out
     pairings = [pairing for pairing, rows in measured if rows.height]
     opened = replace(opened, reruns=tuple(pairing.condition for pairing in pairings))
     episodes = pl.concat([pl.DataFrame(schema=_EPISODE_SCHEMA), *(rows for _, rows in measured)])
@@ -219,9 +222,13 @@ def _all_episodes(question: Question, base: Store) -> list[SelectedEpisode]:
 
 def _left_out(pairings: Sequence[Pairing]) -> list[str]:
     """Why conditions without any compared replan are left out: a sentence for each reason."""
-    elsewhere = [pairing.condition.name for pairing in pairings if not pairing.pairs]
-    empty = [pairing.condition.name for pairing in pairings if pairing.pairs]
+    reruns = [pairing for pairing in pairings if not pairing.condition.recorded]
+    elsewhere = [pairing.condition.name for pairing in reruns if not pairing.pairs]
+    empty = [pairing.condition.name for pairing in reruns if pairing.pairs]
+    recorded = [one.condition for one in pairings if one.condition.recorded]
+    never = [condition.name for condition in recorded if condition.kind != Kind.NOTHING]
     reasons = (
+        (never, "not measured in any selected replan."),
         (elsewhere, "none of the selected episodes was run again."),
         (empty, "in the replans that are compared, the group has no key in the base."),
     )
@@ -327,13 +334,14 @@ def _rows_of_pair(
     group = condition.group
     actions = actions_of(base, rerun, condition, recorded)
     changes = changes_of(base, actions, spread)
-    has_keys = _has_keys(attention, len(changes), condition.kind) & np.isfinite(actions).all(axis=(1, 2))
+    measured = np.isfinite(actions).all(axis=(1, 2))
+    has_keys = _has_keys(attention, len(changes), condition.kind) & measured
     if not has_keys.any():
         return []
     changes[~has_keys] = np.nan
     values = {name: changes[:, i] for i, name in enumerate(CHANGES)}
     if attention is not None:
-        values |= {name: attention[:, i] for i, name in enumerate(MEASURES)}
+        values |= {name: np.where(measured, attention[:, i], np.nan) for i, name in enumerate(MEASURES)}
     attributes = base.item.episode.attributes
     named = {
         "suite": base.item.store.suite,
@@ -426,7 +434,7 @@ def with_floors(episodes: pl.DataFrame, conditions: Sequence[Condition]) -> pl.D
     for condition in conditions:
         names = [other.name for other in conditions if other.is_control_of(condition)]
         among = episodes.filter(pl.col("condition").is_in(names))
-        if not names and condition.recorded and condition.kind == Kind.WITHOUT:
+        if condition.recorded and condition.kind == Kind.WITHOUT:
             among = _nearest_controls(episodes, condition, conditions, place)
         controlled = among.group_by(place).agg(effect.alias("random"))
         controls.append(controlled.with_columns(pl.lit(condition.name).alias("condition")))

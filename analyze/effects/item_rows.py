@@ -42,7 +42,7 @@ class ItemRow:
 
 
 def item_rows(study: EffectStudy) -> list[ItemRow]:
-    """A row for every group of keys that was cut off for two readers or more, the largest effect first."""
+    """A row for every group of keys that was cut off, the largest effect first; of reruns, for two readers or more."""
     by_name: dict[str, dict[Reader, dict[str, Any]]] = {}
     named: dict[str, Condition] = {}
     for condition in study.of_kind(Kind.WITHOUT):
@@ -53,7 +53,7 @@ def item_rows(study: EffectStudy) -> list[ItemRow]:
     rows = [
         ItemRow(item_name(named[name]), selector_kind(named[name]), rows)
         for name, rows in by_name.items()
-        if len(rows) > 1
+        if len(rows) > 1 or study.is_recorded
     ]
     rows = [row for row in rows if {"total", "direct"} & set(row.by_reader)]
     return sorted(rows, key=lambda row: -(row.strongest["effect"] or 0.0))

@@ -31,7 +31,7 @@ _STYLES: dict[str, dict[str, Any]] = {
     "without": {"color": "#D55E00", "marker": "o", "label": "without it"},
     "direct": {"color": "#CC79A7", "marker": "v", "label": "for the action queries"},
     "only": {"color": "#0072B2", "marker": "s", "markerfacecolor": "white", "label": "with it alone"},
-    "random": {"color": "#4D4D4D", "marker": "x", "label": "random keys, as many"},
+    "random": {"color": "#4D4D4D", "marker": "x", "label": "random keys"},
     "other": {"color": "#009E73", "marker": "D", "label": "other change"},
 }
 #: Points of one row stand a little apart.

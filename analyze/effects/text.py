@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,7 @@ from vla_attention.analyze.show.tables import (
     words,
 )
 from vla_attention.analyze.statistics.intervals import DEFAULT_LEVEL
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.reader import Store
 
 #: Conditions beside each other in the table of tasks.
@@ -115,14 +117,23 @@ def _groups(study: EffectStudy) -> list[Section]:
     return [Section([table, note, about], "WITHOUT IT, AND WITH IT ALONE  effect on the action")] if table.rows else []
 
 
+def of_task(settings: AnalysisSettings, task: int | None) -> AnalysisSettings:
+    """The settings for one task; unchanged for None."""
+    return settings if task is None else replace(settings, tasks=(task,))
+
+
 def recorded_sections(stores: Sequence[Store], settings: AnalysisSettings, kind: str) -> list[Section]:
     """The effects of a kind of item (`word`, `object`) that a store measured beside its calls; nothing without any."""
     if len(stores) != 1 or not recorded_conditions(stores[0]):
         return []
-    study = study_effects(stores[0].path, [], settings)
+    title = "WITHOUT IT  effect on the action, by who no longer reads it"
+    try:
+        study = study_effects(stores[0].path, [], settings)
+    except BadArgument as error:
+        return [Section([str(error)], title)]
     table = item_table(study, kind)
     note = f"{_ITEM_NOTE.format(which=counted_actions(study))} More: vla-analyze effects {stores[0].path}"
-    return [Section([table, note], "WITHOUT IT  effect on the action, by who no longer reads it")] if table.rows else []
+    return [Section([table, note], title)] if table.rows else []
 
 
 def item_table(study: EffectStudy, kind: str | None = None) -> Table:

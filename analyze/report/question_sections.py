@@ -165,7 +165,12 @@ def effect_section(analysis: Analysis, given: Sequence[Path], folder: Path) -> S
         raise BadArgument(
             f"--reruns goes with one store, and the report is about {len(stores)}; make a report for each."
         )
-    study = study_of(analysis, open_reruns(stores[0], given))
+    try:
+        study = study_of(analysis, open_reruns(stores[0], given))
+    except BadArgument as error:
+        if given:
+            raise
+        return Section("effects", "Interventions", [Paragraph(str(error), quiet=True)])
     parts: list[Part] = [
         Paragraph(_EFFECT.format(which=counted_actions(study)), quiet=True),
         *(Paragraph(line) for line in answer_lines(study) if line),

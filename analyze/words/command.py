@@ -50,14 +50,14 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure the words; print them, write the table and the picture."""
-    from vla_attention.analyze.effects.text import recorded_sections
+    from vla_attention.analyze.effects.text import of_task, recorded_sections
     from vla_attention.analyze.show.answer import Answer
     from vla_attention.analyze.words.text import words_sections
     from vla_attention.analyze.words.word_study import study_words
 
     stores, settings = stores_of(arguments), settings_of(arguments)
     study = study_words(stores, settings, arguments.task)
-    sections = [*words_sections(study), *recorded_sections(stores, settings, "word")]
+    sections = [*words_sections(study), *recorded_sections(stores, of_task(settings, arguments.task), "word")]
 
     def draw(folder: Path) -> list[Path]:
         from vla_attention.analyze.words.plot_word_bars import plot_word_bars

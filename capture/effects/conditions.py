@@ -10,6 +10,7 @@ from vla_attention.capture.interventions.condition_name import condition_name, k
 from vla_attention.capture.policies.policy import Policy, PolicyInput, UnitsPolicy, VariantPolicy, is_compiled
 from vla_attention.schemas.effects import EffectReaders, EffectsRecorded
 from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.groupings.builtin_groupings import TEXT_KEYS
 from vla_attention.schemas.groupings.selector_weights import selector_weights
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
 from vla_attention.schemas.groupings.words import Word, split_words, words_of
@@ -21,6 +22,7 @@ from vla_attention.schemas.interventions import (
     PromptChange,
     Queries,
 )
+from vla_attention.schemas.limits import WHOLE_NUMBER
 
 #: Whose attention a reader is, as of `KeyKnockout`.
 _READERS: dict[EffectReaders, tuple[Queries, str]] = {
@@ -29,9 +31,8 @@ _READERS: dict[EffectReaders, tuple[Queries, str]] = {
     "pictures": ("prefix", "role:image"),
     "text": ("prefix", "role:bos | role:template | role:instruction | role:state"),
 }
-#: The parts of a prompt, and all of it but the state's digits, as in the grouping `default`.
+#: The parts of a prompt.
 _PARTS = ("bos", "template", "instruction", "state")
-_LINGUISTIC = "role:bos | role:template | role:instruction | role:text"
 #: The call made again among the changed ones, without a change.
 UNCHANGED = Interventions("unchanged")
 
@@ -41,7 +42,7 @@ def check_effects(planned: EffectsRecorded, policy: Policy) -> None:
     if is_compiled(policy.identity()):
         raise BadArgument(
             "Cannot measure effects with compiled denoise steps (--compile), which no change of attention reaches; "
-            "capture without --compile, or measure the effects of the stored calls with vla-capture rerun --effects."
+            "capture without --compile."
         )
     if not isinstance(policy, UnitsPolicy):
         raise BadArgument(f"Cannot measure effects of {policy.family}: it does not say what a unit of its actions is.")
@@ -65,7 +66,8 @@ def planned_effects(settings: EffectSettings | None, policy: Policy, seed: int) 
     if settings is None:
         return None
     steps = policy.num_denoise_steps if settings.denoise_steps is None else settings.denoise_steps
-    planned = EffectsRecorded(settings.items, settings.readers, settings.every, steps, seed + 1)
+    other = seed + 1 if seed + 1 < WHOLE_NUMBER else seed - 1
+    planned = EffectsRecorded(settings.items, settings.readers, settings.every, steps, other)
     check_effects(planned, policy)
     return planned
 
@@ -74,7 +76,7 @@ def describe_effects(planned: EffectsRecorded) -> str:
     """Return the line that is printed before a run."""
     readers = {"all": "for all queries", "action": "for the action queries", "pictures": "by the pictures"}
     by = listing((readers | {"text": "by the prompt"})[reader] for reader in planned.readers)
-    often = "every replan" if planned.every == 1 else f"every {planned.every}th replan"
+    often = "every replan" if planned.every == 1 else f"one replan in {planned.every}"
     return f"Effects of {listing(planned.items)}, {by}, at {often} (docs/effects.md)."
 
 
@@ -141,7 +143,7 @@ def _groups(
         return any((group[0] * tokens[site].valid[0]).any() for site, group in weights.items())
 
     if "text" in planned.items:
-        yield "linguistic", (_LINGUISTIC, True)
+        yield "linguistic", (TEXT_KEYS, True)
         yield from ((part, (f"role:{part}", False)) for part in _PARTS if has_keys(f"role:{part}"))
         yield from ((_word_name(text), (f'word:"{text}"', False)) for text in dict.fromkeys(_texts(words)))
     if "tokens" in planned.items:
@@ -149,7 +151,9 @@ def _groups(
         for site, of_site in tokens.items():
             if of_site.prompts:
                 prompt_keys = [piece.key for piece in of_site.prompts[0].pieces if piece.key not in of_words]
-                yield from ((f"{site}_key_{key}", (f"keys:{key}-{key}", False)) for key in prompt_keys)
+                # Another site has keys of the same numbers, which are others.
+                within = "" if len(tokens) == 1 else f"{_text_spans(of_site)} & "
+                yield from ((f"{site}_key_{key}", (f"{within}keys:{key}-{key}", False)) for key in prompt_keys)
     if "cameras" in planned.items:
         yield "visual", ("role:image", True)
         cameras = [camera.name for camera in policy.cameras]
@@ -157,6 +161,11 @@ def _groups(
     if "objects" in planned.items:
         names = dict.fromkeys(name for vocabulary in vocabularies.values() for name in vocabulary.objects)
         yield from ((f"object_{name}", (f'object:"{name}"', False)) for name in names)
+
+
+def _text_spans(tokens: EpisodeTokens) -> str:
+    names = [f"span:{span.name}" for span in tokens.layout.spans if span.kind == "text"]
+    return names[0] if len(names) == 1 else f"({' | '.join(names)})"
 
 
 def _texts(words: Sequence[Word]) -> list[str]:

@@ -129,6 +129,7 @@ class EpisodeEffectsMeasured:
 
     run: EffectMeasurement
     conditions: tuple[Interventions, ...] | None = None
+    instruction: str = ""
 
     def measure(
         self, policy_input: PolicyInput, noise_seed: int, actions: NDArray[np.float64], context: CallContext
@@ -143,12 +144,17 @@ class EpisodeEffectsMeasured:
         tokens = site_tokens(
             policy.sites, policy_input.key_role, policy_input.prompt, context.objects, context.coverage
         )
-        vocabularies = run_vocabularies(policy.sites, [policy_input.prompt.instruction_text], context.objects)
+        # The words of the first call stay known where the instruction changes: they have no keys then.
+        self.instruction = self.instruction or policy_input.prompt.instruction_text
+        instructions = [self.instruction, policy_input.prompt.instruction_text]
+        vocabularies = run_vocabularies(policy.sites, instructions, context.objects)
         if self.conditions is None:
             siblings = self.run.siblings.get(context.task_id, ())
             self.conditions = conditions_of(planned, policy, policy_input, tokens, vocabularies, siblings)
             if "text" in planned.items and not any(condition.prompt for condition in self.conditions):
                 self.run.say_once("No other task of a family has other words in the same places: none is exchanged.")
+            if "objects" in planned.items and not context.objects:
+                self.run.say_once("The scene's objects are not known here: effects of objects are not measured.")
         variants: dict[int, CallVariant] = {}
         for number, condition in enumerate(self.conditions):
             variant = self._variant(condition, policy_input, noise_seed, context, tokens, vocabularies)

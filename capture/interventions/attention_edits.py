@@ -121,6 +121,11 @@ class SiteEditor(FactorEditor):
 
         return self._change(numbers, ("prefix", len(tokens)), operands, f"the prefix's layer {layer}")
 
+    @property
+    def changes_prefix(self) -> bool:
+        """See `FactorEditor`."""
+        return any(edit.queries != "action" for edit in self._everywhere())
+
     def prefix_factors(self, tokens: NDArray[np.int64]) -> NDArray[np.float64] | None:
         """See `FactorEditor`."""
         edits = [edit for edit in self._everywhere() if edit.queries != "action"]

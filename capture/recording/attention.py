@@ -170,6 +170,10 @@ class AttentionEditor(Protocol):
 class FactorEditor(AttentionEditor, Protocol):
     """An editor that multiplies weights before normalising, the same at all layers, heads and denoise steps."""
 
+    @property
+    def changes_prefix(self) -> bool:
+        """Whether anything changes in the calls before the first denoise step."""
+
     def prefix_factors(self, tokens: NDArray[np.int64]) -> NDArray[np.float64] | None:
         """Return the factors (query, key) in a call before the first denoise step; None where nothing changes.
 

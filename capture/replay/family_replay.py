@@ -14,6 +14,7 @@ from typing import Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.capture.effects.conditions import describe_effects
 from vla_attention.capture.effects.measurement import EffectMeasurement, EpisodeEffectsMeasured, measurement_of
 from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.machine.provenance import describe_machine
@@ -148,6 +149,8 @@ def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: 
         say(f"Black and masked: {listing(masked)}.")
     # A data set knows no families of tasks, so there are no words to exchange.
     effects = measurement_of(recording.effects, policy, [], say)
+    if recording.effects is not None:
+        say(describe_effects(recording.effects))
     replay = Replay(policy, store, every, plan.seed, plan.instruction, attributes.provenance, effects)
     return len(record_episodes(plan, store, todo, every, partial(replay_episode, replay)))
 

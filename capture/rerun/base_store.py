@@ -79,6 +79,19 @@ def instructions_of(store: Store) -> dict[int, str]:
     return instructions
 
 
+def families_of(store: Store) -> list[tuple[int, str, str]]:
+    """Return number, instruction and family of each task that the whole store has an episode of, as `instructions_of`.
+
+    Without the tasks that `open_base` was not asked for, words would be exchanged for others, depending on them.
+    """
+    known: dict[int, tuple[int, str, str]] = {}
+    for episode in open_store(store.path).episodes:
+        with suppress(CorruptEpisode):
+            of = episode.attributes
+            known.setdefault(of.task_id, (of.task_id, of.instruction, of.task_family))
+    return [known[number] for number in sorted(known)]
+
+
 def check_may_change(store: Store, interventions: Interventions) -> None:
     """Raise `StoreError` for interventions on a store whose own run had some already."""
     stored = store.attributes.interventions

@@ -60,10 +60,11 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
         check_writable(target.parent, "--store")
     for line in nothing_changes:
         say(line)
+    if arguments.effects != NO_EFFECTS:
+        refuse_both(interventions)
+        refuse_both(base.attributes.interventions)
     rerun = _prepare(arguments, base, threads, termination)
     interventions = interventions_for(interventions, rerun.policy)
-    if rerun.recording.effects is not None:
-        refuse_both(interventions)
     rerun.check(arguments.check)
     if target is None:
         return 0
@@ -73,6 +74,9 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
     added = rerun.write(target, mode, interventions, allow_empty=arguments.allow_empty)
     say(f"{plural(added, 'episode')} added. Store: {target}")
     rerun.faults.raise_missing()
+    if rerun.recording.effects is not None:
+        say(f"Next: vla-analyze effects {target}")
+        return 0
     say(f"Next: vla-analyze {target}" if interventions.is_none else f"Next: vla-analyze effects {base.path} {target}")
     return 0
 
@@ -102,6 +106,12 @@ def _target(arguments: argparse.Namespace, base: Store, interventions: Intervent
     return target
 
 
+def _noise_seed(arguments: argparse.Namespace, base: Store) -> int:
+    """Return the seed that the noise of the calls is drawn from."""
+    given = [arguments.noise_seed, base.attributes.interventions.noise and base.attributes.interventions.noise.seed]
+    return next((seed for seed in given if seed is not None), base.attributes.protocol.seed)
+
+
 def _prepare(arguments: argparse.Namespace, base: Store, threads: Threads, termination: Termination) -> Rerun:
     """Load the policy, and check that it is the store's."""
     say(threads.describe())
@@ -111,7 +121,7 @@ def _prepare(arguments: argparse.Namespace, base: Store, threads: Threads, termi
     identity = policy.identity()
     check_same_policy(base, identity, policy.sites)
     check_has_inputs(base, policy)
-    recording, note = plan_recording(recording_settings(arguments), policy, base.attributes.protocol.seed)
+    recording, note = plan_recording(recording_settings(arguments), policy, _noise_seed(arguments, base))
     if note:
         say(note)
     say(f"Policy: {identity.name} ({identity.checkpoint_format}: {identity.checkpoint}), weights as in {base.path}.")

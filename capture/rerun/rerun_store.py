@@ -11,11 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from vla_attention.capture.effects.conditions import describe_effects
 from vla_attention.capture.effects.measurement import EffectMeasurement, measurement_of
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.policy import Policy, stored_picture_sizes
-from vla_attention.capture.rerun.base_store import instructions_of
+from vla_attention.capture.rerun.base_store import families_of, instructions_of
 from vla_attention.capture.rerun.fidelity import check_fidelity
 from vla_attention.capture.rerun.stored_calls import Repeater, read_calls
 from vla_attention.capture.rollout.episode_faults import Faults
@@ -232,9 +233,9 @@ class Rerun:
         repeater = self.unchanged
         if not interventions.is_none:
             repeater = Repeater(self.policy, self.recording, interventions, self.instructions, allow_empty)
-        tasks = {episode.attributes.task_id: episode.attributes for episode in self.base.episodes}
-        families = [(number, of.instruction, of.task_family) for number, of in tasks.items()]
-        effects = measurement_of(self.recording.effects, self.policy, families, say)
+        effects = measurement_of(self.recording.effects, self.policy, families_of(self.base), say)
+        if self.recording.effects is not None:
+            say(describe_effects(self.recording.effects))
         source = StoredCallsSource(repeater, store, episodes, self.machine, self.termination, effects)
         loop = OneByOneLoop(store, plan_of(jobs), self.termination, "call", source)
         try:

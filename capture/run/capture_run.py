@@ -87,7 +87,8 @@ def plan_run(settings: RunSettings, policy: Policy, machine: Mapping[str, str]) 
     evaluation = settings.protocol or policy.default_protocol
     protocol = plan_protocol(settings, evaluation, policy)
     check_protocol(protocol, policy)
-    recording, note = plan_recording(settings.recording, policy, protocol.seed)
+    noise = protocol.seed if settings.interventions.noise is None else settings.interventions.noise.seed
+    recording, note = plan_recording(settings.recording, policy, noise)
     tasks = list_tasks(settings.suite)
     wanted = tasks if settings.task_ids is None else tuple(tasks[number] for number in settings.task_ids)
     changes = plan_changes(settings, policy, tasks)

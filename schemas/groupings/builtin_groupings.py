@@ -22,7 +22,8 @@ from vla_attention.schemas.groupings.vocabulary import NO_COVERAGE, NO_WORDS, Vo
 #: Keys that the published pi scripts call text: their prompt is padded to this length by default.
 PUBLISHED_TEXT_KEYS = 256
 _REFERENCE = re.compile(r"reference:(\d+)")
-_TEXT = "role:bos | role:template | role:instruction | role:text"
+#: Every valid text key that is not a state digit.
+TEXT_KEYS = "role:bos | role:template | role:instruction | role:text"
 
 
 def _others(vocabulary: Vocabulary) -> dict[str, tuple[str, ...]]:
@@ -53,7 +54,7 @@ def default(vocabulary: Vocabulary) -> Grouping:
     others = _others(vocabulary)
     return Grouping(
         name="default",
-        groups={"visual": ("role:image",), "linguistic": (_TEXT,), **others},
+        groups={"visual": ("role:image",), "linguistic": (TEXT_KEYS,), **others},
         ratio=_over_linguistic(vocabulary, "visual"),
         allow_empty=("visual", "linguistic", *others),
         description="visual = every valid image key; linguistic = every valid text key that is not a state digit",
@@ -85,7 +86,7 @@ def cameras(vocabulary: Vocabulary) -> Grouping:
     views = {camera: (f"camera:{camera} & role:image",) for camera in vocabulary.cameras}
     return Grouping(
         name="cameras",
-        groups={**views, "linguistic": (_TEXT,), **others},
+        groups={**views, "linguistic": (TEXT_KEYS,), **others},
         ratio=_over_linguistic(vocabulary, *views),
         allow_empty=(*views, "linguistic", *others),
         description="one group per camera; linguistic as in 'default'",
@@ -100,7 +101,7 @@ def objects(vocabulary: Vocabulary) -> Grouping:
     things = {name: (f"object:{name}",) for name in vocabulary.objects}
     return Grouping(
         name="objects",
-        groups={**things, "linguistic": (_TEXT,), **others},
+        groups={**things, "linguistic": (TEXT_KEYS,), **others},
         ratio=_over_linguistic(vocabulary, *things),
         allow_empty=(*things, "linguistic", *others),
         description="one group per scene object, weighted by the area of each patch that it covers; "

@@ -48,9 +48,8 @@ def sample_variants(model: PiModel, calls: Sequence[ModelCall], num_steps: int, 
     """
     inputs = _Inputs(model)
     numbers = [inputs.number(call.tensors) for call in calls]
-    keys = np.arange(model.config.prefix_len)
     prefixes = [
-        _Prefix(number, call.editor if call.editor and call.editor.prefix_factors(keys) is not None else None)
+        _Prefix(number, call.editor if call.editor and call.editor.changes_prefix else None)
         for number, call in zip(numbers, calls, strict=True)
     ]
     actions: list[Tensor | None] = [None] * len(calls)

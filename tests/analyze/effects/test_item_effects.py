@@ -134,7 +134,7 @@ def test_each_word_has_the_random_keys_of_the_nearest_number_of_its_reader(study
 def test_the_first_lines_say_which_word_decides_and_by_which_way(study):
     said = " ".join(item_lines(study, item_rows(study)))
     first, second = WORDS[0], WORDS[1]
-    assert f"'{first}' does most of {len(WORDS)} words: without it the action changes by" in said
+    assert f"'{first}' has the largest effect of {len(WORDS)} words: without it the action changes by" in said
     assert f"'{first}', '{second}' reach the action through the pictures, which have read them" in said
     assert "Without all pictures the action changes 2 times as much as without all text" in said
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -285,3 +287,43 @@ def test_what_a_policy_has_not_is_refused(monkeypatch):
     with pytest.raises(BadArgument, match="beside interventions"):
         refuse_both(Interventions(keys=(KeyKnockout("role:image"),)))
     refuse_both(Interventions(prompt=PromptChange("empty")))
+
+
+def test_words_of_the_first_instruction_have_no_entry_in_another_one():
+    """A data set's task may change within an episode; its conditions are those of the first call."""
+    policy = policy_named("pi05")
+    episode = measurement(policy).begin()
+    given, context, actions = call_of(policy)
+    first = episode.measure(given, 11, actions, context)
+    other = policy.prepare(make_observation(0), "open the drawer")
+    later = replace(context, replan=1)
+    second = episode.measure(other, 11, policy.act(other, 11), later)
+    names = {second.conditions[number].name for number in second.measured}
+    assert second.conditions == first.conditions
+    assert "without_word_the" in names
+    assert "without_word_bowl" not in names
+
+
+def test_single_keys_of_cosmos_are_of_the_site_that_reads_text():
+    policy = policy_named("cosmos")
+    given = policy.prepare(make_observation(0), "pick up , the bowl !")
+    planned = planned_effects(EffectSettings(("tokens",), ("action",)), policy, 3)
+    effects = (
+        EffectMeasurement(policy, planned, {}, print)
+        .begin()
+        .measure(given, 11, policy.act(given, 11), CallContext(0, 2, 0))
+    )
+    keys = [number for number in effects.measured if effects.conditions[number].keys]
+    assert keys
+    for place, number in enumerate(effects.measured):
+        if number in keys:
+            assert effects.cut["cross"][place].sum() == 1
+            assert not effects.cut["self"][place].any()
+
+
+def test_the_other_noise_is_another_one_whatever_the_seed():
+    policy = policy_named("pi05")
+    for seed in (0, 7, 2**63 - 1):
+        planned = planned_effects(EffectSettings(("text",)), policy, seed)
+        assert planned.seed != seed
+        assert 0 <= planned.seed < 2**63

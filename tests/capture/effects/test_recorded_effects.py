@@ -18,6 +18,7 @@ from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.effects.effect_study import study_effects
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.capture.__main__ import main
+from vla_attention.capture.rerun.base_store import families_of
 from vla_attention.capture.store.disk_estimate import estimate_disk
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.verify import verify_store
@@ -112,12 +113,12 @@ def test_effects_of_the_store_are_those_of_its_reruns(with_effects, tmp_path):
 def test_the_command_says_which_word_does_most_and_by_which_way(with_effects, tmp_path, capsys):
     assert analyze(["effects", str(with_effects), "--output", str(tmp_path)]) == 0
     said = capsys.readouterr().out
-    assert "does most of" in said
+    assert "has the largest effect of" in said
     assert "WITHOUT IT" in said
     table = pl.read_parquet(tmp_path / "effects_summary.parquet").filter(scope="all", phase="all")
     words = table.filter(pl.col("condition").str.contains("^without_word_.*_queries_all$"))
     first = words.sort("effect", descending=True)["group"][0].removeprefix("word_")
-    assert f"'{first}' does most of {words.height} words" in said.replace("\n", " ")
+    assert f"'{first}' has the largest effect of {words.height} words" in said.replace("\n", " ")
 
 
 def test_the_disk_estimate_knows_them(with_effects):
@@ -161,6 +162,50 @@ def test_a_rerun_adds_effects_to_stored_calls(pi_store, with_effects, tmp_path, 
         assert set(mine) == set(theirs)
         for episode in mine:
             np.testing.assert_allclose(mine[episode], theirs[episode], atol=1e-6)
+
+
+def test_a_rerun_of_changed_attention_is_refused(pi_store, tmp_path, capsys):
+    """The base's interventions are made again; an effect would be that of an item on top of them."""
+    cut = tmp_path / "cut.zarr"
+    words = ["rerun", str(pi_store), "--check", "0", "--num-episodes", "1"]
+    assert main([*words, "--store", str(cut), "--knockout", "role:image"]) == 0
+    assert main(["rerun", str(cut), "--check", "0", "--store", str(tmp_path / "a.zarr"), "--effects", "text"]) == 2
+    assert "beside interventions on attention" in capsys.readouterr().err
+    assert not (tmp_path / "a.zarr").exists()
+
+
+def test_the_floor_is_another_noise_than_the_rerun_s(pi_store, tmp_path):
+    base = open_store(pi_store).attributes.protocol.seed
+    target = tmp_path / "a.zarr"
+    words = ["rerun", str(pi_store), "--check", "0", "--num-episodes", "1", "--noise-seed", str(base + 1)]
+    assert main([*words, "--store", str(target), "--effects", "text"]) == 0
+    assert open_store(target).attributes.recording.effects.seed == base + 2
+    assert all(np.abs(change).max() > 1e-3 for change in changes(open_store(target), "noise").values())
+
+
+def test_words_are_exchanged_for_those_of_all_tasks_of_the_store(with_effects):
+    base = replace(open_store(with_effects), episodes=open_store(with_effects).episodes[:1])
+    assert [number for number, _, _ in families_of(base)] == [0, 1]
+
+
+def test_refused_effects_leave_the_other_commands_their_answers(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("vla_attention.capture.effects.measurement.MOST_DIFFERENCE", -1.0)
+    store = capture(tmp_path / "pi.zarr", "pi", "--effects", "text")
+    assert verify_store(open_store(store)) == []
+    capsys.readouterr()
+    assert analyze(["effects", str(store)]) == 2
+    assert "No effect that" in capsys.readouterr().err
+    assert analyze(["words", str(store), "--no-plots", "--output", str(tmp_path / "w")]) == 0
+    assert "No effect that" in (tmp_path / "w" / "summary.txt").read_text().replace("\n", " ")
+    assert analyze(["report", str(store), "--quick", "--output", str(tmp_path / "r.html")]) == 0
+
+
+def test_one_reader_suffices(tmp_path):
+    store = capture(tmp_path / "pi.zarr", "pi", "--effects", "text", "--effects-readers", "action")
+    assert analyze(["words", str(store), "--task", "0", "--no-plots", "--output", str(tmp_path)]) == 0
+    (table,) = (tmp_path / "summary.txt").read_text().split("WITHOUT IT")[1:]
+    assert "'red'" in table
+    assert "'green'" not in table
 
 
 def test_resume_continues_and_another_choice_is_another_run(with_effects, tmp_path, capsys):
