@@ -14,6 +14,9 @@ from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.limit_checks import check_at_most
 from vla_attention.schemas.limits import AXIS, CONDITIONS, EFFECT_ENTRIES, REPLANS
 
+#: Changes of actions under the conditions of `EpisodeEffects`; below each site, the weights of the keys cut for them.
+CHANGE = "effects/change"
+CUT = "cut"
 #: What is taken away, one at a time. `text`: every word of the instruction, every part of the prompt, and all of it.
 #: `cameras`: every camera's picture, and all of them. `objects`: the patches of every object. `tokens`: every key of
 #: the prompt that is no piece of a word.

@@ -21,8 +21,8 @@ from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.analyze.statistics.episode_intervals import means_of_all_and_of_tasks
 from vla_attention.analyze.statistics.intervals import POSITIVE
+from vla_attention.schemas.effects import CUT
 from vla_attention.schemas.safe_text import visible
-from vla_attention.schemas.stores.store_format import CUT
 
 #: Weights that differ by less are the same.
 _SAME = 1e-4

@@ -15,7 +15,7 @@ from vla_attention.capture.store.codecs import write_whole
 from vla_attention.capture.store.replan_records import EpisodeStart, ReplanEffects, ReplanRecord
 from vla_attention.capture.store.site_writer import SiteWriter
 from vla_attention.capture.store.store_root import check_same_run, read_existing_root
-from vla_attention.schemas.effects import EpisodeEffects
+from vla_attention.schemas.effects import CHANGE, CUT, EpisodeEffects
 from vla_attention.schemas.errors import UserError, listing
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import Prompt, prompt_at
@@ -37,8 +37,6 @@ from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.root import read_run
 from vla_attention.schemas.stores.seal import seal_episode
 from vla_attention.schemas.stores.store_format import (
-    CHANGE,
-    CUT,
     EPISODES_GROUP,
     ArrayRecord,
     CorruptEpisode,

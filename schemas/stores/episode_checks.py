@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.schemas.effects import CHANGE, CUT
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import prompt_at
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
@@ -36,14 +37,7 @@ from vla_attention.schemas.stores.episode_files import files_of_no_array
 from vla_attention.schemas.stores.episode_shapes import effect_misfits, expected_shapes, shape_problems
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.root import group_attributes
-from vla_attention.schemas.stores.store_format import (
-    CHANGE,
-    CUT,
-    NUMBERS,
-    CorruptEpisode,
-    Problem,
-    RootAttributes,
-)
+from vla_attention.schemas.stores.store_format import NUMBERS, CorruptEpisode, Problem, RootAttributes
 
 
 def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[Problem]:

@@ -8,14 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from vla_attention.schemas.effects import CHANGE, CUT
 from vla_attention.schemas.layout import Role
-from vla_attention.schemas.stores.store_format import (
-    CHANGE,
-    CUT,
-    NUMBERS,
-    EpisodeAttributes,
-    RootAttributes,
-)
+from vla_attention.schemas.stores.store_format import NUMBERS, EpisodeAttributes, RootAttributes
 
 _ROLES = frozenset(role.label for role in Role)
 #: Arrays of a site whose axes, but for the last, have length 1 where nothing changes along them.

@@ -75,10 +75,6 @@ NUMBERS = {
     "denoise_time": "float32",
 }
 
-#: Changes of actions under the conditions of `EpisodeEffects`; below each site, the weights of the keys cut for them.
-CHANGE = "effects/change"
-CUT = "cut"
-
 #: The group of an episode whose attributes are an `EpisodeSeal`.
 SEAL_GROUP = "seal"
 

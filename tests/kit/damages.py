@@ -23,10 +23,10 @@ import polars as pl
 import vla_attention as va
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.api import OpenStores
+from vla_attention.schemas.effects import CHANGE, CUT
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.seal import SEAL_FILE
-from vla_attention.schemas.stores.store_format import CHANGE, CUT
 from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
 from vla_attention.testing.stores import StoreSpec, small_effects, write_store
 

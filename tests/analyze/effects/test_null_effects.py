@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from vla_attention.analyze.effects.conditions import Condition, Kind
-from vla_attention.analyze.effects.effect_study import summary_of, with_floors
+from vla_attention.analyze.effects.floors import summary_of, with_floors
 from vla_attention.analyze.effects.paired_replans import ALL
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange
