@@ -72,6 +72,8 @@ def run(arguments: argparse.Namespace) -> int:
         "runs": comparison.estimates,
         "unpaired": comparison.unpaired,
     }
+    if not comparison.effects.is_empty():
+        tables["effects"] = comparison.effects
     joined = shortened("-vs-".join(comparison.names).replace("/", "-"), 100)
     folder = arguments.output or Path("results") / joined / "compare"
     return show(Answer(comparison_sections(comparison), tables, draw), folder, arguments)

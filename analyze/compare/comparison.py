@@ -15,11 +15,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import polars as pl
 
+from vla_attention.analyze.compare.differences import (
+    pair_episodes,
+    paired_differences,
+    unpaired_differences,
+    with_adjusted,
+)
+from vla_attention.analyze.compare.effect_differences import effect_differences
 from vla_attention.analyze.compare.replan_pairs import intervention_notes, is_rerun, with_paired_replans
 from vla_attention.analyze.compare.runs import Run, RunArgument, check_comparable, noted_differences, open_runs
 from vla_attention.analyze.measures.aggregate import (
@@ -33,26 +39,18 @@ from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables, concat_tab
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.steps import measure_episodes
 from vla_attention.analyze.measures.task_families import relation_remarks, sampling_of, units_of
-from vla_attention.analyze.statistics.effect_sizes import contrast, standardised_mean
 from vla_attention.analyze.statistics.episode_intervals import ABOUT_COLUMNS, Sampling, about_row
 from vla_attention.analyze.statistics.intervals import (
     SHARE,
-    Estimate,
     ends,
     estimates,
     geometric_mean_over_episodes,
     mean_over_episodes,
-    named_interval,
 )
-from vla_attention.analyze.statistics.many_looks import adjusted_p_values
 from vla_attention.analyze.statistics.units import Units
 from vla_attention.schemas.groupings.grouping import Grouping
 
 LOG2_RATIO, SUCCESS = "log2_ratio", "success"
-#: The effect sizes: of pairs, and of independent episodes.
-D_Z, HEDGES_G = "d_z", "hedges_g"
-#: Two episodes with equal values here are a pair; `occurrence` counts the episodes of a run with the same first state.
-PAIR_KEYS = ("suite", "task_id", "initial_state_digest", "seed", "occurrence")
 
 
 @dataclass(frozen=True)
@@ -78,6 +76,7 @@ class Comparison:
             `difference`.
         unpaired: one row per episode that has no partner: `run`, `compared_with`, its suite, task and episode index.
         notes: one line per difference between the runs that was allowed, or that has no effect on the numbers.
+        effects: differences of recorded effects, see `effect_differences`.
         units: what intervals over all tasks are about.
         ignores_seed: whether episodes of different seeds may be pairs.
     """
@@ -89,6 +88,7 @@ class Comparison:
     differences: pl.DataFrame
     pairs: pl.DataFrame
     unpaired: pl.DataFrame
+    effects: pl.DataFrame
     notes: tuple[str, ...]
     units: Units
     ignores_seed: bool = False
@@ -149,7 +149,7 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
     )
     differences, pairs, unpaired = [], [], []
     for run, table, of_run in zip(runs[1:], tables[1:], measured[1:], strict=True):
-        joined = _pair(tables[0], table, quantities)
+        joined = pair_episodes(tables[0], table, quantities)
         if is_rerun(runs[0], run):
             base, again = (concat_tables(replan_tables(one, grouping).parts) for one in (measured[0], of_run))
             sides = with_paired_replans(base, again, run.name)
@@ -157,25 +157,27 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
                 _episode_values(one, episode_tables(side, grouping), filled, False)
                 for one, side in zip((runs[0], run), sides, strict=True)
             )
-            joined = _pair(first, other, quantities, same_episode=True)
+            joined = pair_episodes(first, other, quantities, same_episode=True)
         pairs.append(_pairs_table(run.name, joined, quantities))
         unpaired += [_without_partner(tables[0], joined, "first", runs[0].name, run.name)]
         unpaired += [_without_partner(table, joined, "other", run.name, runs[0].name)]
         rows = (
-            _paired(joined, quantities, sampling)
+            paired_differences(joined, quantities, sampling)
             if joined.height
-            else _unpaired(tables[0], table, quantities, sampling)
+            else unpaired_differences(tables[0], table, quantities, sampling)
         )
         differences.append(rows.select(pl.lit(run.name).alias("run"), pl.all()))
+    effects, notes_on_effects = effect_differences(runs, tables, sampling)
     return Comparison(
         runs=tuple(runs),
+        effects=effects,
         grouping=grouping,
         quantities=quantities,
         estimates=of_runs,
-        differences=_with_adjusted(pl.concat(differences)),
+        differences=with_adjusted(pl.concat(differences)),
         pairs=pl.concat(pairs),
         unpaired=pl.concat(unpaired),
-        notes=(*notes, *relation_remarks(sampling, selected)),
+        notes=(*notes, *notes_on_effects, *relation_remarks(sampling, selected)),
         units=units_of(sampling, selected).decided(),
         ignores_seed="seed" in allowed and len({run.stores[0].attributes.protocol.seed for run in runs}) > 1,
     )
@@ -228,32 +230,8 @@ def _episode_values(run: Run, episodes: Tables, groups: Sequence[str], ignore_se
     )
 
 
-def _pair(
-    first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str], same_episode: bool = False
-) -> pl.DataFrame:
-    """Pairs (pair, layer) with `X_first`, `X_other` and `X_difference`, and both episode indices.
-
-    `same_episode`: the other run is a rerun, whose episodes have the same numbers; it may lack some.
-    """
-    # A seed that was allowed to differ is null, and null equals nothing in a join.
-    keys = [*(key for key in PAIR_KEYS if key != "seed" or first["seed"].null_count() == 0), "layer"]
-
-    def side(table: pl.DataFrame, name: str, *more: str) -> pl.DataFrame:
-        values = (pl.col(quantity).alias(f"{quantity}_{name}") for quantity in quantities)
-        return table.select(*keys, *more, pl.col("episode_index").alias(f"episode_{name}"), *values)
-
-    mine, theirs = side(first, "first", "instruction", "block"), side(other, "other")
-    if same_episode:
-        theirs = theirs.drop("occurrence").with_columns(pl.col("episode_other").alias("episode_first"))
-        keys = ["episode_first" if key == "occurrence" else key for key in keys]
-    joined = mine.join(theirs, on=keys, how="inner")
-    return joined.with_columns(
-        (pl.col(f"{q}_other") - pl.col(f"{q}_first")).alias(f"{q}_difference") for q in quantities
-    ).sort("suite", "task_id", "episode_first", "block", nulls_last=True)
-
-
 def _pairs_table(run: str, joined: pl.DataFrame, quantities: Sequence[str]) -> pl.DataFrame:
-    """The table `Comparison.pairs`, from `_pair`."""
+    """The table `Comparison.pairs`, from `pair_episodes`."""
     values = {f"{quantity}_{end}" for quantity in quantities for end in ("first", "other", "difference")}
     identity = [name for name in joined.columns if name not in values]
     parts = [
@@ -273,129 +251,6 @@ def _without_partner(table: pl.DataFrame, joined: pl.DataFrame, side: str, run: 
     paired = joined.select("suite", "task_id", pl.col(f"episode_{side}").alias("episode_index")).unique()
     alone = table.select(keys).unique(maintain_order=True).join(paired, on=keys, how="anti", maintain_order="left")
     return alone.select(pl.lit(run).alias("run"), pl.lit(other).alias("compared_with"), pl.all())
-
-
-def _paired(joined: pl.DataFrame, quantities: Sequence[str], sampling: Sampling) -> pl.DataFrame:
-    rows: list[dict[str, Any]] = []
-    for scope, part in _scopes(joined):
-        given = sampling.units(part)
-        units = given.decided()
-        values = [float_values(part[f"{quantity}_difference"]) for quantity in quantities]
-        statistics = [mean_over_episodes(value) for value in values]
-        differences = estimates(statistics, units)
-        for quantity, value, statistic, one in zip(quantities, values, statistics, differences, strict=True):
-            used = statistic.used
-            counts = {"num_tasks": units.part(used).num_tasks, **about_row(given)}
-            counts |= dict.fromkeys(("num_pairs", "num_first", "num_other"), int(used.sum()))
-            sides = {
-                f"mean_{side}": estimates(
-                    [mean_over_episodes(np.where(used, float_values(part[f"{quantity}_{side}"]), np.nan))], units
-                )[0].value
-                for side in ("first", "other")
-            }
-            of = {**scope, "quantity": quantity, "paired": True, **counts, **sides}
-            rows.append(of | _difference_row(one) | _effect(D_Z, standardised_mean(value[used], units.part(used))))
-    return pl.DataFrame(rows, schema=_DIFFERENCE_SCHEMA)
-
-
-def _unpaired(first: pl.DataFrame, other: pl.DataFrame, quantities: Sequence[str], sampling: Sampling) -> pl.DataFrame:
-    """Differences of means of independent episodes.
-
-    A task that both runs have moves both means, and its difference has less noise than two different tasks.
-    """
-    both = pl.concat(
-        [
-            table.select(*PAIR_KEYS, "instruction", "layer", "block", *quantities, pl.lit(number).alias("_run"))
-            for number, table in enumerate((first, other))
-        ]
-    )
-    rows: list[dict[str, Any]] = []
-    for scope, part in _scopes(both):
-        is_other = part["_run"].to_numpy() == 1
-        units = sampling.units(part)
-        if is_other.all() or not is_other.any():
-            continue  # a task of one run only
-        for quantity in quantities:
-            difference = contrast(float_values(part[quantity]), is_other, units)
-            rows.append(
-                {
-                    **scope,
-                    "quantity": quantity,
-                    "paired": False,
-                    "num_tasks": units.num_tasks,
-                    "num_families": units.num_families,
-                    "intervals": difference.estimand.value,
-                    "num_pairs": 0,
-                    "num_first": difference.num_second,
-                    "num_other": difference.num_first,
-                    "mean_first": difference.mean_second,
-                    "mean_other": difference.mean_first,
-                }
-                | _difference_row(difference.difference)
-                | _effect(HEDGES_G, difference.hedges_g)
-            )
-    return pl.DataFrame(rows, schema=_DIFFERENCE_SCHEMA)
-
-
-def _difference_row(one: Estimate) -> dict[str, Any]:
-    low, high = ends(one.interval())
-    return {"difference": one.value, "low": low, "high": high, "p": one.p_value(0.0)}
-
-
-def _effect(name: str, one: Estimate) -> dict[str, Any]:
-    """An effect size with its interval; without an interval, none at all: it would look more certain than it is."""
-    interval = one.interval()
-    return named_interval(name, None if interval is None else one.value, interval)
-
-
-_DIFFERENCE_SCHEMA = {
-    **dict.fromkeys(("scope", "suite"), pl.String),
-    "task_id": pl.Int64,
-    **dict.fromkeys(("instruction", "layer"), pl.String),
-    "block": pl.Int64,
-    "quantity": pl.String,
-    "paired": pl.Boolean,
-    "num_tasks": pl.Int64,
-    **ABOUT_COLUMNS,
-    **dict.fromkeys(("num_pairs", "num_first", "num_other"), pl.Int64),
-    **dict.fromkeys(("mean_first", "mean_other", "difference", "low", "high", "p"), pl.Float64),
-    **{f"{name}{end}": pl.Float64 for name in (D_Z, HEDGES_G) for end in ("", "_low", "_high")},
-}
-
-
-def _with_adjusted(differences: pl.DataFrame) -> pl.DataFrame:
-    """The columns `q` and `layers_q` of `Comparison.differences`."""
-    whole, single = pl.col("scope") == "all", pl.col("layer") != LAYERS_AVG
-    looks = (
-        ("q", pl.col("scope") == "task", ("run", "layer", "quantity")),
-        ("q", pl.col("scope") != "task", ("run", "scope", "suite", "layer")),
-        ("layers_q", whole & single, ("run", "quantity")),
-    )
-    numbered = differences.with_columns(pl.int_range(pl.len()).alias("_row"))
-    columns: dict[str, list[float | None]] = {"q": [None] * numbered.height, "layers_q": [None] * numbered.height}
-    for name, which, family in looks:
-        for part in numbered.filter(which).partition_by(family, maintain_order=True):
-            for row, q in zip(part["_row"], adjusted_p_values(part["p"].to_list()), strict=True):
-                columns[name][row] = q
-    return differences.with_columns(pl.Series(name, q, dtype=pl.Float64) for name, q in columns.items())
-
-
-def _scopes(table: pl.DataFrame) -> list[tuple[dict[str, Any], pl.DataFrame]]:
-    """Every (task, layer), every (suite, layer) when there are several suites, then every layer over all tasks."""
-    scopes = []
-    for part in table.partition_by("suite", "task_id", "layer", maintain_order=True):
-        row = part.row(0, named=True)
-        names = {name: row[name] for name in ("suite", "task_id", "instruction", "layer", "block")}
-        scopes.append(({"scope": "task", **names}, part))
-    only = table["suite"][0] if table["suite"].n_unique() == 1 else None
-    wider = [("all", only, part) for part in table.partition_by("layer", maintain_order=True)]
-    if only is None:
-        of_suites = table.partition_by("suite", "layer", maintain_order=True)
-        wider = [("suite", part["suite"][0], part) for part in of_suites] + wider
-    for scope, suite, part in wider:
-        names = {"suite": suite, "task_id": None, "instruction": None}
-        scopes.append(({"scope": scope, **names, "layer": part["layer"][0], "block": part["block"][0]}, part))
-    return scopes
 
 
 def _estimates(run: str, table: pl.DataFrame, quantities: Sequence[str], sampling: Sampling) -> pl.DataFrame:

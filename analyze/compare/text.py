@@ -7,7 +7,8 @@ from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.compare.comparison import D_Z, HEDGES_G, LOG2_RATIO, SUCCESS, Comparison
+from vla_attention.analyze.compare.comparison import LOG2_RATIO, SUCCESS, Comparison
+from vla_attention.analyze.compare.differences import D_Z, HEDGES_G
 from vla_attention.analyze.measures.frames import LAYERS_AVG, layer_name
 from vla_attention.analyze.show.answer import Section
 from vla_attention.analyze.show.findings import few_families_note, findings
@@ -41,6 +42,7 @@ def comparison_sections(comparison: Comparison) -> list[Section]:
     sections = [_header(comparison, layer), _estimates_section(comparison, layer)]
     for name in comparison.names[1:]:
         sections.append(_difference_section(comparison, name, layer))
+        sections += _effects_section(comparison, name)
         if name in comparison.runs_with_common_tasks:
             sections.append(_tasks_section(comparison, name, layer))
     return [*sections, *_layers_section(comparison)]
@@ -210,6 +212,33 @@ def _tasks_section(comparison: Comparison, name: str, layer: str) -> Section:
     named = findings([row["q"] for row in tasks], labels, "task", "a difference", _num_sentences(comparison))
     said = f"{named} q: p of no difference, adjusted for the number of tasks (Benjamini-Hochberg)."
     return Section([Table(columns, rows.to_dicts()), said], f"PER TASK  {quantity}, {name} minus {comparison.names[0]}")
+
+
+def _effects_section(comparison: Comparison, name: str) -> list[Section]:
+    """Recorded effects of a run beside those of the first one."""
+    first = comparison.names[0]
+    table = comparison.effects.filter(run=name, scope="all").drop_nulls("difference")
+    rows = table.sort(pl.max_horizontal("mean_first", "mean_other"), descending=True).to_dicts()
+    if not rows:
+        return []
+    columns = [
+        texts("item", lambda row: shortened(row["item"], 24), left=True),
+        texts("read by", lambda row: {"total": "all", "direct": "action"}[row["reader"]], left=True),
+        _num_pairs(),
+        number(first[:14], "mean_first"),
+        number(name[:14], "mean_other"),
+        signed("difference", "difference"),
+        interval(""),
+        number("q", "q"),
+    ]
+    labels = [row["item"] if row["reader"] == "total" else f"{row['item']} (action queries alone)" for row in rows]
+    named = findings([row["q"] for row in rows], labels, "effect", "a difference", _num_sentences(comparison))
+    note = (
+        "Change of the action without the item, in the spread of its own run's actions: when nobody reads it (all), or "
+        "the action queries alone do not (action). q: p of no difference, adjusted for the number of effects "
+        "(Benjamini-Hochberg)."
+    )
+    return [Section([named, Table(columns, rows), note], f"EFFECTS  without it, {name} and {first}")]
 
 
 def _layers_section(comparison: Comparison) -> list[Section]:

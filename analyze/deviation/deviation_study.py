@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from vla_attention.analyze.effects.action_changes import ActionSpread, action_spread
 from vla_attention.analyze.effects.paired_replans import ALL, PHASES
 from vla_attention.analyze.measures.aggregate import overall_layer, replans_of
+from vla_attention.analyze.measures.alignment import episode_timing, on_episode_time
 from vla_attention.analyze.measures.frames import (
     EPISODE_ID,
     Tables,
@@ -30,7 +31,6 @@ from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.statistics.episode_intervals import means_of_all_and_of_tasks, means_with_intervals
 from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE
 from vla_attention.analyze.statistics.many_looks import adjusted_p_values
-from vla_attention.analyze.time.alignment import episode_timing, on_episode_time
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.analyze.measures.alignment import GRIPPER
 from vla_attention.analyze.show.numbers import row_interval
 from vla_attention.analyze.statistics.intervals import estimates, ratio_of_means_over_episodes
 from vla_attention.analyze.statistics.units import Units
-from vla_attention.analyze.time.alignment import GRIPPER
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from typing import Any
 from vla_attention.analyze.effects.conditions import FLOORS, Kind
 from vla_attention.analyze.effects.effect_study import EffectStudy
 from vla_attention.analyze.effects.group_rows import GroupRow, group_rows, readers_of
-from vla_attention.analyze.effects.item_rows import ItemRow, item_rows, ratio_of_effects
+from vla_attention.analyze.effects.item_rows import MODALITIES, ItemRow, item_rows, ratio_of_effects
 from vla_attention.analyze.ratios.answer import ratio_sentence
 from vla_attention.analyze.show.findings import findings
 from vla_attention.analyze.show.numbers import format_number, row_interval
@@ -19,7 +19,6 @@ from vla_attention.schemas.stores.store_format import CALLERS_MODULES
 
 #: Sentences that name conditions after looking at all: beyond noise, and beyond random keys.
 _SENTENCES = 2
-_MODALITIES = ("visual", "linguistic")
 _ACTION, _ALL = readers("action"), readers("all")
 #: What a knockout leaves, by for whom it is.
 _REACH = {
@@ -36,7 +35,7 @@ def answer_lines(study: EffectStudy) -> list[str]:
         return item_lines(study, items)
     grouping, rows = study.analysis.grouping, group_rows(study)
     # Where a site has one of the modalities only (Cosmos), the grouping has no ratio.
-    sides = _MODALITIES if grouping.ratio is None else (*grouping.ratio.numerator, *grouping.ratio.denominator)
+    sides = MODALITIES if grouping.ratio is None else (*grouping.ratio.numerator, *grouping.ratio.denominator)
     lines = [noise_sentence(study)]
     lines += [side_sentence(row) for name in sides for row in rows if row.name == name]
     lines.append(for_whom(rows))

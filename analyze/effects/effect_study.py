@@ -36,7 +36,7 @@ from vla_attention.analyze.effects.paired_replans import (
     pair_episodes,
     stores_executed,
 )
-from vla_attention.analyze.effects.reruns import BaseAndReruns, open_reruns
+from vla_attention.analyze.effects.reruns import BaseAndReruns, open_reruns, recorded_conditions
 from vla_attention.analyze.effects.rollouts import ROLLOUT_COLUMNS, rollout_pairs, rollout_summary
 from vla_attention.analyze.effects.same_calls import held_by_one
 from vla_attention.analyze.effects.sums import sums_of_groups
@@ -151,6 +151,17 @@ def study_effects(
     """
     opened = open_reruns(open_store(base), given)
     return study_of(analyse(ask([opened.base], settings)), opened, dimensions)
+
+
+def recorded_study(stores: Sequence[Store], settings: AnalysisSettings) -> EffectStudy | None:
+    """The effects that a store measured beside its calls; None without any, and for several stores.
+
+    Raises:
+        BadArgument: none that it measured can be shown.
+    """
+    if len(stores) != 1 or not recorded_conditions(stores[0]):
+        return None
+    return study_effects(stores[0].path, [], settings)
 
 
 def study_of(analysis: Analysis, opened: BaseAndReruns, dimensions: Sequence[int] | None = None) -> EffectStudy:

@@ -15,6 +15,9 @@ from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.statistics.episode_intervals import means_of_all_and_of_tasks
 from vla_attention.analyze.statistics.intervals import POSITIVE
 
+#: All pictures, and all text.
+MODALITIES = ("visual", "linguistic")
+
 
 @dataclass(frozen=True)
 class ItemRow:
@@ -67,7 +70,7 @@ def ratio_of_effects(study: EffectStudy) -> dict[str, Any] | None:
     """
     sides: dict[str, str] = {}
     for condition in study.of_kind(Kind.WITHOUT):
-        if reader_of(condition) == "total" and condition.group_name in ("visual", "linguistic"):
+        if reader_of(condition) == "total" and condition.group_name in MODALITIES:
             sides[condition.group_name] = condition.name
     if len(sides) < 2:
         return None
@@ -75,7 +78,7 @@ def ratio_of_effects(study: EffectStudy) -> dict[str, Any] | None:
     place = [*EPISODE_ID, "instruction"]
     visual, linguistic = (
         whole.filter(pl.col("condition") == sides[name]).select(*place, pl.col("effect").alias(name))
-        for name in ("visual", "linguistic")
+        for name in MODALITIES
     )
     pairs = visual.join(linguistic, on=place, how="inner").with_columns(question=pl.lit("effects"))
     if not pairs.height:

@@ -16,9 +16,9 @@ from vla_attention.analyze.effects.action_changes import (
 )
 from vla_attention.analyze.effects.conditions import Condition
 from vla_attention.analyze.effects.same_calls import check_same_calls
+from vla_attention.analyze.measures.alignment import episode_timing, on_episode_time
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.time.alignment import episode_timing, on_episode_time
 from vla_attention.schemas.effects import CHANGE
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.stores.reader import Store, StoredEpisode

@@ -12,11 +12,11 @@ import polars as pl
 from vla_attention.analyze.effects.action_changes import MOSTLY_NOISE
 from vla_attention.analyze.effects.answer import answer_lines, beyond
 from vla_attention.analyze.effects.conditions import FLOORS, READERS, Condition, Kind, Reader
-from vla_attention.analyze.effects.effect_study import EffectStudy, study_effects
+from vla_attention.analyze.effects.effect_study import EffectStudy, recorded_study
 from vla_attention.analyze.effects.group_rows import GroupRow, group_rows
 from vla_attention.analyze.effects.item_rows import ItemRow, item_rows
+from vla_attention.analyze.effects.over_time import NOISE, EffectsOverTime, early_and_late
 from vla_attention.analyze.effects.paired_replans import ALL, PHASES, stores_executed
-from vla_attention.analyze.effects.reruns import recorded_conditions
 from vla_attention.analyze.effects.sums import summary_of_sums
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.show.answer import Section
@@ -124,13 +124,13 @@ def of_task(settings: AnalysisSettings, task: int | None) -> AnalysisSettings:
 
 def recorded_sections(stores: Sequence[Store], settings: AnalysisSettings, kind: str) -> list[Section]:
     """The effects of a kind of item (`word`, `object`) that a store measured beside its calls; nothing without any."""
-    if len(stores) != 1 or not recorded_conditions(stores[0]):
-        return []
     title = "WITHOUT IT  effect on the action, by who no longer reads it"
     try:
-        study = study_effects(stores[0].path, [], settings)
+        study = recorded_study(stores, settings)
     except BadArgument as error:
         return [Section([str(error)], title)]
+    if study is None:
+        return []
     table = item_table(study, kind)
     note = f"{_ITEM_NOTE.format(which=counted_actions(study))} More: vla-analyze effects {stores[0].path}"
     return [Section([table, note], title)] if table.rows else []
@@ -171,6 +171,35 @@ def _items(study: EffectStudy) -> list[Section]:
     note = _ITEM_NOTE.format(which=counted_actions(study))
     about = f"{interval_note(DEFAULT_LEVEL, study.question.units.words)} Effects do not add up."
     return [Section([table, note, about], "WITHOUT IT  effect on the action, by who no longer reads it")]
+
+
+#: Rows of the printed course of effects; the table and the picture have every bin.
+_BINS = 10
+
+
+def over_time_sections(effects: EffectsOverTime) -> list[Section]:
+    """Effects over an episode's time, for `vla-analyze time`."""
+    course = effects.course
+    items = course["item"].unique(maintain_order=True).to_list()
+    bins = course.partition_by("position", maintain_order=True)
+    stride = -(-len(bins) // _BINS)
+    rows = [
+        part.row(0, named=True) | {f"of {row['item']}": row["effect"] for row in part.iter_rows(named=True)}
+        for part in sorted(bins, key=lambda part: float(part["position"][0]))[::stride]
+    ]
+    columns = [
+        texts("time", lambda row: f"{row['position_low']:.2f}-{row['position_high']:.2f}", left=True),
+        *(number("noise" if name == NOISE else broken(name, 12), _value(f"of {name}")) for name in items),
+    ]
+    note = (
+        f"Change of the {counted_actions(effects.study)} actions without it, in their spread; noise: by another noise "
+        f"seed. The table has intervals. More: vla-analyze effects {effects.study.given.base.path}"
+    )
+    return [Section([early_and_late(effects.study), Table(columns, rows), note], "EFFECTS OVER THE EPISODE'S TIME")]
+
+
+def _value(name: str) -> Callable[[dict[str, Any]], float | None]:
+    return lambda row: row.get(name)
 
 
 def _condition(width: int) -> Column:

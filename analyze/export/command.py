@@ -10,7 +10,7 @@ from vla_attention.analyze.show.output_files import files_lines
 from vla_attention.schemas.command_line import command_parser
 from vla_attention.schemas.errors import BadArgument
 
-_TABLES = ("steps", "replans", "episodes", "tasks", "contributions")
+_TABLES = ("steps", "replans", "episodes", "tasks", "contributions", "effects")
 _DEFAULT_TABLES = ("episodes", "tasks", "steps")
 _EXAMPLES = """examples:
   vla-analyze export runs/libero_10.zarr --csv
@@ -19,7 +19,7 @@ _EXAMPLES = """examples:
   vla-analyze export runs/libero_10.zarr --netcdf --rows --layers 25 --tasks 0
 
 Tables: steps (every replan, layer and denoise step), replans, episodes, tasks (with intervals), contributions
-(norms, where recorded). The NetCDF file, attention.nc, has (episode, replan) as one axis `sample`, so that nothing
+(norms, where recorded), effects (of every replan and condition, where recorded). The NetCDF file, attention.nc, has (episode, replan) as one axis `sample`, so that nothing
 is padded; open it with xarray.open_dataset, or with any program that reads HDF5.
 """
 

@@ -6,6 +6,7 @@ import numpy as np
 import polars as pl
 
 from vla_attention.analyze.measures.aggregate import layer_order
+from vla_attention.analyze.measures.alignment import on_episode_time, steps_of_time
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.intervals import (
@@ -13,7 +14,6 @@ from vla_attention.analyze.statistics.intervals import (
     estimates,
     mean_over_episodes,
 )
-from vla_attention.analyze.time.alignment import on_episode_time, steps_of_time
 from vla_attention.schemas.groupings.grouping import Grouping
 
 MOST_BINS = 20

@@ -41,6 +41,8 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the findings; write tables and pictures."""
+    from vla_attention.analyze.effects.over_time import over_time_of_stores
+    from vla_attention.analyze.effects.text import over_time_sections
     from vla_attention.analyze.show.answer import Answer
     from vla_attention.analyze.time.text import time_sections
     from vla_attention.analyze.time.time_courses import TimeSettings, time_courses
@@ -48,11 +50,14 @@ def run(arguments: argparse.Namespace) -> int:
     settings = TimeSettings(arguments.bins, arguments.window)
     question = question_of(arguments)
     courses = time_courses(question, settings)
+    effects = over_time_of_stores(question.stores, question.settings, settings.num_bins)
 
     def draw(folder: Path) -> list[Path]:
+        from vla_attention.analyze.effects.plot_effects_over_time import plot_effects_over_time
         from vla_attention.analyze.time.plot_time_course import plot_time_courses
 
-        return plot_time_courses(courses, question.grouping, folder)
+        files = plot_time_courses(courses, question.grouping, folder)
+        return files + (plot_effects_over_time(effects, folder) if effects is not None else [])
 
     tables = {
         "time_course": courses.course,
@@ -61,5 +66,9 @@ def run(arguments: argparse.Namespace) -> int:
         "success_against_failure": courses.outcomes,
         "autocorrelation": courses.autocorrelation,
     }
-    answer = Answer(time_sections(question, courses, settings), tables, draw)
+    sections = time_sections(question, courses, settings)
+    if effects is not None:
+        tables["effects_over_time"] = effects.course
+        sections[2:2] = over_time_sections(effects)  # after the course of attention
+    answer = Answer(sections, tables, draw)
     return show(answer, output_folder(arguments, "time"), arguments)

@@ -17,6 +17,13 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.aggregate import overall_layer, replans_of
+from vla_attention.analyze.measures.alignment import (
+    around_event,
+    change_and_placebo,
+    closing_replan,
+    episode_timing,
+    on_episode_time,
+)
 from vla_attention.analyze.measures.frames import (
     EPISODE_ID,
     EPISODE_KEYS,
@@ -44,13 +51,6 @@ from vla_attention.analyze.statistics.intervals import (
 from vla_attention.analyze.statistics.many_looks import adjusted_p_values
 from vla_attention.analyze.statistics.summaries import summarize
 from vla_attention.analyze.statistics.units import Units
-from vla_attention.analyze.time.alignment import (
-    around_event,
-    change_and_placebo,
-    closing_replan,
-    episode_timing,
-    on_episode_time,
-)
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.grouping import Grouping
 

@@ -12,8 +12,7 @@ from scipy import stats
 
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.show.answer import text_of
-from vla_attention.analyze.time.alignment import (
+from vla_attention.analyze.measures.alignment import (
     around_event,
     change_and_placebo,
     change_at_event,
@@ -21,6 +20,7 @@ from vla_attention.analyze.time.alignment import (
     on_episode_time,
     replan_starts,
 )
+from vla_attention.analyze.show.answer import text_of
 from vla_attention.analyze.time.text import time_sections
 from vla_attention.analyze.time.time_courses import ALL, FAILURE, GRIPPER_CLOSING, SUCCESS, TimeSettings, time_courses
 from vla_attention.schemas.errors import BadArgument

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from tests.analyze.view.page_answers import needs_node, run_in_node
+from vla_attention.analyze.measures.alignment import closing_replan
 from vla_attention.analyze.show.patch_pictures import upright
-from vla_attention.analyze.time.alignment import closing_replan
 from vla_attention.schemas.stores.store_format import PolicyCameraView
 
 pytestmark = needs_node
