@@ -61,7 +61,7 @@ def effects_by_replan(study: EffectStudy) -> pl.DataFrame:
         values = {"replan": replans, "env_step": base.env_step[replans]}
         values |= {name: changes[replans, i] for i, name in enumerate(CHANGES)}
         constant = [pl.lit(value, schema[name]).alias(name) for name, value in (_identity(base) | names).items()]
-        table = pl.DataFrame(values).with_columns(constant).select(schema)
+        table = pl.DataFrame(values).with_columns(constant).select(*schema)
         parts.append(table.with_columns(pl.col(CHANGES).fill_nan(None)))
     return pl.concat(parts)
 

@@ -18,9 +18,10 @@ _EXAMPLES = """examples:
   vla-analyze export runs/libero_10.zarr --netcdf --group bowl=word:bowl --group rest='*'
   vla-analyze export runs/libero_10.zarr --netcdf --rows --layers 25 --tasks 0
 
-Tables: steps (every replan, layer and denoise step), replans, episodes, tasks (with intervals), contributions
-(norms, where recorded), effects (of every replan and condition, where recorded). The NetCDF file, attention.nc, has (episode, replan) as one axis `sample`, so that nothing
-is padded; open it with xarray.open_dataset, or with any program that reads HDF5.
+Tables: steps (every replan, layer and denoise step), replans, episodes, tasks (with intervals); contributions
+(norms) and effects (of every replan and condition), where recorded. The NetCDF file, attention.nc, has (episode,
+replan) as one axis `sample`, so that nothing is padded; open it with xarray.open_dataset, or with any program that
+reads HDF5.
 """
 
 
@@ -70,10 +71,17 @@ def run(arguments: argparse.Namespace) -> int:
     written: list[Path] = []
     if tables_wanted:
         from vla_attention.analyze.export.tables import chosen_tables, write_tables
+        from vla_attention.analyze.measures.frames import TableInParts
         from vla_attention.analyze.ratios.analysis import analyse
 
         names = list(dict.fromkeys(arguments.table or _DEFAULT_TABLES))
-        written += write_tables(folder, chosen_tables(analyse(question), names), kinds)
+        of_attention = [name for name in names if name != "effects"]
+        tables: dict[str, TableInParts] = chosen_tables(analyse(question), of_attention) if of_attention else {}
+        if "effects" in names:
+            from vla_attention.analyze.export.recorded_effects import effect_table
+
+            tables["effects"] = TableInParts([effect_table(question)])
+        written += write_tables(folder, tables, kinds)
     if arguments.netcdf:
         from vla_attention.analyze.export.labelled_arrays import rows_size, write_netcdf
         from vla_attention.schemas.progress_bar import progress_bar

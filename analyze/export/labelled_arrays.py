@@ -10,6 +10,7 @@ averaged.
     uniform_mass   as mass: what uniform attention gives; uniform_valid as row_sum: what it gives all valid keys
     rows       (sample, layer, denoise, head, key)     only on request: the probabilities themselves
     key_role   (sample, key)                           with rows: codes of `vla_attention.schemas.layout.Role`
+    effect_change (entry, step, dimension) ...         where effects were recorded: `recorded_effects.effect_arrays`
 
 xarray and h5netcdf are the extra `xarray`; nothing here imports them before an array is asked for.
 """
@@ -26,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.analyze.export.recorded_effects import effect_arrays
 from vla_attention.analyze.export.refusing_disk import untold_file
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.steps import measure_episodes
@@ -151,7 +153,7 @@ def write_netcdf(
     """
     h5netcdf = _needed("h5netcdf")
     _needed("h5py")
-    masses = masses_array(question, progress)
+    masses = masses_array(question, progress).assign(effect_arrays(question))
     compressed = {name: {"zlib": True, "complevel": 4} for name in ("mass", "row_sum", "uniform_mass", "uniform_valid")}
     with writing("the arrays", path), replacing(path) as temporary, untold_file(temporary) as untold:
 

@@ -24,7 +24,7 @@ from vla_attention.schemas.errors import BadArgument, MissingDependency
 from vla_attention.schemas.groupings.resolve import resolve
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.precision import mass_error_bound
-from vla_attention.testing.stores import write_store
+from vla_attention.testing.stores import small_effects, write_store
 from vla_attention.testing.strategies import episode_tokens, groupings
 from vla_attention.testing.tokens import small_layout
 
@@ -256,3 +256,26 @@ def test_files_of_any_layout_and_grouping_hold_the_raw_rows_and_their_sums(data)
             np.testing.assert_allclose(found["mass"].values, expected, rtol=mass_error_bound(10) + 1e-5, atol=1e-9)
             assert found["group"].values.tolist() == list(grouping.names)
             np.testing.assert_array_equal(found["key_role"].values, np.concatenate([tokens.key_role] * 2))
+
+
+def test_recorded_effects_are_a_table_and_arrays(tmp_path, capsys):
+    store = write_store(tmp_path / "effects.zarr", tasks=(0, 1), episodes=2, replans=3, plant_effects=small_effects)
+    words = [store, "--csv", "--netcdf", "--table", "effects", "--output", tmp_path / "out"]
+    assert exported(*words) == 0
+    raw = zarr.open_group(store, mode="r")["episodes"]
+    changes = [raw[name]["effects/change"][:] for name in sorted(raw.group_keys())]
+    dataset = xr.open_dataset(tmp_path / "out/attention.nc")
+    assert np.array_equal(dataset["effect_change"], np.concatenate(changes))
+    samples = [3 * number + replan for number, name in enumerate(sorted(raw.group_keys()))
+               for replan in raw[name].attrs["effects"]["replan"]]  # fmt: skip
+    assert dataset["effect_sample"].values.tolist() == samples
+    assert (dataset["effect_units"] == 2.0).all()
+    table = pl.read_csv(tmp_path / "out/effects.csv")
+    named = [str(name) for name in dataset["effect_condition"].values if name != "unchanged"]
+    assert table.height == len(named)
+    assert sorted(table["condition"]) == sorted(named)
+
+
+def test_effects_that_were_not_recorded_are_no_table(ragged, tmp_path, capsys):
+    assert exported(*ragged, "--csv", "--table", "effects", "--output", tmp_path / "out") == 2
+    assert "These stores hold no effects; record them with vla-capture --effects" in capsys.readouterr().err

@@ -1,0 +1,82 @@
+"""Recorded effects of two runs side by side: a planted difference in one word, and runs without effects."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from tests.kit.planted_effects import FIRST, ITEMS, planted_effects
+from vla_attention.analyze.compare.comparison import compare
+from vla_attention.analyze.compare.runs import open_runs, parse_runs
+from vla_attention.analyze.compare.text import comparison_sections
+from vla_attention.analyze.effects.effect_study import study_effects
+from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.show.answer import text_of
+from vla_attention.testing.stores import StoreSpec, write_store
+
+SETTINGS = AnalysisSettings(intervals="these-tasks")
+SPEC = StoreSpec(tasks=(0, 1, 2), episodes=4, replans=2)
+
+
+def jitter(run: int, factor: float):
+    """Planted: the first word matters `factor` times as much; every episode differs a little, in each run."""
+
+    def scale(name: str, task: int, episode: int, replan: int) -> float:
+        own = 1.0 + 0.02 * ((task + episode * (1 + run)) % 3)
+        return own * (factor if f"word_{FIRST}_queries_all" in name else 1.0)
+
+    return scale
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("effects_of_runs")
+    specs = {
+        "base": replace(SPEC, plant_effects=planted_effects(jitter(0, 1.0))),
+        "other": replace(SPEC, plant_effects=planted_effects(jitter(1, 1.5)), policy="tuned"),
+        "plain": replace(SPEC, policy="tuned"),
+        "elsewhere": replace(SPEC, plant_effects=planted_effects(jitter(1, 1.5)), seed=5),
+    }
+    return {name: write_store(folder / f"{name}.zarr", spec=spec) for name, spec in specs.items()}
+
+
+def compared(stores, *names, allowed=()):
+    return compare(open_runs(parse_runs([str(stores[name]) for name in names]), SETTINGS, allowed), allowed)
+
+
+def test_the_differences_are_those_of_the_two_commands(stores):
+    comparison = compared(stores, "base", "other")
+    studies = [study_effects(stores[name], [], SETTINGS) for name in ("base", "other")]
+    rows = comparison.effects.filter(scope="all")
+    assert rows.height == 2 * len(ITEMS)
+    for row in rows.iter_rows(named=True):
+        group = (
+            row["item"].strip("'") if row["item"] in ("visual", "linguistic") else f"word_{row['item'].strip(chr(39))}"
+        )
+        name = f"without_{group}" + ("_queries_all" if row["reader"] == "total" else "")
+        sides = [study.summary.filter(scope="all", phase="all", condition=name)["effect"].item() for study in studies]
+        assert [row["mean_first"], row["mean_other"]] == pytest.approx(sides, rel=1e-9)
+        assert row["difference"] == pytest.approx(sides[1] - sides[0], rel=1e-6, abs=1e-9)
+        assert row["paired"]
+
+
+def test_the_planted_word_is_named_and_nothing_else(stores):
+    comparison = compared(stores, "base", "other")
+    shown = comparison.effects.filter(scope="all").sort("q", nulls_last=True)
+    assert (shown["item"][0], shown["reader"][0]) == (f"'{FIRST}'", "total")
+    text = text_of(comparison_sections(comparison))
+    assert f"'{FIRST}'" in text.split("EFFECTS  without it")[1].splitlines()[2]
+
+
+def test_where_a_run_recorded_none_a_note_says_so(stores):
+    comparison = compared(stores, "base", "plain")
+    assert comparison.effects.is_empty()
+    assert "effects are not compared: plain recorded none." in comparison.notes
+    assert "EFFECTS" not in text_of(comparison_sections(comparison))
+
+
+def test_runs_of_other_seeds_are_compared_by_their_means(stores):
+    comparison = compared(stores, "base", "elsewhere", allowed=("seed",))
+    (row,) = comparison.effects.filter(scope="all", item=f"'{FIRST}'", reader="total").to_dicts()
+    assert row["difference"] > 0.3 * row["mean_first"]

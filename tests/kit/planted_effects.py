@@ -1,0 +1,87 @@
+"""Recorded effects of planted sizes, for stores of `vla_attention.testing`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from vla_attention.capture.interventions.condition_name import knockout_of_group
+from vla_attention.capture.store.replan_records import ReplanEffects
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
+from vla_attention.schemas.groupings.words import words_of
+from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange
+from vla_attention.schemas.layout import Role
+from vla_attention.testing.stores import PlantEffects
+from vla_attention.testing.tokens import INSTRUCTIONS
+
+READERS = {"total": ("all", ""), "direct": ("action", ""), "pictures": ("prefix", "role:image")}
+WORDS = tuple(dict.fromkeys(word for text in INSTRUCTIONS for word in text.split()))
+FIRST = INSTRUCTIONS[0].split()[0]
+#: Item -> its selector, and the size of its change by reader.
+ITEMS = {
+    "visual": ("role:image", {"total": 2.0, "direct": 1.5, "pictures": 0.5}),
+    "linguistic": ("role:instruction | role:template", {"total": 1.0, "direct": 0.2, "pictures": 0.8}),
+    **{
+        f"word_{word}": (
+            f'word:"{word}"',
+            {"total": 0.9 / (1 + i), "direct": 0.01 + 0.1 * i, "pictures": 0.7 / (1 + i)},
+        )
+        for i, word in enumerate(WORDS)
+    },
+}
+NOISE, RANDOM = 0.05, 0.02
+
+
+def conditions() -> dict[Interventions | str, tuple[Interventions, float]]:
+    planted = {"unchanged": (Interventions("unchanged"), 0.0)}
+    planted["noise"] = (Interventions("noise", noise=NoiseChange(1)), NOISE)
+    for name, (selector, sizes) in ITEMS.items():
+        for reader, (queries, readers) in READERS.items():
+            one = KeyKnockout(selector, queries=queries, query_selector=readers)
+            made = knockout_of_group("without", name, one)
+            planted[made.name] = (made, sizes[reader])
+    for queries, readers in READERS.values():
+        one = KeyKnockout(f'word:"{FIRST}"', queries=queries, query_selector=readers, random_seed=1)
+        made = knockout_of_group("random", f"word_{FIRST}", one)
+        planted[made.name] = (made, RANDOM)
+    return planted
+
+
+def planted_effects(scale: Callable[[str, int, int, int], float] = lambda *_: 1.0) -> PlantEffects:
+    """Every dimension changes by the size, in the sign of a coin; words of other instructions have no entry.
+
+    scale: a factor of the size by the name of the condition, task, episode and replan.
+    """
+
+    def plant(task: int, episode: int, replan: int, tokens: EpisodeTokens) -> ReplanEffects:
+        return _effects_of(task, episode, replan, tokens, scale)
+
+    return plant
+
+
+def _effects_of(
+    task: int, episode: int, replan: int, tokens: EpisodeTokens, scale: Callable[[str, int, int, int], float]
+) -> ReplanEffects:
+    known = INSTRUCTIONS[task % len(INSTRUCTIONS)].split()
+    all_of = conditions()
+    measured, changes = [], []
+    for number, (name, (_, size)) in enumerate(all_of.items()):
+        word = name.split("word_")[-1].split("_queries")[0] if "word_" in name else known[0]
+        if word in known:
+            measured.append(number)
+            signs = np.random.default_rng([task, episode, replan, number]).choice([-1.0, 1.0], (5, 7))
+            changes.append(scale(name, task, episode, replan) * size * signs)
+    roles = tokens.key_role[replan]
+    keys_of = {"visual": roles == Role.IMAGE, "linguistic": np.isin(roles, [Role.INSTRUCTION, Role.TEMPLATE])}
+    for word in words_of(tokens.prompts[tokens.prompt_index[replan]]):
+        of_word = keys_of.setdefault(f"word_{word.text}", np.zeros(len(roles), dtype=bool))
+        of_word[list(word.keys)] = True
+    cut = np.zeros((len(measured), tokens.layout.num_keys), np.float32)
+    for row, number in zip(cut, measured, strict=True):
+        name = list(all_of)[number]
+        if name.startswith("without_"):
+            row[:] = keys_of[name.removeprefix("without_").split("_queries")[0]]
+    listed = tuple(one for one, _ in all_of.values())
+    change = np.array(changes, np.float32)
+    return ReplanEffects(listed, (3.0,) * 7, tuple(measured), change, {"joint": cut})
