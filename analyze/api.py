@@ -305,7 +305,7 @@ class OpenStores:
     def compare(
         self,
         other: OpenStores | str | Path | Sequence[str | Path],
-        table: Literal["differences", "estimates", "pairs", "unpaired"] = "differences",
+        table: Literal["differences", "estimates", "pairs", "unpaired", "effects"] = "differences",
         allow_mismatch: Sequence[str] = (),
         names: tuple[str, str] = ("first", "other"),
         **settings: Unpack[SettingKeywords],
@@ -323,7 +323,7 @@ class OpenStores:
         from vla_attention.analyze.compare.comparison import compare_stores
         from vla_attention.analyze.compare.runs import RunArgument
 
-        known = ("differences", "estimates", "pairs", "unpaired")
+        known = ("differences", "estimates", "pairs", "unpaired", "effects")
         both = self, other if isinstance(other, OpenStores) else open_stores(other)
         runs = [RunArgument(name, tuple(one.path for one in run.stores)) for name, run in zip(names, both, strict=True)]
         return _chosen(table, known, lambda: compare_stores(runs, settings_from_keywords(**settings), allow_mismatch))
@@ -331,7 +331,7 @@ class OpenStores:
     def effects(
         self,
         reruns: str | Path | Sequence[str | Path] = (),
-        table: Literal["summary", "episodes", "rollouts", "rollout_episodes"] = "summary",
+        table: Literal["summary", "episodes", "rollouts", "rollout_episodes", "replans"] = "summary",
         dimensions: Sequence[int] | None = None,
         **settings: Unpack[SettingKeywords],
     ) -> pl.DataFrame:
@@ -339,7 +339,8 @@ class OpenStores:
 
         `reruns`: stores of `vla-capture rerun`, rollouts with interventions, or folders of them; this is their base.
         Without any, the effects that were measured beside its own calls (`vla-capture --effects`).
-        `dimensions`: those of the action that are compared. "rollouts" compares success and number of steps.
+        `dimensions`: those of the action that are compared. "rollouts" compares success and number of steps, "replans"
+        has every replan of effects that were measured beside the calls.
 
         >>> effects = va.open(store).effects(rerun)
         >>> effects.filter(scope="all", phase="all").select("condition", "group", "num_episodes").rows()
@@ -349,13 +350,16 @@ class OpenStores:
             BadArgument: several stores are open, or a store is no rerun of this one.
         """
         from vla_attention.analyze.effects.effect_study import study_effects
+        from vla_attention.analyze.effects.over_time import effects_by_replan
 
-        known, stores = ("summary", "episodes", "rollouts", "rollout_episodes"), self.stores
+        known, stores = ("summary", "episodes", "rollouts", "rollout_episodes", "replans"), self.stores
         if len(stores) > 1:
             raise BadArgument(f"Effects are those of reruns of one store; {len(stores)} are open: open one of them.")
         paths = [Path(reruns)] if isinstance(reruns, (str, Path)) else [Path(path) for path in reruns]
         asked = settings_from_keywords(**settings)
-        return _chosen(table, known, lambda: study_effects(stores[0].path, paths, asked, dimensions))
+        check_name("table", table, known)
+        study = study_effects(stores[0].path, paths, asked, dimensions)
+        return effects_by_replan(study) if table == "replans" else _chosen(table, known, lambda: study)
 
     def deviation(
         self,

@@ -51,9 +51,8 @@ def test_the_differences_are_those_of_the_two_commands(stores):
     rows = comparison.effects.filter(scope="all")
     assert rows.height == 2 * len(ITEMS)
     for row in rows.iter_rows(named=True):
-        group = (
-            row["item"].strip("'") if row["item"] in ("visual", "linguistic") else f"word_{row['item'].strip(chr(39))}"
-        )
+        bare = row["item"].strip("'")
+        group = bare if row["item"] == bare else f"word_{bare}"
         name = f"without_{group}" + ("_queries_all" if row["reader"] == "total" else "")
         sides = [study.summary.filter(scope="all", phase="all", condition=name)["effect"].item() for study in studies]
         assert [row["mean_first"], row["mean_other"]] == pytest.approx(sides, rel=1e-9)
