@@ -11,12 +11,14 @@ import polars as pl
 from vla_attention.analyze.effects.conditions import Condition, Kind, Reader, item_name, reader_of, selector_kind
 from vla_attention.analyze.effects.effect_study import EffectStudy
 from vla_attention.analyze.effects.paired_replans import ALL
+from vla_attention.analyze.measures.aggregate import overall_layer
 from vla_attention.analyze.measures.frames import EPISODE_ID
-from vla_attention.analyze.statistics.episode_intervals import means_of_all_and_of_tasks
-from vla_attention.analyze.statistics.intervals import POSITIVE
+from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
+from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE
+from vla_attention.schemas.safe_text import visible
 
 #: All pictures, and all text.
-MODALITIES = ("visual", "linguistic")
+MODALITIES: tuple[str, str] = ("visual", "linguistic")
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,44 @@ def ratio_of_effects(study: EffectStudy) -> dict[str, Any] | None:
     Returns:
         ratio, ratio_low, ratio_high, num_episodes of the quotient of mean effects over the same episodes.
     """
+    table = _both_sides(study)
+    if table is None:
+        return None
+    return means_with_intervals(table, ["question"], _SIDES, study.question.sampling, quotients=_RATIO).row(
+        0, named=True
+    )
+
+
+def ratios_by_family(study: EffectStudy) -> list[dict[str, Any]]:
+    """The same for each family of tasks, with the ratio of the base's attention beside it; nothing with one family.
+
+    Returns:
+        For each family: family, num_episodes, num_tasks, visual, linguistic, ratio with its bounds, and `attention`,
+        the geometric mean over the family's tasks of the ratio visual / linguistic (null without one).
+    """
+    table, sampling = _both_sides(study), study.question.sampling
+    if table is None or len({*sampling.families.values()}) < 2:
+        return []
+    families = [sampling.families.get((row["suite"], row["task_id"]), "") for row in table.iter_rows(named=True)]
+    named = table.with_columns(family=pl.Series([visible(name) for name in families], dtype=pl.String))
+    episodes = study.analysis.episodes
+    layer = overall_layer(episodes.parts[0].cells)
+    if study.analysis.grouping.ratio is not None:
+        of_layer = episodes.cells.filter(layer=layer).select(*EPISODE_ID, pl.col("log_ratio_mean").alias("attention"))
+        named = named.join(of_layer, on=EPISODE_ID, how="left", maintain_order="left")
+    else:
+        named = named.with_columns(attention=pl.lit(None, pl.Float64))
+    values = {**_SIDES, "attention": NO_LIMITS}
+    rows = means_with_intervals(named, ["family"], values, sampling, quotients=_RATIO)
+    return rows.with_columns(pl.col("attention").exp()).to_dicts()
+
+
+_SIDES = dict.fromkeys(MODALITIES, POSITIVE)
+_RATIO = {"ratio": MODALITIES}
+
+
+def _both_sides(study: EffectStudy) -> pl.DataFrame | None:
+    """One row per episode with the total effects `visual` and `linguistic`; None where one was not measured."""
     sides: dict[str, str] = {}
     for condition in study.of_kind(Kind.WITHOUT):
         if reader_of(condition) == "total" and condition.group_name in MODALITIES:
@@ -81,13 +121,4 @@ def ratio_of_effects(study: EffectStudy) -> dict[str, Any] | None:
         for name in MODALITIES
     )
     pairs = visual.join(linguistic, on=place, how="inner").with_columns(question=pl.lit("effects"))
-    if not pairs.height:
-        return None
-    table = means_of_all_and_of_tasks(
-        pairs,
-        ["question"],
-        {"visual": POSITIVE, "linguistic": POSITIVE},
-        study.question.sampling,
-        quotients={"ratio": ("visual", "linguistic")},
-    )
-    return table.row(by_predicate=pl.col("scope") == "all", named=True)
+    return pairs if pairs.height else None

@@ -14,7 +14,7 @@ from vla_attention.analyze.effects.answer import answer_lines, beyond
 from vla_attention.analyze.effects.conditions import FLOORS, READERS, Condition, Kind, Reader
 from vla_attention.analyze.effects.effect_study import EffectStudy, recorded_study
 from vla_attention.analyze.effects.group_rows import GroupRow, group_rows
-from vla_attention.analyze.effects.item_rows import ItemRow, item_rows
+from vla_attention.analyze.effects.item_rows import ItemRow, item_rows, ratios_by_family
 from vla_attention.analyze.effects.over_time import NOISE, EffectsOverTime, early_and_late
 from vla_attention.analyze.effects.paired_replans import ALL, PHASES, stores_executed
 from vla_attention.analyze.effects.sums import summary_of_sums
@@ -51,10 +51,8 @@ _EFFECT_NOTE = (
 
 _READER_NAMES: dict[Reader, str] = {"total": "all", "direct": "action", "pictures": "pictures", "text": "text"}
 _ITEM_NOTE = (
-    "Effect: root mean square change of the {which} actions, each dimension in its standard deviation in the base, "
-    "when no query reads the item (all), or these alone do not: the action queries, the pictures, the text. "
-    "direct/all: the share of the effect that is the action queries' own. x noise: times that of another noise seed; "
-    "random: of random keys of about the same number. lift: the base's."
+    "Change of the {which} actions, in their spread, when nobody reads the item (all), or only these do not: the "
+    "action queries, pictures, text. direct/all: the action queries' share. lift: of the base's attention."
 )
 
 
@@ -66,7 +64,10 @@ def counted_actions(study: EffectStudy) -> str:
 def effects_sections(study: EffectStudy) -> list[Section]:
     """The whole answer."""
     groups = _items(study) if study.is_recorded else _groups(study)
-    sections = [*_header(study), *groups, *_left_out(study), *_others(study), *_rollouts(study), _notes(study)]
+    if study.is_recorded:  # the notes stand below: the table of items is what the first screen has room for
+        sections = [*_header(study), *groups, *_families(study), *_left_out(study), _notes(study), *_others(study)]
+    else:
+        sections = [*_header(study), *groups, *_left_out(study), *_others(study), *_rollouts(study), _notes(study)]
     if study.conditions:
         sections += [*_floors(study), _every(study), _phases(study), *_tasks(study)]
         sections += [*_sums(study), _dimensions(study), _attention_notes(study)]
@@ -306,6 +307,25 @@ def _tasks(study: EffectStudy) -> list[Section]:
     more = len(study.conditions) - len(shown)
     title = f"PER TASK  effect{f'; {more} more conditions are in the tables' if shown and more else ''}"
     return [Section([Table(columns, tasks.to_dicts())], title)]
+
+
+def _families(study: EffectStudy) -> list[Section]:
+    """All pictures against all text, by family of tasks."""
+    columns = [
+        texts("family", lambda row: broken(row["family"] or "(none)", 40), left=True),
+        count("tasks", "num_tasks"),
+        count("n", "num_episodes"),
+        number("visual", "visual"),
+        number("text", "linguistic"),
+        *estimate("ratio", "ratio"),
+        number("attention", "attention"),
+    ]
+    note = (
+        "Effect without all pictures, without all text, and their quotient. attention: the ratio visual / linguistic "
+        "of the same episodes, geometric mean."
+    )
+    rows = ratios_by_family(study)
+    return [Section([Table(columns, rows), note], "BY FAMILY OF TASKS  pictures against text")] if rows else []
 
 
 def _most_telling(study: EffectStudy) -> list[Condition]:

@@ -11,7 +11,7 @@ import pytest
 from tests.kit.planted_effects import FIRST, ITEMS, RANDOM, READERS, WORDS, conditions, planted_effects
 from vla_attention.analyze.effects.answer import item_lines
 from vla_attention.analyze.effects.effect_study import study_effects
-from vla_attention.analyze.effects.item_rows import item_rows, ratio_of_effects
+from vla_attention.analyze.effects.item_rows import item_rows, ratio_of_effects, ratios_by_family
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.testing.stores import StoreSpec, write_store
 from vla_attention.testing.tokens import INSTRUCTIONS
@@ -123,3 +123,27 @@ def test_a_group_that_was_not_measured_has_the_sums_of_its_words(store):
 def test_no_group_of_half_words_has_sums(store):
     groups = (f"part=word:{FIRST} | role:template", "v=role:image", "rest=*")
     assert study_effects(store, [], AnalysisSettings(groups=groups, ratio="v/part")).sums.is_empty()
+
+
+def test_each_family_has_its_ratio_of_effects(tmp_path):
+    factors = {0: 1.0, 1: 3.0, 2: 0.5}
+
+    def scale(name, task, episode, replan):
+        return factors[task] if "visual" in name else 1.0
+
+    families = {0: "one", 1: "two", 2: "two"}
+    spec = StoreSpec(tasks=(0, 1, 2), episodes=2, task_families=families, plant_effects=planted_effects(scale))
+    path = write_store(tmp_path / "families.zarr", spec=spec)
+    study = study_effects(path, [], AnalysisSettings(intervals="these-tasks"))
+    rows = {row["family"]: row for row in ratios_by_family(study)}
+    planted = ITEMS["visual"][1]["total"] / ITEMS["linguistic"][1]["total"]
+    assert rows["one"]["ratio"] == pytest.approx(planted, rel=1e-6)
+    assert rows["two"]["ratio"] == pytest.approx(planted * (3.0 + 0.5) / 2, rel=1e-6)
+    assert (rows["one"]["num_tasks"], rows["two"]["num_tasks"]) == (1, 2)
+    cells = study.analysis.episodes.cells.filter(layer="layers_avg")
+    of_two = [cells.filter(task_id=task)["log_ratio_mean"].mean() for task in (1, 2)]
+    assert rows["two"]["attention"] == pytest.approx(np.exp(np.mean(of_two)), rel=1e-9)
+
+
+def test_one_family_is_no_table(study):
+    assert ratios_by_family(study) == []
