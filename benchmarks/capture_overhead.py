@@ -58,11 +58,13 @@ def sizes(name: str) -> Any:
 def make_policy(name: str, device: str = "cpu", dtype: str = "float32") -> Any:
     """Return a policy of a size with seeded random weights."""
     import torch
+    from full_size_tokenizer import FullSizeTokenizer
 
     from vla_attention.capture.policies.pi import embedded
     from vla_attention.capture.policies.pi.model import PiModel, model_from_state
     from vla_attention.capture.policies.pi.policy import PiPolicy
     from vla_attention.capture.policies.pi.processing import OpenpiProcessing
+    from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 
     config = sizes(name)
     if name == "full":  # drawn where they are used: the structure of the rows is not measured
@@ -81,7 +83,8 @@ def make_policy(name: str, device: str = "cpu", dtype: str = "float32") -> Any:
         model = model_from_state(config, weights, dtype=getattr(torch, dtype), device=device)
     small = embedded.embedded_policy()
     processing = OpenpiProcessing(config, embedded.builtin_stats(), normalisation="quantile", replan_steps=5)
-    return PiPolicy(model, small.tokenizer, processing, small.source)
+    tokenizer = FullSizeTokenizer(EMBEDDED_TOKENIZER) if name == "full" else small.tokenizer
+    return PiPolicy(model, tokenizer, processing, small.source)
 
 
 def prepared_input(policy: Any) -> Any:

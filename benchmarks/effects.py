@@ -1,10 +1,11 @@
 """What effects cost: the calls that are made again at a replan, in policy calls, and what they take on disk.
 
-Usage: python benchmarks/effects.py [--rounds 7] [--calls 4] [--threads 1]
+Usage: python benchmarks/effects.py [--rounds 7] [--calls 4] [--threads 1] [--full-size] [--device cpu]
 
 Stored calls of the example store of `pi05_cubes`, one of each of its episodes, are made as they are and with effects,
 taking turns; a number is a median over rounds of the seconds divided by those of the plain calls of the same round.
 `rank`: Spearman's correlation of the words' and parts' effects with those of all denoise steps, over all calls.
+`--full-size`: instead, one call of a pi0.5 of full size in bfloat16 (978 keys, random weights), with its memory.
 """
 
 from __future__ import annotations
@@ -34,8 +35,13 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--calls", type=int, default=4)
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--full-size", action="store_true")
+    parser.add_argument("--device", default="cpu")
     arguments = parser.parse_args()
     fix_threads(arguments.threads)
+    if arguments.full_size:
+        write_rows("effects", {"full_size": full_size_table(arguments.device, arguments.threads)})
+        return
     write_rows("effects", {"cost": cost_table(arguments.rounds, arguments.calls, arguments.threads)})
 
 
@@ -119,6 +125,77 @@ def cost_table(rounds: int, number: int, threads: int) -> Table:
         )
     columns = {"what": "effects", "conditions": "conditions", "calls": "policy calls", "rank": "rank correlation"}
     return Table(columns, rows)
+
+
+def full_size_table(device: str, threads: int) -> Table:
+    """One call as it is, and with effects of some numbers of items: seconds, policy calls, and the most memory."""
+    import numpy as np
+    import torch
+    from capture_overhead import make_policy, prepared_input
+
+    from vla_attention.capture.effects.arguments import EffectSettings
+    from vla_attention.capture.effects.conditions import UNCHANGED, planned_effects
+    from vla_attention.capture.effects.measurement import EffectMeasurement
+    from vla_attention.capture.interventions.changed_inputs import CallContext
+
+    torch.set_num_threads(threads)
+    policy = make_policy("full", device, "bfloat16")
+    given, context = prepared_input(policy), CallContext(0, 0, 0)
+    planned = planned_effects(EffectSettings(("text", "cameras")), policy, 7)
+    run = EffectMeasurement(policy, planned, {}, print)
+    began = time.perf_counter()
+    actions = policy.act(given, 7)
+    print(f"first call: {time.perf_counter() - began:.1f} s", flush=True)
+
+    def timed(call):
+        forget_peak(device)
+        before, began = peak_memory(device), time.perf_counter()
+        result = call()
+        return result, time.perf_counter() - began, (peak_memory(device) - before) / 2**30
+
+    _, plain, memory = timed(lambda: policy.act(given, 7))
+    rows = [{"what": "the call alone", "conditions": 0, "seconds": plain, "calls": 1.0, "gb": memory, "floor": "-"}]
+    whole = run.begin()
+    whole.measure(given, 7, actions, context)
+    kept = [one for one in whole.conditions or () if one.keys and one.keys[0].random_seed is None]
+    wanted = {"1 item, nobody reads it": 1, "5 items": 5, "14 items": 14, "text,cameras": None}
+    for what, number in wanted.items():
+        episode = run.begin()
+        episode.conditions = whole.conditions if number is None else (UNCHANGED, *kept[:number])
+        effects, seconds, memory = timed(lambda episode=episode: episode.measure(given, 7, actions, context))
+        row = {"what": what, "conditions": len(effects.measured), "seconds": seconds, "calls": seconds / plain}
+        rows.append(row | {"gb": memory, "floor": f"{float(np.abs(effects.change[0]).max()):.2g}"})
+        print(rows[-1], flush=True)
+    columns = {
+        "what": "effects",
+        "conditions": "conditions",
+        "seconds": "seconds",
+        "calls": "policy calls",
+        "gb": "memory beyond the model's, GB",
+        "floor": "largest difference of the unchanged call",
+    }
+    return Table(columns, rows)
+
+
+def forget_peak(device: str) -> None:
+    """Let the largest memory begin anew."""
+    import torch
+
+    if device != "cpu":
+        torch.cuda.reset_peak_memory_stats()
+        return
+    with open("/proc/self/clear_refs", "w") as file:
+        file.write("5")
+
+
+def peak_memory(device: str) -> float:
+    """Return the largest memory since `forget_peak`, in bytes."""
+    import torch
+
+    if device != "cpu":
+        return float(torch.cuda.max_memory_allocated())
+    with open("/proc/self/status") as file:
+        return 1024.0 * next(int(line.split()[1]) for line in file if line.startswith("VmHWM"))
 
 
 if __name__ == "__main__":

@@ -118,16 +118,11 @@ def write_checkpoint(folder: Path, checkpoint_format: str, dtype: str) -> None:
 
 def load_and_run(folder: Path, checkpoint_format: str, dtype: str) -> dict[str, float]:
     """Load the policy and run one replan with the default recording; seconds, and peak resident memory in GB."""
+    from benchmarks.full_size_tokenizer import FullSizeTokenizer
     from vla_attention.capture.environments.base import Observation
     from vla_attention.capture.policies.pi import loading
-    from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
     from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
     from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
-
-    class FullSizeTokenizer(PromptTokenizer):
-        """The embedded policy's tokenizer with the vocabulary size of PaliGemma's, which may not be distributed."""
-
-        vocab_size = 257_152  # type: ignore[assignment]
 
     loading.PromptTokenizer = FullSizeTokenizer  # type: ignore[misc]
     begun = time.perf_counter()

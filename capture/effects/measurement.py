@@ -24,8 +24,9 @@ from vla_attention.capture.interventions.resolution import (
 )
 from vla_attention.capture.policies.policy import CallVariant, Policy, PolicyInput, UnitsPolicy, VariantPolicy
 from vla_attention.capture.store.replan_records import ReplanEffects
+from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.effects import EffectsRecorded
-from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.errors import BadArgument, UserError, plural
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.stores.store_format import episode_name
@@ -33,6 +34,8 @@ from vla_attention.schemas.stores.store_format import episode_name
 #: Calls that are made at a time, at most; a family takes fewer where its model is large. With 32, effects take 8 %
 #: longer, with 8 a third.
 MOST_CALLS = 64
+#: Of the memory that is left, the part that changed calls may take: the simulators' processes need some, too.
+_SHARE_OF_MEMORY = 0.8
 #: Largest difference, in normalised actions, of the unchanged call from the same call among the changed ones. A model
 #: in float32 leaves 1e-6. Beyond it something else than rounding differs, and the effects of the replan are refused.
 MOST_DIFFERENCE = 1e-4
@@ -56,8 +59,12 @@ class EffectMeasurement:
     refused: int = field(default=0, init=False)
     #: What each replan with effects took.
     seconds: list[float] = field(default_factory=list, init=False)
-    _batch: int = field(default=MOST_CALLS, init=False)
+    _batch: int = field(init=False)
     _said: set[str] = field(default_factory=set, init=False)
+
+    def __post_init__(self) -> None:
+        """Choose how many calls are made at a time, by the memory that is left."""
+        self._batch = calls_at_a_time(self.policy, self.say)
 
     def begin(self) -> EpisodeEffectsMeasured:
         """Return what measures one episode."""
@@ -105,6 +112,30 @@ class EffectMeasurement:
         except QueryWithoutKeys as error:
             self.say_once(f"Left out of the effects: {error}")
             return None
+
+
+def calls_at_a_time(policy: Policy, say: Callable[[str], None]) -> int:
+    """Return how many changed calls the memory holds, at most `MOST_CALLS`; say so where it is few.
+
+    Raises:
+        BadArgument: it holds not even one.
+    """
+    if not isinstance(policy, VariantPolicy):
+        return 1
+    memory = policy.variant_memory()
+    wanted = min(MOST_CALLS, memory.most_calls)
+    fitting = int(min(memory.left * _SHARE_OF_MEMORY / memory.call_bytes, wanted))
+    room = (
+        f"each takes up to {format_bytes(memory.call_bytes)}, and {memory.device} has {format_bytes(memory.left)} left"
+    )
+    if fitting < 1:
+        raise BadArgument(
+            f"Cannot measure effects: there is no memory for one changed call ({room}). Leave --effects out."
+        )
+    if fitting < wanted:
+        say(f"Effects: {plural(fitting, 'changed call')} at a time, not {wanted} ({room}).")
+        return fitting
+    return MOST_CALLS
 
 
 def siblings_of(tasks: Iterable[tuple[int, str, str]]) -> dict[int, tuple[str, ...]]:

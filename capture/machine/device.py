@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+from vla_attention.capture.machine.memory import memory_left
 from vla_attention.schemas.errors import BadArgument
+
+if TYPE_CHECKING:
+    import torch
 
 
 def load_torch(name: str, threads: int) -> str:
@@ -26,3 +32,13 @@ def load_torch(name: str, threads: int) -> str:
     if device.type not in ("cpu", "cuda"):
         raise BadArgument(f"Cannot use --device '{name}'; expected auto, cpu, cuda or cuda:N.")
     return name
+
+
+def memory_left_on(device: torch.device) -> float:
+    """Return the bytes that are left on a device: of a GPU what is free or kept by torch, else of the processor's."""
+    import torch
+
+    if device.type != "cuda":
+        return memory_left()
+    kept_free = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
+    return float(torch.cuda.mem_get_info(device)[0] + kept_free)

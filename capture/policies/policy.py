@@ -195,6 +195,26 @@ class VariantPolicy(Protocol):
         num_steps: denoise steps. batch: variants that are made at a time, at most.
         """
 
+    def variant_memory(self) -> VariantMemory:
+        """Return how much memory variants take, and how much is left for them."""
+
+
+@dataclass(frozen=True)
+class VariantMemory:
+    """What variants of a call take in memory.
+
+    Attributes:
+        call_bytes: of each variant among those that are made at a time, at most.
+        most_calls: variants at a time beyond which the policy makes no larger batch.
+        left: bytes that the model's device has left.
+        device: its name, for a sentence.
+    """
+
+    call_bytes: int
+    most_calls: int
+    left: float
+    device: str
+
 
 @runtime_checkable
 class UnitsPolicy(Protocol):

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.flow_time import denoise_times, embed_times
 from vla_attention.capture.policies.pi.gemma import KeysValues, Rotation
 from vla_attention.capture.policies.pi.model import Denoising, PiModel
@@ -21,6 +22,25 @@ from vla_attention.capture.recording.attention import FactorEditor, LogitChange
 
 #: Bytes of the logits of one block that a batch may have: beyond it, larger batches gain nothing.
 _MOST_LOGITS = 1 << 28
+
+
+def most_calls(config: PiConfig, num_keys: int) -> int:
+    """Return the number of calls whose logits of one prefix block take `_MOST_LOGITS`; num_keys: of the prefix."""
+    return max(1, _MOST_LOGITS // (4 * config.paligemma.num_heads * num_keys**2))
+
+
+def call_bytes(config: PiConfig, num_bytes: int) -> int:
+    """Return the memory that one call of a batch takes at most: one prefix block, and the caches of all.
+
+    num_bytes: of a number of the model. Counted are the three matrices of the block's feed-forward layer, eight of the
+    width of its residual stream, its logits in float32 before and after the softmax, and the caches twice, as they are
+    brought into the order of the calls.
+    """
+    model, keys = config.paligemma, config.prefix_len
+    block = keys * (3 * model.mlp_dim + 8 * model.width) * num_bytes
+    logits = 2 * 4 * model.num_heads * keys**2
+    caches = 2 * model.depth * 2 * keys * model.num_kv_heads * model.head_dim * num_bytes
+    return block + logits + caches
 
 
 @dataclass(frozen=True)
@@ -58,7 +78,7 @@ def sample_variants(model: PiModel, calls: Sequence[ModelCall], num_steps: int, 
         # Calls with a prefix of their own first: in the batches after them, all share one.
         ordered = sorted(of_mask, key=lambda i: (prefixes[i].editor is None, prefixes[i].number))
         group = _Group(model, inputs, np.flatnonzero(valid), num_steps)
-        size = min(batch, group.most_calls)
+        size = min(batch, most_calls(model.config, len(group.real)))
         for first in range(0, len(ordered), size):
             chosen = ordered[first : first + size]
             made = group.sample([calls[i] for i in chosen], [prefixes[i] for i in chosen])
@@ -125,12 +145,6 @@ class _Group:
             min_period=config.min_period,
             max_period=config.max_period,
         ).to(model.device)
-
-    @property
-    def most_calls(self) -> int:
-        """Calls whose logits of one prefix block take `_MOST_LOGITS`."""
-        of_call = 4 * self.model.config.paligemma.num_heads * len(self.real) ** 2
-        return max(1, _MOST_LOGITS // of_call)
 
     def sample(self, calls: Sequence[ModelCall], prefixes: Sequence[_Prefix]) -> Tensor:
         """Make the calls as one batch; returns (call, horizon, action dim)."""

@@ -13,16 +13,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vla_attention.capture.environments.base import Observation
+from vla_attention.capture.machine.device import memory_left_on
 from vla_attention.capture.policies.identity import PolicySource, describe_policy
 from vla_attention.capture.policies.noise import initial_noise, noise_seed
-from vla_attention.capture.policies.pi.call_variants import ModelCall, sample_variants
+from vla_attention.capture.policies.pi.call_variants import ModelCall, call_bytes, most_calls, sample_variants
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.flow_time import denoise_times
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.preprocess import libero_state, pad_to
 from vla_attention.capture.policies.pi.processing import Processing, image_tensor
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, TokenizedPrompt, check_vocabulary
-from vla_attention.capture.policies.policy import CallVariant, GivenInputs, PolicyInput, camera_frame
+from vla_attention.capture.policies.policy import CallVariant, GivenInputs, PolicyInput, VariantMemory, camera_frame
 from vla_attention.capture.policies.weights import dtype_name, weights_digest
 from vla_attention.capture.recording.attention import AttentionEditor, BatchCollector, RowCollector
 from vla_attention.schemas.errors import BadArgument
@@ -284,6 +285,14 @@ class PiPolicy:
             self.processing.environment_actions(actions, each.policy_input.state)
             for actions, each in zip(sampled, variants, strict=True)
         ]
+
+    def variant_memory(self) -> VariantMemory:
+        """Return how much memory variants take, and how much is left for them."""
+        config, device = self.model.config, self.model.device
+        number = self.model.action_in_proj.weight.element_size()
+        return VariantMemory(
+            call_bytes(config, number), most_calls(config, config.prefix_len), memory_left_on(device), str(device)
+        )
 
     def action_units(self) -> NDArray[np.float64]:
         """Return how far 1 of the model's normalised actions moves the robot, (action dim,), in the robot's units."""

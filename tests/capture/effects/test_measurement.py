@@ -22,7 +22,8 @@ from vla_attention.capture.interventions.resolution import (
     run_vocabularies,
     site_tokens,
 )
-from vla_attention.capture.policies.policy import CallVariant
+from vla_attention.capture.policies.pi.call_variants import call_bytes
+from vla_attention.capture.policies.policy import CallVariant, VariantMemory
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.groupings.words import words_of
@@ -216,6 +217,40 @@ def test_memory_that_does_not_suffice_makes_batches_smaller(monkeypatch):
     most, run = 0, measurement(policy)
     assert run.begin().measure(given, 11, actions, context).measured == ()
     assert "The memory does not suffice for the effects of a single call: they are left out." in run.lines
+
+
+def test_memory_is_asked_before_the_first_call(monkeypatch):
+    policy = policy_named("pi05")
+    left = {"bytes": 1000.0}
+    monkeypatch.setattr(
+        type(policy), "variant_memory", lambda self: VariantMemory(100, 20, left["bytes"], "cuda:0"), raising=True
+    )
+    run = measurement(policy)
+    assert run.lines == [
+        "Effects: 8 changed calls at a time, not 20 (each takes up to 100 B, and cuda:0 has 1.00 kB left)."
+    ]
+    sizes, make = [], type(policy).act_variants
+
+    def counted(self, variants, num_steps, batch):
+        sizes.append(batch)
+        return make(self, variants, num_steps, batch)
+
+    monkeypatch.setattr(type(policy), "act_variants", counted)
+    given, context, actions = call_of(policy)
+    run.begin().measure(given, 11, actions, context)
+    assert sizes == [8]
+    left["bytes"] = float("inf")
+    assert measurement(policy).lines == []
+    left["bytes"] = 120.0
+    with pytest.raises(BadArgument, match="there is no memory for one changed call"):
+        measurement(policy)
+
+
+def test_a_call_is_counted_with_all_that_one_block_holds():
+    config = policy_named("pi05").model.config
+    keys, model = config.prefix_len, config.paligemma
+    assert call_bytes(config, 4) > 4 * keys * (3 * model.mlp_dim + model.width) + 4 * model.num_heads * keys**2
+    assert call_bytes(config, 4) > call_bytes(config, 2)
 
 
 def test_numbers_that_are_not_finite_are_left_out(monkeypatch):

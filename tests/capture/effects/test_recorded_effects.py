@@ -258,3 +258,12 @@ def test_verify_finds_effects_that_do_not_fit(with_effects, tmp_path, edit, said
     shutil.copytree(with_effects, copy)
     faults = damaged(copy, edit)
     assert any(said in fault for fault in faults), faults
+
+
+def test_a_run_without_memory_for_one_changed_call_is_refused_before_it_starts(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("vla_attention.capture.policies.pi.policy.memory_left_on", lambda device: 1e5)
+    target = tmp_path / "a.zarr"
+    words = ["pi", "--task-id", "0", "--num-episodes", "1", "--store", str(target), "--effects", "text"]
+    assert main(words) == 2
+    assert "Cannot measure effects: there is no memory for one changed call (each takes up to" in capsys.readouterr().err
+    assert not target.exists()
