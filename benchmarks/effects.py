@@ -11,6 +11,8 @@ taking turns; a number is a median over rounds of the seconds divided by those o
 from __future__ import annotations
 
 import argparse
+import ctypes
+import gc
 import time
 
 import measurement
@@ -140,6 +142,8 @@ def full_size_table(device: str, threads: int) -> Table:
 
     torch.set_num_threads(threads)
     policy = make_policy("full", device, "bfloat16")
+    forget_peak(device)
+    model = peak_memory(device)
     given, context = prepared_input(policy), CallContext(0, 0, 0)
     planned = planned_effects(EffectSettings(("text", "cameras")), policy, 7)
     run = EffectMeasurement(policy, planned, {}, print)
@@ -149,14 +153,16 @@ def full_size_table(device: str, threads: int) -> Table:
 
     def timed(call):
         forget_peak(device)
-        before, began = peak_memory(device), time.perf_counter()
+        began = time.perf_counter()
         result = call()
-        return result, time.perf_counter() - began, (peak_memory(device) - before) / 2**30
+        return result, time.perf_counter() - began, round((peak_memory(device) - model) / 1e9, 2)
 
     _, plain, memory = timed(lambda: policy.act(given, 7))
     rows = [{"what": "the call alone", "conditions": 0, "seconds": plain, "calls": 1.0, "gb": memory, "floor": "-"}]
     whole = run.begin()
+    made, run.actions_of = run.actions_of, lambda variants: {}  # the conditions alone
     whole.measure(given, 7, actions, context)
+    run.actions_of = made
     kept = [one for one in whole.conditions or () if one.keys and one.keys[0].random_seed is None]
     wanted = {"1 item, nobody reads it": 1, "5 items": 5, "14 items": 14, "text,cameras": None}
     for what, number in wanted.items():
@@ -184,6 +190,8 @@ def forget_peak(device: str) -> None:
     if device != "cpu":
         torch.cuda.reset_peak_memory_stats()
         return
+    gc.collect()
+    ctypes.CDLL("libc.so.6").malloc_trim(0)  # what calls before gave back
     with open("/proc/self/clear_refs", "w") as file:
         file.write("5")
 

@@ -184,11 +184,12 @@ class ImageChange:
 
     `blank`: grey. `noise`: uniform noise, drawn from `seed`. `rotated`: by half a turn. `shifted`: by `rows` patches
     down and `columns` patches to the right. `masked`: the patches that show some of `object` get the mean colour
-    of the others. `filled`: they are filled from their surroundings.
+    of the others. `filled`: they are filled from their surroundings. `mean`: the mean of the task's pictures in a
+    store; effects alone use it.
     """
 
     camera: str
-    kind: Literal["blank", "noise", "rotated", "shifted", "masked", "filled"]
+    kind: Literal["blank", "noise", "rotated", "shifted", "masked", "filled", "mean"]
     object: str = ""
     rows: int = 0
     columns: int = 0
@@ -211,7 +212,8 @@ class ImageChange:
         detail = f" '{self.object}'" if self.object else ""
         detail += f" by {self.rows}, {self.columns} patches" if self.kind == "shifted" else ""
         detail += f" (seed {self.seed})" if self.kind == "noise" and self.seed else ""
-        return f"camera '{self.camera}' {self.kind}{detail}"
+        how = "replaced by the mean of the task's pictures" if self.kind == "mean" else self.kind
+        return f"camera '{self.camera}' {how}{detail}"
 
 
 @dataclass(frozen=True)

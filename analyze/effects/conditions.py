@@ -162,8 +162,9 @@ def change_name(condition: Condition) -> str:
         return condition.name
     if given.prompt is not None and given.prompt.kind == "synonyms":
         return visible(", ".join(f"'{word}' as '{other}'" for word, other in given.prompt.synonyms.items()))
-    blank = [change.camera for change in given.images if change.kind == "blank"]
-    return visible(f"{blank[0]} grey") if len(blank) == len(given.images) == 1 else condition.name
+    how = {"blank": "grey", "mean": "as the task's mean"}
+    named = [f"{change.camera} {how[change.kind]}" for change in given.images if change.kind in how]
+    return visible(named[0]) if len(named) == len(given.images) == 1 else condition.name
 
 
 def kind_of(interventions: Interventions) -> Kind:

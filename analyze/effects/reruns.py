@@ -66,8 +66,12 @@ def open_reruns(base: Store, given: Sequence[StorePlace]) -> BaseAndReruns:
             notes.append(f"{path} is left out: it {problem}.")
         elif other.attributes.rerun_of is not None:
             reruns.append(other)
+            if other.attributes.interventions.is_none and recorded_conditions(other):
+                notes.append(f"{path} holds effects of its own: vla-analyze effects {path} shows them.")
         else:
             rollouts.append(other)
+    if len(notes) == len(reruns) == 1 and not rollouts and recorded_conditions(reruns[0]):
+        raise BadArgument(f"{reruns[0].path} changes nothing that {base.path} does not. {notes[0]}")
     if not reruns and not rollouts:
         raise BadArgument(
             f"{listing(given)} {'holds' if len(given) == 1 else 'hold'} no rerun of {base.path} "

@@ -8,20 +8,25 @@ from typing import cast, get_args
 
 from vla_attention.schemas.effects import EffectItems, EffectReaders
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
+from vla_attention.schemas.stores.store_url import StorePlace, store_place
 
 NO_EFFECTS = "none"
 DEFAULT_READERS: tuple[EffectReaders, ...] = ("all", "action")
-_OPTIONS = ("every", "readers", "steps")
+_OPTIONS = ("every", "readers", "steps", "pictures")
 
 
 @dataclass(frozen=True)
 class EffectSettings:
-    """Which effects are measured; see `EffectsRecorded`. denoise_steps: None takes those of the policy."""
+    """Which effects are measured; see `EffectsRecorded`. denoise_steps: None takes those of the policy.
+
+    pictures: the store of whose pictures cameras get the mean; None: in a rerun that of the base, else grey.
+    """
 
     items: tuple[EffectItems, ...]
     readers: tuple[EffectReaders, ...] = DEFAULT_READERS
     every: int = 1
     denoise_steps: int | None = None
+    pictures: StorePlace | None = None
 
 
 def add_effect_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,6 +52,13 @@ def add_effect_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="denoise steps of the calls that are made again (default: the policy's; half of them take half the time)",
     )
+    group.add_argument(
+        "--effects-pictures",
+        type=store_place,
+        metavar="STORE",
+        help="exchange a camera's picture for the mean of the task's pictures in this store (default: for a grey one; "
+        "in a rerun: the store that is run again)",
+    )
 
 
 def effect_settings(arguments: argparse.Namespace) -> EffectSettings | None:
@@ -70,6 +82,7 @@ def effect_settings(arguments: argparse.Namespace) -> EffectSettings | None:
         cast("tuple[EffectReaders, ...]", tuple(reader for reader in get_args(EffectReaders) if reader in readers)),
         given["every"] or 1,
         given["steps"],
+        given["pictures"],
     )
 
 

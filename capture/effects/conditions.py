@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from vla_attention.capture.effects.arguments import EffectSettings
@@ -96,10 +96,12 @@ def conditions_of(
     tokens: Mapping[str, EpisodeTokens],
     vocabularies: Mapping[str, Vocabulary],
     siblings: Sequence[str],
+    with_mean: Collection[str] = (),
 ) -> tuple[Interventions, ...]:
     """Return the conditions of an episode, from its first call: the unchanged call, other noise, then every item.
 
-    tokens, vocabularies: by site. siblings: the instructions of the other tasks of the task's family.
+    tokens, vocabularies: by site. siblings: the instructions of the other tasks of the task's family. with_mean: the
+    cameras of which a mean picture is known; the others become grey.
     """
     words = words_of(policy_input.prompt)
     groups = dict(_groups(planned, policy, tokens, vocabularies, words))
@@ -121,7 +123,9 @@ def conditions_of(
     if "text" in planned.items:
         conditions += [_named(Interventions(prompt=change)) for change in exchanges(words, siblings)]
     if "cameras" in planned.items:
-        conditions += [_named(Interventions(images=(ImageChange(camera, "blank"),))) for camera in policy_input.frames]
+        for camera in policy_input.frames:
+            change = ImageChange(camera, "mean" if camera in with_mean else "blank")
+            conditions.append(_named(Interventions(images=(change,))))
     return tuple(conditions)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import cast
 
@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from vla_attention.capture.effects.conditions import UNCHANGED, conditions_of
+from vla_attention.capture.effects.mean_pictures import MeanPictures
 from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys, SiteEditor
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
 from vla_attention.capture.interventions.resolution import (
@@ -49,12 +50,14 @@ class EffectMeasurement:
         policy, planned: which effects are measured of which policy.
         siblings: by task id, the instructions of the other tasks of its family, whose words are exchanged for its own.
         say: takes a line for the person at the terminal; each is said once.
+        pictures: the mean pictures that cameras' own are exchanged for; None for grey ones.
     """
 
     policy: Policy
     planned: EffectsRecorded
     siblings: Mapping[int, Sequence[str]]
     say: Callable[[str], None]
+    pictures: MeanPictures | None = None
     #: Replans whose effects were refused.
     refused: int = field(default=0, init=False)
     #: What each replan with effects took.
@@ -148,10 +151,14 @@ def siblings_of(tasks: Iterable[tuple[int, str, str]]) -> dict[int, tuple[str, .
 
 
 def measurement_of(
-    planned: EffectsRecorded | None, policy: Policy, tasks: Iterable[tuple[int, str, str]], say: Callable[[str], None]
+    planned: EffectsRecorded | None,
+    policy: Policy,
+    tasks: Iterable[tuple[int, str, str]],
+    say: Callable[[str], None],
+    pictures: MeanPictures | None = None,
 ) -> EffectMeasurement | None:
     """Return what measures a run's effects, None for none; tasks: number, instruction and family."""
-    return None if planned is None else EffectMeasurement(policy, planned, siblings_of(tasks), say)
+    return None if planned is None else EffectMeasurement(policy, planned, siblings_of(tasks), say, pictures)
 
 
 @dataclass
@@ -172,6 +179,8 @@ class EpisodeEffectsMeasured:
         policy, planned, begun = self.run.policy, self.run.planned, time.perf_counter()
         if context.replan % planned.every:
             return None
+        if "cameras" in planned.items:
+            context = replace(context, mean_pictures=self._mean_pictures(context))
         tokens = site_tokens(
             policy.sites, policy_input.key_role, policy_input.prompt, context.objects, context.coverage
         )
@@ -181,7 +190,9 @@ class EpisodeEffectsMeasured:
         vocabularies = run_vocabularies(policy.sites, instructions, context.objects)
         if self.conditions is None:
             siblings = self.run.siblings.get(context.task_id, ())
-            self.conditions = conditions_of(planned, policy, policy_input, tokens, vocabularies, siblings)
+            self.conditions = conditions_of(
+                planned, policy, policy_input, tokens, vocabularies, siblings, context.mean_pictures
+            )
             if "text" in planned.items and not any(condition.prompt for condition in self.conditions):
                 self.run.say_once("No other task of a family has other words in the same places: none is exchanged.")
             if "objects" in planned.items and not context.objects:
@@ -213,6 +224,20 @@ class EpisodeEffectsMeasured:
         return ReplanEffects(
             self.conditions, tuple(float(unit) for unit in self.run.units), tuple(measured), change, cut
         )
+
+    def _mean_pictures(self, context: CallContext) -> Mapping[str, NDArray[np.uint8]]:
+        pictures = self.run.pictures
+        if pictures is None:
+            self.run.say_once(
+                "Cameras' pictures are exchanged for grey ones; --effects-pictures STORE takes the task's mean ones."
+            )
+            return {}
+        known = pictures.of_task(context.task_id)
+        if not known:
+            self.run.say_once(
+                f"{pictures.store.path} has no pictures of task {context.task_id}: they are exchanged for grey ones."
+            )
+        return known
 
     def _variant(
         self,

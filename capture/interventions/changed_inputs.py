@@ -28,7 +28,7 @@ class CallContext:
     """Where a policy call is in its run, and what is known of its scene.
 
     instructions: of the suite's tasks, by task id. coverage: camera -> (patch, object), the share of each patch that
-    each of `objects` covers.
+    each of `objects` covers. mean_pictures: camera -> the mean of the task's pictures, where it is known.
     """
 
     task_id: int
@@ -37,6 +37,7 @@ class CallContext:
     instructions: Mapping[int, str] = field(default_factory=dict)
     objects: Sequence[SceneObject] = ()
     coverage: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    mean_pictures: Mapping[str, NDArray[np.uint8]] = field(default_factory=dict)
 
 
 def changed_inputs(
@@ -86,6 +87,13 @@ def changed_picture(
     """Return a camera's other picture, (height, width, 3) uint8 as the model sees it; errors as `changed_inputs`."""
     if change.kind == "blank":
         return blank(picture)
+    if change.kind == "mean":
+        if change.camera not in context.mean_pictures:
+            raise BadArgument(
+                f"No mean picture of camera '{change.camera}' is known: only effects use it (vla-capture rerun STORE "
+                "--effects cameras)."
+            )
+        return context.mean_pictures[change.camera]
     if change.kind == "noise":
         place = (context.task_id, context.episode_index, context.replan, zlib.crc32(change.camera.encode()))
         return noise(picture, np.random.default_rng((change.seed, *place)))

@@ -14,7 +14,9 @@ from typing import Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.capture.effects.arguments import effect_settings
 from vla_attention.capture.effects.conditions import describe_effects
+from vla_attention.capture.effects.mean_pictures import pictures_of
 from vla_attention.capture.effects.measurement import EffectMeasurement, EpisodeEffectsMeasured, measurement_of
 from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.machine.provenance import describe_machine
@@ -148,7 +150,8 @@ def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: 
     if masked:
         say(f"Black and masked: {listing(masked)}.")
     # A data set knows no families of tasks, so there are no words to exchange.
-    effects = measurement_of(recording.effects, policy, [], say)
+    pictures = pictures_of(effect_settings(arguments), policy, attributes.protocol.suite)
+    effects = measurement_of(recording.effects, policy, [], say, pictures)
     if recording.effects is not None:
         say(describe_effects(recording.effects))
     replay = Replay(policy, store, every, plan.seed, plan.instruction, attributes.provenance, effects)

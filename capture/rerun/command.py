@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vla_attention.capture.effects.arguments import NO_EFFECTS
+from vla_attention.capture.effects.arguments import NO_EFFECTS, effect_settings
 from vla_attention.capture.effects.conditions import refuse_both
+from vla_attention.capture.effects.mean_pictures import pictures_of
 from vla_attention.capture.interventions.resolution import check_not_compiled, check_places, interventions_for
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.machine.device import load_torch
@@ -125,4 +126,7 @@ def _prepare(arguments: argparse.Namespace, base: Store, threads: Threads, termi
     if note:
         say(note)
     say(f"Policy: {identity.name} ({identity.checkpoint_format}: {identity.checkpoint}), weights as in {base.path}.")
-    return Rerun(policy, base, recording, describe_machine(device) | downloads_of(policy), termination)
+    pictures = pictures_of(effect_settings(arguments), policy, base.suite, base)
+    return Rerun(
+        policy, base, recording, describe_machine(device) | downloads_of(policy), termination, pictures=pictures
+    )

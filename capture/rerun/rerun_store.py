@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from vla_attention.capture.effects.conditions import describe_effects
+from vla_attention.capture.effects.mean_pictures import MeanPictures
 from vla_attention.capture.effects.measurement import EffectMeasurement, measurement_of
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Termination
@@ -148,6 +149,7 @@ class Rerun:
     """A loaded policy and the store whose calls it makes again.
 
     recording: what is recorded of the calls. machine: provenance of this process. faults: of all stores that it wrote.
+    pictures: what cameras' own are exchanged for in effects.
     """
 
     policy: Policy
@@ -156,6 +158,7 @@ class Rerun:
     machine: Mapping[str, str]
     termination: Termination
     faults: Faults = field(default_factory=Faults)
+    pictures: MeanPictures | None = None
 
     @cached_property
     def instructions(self) -> dict[int, str]:
@@ -233,7 +236,7 @@ class Rerun:
         repeater = self.unchanged
         if not interventions.is_none:
             repeater = Repeater(self.policy, self.recording, interventions, self.instructions, allow_empty)
-        effects = measurement_of(self.recording.effects, self.policy, families_of(self.base), say)
+        effects = measurement_of(self.recording.effects, self.policy, families_of(self.base), say, self.pictures)
         if self.recording.effects is not None:
             say(describe_effects(self.recording.effects))
         source = StoredCallsSource(repeater, store, episodes, self.machine, self.termination, effects)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from vla_attention.capture.budget.budgeted_recording import Budget, BudgetedRecording, open_within_budget
 from vla_attention.capture.effects.conditions import describe_effects, refuse_both
+from vla_attention.capture.effects.mean_pictures import pictures_of
 from vla_attention.capture.effects.measurement import EffectMeasurement, measurement_of
 from vla_attention.capture.environments.base import EnvironmentSettings, Task, check_initial_state_index
 from vla_attention.capture.environments.episode_protocol import WAIT_STEPS, EvaluationProtocol
@@ -98,7 +99,8 @@ def plan_run(settings: RunSettings, policy: Policy, machine: Mapping[str, str]) 
         policy.identity(), policy.sites, protocol, recording, machine, interventions=changes.interventions
     )
     families = [(task.task_id, task.instruction, task.task_family) for task in tasks]
-    effects = measurement_of(recording.effects, policy, families, say)
+    pictures = pictures_of(settings.recording.effects, policy, settings.suite.name)
+    effects = measurement_of(recording.effects, policy, families, say, pictures)
     return RunPlan(evaluation, tasks, wanted, changes, attributes, note, effects)
 
 

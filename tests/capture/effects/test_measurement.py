@@ -227,7 +227,7 @@ def test_memory_is_asked_before_the_first_call(monkeypatch):
     )
     run = measurement(policy)
     assert run.lines == [
-        "Effects: 8 changed calls at a time, not 20 (each takes up to 100 B, and cuda:0 has 1.00 kB left)."
+        "Effects: 8 changed calls at a time, not 20 (each takes up to 100 B, and cuda:0 has 1 kB left)."
     ]
     sizes, make = [], type(policy).act_variants
 

@@ -265,5 +265,15 @@ def test_a_run_without_memory_for_one_changed_call_is_refused_before_it_starts(t
     target = tmp_path / "a.zarr"
     words = ["pi", "--task-id", "0", "--num-episodes", "1", "--store", str(target), "--effects", "text"]
     assert main(words) == 2
-    assert "Cannot measure effects: there is no memory for one changed call (each takes up to" in capsys.readouterr().err
+    assert (
+        "Cannot measure effects: there is no memory for one changed call (each takes up to" in capsys.readouterr().err
+    )
     assert not target.exists()
+
+
+def test_a_rerun_that_only_measured_effects_is_named_as_what_to_ask(pi_store, tmp_path, capsys):
+    target = tmp_path / "pi_effects.zarr"
+    words = ["--check", "0", "--task-id", "0", "--effects", "text", "--effects-every", "9"]
+    assert main(["rerun", str(pi_store), "--store", str(target), *words]) == 0
+    assert analyze(["effects", str(pi_store), str(target), "--no-plots", "--output", str(tmp_path / "out")]) == 2
+    assert f"vla-analyze effects {target} shows them." in capsys.readouterr().err.replace("\n  ", " ")
