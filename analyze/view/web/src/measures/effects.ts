@@ -41,7 +41,7 @@ export interface Sizes {
 export function sizesOf(values: Float64Array | null | undefined, replan: number | null): Sizes {
   const own = (values && replan !== null ? values.subarray(replan, replan + 1) : (values ?? new Float64Array())).filter(Number.isFinite);
   if (!own.length) return { mean: NaN, low: NaN, high: NaN, count: 0 };
-  const over = (join: (a: number, b: number) => number): number => own.reduce(join);
+  const over = (join: (a: number, b: number) => number): number => own.reduce((a, b) => join(a, b));
   return { mean: over((a, b) => a + b) / own.length, low: over(Math.min), high: over(Math.max), count: own.length };
 }
 

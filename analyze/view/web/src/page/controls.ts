@@ -11,8 +11,8 @@ const MEASURE_NAMES: readonly (readonly [Measure, string])[] = [
 ];
 
 const SHADE_NAMES: readonly (readonly [WordShade, string])[] = [
-  ["effect", "effect, mean of the episode"],
-  ["replan", "effect at this replan"],
+  ["effect", "effect (episode)"],
+  ["replan", "effect (replan)"],
   ["attention", "attention (lift)"],
 ];
 

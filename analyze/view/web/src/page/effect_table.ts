@@ -1,7 +1,7 @@
 /** The effects of all words, parts and cameras as a table, and what they have to exceed. */
 import { type Item, READERS, sizesOf, type Sizes, strongest } from "../measures/effects";
 import { element } from "./dom";
-import { formatNumber, plural } from "./number_text";
+import { formatNumber } from "./number_text";
 import type { Shown } from "./shown";
 
 const HEADS = { total: "all", direct: "action", pictures: "pictures", text: "text" } as const;
@@ -25,7 +25,7 @@ export class EffectTable {
     const readers = READERS.filter((reader) => known.items.some(({ by }) => by[reader]));
     const heads = ["", ...readers.map((reader) => HEADS[reader]), ...(at === null ? ["lowest to highest", "replans"] : [])];
     this.#head.replaceChildren(...heads.map((name) => element("th", { scope: "col" }, name)));
-    const row = (name: string, by: Item["by"], size: Sizes): HTMLElement => {
+    const row = (name: string, by: Item["by"], size: Sizes, floor: boolean): HTMLElement => {
       const cells = readers.map((reader) => {
         const { mean } = sizesOf(by[reader], at);
         return element("td", { "data-effect": `${reader}-${name}`, "data-value": String(mean) }, formatNumber(mean));
@@ -33,23 +33,22 @@ export class EffectTable {
       const spread = [size.count > 1 ? `${formatNumber(size.low)} to ${formatNumber(size.high)}` : "-", String(size.count)];
       return element(
         "tr",
-        {},
+        { class: floor ? "floor" : null },
         element("th", { scope: "row" }, name),
         ...cells,
         ...(at === null ? spread.map((text) => element("td", {}, text)) : []),
       );
     };
-    const ofItem = (item: Item, name = item.name): HTMLElement => row(name, item.by, strongest(item, at));
     const ofCall = (name: string, values: Float64Array | null): HTMLElement[] =>
-      values ? [row(name, { [readers[0]!]: values }, sizesOf(values, at))] : [];
+      values ? [row(name, { [readers[0]!]: values }, sizesOf(values, at), true)] : [];
     const sorted = [...known.items].sort((a, b) => (strongest(b, at).mean || 0) - (strongest(a, at).mean || 0));
     this.#body.replaceChildren(
-      ...sorted.map((item) => ofItem(item)),
+      ...sorted.map((item) => row(item.name, item.by, strongest(item, at), false)),
       ...ofCall("another noise seed", known.noise),
-      ...known.random.map((item) => ofItem(item, `random keys, as many as ${item.name}`)),
+      ...known.random.map((item) => row(`random keys, as many as ${item.name}`, item.by, strongest(item, at), true)),
       ...ofCall("the unchanged call again", known.unchanged),
     );
-    const where = at === null ? `Means of up to ${plural(known.noise?.length ?? 0, "replan")} of this episode` : `At replan ${at}`;
+    const where = at === null ? "Means over the replans at which the item was measured" : `At replan ${at}`;
     this.#about.textContent =
       `${where}: root mean square change of the executed actions, each dimension in units of its spread in the store, when no query ` +
       "reads the item (all), or these alone do not: the action queries, the pictures, the text. Effects do not add up. " +

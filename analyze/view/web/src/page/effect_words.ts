@@ -4,12 +4,7 @@ import { type EpisodeEffects, type Item, type Reader, READERS, sizesOf, type Siz
 import { formatNumber, plural } from "./number_text";
 
 const MOST_NAMED = 8;
-const BY: Readonly<Record<Reader, string>> = {
-  total: "read by nobody",
-  direct: "hidden from the action queries alone",
-  pictures: "hidden from the pictures alone",
-  text: "hidden from the text alone",
-};
+const ALONE: Readonly<Partial<Record<Reader, string>>> = { direct: "the action queries", pictures: "the pictures", text: "the text" };
 
 /** The item of each word, null without one. All places of a word in the instruction are one item. */
 export function itemsOfWords({ items }: EpisodeEffects, words: readonly Word[]): (Item | null)[] {
@@ -32,10 +27,12 @@ export function wordEffect(item: Item | null, { noise }: EpisodeEffects, replan:
   const floor = sizesOf(noise, replan).mean;
   const below = size.mean <= floor;
   if (!item || !size.count) return { size, below: false, said: replan === null ? "no effect was measured" : "no effect was measured at this replan" };
-  const parts = READERS.flatMap((reader) => (item.by[reader] ? [`${BY[reader]}: ${formatNumber(sizesOf(item.by[reader], replan).mean)}`] : []));
-  const verdict = Number.isNaN(floor) ? "no noise floor was measured" : `${below ? "below" : "above"} the noise floor, ${formatNumber(floor)}`;
-  const mean = size.count > 1 ? `, mean of ${plural(size.count, "replan")}` : "";
-  return { size, below, said: `change of the action${mean}: ${parts.join("; ")} (${verdict})` };
+  const verdict = Number.isNaN(floor) ? "of which the noise floor is not known" : `${below ? "below" : "above"} the noise floor of ${formatNumber(floor)}`;
+  const alone = READERS.flatMap((reader) =>
+    ALONE[reader] && item.by[reader] ? [`from ${ALONE[reader]} alone by ${formatNumber(sizesOf(item.by[reader], replan).mean)}`] : [],
+  );
+  const total = item.by.total ? `without it the action changes by ${sizeText(size)}, ${verdict}; ` : `${verdict}; `;
+  return { size, below, said: `${total}hidden ${alone.join(", ")}` };
 }
 
 const atLeastHalf = (part: number, whole: number): boolean => part >= whole / 2;

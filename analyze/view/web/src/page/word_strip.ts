@@ -1,7 +1,7 @@
 /** The prompt as text: the instruction's words shaded by their effect or by the attention on their keys, the rest as it stands. */
 import { characters } from "../grouping/text";
 import type { Word } from "../grouping/words";
-import type { EpisodeEffects } from "../measures/effects";
+import { type EpisodeEffects, sizesOf } from "../measures/effects";
 import { overUniform } from "../measures/ranks";
 import type { SpanDocument } from "../store/documents";
 import type { Episode } from "../store/episode";
@@ -131,7 +131,8 @@ export class WordStrip {
       this.#buttons[i]!.dataset.effect = String(size.mean);
     });
     const full = top > 0 ? ` (full shade ${formatNumber(top)})` : "";
-    const below = found.some((one) => one.below) ? " Dashed and without a shade: below the noise floor." : "";
+    const floor = formatNumber(sizesOf(effects.noise, replan).mean);
+    const below = found.some((one) => one.below) ? ` Dashed and without a shade: below the noise floor, ${floor}.` : "";
     return `Shade and number of a word: how far the action changes without it, in units of its spread${full}.${below}`;
   }
 
