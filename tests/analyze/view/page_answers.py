@@ -20,7 +20,7 @@ needs_node = pytest.mark.skipif(NODE is None, reason="the page's script is run b
 
 @dataclass(frozen=True)
 class PageQuestion:
-    """An episode of a store whose root is at `base` + `root`, and a link's query; effects need `summary`, an address."""
+    """An episode of a store whose root is at `base` + `root`, and a link's query; effects need its `summary`."""
 
     base: str
     root: str

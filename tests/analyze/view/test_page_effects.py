@@ -19,7 +19,7 @@ from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answe
 from tests.kit.golden_stores import folder_of
 from tests.kit.http_ranges import serve
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.effects.answer import item_lines
+from vla_attention.analyze.effects.answer import item_lines, noise_sentence
 from vla_attention.analyze.effects.effect_study import study_effects, units_of_recorded
 from vla_attention.analyze.effects.item_rows import item_rows
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
@@ -189,7 +189,7 @@ def test_which_word_decides_and_by_which_way_is_pythons_sentence(tmp_path, way):
     store = write_store(tmp_path / "a.zarr", spec=spec)
     (answer,) = answers_of([store])
     study = study_effects(store, (), AnalysisSettings())
-    expected, *_ = item_lines(study, item_rows(study))
+    expected = f"{item_lines(study, item_rows(study))[0]} {noise_sentence(study)}"
     sentence, here = answer["effects"]["sentences"]
     assert re.sub(r" \(mean of 3 replans, [0-9.]+ to [0-9.]+\)", "", sentence, count=1) == expected
     assert sentence != expected

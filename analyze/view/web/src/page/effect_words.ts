@@ -42,7 +42,7 @@ function listed(items: readonly Item[]): string {
   return names.join(", ") + (items.length > MOST_NAMED ? ` and ${items.length - MOST_NAMED} more` : "");
 }
 
-/** Which word decides, and by which way words with large effects reach the action; empty without a word's effect. */
+/** Which word decides, by which way words with large effects reach the action, and the floor; empty without a word's effect. */
 export function decidingWord(effects: EpisodeEffects, replan: number | null): string {
   const size = (item: Item): number => strongest(item, replan).mean;
   const words = effects.items.filter((item) => item.atom?.kind === "word" && size(item) >= 0).sort((a, b) => size(b) - size(a));
@@ -75,5 +75,8 @@ export function decidingWord(effects: EpisodeEffects, replan: number | null): st
     ways.push(`hidden from the action queries alone, ${others.length === 1 ? "that one changes" : "these change"} it by ${span}`);
   }
   const text = ways.join("; ");
-  return text ? `${said} ${text[0]!.toUpperCase()}${text.slice(1)}.` : said;
+  const noise = Number.isNaN(floor)
+    ? `No other noise seed was tried${where}, so nobody knows the floor of these effects.`
+    : `Another noise seed on the same inputs changes the action by ${formatNumber(floor)} of its spread: the floor of every effect.`;
+  return [said, text ? `${text[0]!.toUpperCase()}${text.slice(1)}.` : "", noise].filter(Boolean).join(" ");
 }

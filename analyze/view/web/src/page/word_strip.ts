@@ -133,7 +133,7 @@ export class WordStrip {
     const full = top > 0 ? ` (full shade ${formatNumber(top)})` : "";
     const floor = formatNumber(sizesOf(effects.noise, replan).mean);
     const below = found.some((one) => one.below) ? ` Dashed and without a shade: below the noise floor, ${floor}.` : "";
-    return `Shade and number of a word: how far the action changes without it, in units of its spread${full}.${below}`;
+    return `Shade and number of a word: how far the action changes without it, in units of its spread in the store${full}.${below}`;
   }
 
   #build({ prompt, words, episode }: Shown): void {
