@@ -156,10 +156,13 @@ def test_a_static_site_and_a_phone_show_the_same(browser, store, server, tmp_pat
     assert found[0] == found[1] != ""
 
 
-def test_a_store_without_effects_has_no_sentence_no_table_and_no_choice(browser, tmp_path):
+def test_a_store_without_effects_has_no_sentence_no_table_and_no_choice(browser, store, tmp_path):
     plain = write_store(tmp_path / "plain.zarr", spec=StoreSpec(tasks=(0,), episodes=1))
-    with served(plain, summaries=True) as running, watched_page(browser) as watched:
-        watched.open(running.link)
+    with served(plain, store, summaries=True) as running, watched_page(browser) as watched:
+        watched.open(f"{running.link}?other=1:task000_episode000")
+        # Beside it the effects of a store that has some appear, when their unit is known.
+        watched.page.wait_for_selector('[data-panel="compare"] .words[data-shade="effect"]')
+        assert watched.page.locator(".words[data-shade='attention']").count() == 2
         for part in (".main .decides", ".main .effects", 'select[name="words"]'):
             assert not watched.page.locator(part).is_visible(), part
         assert watched.page.locator(".main .word small").first.inner_text().startswith("\N{MULTIPLICATION SIGN}")

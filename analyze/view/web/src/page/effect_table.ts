@@ -23,7 +23,7 @@ export class EffectTable {
     if (!known) return;
     const at = state.words === "replan" ? replan : null;
     const readers = READERS.filter((reader) => known.items.some(({ by }) => by[reader]));
-    const heads = ["", ...readers.map((reader) => HEADS[reader]), ...(at === null ? ["lowest to highest", "replans"] : [])];
+    const heads = ["", ...readers.map((reader) => HEADS[reader]), ...(at === null ? [`lowest to highest (${HEADS[readers[0]!]})`, "replans"] : [])];
     this.#head.replaceChildren(...heads.map((name) => element("th", { scope: "col" }, name)));
     const row = (name: string, by: Item["by"], size: Sizes, floor: boolean): HTMLElement => {
       const cells = readers.map((reader) => {
