@@ -209,6 +209,18 @@ def study_of(analysis: Analysis, opened: BaseAndReruns, dimensions: Sequence[int
     )
 
 
+def units_of_recorded(store: Store) -> ActionSpread:
+    """The units of the effects that a store recorded, as `study_effects` has them: over all of its episodes.
+
+    Raises:
+        UserError: see `study_effects`.
+    """
+    opened = open_reruns(store, ())
+    question = ask([store], AnalysisSettings())
+    members = [BaseEpisode.of(item) for item in _all_episodes(question, store) if item.episode.attributes.num_replans]
+    return _spread(opened, members, question.settings, None)
+
+
 def _all_episodes(question: Question, base: Store) -> list[SelectedEpisode]:
     """All episodes of the base, selected or not; with `skip_corrupt`, damaged ones are left out."""
     known = {item.episode.name: item for item in question.selected}

@@ -35,7 +35,7 @@ class Summary:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._rows: dict[str, dict[str, Any]] = {}
-        self._about: dict[str, str | None] = {"site": None, "grouping": None, "ratio": None, "failed": None}
+        self._about: dict[str, Any] = dict.fromkeys(("site", "grouping", "ratio", "effect_units", "failed"))
         self._complete = False
         self._process: subprocess.Popen[str] | None = None
         self._reader: threading.Thread | None = None
@@ -53,7 +53,7 @@ class Summary:
             names = [episode.name for episode in store.episodes]
             self._rows = {name: self._rows.get(name) or empty_row(name) for name in names}
             self._complete = False
-            self._about["failed"] = None
+            self._about |= {"failed": None, "effect_units": None}
         # The module is found as this process found it.
         variables = {**os.environ, "PYTHONPATH": os.pathsep.join(path or os.curdir for path in sys.path)}
         command = [sys.executable, "-m", _MODULE, str(store.path)]
@@ -84,7 +84,8 @@ class Summary:
         if self._reader is not None:
             self._reader.join()
         with self._lock:
-            return self._about["failed"]
+            failed: str | None = self._about["failed"]
+            return failed
 
     def _read(self, process: subprocess.Popen[str]) -> None:
         assert process.stdout is not None

@@ -17,6 +17,7 @@ from typing import Any
 
 import polars as pl
 
+from vla_attention.analyze.effects.effect_study import units_of_recorded
 from vla_attention.analyze.measures.aggregate import HEADLINE, overall_layer
 from vla_attention.analyze.measures.episodes import episode_tables_of
 from vla_attention.analyze.measures.question import Question, ask
@@ -48,12 +49,15 @@ def main(place: str) -> int:
 def summary_parts(store: Store) -> Iterator[dict[str, Any]]:
     """The summary of a store in parts: entries of episodes, then of these with their numbers, and what is said of all.
 
+    Before the numbers come the units of effects, if the store recorded some: the page shows no effect without them.
     An episode that cannot be read, or whose ratio is not defined, has no numbers; the first such sentence is `failed`.
     """
     failed = None
     batches = [store.episodes[at : at + _AT_ONCE] for at in range(0, len(store.episodes), _AT_ONCE)]
     for batch in batches:
         yield {"episodes": [_described(episode) for episode in batch]}
+    if store.attributes.recording.effects is not None:
+        yield {"effect_units": _effect_units(store)}
     for batch in batches:
         try:
             yield _measured(store, batch)
@@ -66,6 +70,16 @@ def summary_parts(store: Store) -> Iterator[dict[str, Any]]:
             except UserError as error:
                 failed = failed or str(error)
                 yield {"failed": failed}
+
+
+def _effect_units(store: Store) -> dict[str, Any]:
+    """`spread`: by dimension of the action, None for those that are not compared; or `failed`, why there is none."""
+    try:
+        units = units_of_recorded(store)
+    except UserError as error:
+        return {"failed": str(error)}
+    spread = zip(units.spread, units.used, strict=True)
+    return {"spread": [float(deviation) if used else None for deviation, used in spread]}
 
 
 def _described(episode: StoredEpisode) -> dict[str, Any]:

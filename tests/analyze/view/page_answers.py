@@ -20,13 +20,14 @@ needs_node = pytest.mark.skipif(NODE is None, reason="the page's script is run b
 
 @dataclass(frozen=True)
 class PageQuestion:
-    """An episode of a store whose root is at `base` + `root`, and a link's query."""
+    """An episode of a store whose root is at `base` + `root`, and a link's query; effects need its `summary`."""
 
     base: str
     root: str
     episode: str = "task000_episode000"
     query: str = ""
     packed: bool = False
+    summary: str = ""
 
 
 def run_in_node(script: str, folder: Path, given: Any) -> str:

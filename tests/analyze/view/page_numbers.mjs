@@ -24,10 +24,31 @@ function ofReplan(values, names) {
   return { groups, ratio: ratio ? [ratio.value, ratio.uniform, ratio.lift].map(plain) : null };
 }
 
-async function answerOf({ base, root, packed, episode, query }) {
-  const entry = { name: root.replace(/\/$/, ""), root, episodes: [{ name: episode }], packed, summary: "" };
+/** Sizes of every item by reader, of the episode (mean, lowest, highest, number) and of each replan; what words say of them. */
+function ofEffects({ effects, words, replan }) {
+  if (!effects?.known) return effects && { note: effects.note, waiting: effects.waiting };
+  const { known } = effects;
+  const of = (values) => {
+    const { mean, low, high, count } = reading.sizesOf(values, null);
+    return { mean: [mean, low, high, count].map(plain), replans: plainList(values) };
+  };
+  const ofItems = (items) =>
+    Object.fromEntries(items.map(({ name, by }) => [name, Object.fromEntries(Object.entries(by).map(([reader, values]) => [reader, of(values)]))]));
+  return {
+    items: ofItems(known.items),
+    random: ofItems(known.random),
+    noise: known.noise && of(known.noise),
+    unchanged: known.unchanged && of(known.unchanged),
+    sentences: [null, replan].map((at) => reading.decidingWord(known, at)),
+    words: reading.itemsOfWords(known, words).map((item) => reading.wordEffect(item, known, null)).map(({ size, ...more }) => ({ mean: plain(size.mean), ...more })),
+  };
+}
+
+async function answerOf({ base, root, packed, episode, query, summary }) {
+  const entry = { name: root.replace(/\/$/, ""), root, episodes: [{ name: episode }], packed, summary };
   const store = await libraryAt(base).openStore(entry);
   const opened = await store.openEpisode(episode);
+  if (summary) await store.readEffectUnits();
   const state = { ...reading.stateOfLink(query), episode };
   const shown = await reading.loadShown(store, opened, state);
   const { site, row, valid, uniform, replan, numbers, selection } = shown;
@@ -62,6 +83,7 @@ async function answerOf({ base, root, packed, episode, query }) {
     cameras,
     words: shown.words.map((word) => ({ text: word.text, keys: word.keys, ...reading.measuresOfKeys(word.keys, shown) })),
     readers: shown.words.length ? reading.headsThatRead(heads, shown.words[0].keys, 3) : [],
+    effects: ofEffects(shown),
     events: await reading.eventsOf(store.root, opened),
   };
 }

@@ -28,9 +28,10 @@ LINKS = {
     "?layer=3&head=0&replan=12": "?replan=12&layer=3&head=0",
     "?measure=rank&colours=cividis&opacity=0.5&smooth=1": "?measure=rank&colours=cividis&opacity=0.5&smooth=1",
     "?store=1&episode=task000_episode001&site=self&query=2": "?store=1&episode=task000_episode001&site=self&query=2",
+    "?words=attention": "?words=attention",
     "?other=1%3Atask000_episode001&grouping=a+%3D+b": "?grouping=a+%3D+b&other=1%3Atask000_episode001",
     # What a link names wrongly is as at first.
-    "?layer=-3&head=x&replan=1e9&measure=none&colours=red&opacity=7&smooth=yes&other=task&store=99999999999": "",
+    "?layer=-3&head=x&replan=1e9&measure=none&words=all&colours=red&opacity=7&smooth=2&other=task&store=9999999999": "",
 }
 ROWS = [
     {"name": "task000_episode000", "task": "bowl", "instruction": "pick the bowl", "success": True, "ratio": 3.0},

@@ -8,8 +8,10 @@ import shutil
 import sys
 import webbrowser
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import vla_attention as va
@@ -23,7 +25,7 @@ from vla_attention.analyze.view.summary_process import summary_parts
 from vla_attention.schemas.stores.digest import seal_digest
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
-from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.stores import StoreSpec, small_effects, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2)
 
@@ -72,6 +74,18 @@ def test_a_damaged_episode_has_no_numbers_and_the_others_have(store, tmp_path):
     assert "task001_episode000" in failed
     rows = {row["name"]: row for part in parts for row in part.get("episodes", ())}
     assert [rows[name]["ratio"] is None for name in sorted(rows)] == [False, False, True, False]
+
+
+def test_the_units_of_effects_come_first_or_why_there_are_none(tmp_path):
+    path = write_store(tmp_path / "a.zarr", spec=replace(SPEC, plant_effects=small_effects))
+    _, part, *rest = summary_parts(open_store(path))
+    actions = np.concatenate([episode.read("actions").reshape(-1, 7) for episode in open_store(path).episodes])
+    assert part == {"effect_units": {"spread": pytest.approx(actions.std(axis=0))}}
+    assert not any("effect_units" in each for each in rest)
+    (path / "episodes/task001_episode000/actions/zarr.json").unlink()
+    _, part, *_ = summary_parts(open_store(path))
+    assert "task001_episode000" in part["effect_units"]["failed"]
+    assert not any("effect_units" in each for each in summary_parts(open_store(write_store(tmp_path / "b.zarr"))))
 
 
 def test_a_site_without_both_sides_has_no_ratio(tmp_path):

@@ -3,6 +3,7 @@ import "./compare.css";
 import { button, choice, element } from "../page/dom";
 import { type EpisodeColumn, episodeColumn } from "../page/episode_column";
 import { type PageContext, type PanelInstance, registerPanel } from "../page/panels";
+import { whenEffectsAreKnown } from "../page/effects_shown";
 import { loadShown, selectionAt, type Shown, siteOf } from "../page/shown";
 import { sentenceOf, StoreError } from "../store/errors";
 import { commonCells } from "./common_cells";
@@ -142,6 +143,7 @@ class ComparePanel implements PanelInstance {
       if (asked !== this.#asked) return;
       this.#draw(here, other, said);
       this.#drawSeries(isShown ? here : null, other);
+      whenEffectsAreKnown(other, () => asked === this.#asked && void this.#compare(shown));
       this.host.dataset.ready = "1";
       this.host.dataset.shown = `${other.store.entry.name}:${other.episode.name}:${other.replan}`;
     } catch (failure) {

@@ -4,11 +4,12 @@ import "./parts.css";
 import "./viewer.css";
 import "../panels";
 import { sentenceOf, StoreError, visible } from "../store/errors";
-import { Library, openStores, type Store, type StoreEntry, type Summary, summaryOf } from "../store/open";
+import { Library, openStores, type Store, type StoreEntry, type Summary, SUMMARY_AGAIN, summaryOf } from "../store/open";
 import { workerPort } from "../store/reader_pool";
 import { Controls } from "./controls";
 import { button, element } from "./dom";
 import { episodeColumn } from "./episode_column";
+import { whenEffectsAreKnown } from "./effects_shown";
 import { EpisodeList } from "./episode_list";
 import { eventsOf } from "./events";
 import { HeadGrid } from "./head_grid";
@@ -23,7 +24,6 @@ import { themeButton } from "./theme";
 import { Timeline } from "./timeline";
 
 const WORKERS = 2;
-const SUMMARY_AGAIN = 1500;
 
 interface Timing {
   name: string;
@@ -213,6 +213,7 @@ export class App {
       this.#timings.push({ name: linkOfState(state), ms: performance.now() - begun });
       if (this.#timings.length > 1000) this.#timings.shift();
       this.#prefetch(shown);
+      whenEffectsAreKnown(shown, () => asked === this.#asked && void this.#load());
     } catch (failure) {
       if (asked === this.#asked) this.#fail(failure);
     }

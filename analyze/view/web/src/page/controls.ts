@@ -2,12 +2,18 @@
 import { COLOUR_MAPS, type ColourMap } from "./colour_maps";
 import { choice, element } from "./dom";
 import type { Shown } from "./shown";
-import type { Measure, OneOrMean, View, ViewState } from "./state";
+import type { Measure, OneOrMean, View, ViewState, WordShade } from "./state";
 
 const MEASURE_NAMES: readonly (readonly [Measure, string])[] = [
   ["lift", "lift (over uniform attention)"],
   ["raw", "raw (share of all attention)"],
   ["rank", "rank (among the valid keys)"],
+];
+
+const SHADE_NAMES: readonly (readonly [WordShade, string])[] = [
+  ["effect", "effect (episode)"],
+  ["replan", "effect (replan)"],
+  ["attention", "attention (lift)"],
 ];
 
 const oneOrMean = (text: string): OneOrMean => (text === "mean" ? "mean" : Number(text));
@@ -17,6 +23,7 @@ export class Controls {
   readonly #site = choice("Site", "site", (site) => this.view.update({ site, layer: "mean", head: "mean", denoise: "mean", query: "mean" }));
   readonly #axes: Readonly<Record<"layer" | "head" | "denoise" | "query", ReturnType<typeof choice>>>;
   readonly #measure = choice("Values", "measure", (measure) => this.view.update({ measure: measure as Measure }));
+  readonly #words = choice("Words shaded by", "words", (words) => this.view.update({ words: words as WordShade }));
   readonly #colours = choice("Colours", "colours", (colours) => this.view.update({ colours: colours as ColourMap }));
   readonly #opacity = element("input", { type: "range", min: 0, max: 100, step: 5, name: "opacity" });
   readonly #smooth = element("input", { type: "checkbox", name: "smooth" });
@@ -36,13 +43,14 @@ export class Controls {
       this.#site.host,
       ...Object.values(this.#axes).map((one) => one.host),
       this.#measure.host,
+      this.#words.host,
       this.#colours.host,
       element("label", { class: "choice" }, element("span", {}, "Opacity"), this.#opacity),
       element("label", { class: "choice check" }, this.#smooth, element("span", {}, "smooth between patches")),
     );
   }
 
-  show({ state, site, episode, selection }: Shown): void {
+  show({ state, site, episode, selection, effects }: Shown): void {
     this.#site.show(episode.sites.map((each) => [each.layout.name, each.layout.name]), site.layout.name);
     const axis = (name: "layer" | "head" | "denoise", numbers: readonly number[], at: readonly number[], all: string): void => {
       const mean: [string, string][] = numbers.length > 1 ? [["mean", all]] : [];
@@ -57,6 +65,8 @@ export class Controls {
     if (site.numQueries > 1) this.#axes.query.show([["mean", `mean of ${site.numQueries}`], ...queries], String(selection.query));
     else this.#axes.query.show([["mean", "mean, as recorded"]], "mean");
     this.#measure.show(MEASURE_NAMES, state.measure);
+    this.#words.host.hidden = !effects?.known;
+    this.#words.show(SHADE_NAMES, state.words);
     this.#colours.show(COLOUR_MAPS.map((name) => [name, name]), state.colours);
     if (document.activeElement !== this.#opacity) this.#opacity.value = String(Math.round(100 * state.opacity));
     this.#opacity.setAttribute("aria-valuetext", `${Math.round(100 * state.opacity)} per cent`);

@@ -1,6 +1,7 @@
 /** Pictures, words and numbers of one episode at one replan: the page's own, and that of an episode beside it. */
 import { visible } from "../store/errors";
 import { element } from "./dom";
+import { EffectTable } from "./effect_table";
 import { Headline } from "./headline";
 import { Inspector } from "./inspector";
 import { Legend } from "./legend";
@@ -40,6 +41,7 @@ export function episodeColumn(host: HTMLElement, explain: () => void, level: "h1
   const about = element("p", { class: "soft about" });
   const pictures = new PictureBoard();
   const words = new WordStrip();
+  const effects = new EffectTable();
   const legend = new Legend();
   const inspector = new Inspector(pictures, words);
   const headline = new Headline(explain);
@@ -47,7 +49,7 @@ export function episodeColumn(host: HTMLElement, explain: () => void, level: "h1
   const corrections = element("p", { class: "warning", role: "status", hidden: true });
   const baseline = element("p", { class: "soft", role: "note", hidden: true });
   host.classList.add("column");
-  host.append(title, about, corrections, baseline, headline.figures, words.host, pictures.host, legend.host, inspector.host, note, headline.masses);
+  host.append(title, about, corrections, baseline, headline.figures, words.host, effects.host, pictures.host, legend.host, inspector.host, note, headline.masses);
   return {
     host,
     pictures,
@@ -76,6 +78,7 @@ export function episodeColumn(host: HTMLElement, explain: () => void, level: "h1
       pictures.onScale = (scale) => legend.show(scale, shown.state);
       pictures.show(shown);
       words.show(shown);
+      effects.show(shown);
       headline.show(shown);
       inspector.show(shown);
       const cameras = [...shown.frames.keys()];

@@ -10,6 +10,7 @@ export const KEYS: readonly (readonly [string, string])[] = [
   ["- +", "denoise step before or after"],
   ["0", "mean over layers, heads, denoise steps and queries"],
   ["v", "next of lift, raw, rank"],
+  ["w", "words shaded by effect, effect at this replan, attention (where effects were recorded)"],
   ["c", "next colours"],
   ["s", "smooth or blocks"],
   ["n p", "next or previous episode of the list"],
@@ -22,6 +23,7 @@ const MEANING: readonly (readonly [string, string])[] = [
   ["Ratio", "Attention on picture keys divided by attention on words. With 512 patches and a dozen words, attention that ignores content has a ratio of about 43: compare with the uniform ratio, or read the lift."],
   ["What it can mean", "Where the action queries of these layers looked. A key without mass in any head of any layer adds nothing there."],
   ["What it cannot mean", "That the policy used what it looked at, or would act differently without it. In a deep layer a patch's key also carries words, and a word's key pictures. Only an intervention shows an effect."],
+  ["Effect", "How far the executed actions change when nobody reads a word, a part of the prompt or a picture: root mean square, each dimension in units of its spread over all actions of the store. Without it the policy sees what it never saw in training. What another noise seed changes is the floor: an effect below it is none. Effects do not add up."],
   ["Means", "A mean over layers or heads may describe none of them: look at the grid. Some heads put their attention on keys that hold little (sinks)."],
   ["Checksums", "Every chunk is compared with its checksum (crc32c). The page does not compare seals: run vla-analyze verify before you believe a store from somebody else."],
 ];

@@ -4,7 +4,7 @@ import type { EpisodeList } from "./episode_list";
 import type { Help } from "./help";
 import type { Player } from "./player";
 import type { Shown } from "./shown";
-import { MEASURES, type OneOrMean, type View, type ViewState } from "./state";
+import { MEASURES, type OneOrMean, type View, type ViewState, WORD_SHADES } from "./state";
 
 const next = <T>(values: readonly T[], value: T): T => values[(values.indexOf(value) + 1) % values.length]!;
 
@@ -50,6 +50,9 @@ function act(event: KeyboardEvent, { view, player, list, help, shown }: Parts): 
     "=": () => axis("denoise", 1),
     "0": () => view.update({ layer: "mean", head: "mean", denoise: "mean", query: "mean" }),
     v: () => view.update({ measure: next(MEASURES, state.measure) }),
+    w: () => {
+      if (now?.effects?.known) view.update({ words: next(WORD_SHADES, state.words) });
+    },
     c: () => view.update({ colours: next(COLOUR_MAPS, state.colours) }),
     s: () => view.update({ smooth: !state.smooth }),
     n: () => episode(1),

@@ -8,6 +8,7 @@ import type { PromptDocument } from "../store/documents";
 import type { Coverage, Episode, Picture, Selection, SiteInfo } from "../store/episode";
 import type { Store } from "../store/open";
 import { baselineNote, uniformKeys } from "./baselines";
+import { type EffectsShown, effectsOf } from "./effects_shown";
 import { type EpisodeNumbers, episodeNumbers } from "./episode_numbers";
 import type { OneOrMean, ViewState } from "./state";
 
@@ -36,6 +37,8 @@ export interface Shown {
   readonly frames: ReadonlyMap<string, Picture | null>;
   readonly coverage: ReadonlyMap<string, Coverage>;
   readonly numbers: EpisodeNumbers;
+  /** null: the episode recorded none. */
+  readonly effects: EffectsShown | null;
   /** What of the state does not exist here, in a sentence; empty: nothing. */
   readonly corrections: string;
   /** What to know of the lifts' baseline, in a sentence; empty: nothing. */
@@ -184,12 +187,13 @@ export async function loadShown(store: Store, episode: Episode, state: ViewState
     return { all, own: all.subarray(replan * site.keys, (replan + 1) * site.keys) };
   });
   const place = reading.then((known) => ({ episode, site, tokens: known, selection }));
-  const [tokens, { all, own }, taken, allUniform, numbers] = await Promise.all([
+  const [tokens, { all, own }, taken, allUniform, numbers, effects] = await Promise.all([
     reading,
     rows,
     pictures,
     place.then(uniformKeys),
     place.then(episodeNumbers),
+    effectsOf(store, episode),
   ]);
   const frames = new Map(seenCameras(tokens).map((camera) => [camera, taken.get(camera) ?? null]));
   const first = tokens.keyRole.replans === 1 ? 0 : replan * site.keys;
@@ -213,6 +217,7 @@ export async function loadShown(store: Store, episode: Episode, state: ViewState
     frames,
     coverage: tokens.coverage,
     numbers,
+    effects,
     corrections: missing.length ? `${missing.join("; ")}.` : "",
     baselineNote: baselineNote(store.root, store.entry.name),
   };

@@ -3,6 +3,9 @@ import { COLOUR_MAPS, type ColourMap } from "./colour_maps";
 
 export const MEASURES = ["lift", "raw", "rank"] as const;
 export type Measure = (typeof MEASURES)[number];
+/** What words are shaded by: their effect, mean of the episode or at the replan shown, or attention. */
+export const WORD_SHADES = ["effect", "replan", "attention"] as const;
+export type WordShade = (typeof WORD_SHADES)[number];
 export type OneOrMean = number | "mean";
 
 /** `layer`, `denoise` and `head` are recorded numbers, `query` a position. */
@@ -17,6 +20,8 @@ export interface ViewState {
   readonly head: OneOrMean;
   readonly query: OneOrMean;
   readonly measure: Measure;
+  /** Where no effects were recorded, words are shaded by attention. */
+  readonly words: WordShade;
   readonly colours: ColourMap;
   /** Of the colours at the top of the scale, 0 to 1. */
   readonly opacity: number;
@@ -41,6 +46,7 @@ export const FIRST_STATE: ViewState = {
   head: "mean",
   query: "mean",
   measure: "lift",
+  words: "effect",
   colours: "inferno",
   opacity: 0.8,
   smooth: false,
@@ -76,6 +82,7 @@ export function stateOfLink(query: string): ViewState {
     head: oneOrMean("head"),
     query: oneOrMean("query"),
     measure: among(link.get("measure"), MEASURES, FIRST_STATE.measure),
+    words: among(link.get("words"), WORD_SHADES, FIRST_STATE.words),
     colours: among(link.get("colours"), COLOUR_MAPS, FIRST_STATE.colours),
     opacity: opacity >= 0 && opacity <= 1 ? opacity : FIRST_STATE.opacity,
     smooth: link.get("smooth") === "1",
@@ -98,6 +105,7 @@ export function linkOfState(state: ViewState): string {
   put("replan", state.replan, 0);
   for (const axis of ["layer", "denoise", "head", "query"] as const) put(axis, state[axis], "mean");
   put("measure", state.measure, FIRST_STATE.measure);
+  put("words", state.words, FIRST_STATE.words);
   put("colours", state.colours, FIRST_STATE.colours);
   put("opacity", state.opacity, FIRST_STATE.opacity);
   if (state.smooth) link.set("smooth", "1");

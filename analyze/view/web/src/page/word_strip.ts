@@ -1,10 +1,12 @@
-/** The prompt as text: the instruction's words shaded by the attention on their keys, the rest as it stands. */
+/** The prompt as text: the instruction's words shaded by their effect or by the attention on their keys, the rest as it stands. */
 import { characters } from "../grouping/text";
 import type { Word } from "../grouping/words";
+import { type EpisodeEffects, sizesOf } from "../measures/effects";
 import { overUniform } from "../measures/ranks";
 import type { SpanDocument } from "../store/documents";
 import type { Episode } from "../store/episode";
 import { button, element } from "./dom";
+import { decidingWord, itemsOfWords, wordEffect } from "./effect_words";
 import { formatNumber, formatPercent } from "./number_text";
 import type { Shown } from "./shown";
 
@@ -26,6 +28,10 @@ export function measuresOfKeys(keys: readonly number[], { row, valid, uniform }:
   return { mass, lift: given > 0 ? mass / given / overUniform(row, valid, uniform) : NaN };
 }
 
+function attentionText({ mass, lift }: WordMeasures): string {
+  return `${formatPercent(mass, 2)} of the attention, ${formatNumber(lift)} times uniform attention`;
+}
+
 /** The sites whose keys have spans of a kind, to choose from: a sentence, empty where there is none. */
 export function otherSites(episode: Episode, has: (span: SpanDocument) => boolean): string {
   const names = episode.sites.filter((each) => each.layout.spans.some(has)).map((each) => each.layout.name);
@@ -42,13 +48,14 @@ export class WordStrip {
   readonly #clicked = new Set<WordListener>();
   readonly #hovered = new Set<(place: number | null) => void>();
   readonly #marks = new Map<string, { places: ReadonlySet<number>; colour: string }>();
+  readonly #decides = element("p", { class: "decides", hidden: true });
   readonly #line = element("p", { class: "prompt" });
   readonly #note = element("p", { class: "soft" });
   #buttons: HTMLButtonElement[] = [];
   #built = "";
 
   constructor() {
-    this.host.append(this.#line, this.#note);
+    this.host.append(this.#decides, this.#line, this.#note);
   }
 
   onWord(listen: WordListener): () => void {
@@ -77,21 +84,56 @@ export class WordStrip {
       this.#build(shown);
     }
     const measures = words.map((word) => measuresOfKeys(word.keys, shown));
+    measures.forEach(({ mass, lift }, i) => Object.assign(this.#buttons[i]!.dataset, { mass: String(mass), lift: String(lift) }));
+    const { effects, state, replan } = shown;
+    const at = state.words === "replan" ? replan : null;
+    const sentence = effects?.known ? decidingWord(effects.known, at) : (effects?.note ?? "");
+    this.#decides.hidden = !sentence;
+    this.#decides.textContent = sentence;
+    this.host.dataset.shade = effects?.known && state.words !== "attention" ? "effect" : "attention";
+    const note = !words.length
+      ? `The keys of site ${site.layout.name} spell no words.${otherSites(episode, (span) => span.kind === "text")}`
+      : effects?.known && state.words !== "attention"
+        ? this.#shadeByEffect(shown, effects.known, at, measures)
+        : this.#shadeByLift(measures);
+    this.#note.textContent = note;
+  }
+
+  #shade(place: number, part: number, number: string, said: string, title: string): void {
+    const made = this.#buttons[place]!;
+    made.style.setProperty("--part", `${Math.round(MOST_SHADE * (part > 0 ? Math.min(part, 1) : 0))}%`);
+    made.title = title;
+    const [, unseen, shownNumber] = made.children as unknown as [HTMLElement, HTMLElement, HTMLElement];
+    unseen.textContent = `: ${said}`;
+    shownNumber.textContent = number;
+  }
+
+  #shadeByLift(measures: readonly WordMeasures[]): string {
     const finite = measures.map(({ lift }) => lift).filter(Number.isFinite);
     const top = Math.max(LEAST_TOP, ...finite);
-    measures.forEach(({ mass, lift }, i) => {
-      const made = this.#buttons[i]!;
-      made.dataset.mass = String(mass);
-      made.dataset.lift = String(lift);
-      const part = Number.isFinite(lift) ? Math.min(lift / top, 1) : 0;
-      made.style.setProperty("--part", `${Math.round(MOST_SHADE * part)}%`);
-      const [, said, number] = made.children as unknown as [HTMLElement, HTMLElement, HTMLElement];
-      number.textContent = Number.isFinite(lift) ? `×${formatNumber(lift)}` : "-";
-      said.textContent = `: ${formatPercent(mass, 2)} of the attention, ${formatNumber(lift)} times uniform attention`;
+    measures.forEach((measure, i) => {
+      const { lift } = measure;
+      this.#shade(i, lift / top, Number.isFinite(lift) ? `×${formatNumber(lift)}` : "-", attentionText(measure), "");
+      this.#buttons[i]!.classList.remove("below");
     });
-    this.#note.textContent = words.length
-      ? `Shade and number of a word: its lift (×1 is uniform, full shade ×${formatNumber(top)}).`
-      : `The keys of site ${site.layout.name} spell no words.${otherSites(episode, (span) => span.kind === "text")}`;
+    return `Shade and number of a word: its lift (×1 is uniform, full shade ×${formatNumber(top)}).`;
+  }
+
+  #shadeByEffect({ words }: Shown, effects: EpisodeEffects, replan: number | null, measures: readonly WordMeasures[]): string {
+    const items = itemsOfWords(effects, words);
+    const found = items.map((item) => wordEffect(item, effects, replan));
+    const top = Math.max(...found.filter(({ below }) => !below).map(({ size }) => size.mean || 0), 0);
+    found.forEach(({ size, below, said }, i) => {
+      const together = items[i] && items.indexOf(items[i]) !== items.lastIndexOf(items[i]) ? ", all its places together" : "";
+      const attention = attentionText(measures[i]!);
+      this.#shade(i, below ? 0 : size.mean / top, formatNumber(size.mean), `${said}${together}`, `${said}${together}. ${attention}.`);
+      this.#buttons[i]!.classList.toggle("below", below);
+      this.#buttons[i]!.dataset.effect = String(size.mean);
+    });
+    const full = top > 0 ? ` (full shade ${formatNumber(top)})` : "";
+    const floor = formatNumber(sizesOf(effects.noise, replan).mean);
+    const below = found.some((one) => one.below) ? ` Dashed and without a shade: below the noise floor, ${floor}.` : "";
+    return `Shade and number of a word: how far the action changes without it, in units of its spread in the store${full}.${below}`;
   }
 
   #build({ prompt, words, episode }: Shown): void {

@@ -3,6 +3,7 @@
  *
  * Fields have the names that they have in the files. Characters are counted as code points, as Python does.
  */
+import { type EffectsDocument, parseEffects } from "./effects_document";
 import { StoreError } from "./errors";
 import { type Fields, flag, list, name, object, oneOf, text, whole, wholes } from "./json_fields";
 import * as limits from "./limits";
@@ -133,6 +134,8 @@ export interface EpisodeDocument {
   env_step: number[];
   prompt_index: number[];
   denoise_time: number[];
+  /** What was measured beside the calls; null: nothing. */
+  effects: EffectsDocument | null;
 }
 
 /** The axes of one site of an episode: the recorded numbers of its layers, denoise steps and heads. */
@@ -332,6 +335,7 @@ export function parseEpisode(document: unknown, name_: string): EpisodeDocument 
     env_step: numbers("env_step", 2 ** 40),
     prompt_index: prompts.length ? numbers("prompt_index", prompts.length - 1) : [],
     denoise_time: list(fields.denoise_time ?? [], "denoise_time", limits.AXIS).map(Number),
+    effects: parseEffects(fields.effects, replans),
   };
 }
 

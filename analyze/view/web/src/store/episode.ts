@@ -308,6 +308,21 @@ export class Episode {
     return { replans: this.numReplans, size, shape: array.shape, values: found.values as Float64Array };
   }
 
+  /** Changes of the normalised actions under the conditions of `document.effects`, (entry, step, dimension); null without any. */
+  async effectChanges(): Promise<{ values: Float32Array; shape: readonly number[] } | null> {
+    const { effects, arrays } = this.document;
+    if (!effects?.replan.length) return null;
+    if (8 * effects.conditions.length * this.numReplans > ARRAY_IN_PAGE_BYTES) {
+      throw new StoreError(`${effects.conditions.length} conditions at ${this.numReplans} replans are more than a page can hold.`);
+    }
+    const [, horizon, size] = arrays.actions?.shape ?? [];
+    if (horizon === undefined || size !== effects.units.length) {
+      throw new StoreError(`The effects of ${this.name} have ${effects.units.length} units, and its actions ${size ?? 0} dimensions.`);
+    }
+    const array = this.#array("effects/change", "float32", [effects.replan.length, horizon, size]);
+    return { values: (await this.#whole(array, 4)).values as Float32Array, shape: array.shape };
+  }
+
   /** A prompt with its pieces at the keys of a site. */
   promptOf(layout: SiteDocument, prompt: PromptDocument): PromptDocument {
     return promptAtSite(this.root.sites, layout, prompt);

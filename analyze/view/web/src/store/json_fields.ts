@@ -54,6 +54,11 @@ export function wholes(value: unknown, where: string, length: number, most: numb
   return list(value, where, length).map((each, i) => whole(each, `${where}[${i}]`, most, least));
 }
 
+export function finite(value: unknown, where: string): number {
+  if (typeof value !== "number" || !Number.isFinite(value)) wrong(where, value, "a number");
+  return value;
+}
+
 export function flag(value: unknown, where: string): boolean {
   if (typeof value !== "boolean") wrong(where, value, "true or false");
   return value;

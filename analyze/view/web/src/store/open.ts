@@ -1,9 +1,9 @@
 /** Stores beside the page: what `stores.json` lists, their roots, and their episodes. */
 import { type EpisodeDocument, type RootDocument, parseEpisode, parseRoot } from "./documents";
 import { Episode } from "./episode";
-import { StoreError, visible } from "./errors";
+import { sentenceOf, StoreError, visible } from "./errors";
 import { type Fields, flag, list, name, object, parseDocument, text, whole } from "./json_fields";
-import { DOCUMENT_BYTES, ROOT_BYTES, ZIP_TAIL_BYTES } from "./limits";
+import { AXIS, DOCUMENT_BYTES, ROOT_BYTES, ZIP_TAIL_BYTES } from "./limits";
 import type { Place } from "./messages";
 import { type Port, ReaderPool } from "./reader_pool";
 
@@ -36,13 +36,20 @@ export interface Summary {
   ratio: string;
   grouping: string;
   site: string;
+  /** null: not computed yet, or nothing was recorded. */
+  effectUnits: EffectUnits | null;
   episodes: EpisodeSummary[];
 }
+
+/** The spread of the store's actions by dimension, null for those that are not compared; or why there is none. */
+export type EffectUnits = { spread: readonly (number | null)[] } | { failed: string };
 
 const MOST_STORES = 1000;
 const MOST_EPISODES = 1_000_000;
 const EPISODE_NAME = /^task[0-9]{3,12}_episode[0-9]{3,12}$/;
 const EPISODES_KEPT = 8;
+/** Milliseconds after which a summary that is not complete is asked for again. */
+export const SUMMARY_AGAIN = 1500;
 
 async function documentAt(address: string): Promise<Fields> {
   let response: Response;
@@ -81,6 +88,15 @@ export async function openStores(): Promise<StoreEntry[]> {
 
 const numberOrNull = (value: unknown): number | null => (typeof value === "number" ? value : null);
 
+function effectUnits(value: unknown): EffectUnits | null {
+  if (value == null) return null;
+  const fields = object(value, "effect_units");
+  if (fields.failed != null) return { failed: text(fields.failed, "effect_units.failed") };
+  const spread = list(fields.spread, "effect_units.spread", AXIS).map((one) => numberOrNull(one));
+  if (spread.some((one) => one !== null && !(one > 0))) throw new StoreError("The spread of the actions is not above 0.");
+  return { spread };
+}
+
 /** What Python measured of a store's episodes, as far as it is done. */
 export async function summaryOf(entry: StoreEntry): Promise<Summary> {
   const document = await documentAt(entry.summary);
@@ -90,6 +106,7 @@ export async function summaryOf(entry: StoreEntry): Promise<Summary> {
     ratio: text(document.ratio ?? "", "ratio"),
     grouping: text(document.grouping ?? "", "grouping"),
     site: text(document.site ?? "", "site"),
+    effectUnits: effectUnits(document.effect_units),
     episodes: list(document.episodes, "episodes", MOST_EPISODES).map((each) => {
       const one = object(each, "an episode");
       return {
@@ -136,6 +153,9 @@ function packedEntries(document: unknown): Map<string, PackedEntry> {
 export class Store {
   readonly #episodes = new Map<string, Promise<Episode>>();
   #packed: Promise<Map<string, PackedEntry>> | undefined;
+  #readingUnits: Promise<EffectUnits> | undefined;
+  /** The units of recorded effects; null until `readEffectUnits` has them. */
+  effectUnits: EffectUnits | null = null;
 
   constructor(
     readonly entry: StoreEntry,
@@ -146,6 +166,24 @@ export class Store {
 
   get episodeNames(): string[] {
     return this.entry.episodes.map((episode) => episode.name);
+  }
+
+  /** Ask for the units of recorded effects until Python has computed them. */
+  readEffectUnits(): Promise<EffectUnits> {
+    return (this.#readingUnits ??= this.#unitsOfSummary().then((units) => (this.effectUnits = units)));
+  }
+
+  async #unitsOfSummary(): Promise<EffectUnits> {
+    try {
+      for (;;) {
+        const { effectUnits, complete } = await summaryOf(this.entry);
+        if (effectUnits) return effectUnits;
+        if (complete) return { failed: `${this.entry.summary} has no units of effects: make the site or start the server anew.` };
+        await new Promise((resolve) => setTimeout(resolve, SUMMARY_AGAIN));
+      }
+    } catch (failure) {
+      return { failed: sentenceOf(failure) };
+    }
   }
 
   async #placeOf(episode: string): Promise<Place> {
