@@ -22,8 +22,8 @@ from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.effects.answer import item_lines, noise_sentence
 from vla_attention.analyze.effects.effect_study import study_effects, units_of_recorded
 from vla_attention.analyze.effects.item_rows import item_rows
+from vla_attention.analyze.measures.alignment import replan_starts, steps_of_time
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
-from vla_attention.analyze.time.alignment import replan_starts, steps_of_time
 from vla_attention.analyze.view.summary_process import summary_parts
 from vla_attention.capture.store.replan_records import ReplanEffects
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
