@@ -11,7 +11,7 @@ from vla_attention.analyze.effects.group_rows import GroupRow, group_rows, reade
 from vla_attention.analyze.effects.item_rows import MODALITIES, ItemRow, item_rows, ratio_of_effects
 from vla_attention.analyze.ratios.answer import ratio_sentence
 from vla_attention.analyze.show.findings import findings
-from vla_attention.analyze.show.numbers import format_number, row_interval
+from vla_attention.analyze.show.numbers import format_interval, format_number, row_interval
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.interventions import readers
@@ -49,13 +49,7 @@ def item_lines(study: EffectStudy, items: Sequence[ItemRow]) -> list[str]:
     words = [item for item in items if item.kind == "word"]
     lines = [_deciding(words)] if words else []
     lines += [_unlike_attention(words)] if words else []
-    ratio = ratio_of_effects(study)
-    if ratio is not None and ratio["ratio"] is not None:
-        lines.append(
-            f"Without all pictures the action changes {format_number(ratio['ratio'])}{_interval(ratio, 'ratio')} times "
-            f"as much as without all text ({format_number(ratio['visual'])} and {format_number(ratio['linguistic'])})."
-        )
-    lines += attention_line(study)
+    lines.append(_ratios(study))
     lines.append(noise_sentence(study))
     known = [item for item in items if item.strongest["minus_noise"] is not None]
     if known:
@@ -63,6 +57,30 @@ def item_lines(study: EffectStudy, items: Sequence[ItemRow]) -> list[str]:
         names = [item.name for item in known]
         lines.append(findings(q_values, names, "item", "an effect beyond the noise", _SENTENCES))
     return [line for line in lines if line]
+
+
+def _ratios(study: EffectStudy) -> str:
+    """Pictures against text by effect, and the same replans' ratios of attention and of contributions beside it."""
+    ratio, said = ratio_of_effects(study), ""
+    if ratio is not None and ratio["ratio"] is not None:
+        said = (
+            f"Without all pictures the action changes {format_number(ratio['ratio'])}{_interval(ratio, 'ratio')} times "
+            f"as much as without all text ({format_number(ratio['visual'])} and {format_number(ratio['linguistic'])})."
+        )
+    headline, rows = study.analysis.headline, study.analysis.contribution_rows
+    sides = study.analysis.grouping.ratio
+    if sides is None or (*sides.numerator, *sides.denominator) != MODALITIES:
+        return " ".join([said, *attention_line(study)]).lstrip()
+    if headline is None or headline.value is None:
+        return said
+    bounds = format_interval(headline.low, headline.high)
+    said += f" Their attention: {format_number(headline.value)}{'' if bounds == '-' else f' {bounds}'} times as much"
+    said += f", uniform attention's {format_number(headline.uniform)}" if headline.uniform is not None else ""
+    if rows is not None:
+        row = rows.row(-1, named=True)
+        said += f"; norms of contributions: {format_number(row['geometric_mean'])}{_interval(row, 'geometric_mean')}"
+    measured, every = study.measured[0], study.analysis.overall["num_episodes"]
+    return f"{said.lstrip()}{f' (all {every} episodes, effects in {measured})' if measured < every else ''}."
 
 
 def _deciding(words: Sequence[ItemRow]) -> str:
