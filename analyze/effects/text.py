@@ -69,7 +69,8 @@ def effects_sections(study: EffectStudy) -> list[Section]:
     else:
         sections = [*_header(study), *groups, *_left_out(study), *_others(study), *_rollouts(study), _notes(study)]
     if study.conditions:
-        sections += [*_floors(study), _every(study), _phases(study), *_tasks(study)]
+        every = [] if study.is_recorded else [_every(study)]
+        sections += [*_floors(study), *every, _phases(study), *_tasks(study)]
         sections += [*_sums(study), _dimensions(study), _attention_notes(study)]
     return sections
 
@@ -244,9 +245,21 @@ def _every(study: EffectStudy) -> Section:
     return Section([Table(columns, [*map(study.of, study.conditions)]), note, described], "EVERY CONDITION")
 
 
+def _told(study: EffectStudy) -> list[Condition]:
+    """The conditions that the text has row by row: of recorded effects one for each item, and other changes.
+
+    A run that records effects has some hundred; the tables have all.
+    """
+    if not study.is_recorded:
+        return list(study.conditions)
+    strongest = {item.strongest["condition"] for item in item_rows(study)}
+    of_keys = (Kind.WITHOUT, Kind.ONLY, Kind.RANDOM)
+    return [one for one in study.conditions if one.name in strongest or one.kind not in of_keys]
+
+
 def _floors(study: EffectStudy) -> list[Section]:
     """Effects minus those of another noise seed and of random keys, in the same episodes."""
-    tested = [study.of(condition) for condition in study.conditions if condition.kind not in FLOORS]
+    tested = [study.of(condition) for condition in _told(study) if condition.kind not in FLOORS]
     columns = [
         _condition(24),
         *signed_estimate("- noise", "minus_noise"),
@@ -277,7 +290,7 @@ def _phases(study: EffectStudy) -> Section:
 
     condition = texts("condition", lambda condition: broken(condition.name, 24), left=True)
     columns = [condition, *(column for phase in PHASES for column in of(phase))]
-    return Section([Table(columns, study.conditions)], "THIRDS OF THE EPISODE  effect")
+    return Section([Table(columns, _told(study))], "THIRDS OF THE EPISODE  effect")
 
 
 def _tasks(study: EffectStudy) -> list[Section]:
@@ -330,6 +343,10 @@ def _families(study: EffectStudy) -> list[Section]:
 
 def _most_telling(study: EffectStudy) -> list[Condition]:
     """The conditions that stand beside each other per task: noise, then groups without, then alone, then others."""
+    if study.is_recorded:
+        largest = [item.strongest["condition"] for item in item_rows(study)][: _MOST_IN_TASKS - 1]
+        by_name = {condition.name: condition for condition in study.conditions}
+        return [*study.of_kind(Kind.NOISE)[:1], *(by_name[name] for name in largest)]
     order = (Kind.NOISE, Kind.WITHOUT, Kind.ONLY)
     first = [condition for kind in order for condition in study.of_kind(kind)]
     rest = [condition for condition in study.conditions if condition.kind not in (*order, Kind.RANDOM)]
