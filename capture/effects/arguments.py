@@ -37,7 +37,7 @@ def add_effect_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="ITEMS",
         default=NO_EFFECTS,
         help=f"{', '.join(get_args(EffectItems))}, with commas between, or none (default). Each call is made again "
-        "without each of them; text,cameras takes about seven calls' time with pi",
+        "without each of them; text,cameras takes the time of 7 calls with a small pi, of 17 with a large one",
     )
     group.add_argument(
         "--effects-readers",
