@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.options import Numbers, add_option, add_task, number_range
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.store_url import store_place
 
@@ -64,33 +66,48 @@ def add_grouping(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
 
 
 def add_site_and_tasks(chosen: argparse._ArgumentGroup) -> None:
-    """--site and --tasks."""
+    """--site and --task."""
     chosen.add_argument(
         "--site",
         metavar="NAME",
         help="softmax family: joint (pi), self or cross (Cosmos), or others that --list shows; default: the first one",
     )
-    chosen.add_argument("--tasks", type=int, nargs="+", metavar="N", help="task ids (default: all)")
+    add_task(chosen, "tasks", "tasks", was=("--tasks",))
 
 
 def add_episode(parser: argparse.ArgumentParser, title: str) -> argparse._ArgumentGroup:
-    """--task and --episode, which name one episode."""
+    """--episode, which names one episode of the chosen tasks."""
     episode = parser.add_argument_group(title)
-    episode.add_argument("--task", type=int, metavar="N", help="its task (default: the first one)")
-    episode.add_argument("--episode", type=int, metavar="N", help="its episode (default: the task's first one)")
+    episode.add_argument("--episode", type=int, metavar="N", help="its number in its task (default: the first one)")
     return episode
 
 
+def only_task(arguments: argparse.Namespace, stores: Sequence[Store]) -> int | None:
+    """The number of the task that --task chose, where it is a single one."""
+    if arguments.tasks is None:
+        return None
+    from vla_attention.analyze.stores.selection import task_numbers
+
+    numbers = {number for store in stores for number in task_numbers(store, arguments.tasks)}
+    return numbers.pop() if len(numbers) == 1 else None
+
+
 def add_selection(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
-    """--site, --layers, --denoise, --heads, --tasks and --skip-corrupt, and where episodes are measured."""
+    """--site, --layers, --denoise, --heads, --task and --skip-corrupt, and where episodes are measured."""
     add_workers(parser)
     chosen = parser.add_argument_group("selection")
     add_site_and_tasks(chosen)
-    chosen.add_argument("--layers", type=int, nargs="+", metavar="N", help="layers (default: all recorded)")
-    chosen.add_argument(
-        "--denoise", nargs="+", metavar="STEP", help="denoise steps, first, last or all (default: all recorded)"
+    numbers: dict[str, Any] = {"type": number_range, "nargs": "+", "action": Numbers, "metavar": "N"}
+    chosen.add_argument("--layers", **numbers, help="layers, or ranges as 0-2 (default: all recorded)")
+    add_option(
+        chosen,
+        "--denoise",
+        was=("--denoise-steps",),
+        nargs="+",
+        metavar="STEP",
+        help="denoise steps, first, last or all (default: all recorded)",
     )
-    chosen.add_argument("--heads", type=int, nargs="+", metavar="N", help="heads (default: all recorded)")
+    chosen.add_argument("--heads", **numbers, help="heads, or ranges as 0-2 (default: all recorded)")
     chosen.add_argument(
         "--skip-corrupt",
         action="store_true",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 from vla_attention.schemas.errors import BadArgument, listing
 
@@ -38,6 +39,12 @@ def select_layers(numbers: Sequence[int] | None, num_layers: int, family: str) -
         if not 0 <= number <= last:
             also = f", or recorded-call numbers {num_layers} to {last}" if accepts_call_numbers else ""
             raise BadArgument(f"There is no layer {number}; expected block indices 0 to {num_layers - 1}{also}.")
+    if accepts_call_numbers and any(pair == (num_layers - 1, num_layers) for pair in pairwise(numbers)):
+        raise BadArgument(
+            f"Layers {num_layers - 1} and {num_layers} do not follow each other: {num_layers - 1} is the last block, and "
+            f"{num_layers} the published scripts' number of block 0. A range stays on one side: 0-{num_layers - 1}, or "
+            f"{num_layers}-{last}."
+        )
     if len(set(numbers)) != len(numbers):
         raise BadArgument(f"Layers {listing(numbers, 40)} name one of them twice; give each number once.")
     return LayerSelection(block_of_labels(numbers, num_layers), tuple(numbers), _translation_note(numbers, num_layers))

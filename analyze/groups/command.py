@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
     from vla_attention.analyze.show.answer import Answer
 
     question = question_of(arguments)
-    example = find_episode(question.selected, arguments.task, arguments.episode)
+    example = find_episode(question.selected, None, arguments.episode)
     replan = check_replan(example, arguments.replan)
     preview = preview_groups(question)
 

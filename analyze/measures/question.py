@@ -114,7 +114,7 @@ class Question:
 
 
 #: Site and tasks -> the episodes with their tokens, and their vocabulary.
-KnownEpisodes = dict[tuple[str, tuple[int, ...] | None], tuple[tuple[SelectedEpisode, ...], Vocabulary]]
+KnownEpisodes = dict[tuple[str, tuple[int | str, ...] | None], tuple[tuple[SelectedEpisode, ...], Vocabulary]]
 
 
 def ask(stores: Sequence[Store], settings: AnalysisSettings, known: KnownEpisodes | None = None) -> Question:

@@ -22,7 +22,7 @@ class AnalysisSettings:
     denoise: tuple[str, ...] | None = None
     heads: tuple[int, ...] | None = None
     per_head: bool = False
-    tasks: tuple[int, ...] | None = None
+    tasks: tuple[int | str, ...] | None = None
     site: str | None = None
     intervals: Estimand = Estimand.TASKS_LIKE_THESE
     skip_corrupt: bool = False
@@ -43,7 +43,8 @@ class SettingKeywords(TypedDict, total=False):
         grouping: a built-in grouping or the path of a TOML file.
         groups: further groups, from name to selector or list of selectors; or a list of "NAME=SELECTOR".
         ratio: "A,B/C", or a pair (numerator, denominator) of names or lists of names.
-        layers, heads, tasks: a number or several.
+        layers, heads: a number or several.
+        tasks: a number or an instruction, or several.
         denoise: "first", "last", "all", a number or several.
         per_head: whether heads are kept apart.
         site: the softmax family.
@@ -58,7 +59,7 @@ class SettingKeywords(TypedDict, total=False):
     denoise: int | str | Sequence[int | str] | None
     heads: int | Sequence[int] | None
     per_head: bool
-    tasks: int | Sequence[int] | None
+    tasks: int | str | Sequence[int | str] | None
     site: str | None
     intervals: str
     skip_corrupt: bool
@@ -101,6 +102,11 @@ def _whole_numbers(value: int | Sequence[int]) -> tuple[int, ...]:
         raise BadArgument(f"Cannot use {value!r} as numbers; expected a whole number or several.") from None
 
 
+def _tasks(value: int | str | Sequence[int | str]) -> tuple[int | str, ...]:
+    items: Sequence[int | str] = [value] if isinstance(value, (int, str)) else list(value)
+    return tuple(item if isinstance(item, str) else _whole_numbers(item)[0] for item in items)
+
+
 def _steps(value: int | str | Sequence[int | str]) -> tuple[str, ...]:
     items: Sequence[int | str] = [value] if isinstance(value, (int, str)) else list(value)
     return tuple(str(item) for item in items)
@@ -132,6 +138,6 @@ _CONVERT: dict[str, Any] = {
     "ratio": _ratio,
     "layers": _whole_numbers,
     "heads": _whole_numbers,
-    "tasks": _whole_numbers,
+    "tasks": _tasks,
     "denoise": _steps,
 }

@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     study = study_overlay(
         stores_of(arguments),
         settings_of(arguments),
-        task=arguments.task,
+        task=None,
         episode=arguments.episode,
         cameras=arguments.camera,
         replans=arguments.replans,

@@ -7,11 +7,12 @@ import argparse
 from vla_attention.analyze.arguments import add_question, add_stores, output_place, question_of
 from vla_attention.analyze.report.report_settings import ReportSettings
 from vla_attention.schemas.command_line import command_parser
+from vla_attention.schemas.options import add_option
 
 _EXAMPLES = """examples:
   vla-analyze report runs/libero_10.zarr --open
   vla-analyze report runs/libero_10.zarr --grouping instruction --layers 9 13 17 --output paper/report.html
-  vla-analyze report runs/a.zarr runs/b.zarr --episodes 8 --replans 10 --output results/both
+  vla-analyze report runs/a.zarr runs/b.zarr --num-episodes 8 --num-replans 10 --output results/both
   vla-analyze report runs/cosmos.zarr --site self
   vla-analyze report runs/cubes.zarr --reruns reruns/cubes
 
@@ -32,23 +33,30 @@ def build_parser() -> argparse.ArgumentParser:
     add_stores(parser)
     add_question(parser)
     content, defaults = parser.add_argument_group("content"), ReportSettings()
-    content.add_argument(
-        "--episodes",
+    add_option(
+        content,
+        "--num-episodes",
+        was=("--episodes",),
+        dest="episodes",
         type=int,
         default=defaults.episodes,
         metavar="N",
         help="episodes with overlays (default: %(default)s; 0: none)",
     )
-    content.add_argument(
-        "--replans",
+    add_option(
+        content,
+        "--num-replans",
+        was=("--replans",),
+        dest="replans",
         type=int,
         default=defaults.replans,
         metavar="N",
         help="replans of each, at most (default: %(default)s)",
     )
-    content.add_argument(
+    add_option(
+        content,
         "--reruns",
-        "--effects",
+        was=("--effects",),
         type=Path,
         nargs="+",
         default=[],

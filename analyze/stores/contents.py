@@ -87,7 +87,7 @@ def header_lines(stores: Sequence[Store]) -> list[str]:
     ]
 
 
-def describe_store(store: Store, tasks: Sequence[int] | None = None) -> str:
+def describe_store(store: Store, tasks: Sequence[int | str] | None = None) -> str:
     """Describe a store: run, recorded axes, spans and roles of every site, tasks with their words, objects."""
     episodes = select_episodes(store, tasks)
     # Texts stand in columns: what continues on a further line stands below its own.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.layers import LayerSelection, block_of_labels, select_layers
 from vla_attention.schemas.layout import SiteLayout
+from vla_attention.schemas.options import resolve_tasks
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import CorruptEpisode, RootAttributes, StoreError, parse_episode_name
 
@@ -156,18 +157,27 @@ def parse_denoise_steps(words: Sequence[str] | None, recorded: Sequence[int]) ->
     return tuple(steps)
 
 
-def select_episodes(store: Store, tasks: Sequence[int] | None) -> tuple[StoredEpisode, ...]:
+def task_numbers(store: Store, tasks: Sequence[int | str]) -> tuple[int, ...]:
+    """The numbers of tasks of a store that were chosen by number or by instruction (`options.resolve_tasks`)."""
+    instructions: dict[int, str] = {}
+    if not all(isinstance(task, int) for task in tasks):
+        instructions = {one.attributes.task_id: one.attributes.instruction for one in store.episodes}
+    return resolve_tasks(tasks, instructions, str(store.path))
+
+
+def select_episodes(store: Store, tasks: Sequence[int | str] | None) -> tuple[StoredEpisode, ...]:
     """The store's episodes of the wanted tasks, in order; an empty selection is an error."""
     if not store.episodes:
         raise StoreError(f"The store {store.path} holds no complete episode yet; let vla-capture finish one.")
     if tasks is None:
         return store.episodes
-    for task in tasks:
+    numbers = task_numbers(store, tasks)
+    for task in numbers:
         if task not in store.task_ids:
             raise BadArgument(
                 f"Store {store.path} has no episode of task {task}; it has tasks {listing(store.task_ids, 40)}."
             )
-    return tuple(episode for episode in store.episodes if parse_episode_name(episode.name)[0] in tasks)
+    return tuple(episode for episode in store.episodes if parse_episode_name(episode.name)[0] in numbers)
 
 
 def check_combinable(stores: Sequence[Store]) -> None:

@@ -6,6 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from vla_attention.schemas.command_line import command_parser
+from vla_attention.schemas.options import add_option
 from vla_attention.schemas.stores.store_url import store_place
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ _EXAMPLES = """examples:
   vla-analyze view runs/cubes.zarr reruns/cubes/no_text.zarr         a run beside its rerun
   vla-analyze view hf://datasets/ORG/NAME/libero_10.zarr
   vla-analyze view runs/cubes.zarr --port 8765 --no-open             on another machine, with ssh -L 8765:127.0.0.1:8765
-  vla-analyze view runs/cubes.zarr --site public/cubes               a folder for a web server
+  vla-analyze view runs/cubes.zarr --output public/cubes             a folder for a web server
 
 The page is served to this machine only, to whoever has the printed link, until Ctrl-C. It asks nothing of any other
 place. With the same stores and the same --port the link stays the same.
@@ -38,8 +39,10 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses")
     parser.add_argument("--port", type=int, default=0, metavar="N", help="port of the page (default: any free one)")
     parser.add_argument("--no-open", action="store_true", help="print the link only")
-    parser.add_argument(
-        "--site",
+    add_option(
+        parser,
+        "--output",
+        was=("--site",),
         type=Path,
         metavar="FOLDER",
         help="write the page, and links to the stores, into a folder that any web server can serve, and stop",
@@ -56,16 +59,16 @@ def run(arguments: argparse.Namespace) -> int:
     from vla_attention.analyze.view.summaries import Summary
     from vla_attention.schemas.stores.reader import open_store
 
-    if arguments.site is not None:
-        check_site(arguments.site, arguments.stores)
+    if arguments.output is not None:
+        check_site(arguments.output, arguments.stores)
     places: list[StorePlace] = list(dict.fromkeys(arguments.stores))
     with ExitStack() as stack:
         stores = [ServedStore(open_store(place), stack.enter_context(Summary())) for place in places]
-        if arguments.site is not None:
-            check_uploads(arguments.site, [store.store for store in stores])
+        if arguments.output is not None:
+            check_uploads(arguments.output, [store.store for store in stores])
         for store in stores:
             store.summary.begin(store.store)
-        if arguments.site is not None:
+        if arguments.output is not None:
             _write(arguments, stores)
         else:
             _serve(arguments, stores)
@@ -81,7 +84,7 @@ def _write(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None
     for store in stores:
         if failed := store.summary.wait():
             warnings.warn(f"Not every episode of {store.place} has numbers: {failed}", Note, stacklevel=2)
-    print(write_site(arguments.site, stores))
+    print(write_site(arguments.output, stores))
 
 
 def _serve(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None:

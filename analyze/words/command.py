@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from vla_attention.analyze.arguments import (
@@ -10,6 +11,7 @@ from vla_attention.analyze.arguments import (
     add_output,
     add_selection,
     add_stores,
+    only_task,
     output_folder,
     settings_of,
     show,
@@ -40,9 +42,6 @@ def build_parser() -> argparse.ArgumentParser:
     add_stores(parser)
     selection = add_selection(parser)
     add_intervals(parser)
-    selection.add_argument(
-        "--task", type=int, metavar="N", help="one task only: its instruction word by word, in reading order"
-    )
     selection.add_argument("--per-head", action="store_true", help="keep heads apart in the table")
     add_output(parser, "results/STORE/words")
     return parser
@@ -56,13 +55,16 @@ def run(arguments: argparse.Namespace) -> int:
     from vla_attention.analyze.words.word_study import study_words
 
     stores, settings = stores_of(arguments), settings_of(arguments)
-    study = study_words(stores, settings, arguments.task)
-    sections = [*words_sections(study), *recorded_sections(stores, of_task(settings, arguments.task), "word")]
+    # Of a single task, the instruction is shown word by word, in reading order.
+    task = only_task(arguments, stores)
+    settings = settings if task is None else replace(settings, tasks=None)
+    study = study_words(stores, settings, task)
+    sections = [*words_sections(study), *recorded_sections(stores, of_task(settings, task), "word")]
 
     def draw(folder: Path) -> list[Path]:
         from vla_attention.analyze.words.plot_word_bars import plot_word_bars
 
         return plot_word_bars(study.summary, folder, study.layer, study.instruction)
 
-    folder = output_folder(arguments, "words" if arguments.task is None else f"words_task{arguments.task:03d}")
+    folder = output_folder(arguments, "words" if task is None else f"words_task{task:03d}")
     return show(Answer(sections, study.files(), draw), folder, arguments)

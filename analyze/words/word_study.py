@@ -216,7 +216,7 @@ def study_words(stores: Sequence[Store], settings: AnalysisSettings, task: int |
         BadArgument: the site has no words, or both `task` and `settings.tasks` are given.
     """
     if task is not None and settings.tasks:
-        raise BadArgument("Give --task or --tasks, not both: --task shows one instruction word by word.")
+        raise BadArgument("Give task or tasks, not both: task shows one instruction word by word.")
     tasks = settings.tasks if task is None else (task,)
     site = site_of_words(stores[0].attributes, settings.site)
     question = ask(stores, replace(settings, site=site, tasks=tasks))

@@ -21,6 +21,7 @@ from vla_attention.capture.rollout.recording_arguments import add_recording_argu
 from vla_attention.capture.run.command import run_capture_of_family
 from vla_attention.schemas.command_line import OneSentenceParser
 from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.options import add_capture_output, add_task
 from vla_attention.schemas.stores import repair_command, verify_command
 from vla_attention.schemas.stores.repair_command import VERIFY_HELP
 from vla_attention.schemas.threads import add_threads
@@ -191,9 +192,7 @@ def _add_evaluation_arguments(
     if script:
         which = f"one of {names}, or {ALL_SUITES} for {listing(STANDARD_SUITES)} (default: libero_10)"
     group.add_argument("--task-suite", default=family.default_suite, metavar="SUITE", help=which)
-    group.add_argument(
-        "--task-id", type=int, nargs="+", metavar="N", help="one or several tasks (default: all tasks of the suite)"
-    )
+    add_task(group, "task_id", "tasks of the suite")
     group.add_argument("--num-episodes", type=int, default=5, metavar="N", help="episodes per task (default: 5)")
     if len(family.protocols) > 1:
         group.add_argument(
@@ -239,20 +238,14 @@ def _add_output_arguments(
     parser: argparse.ArgumentParser, family: PolicyFamily, script: PublishedScript | None
 ) -> None:
     group = parser.add_argument_group("output")
-    group.add_argument(
-        "--store",
-        type=Path,
-        metavar="NAME.zarr",
-        help=f"store to write (default: {family.store_prefix}SUITE.zarr in {'--output-dir' if script else 'runs'})",
-    )
-    analysis = "an analysis that runs afterwards"
+    name, default = f"{family.store_prefix}SUITE.zarr", "a store in runs"
     if script:
-        analysis = f"the analysis; default: results/attention_ratio_{family.store_prefix}SUITE"
-    group.add_argument(
-        "--output-dir",
-        type=Path,
-        metavar="PATH",
-        help=f"folder for the store (unless --store is given) and for the results of {analysis}",
+        default = f"the folder results/attention_ratio_{family.store_prefix}SUITE"
+    add_capture_output(
+        group,
+        "PATH",
+        f"the store, NAME.zarr, or a folder: for the store {name} and the results of an analysis that runs afterwards; "
+        f"may be given twice, once for each (default: {default})",
     )
     group.add_argument("--save-viz", action="store_true", help="analyse afterwards, with pictures of every episode")
     group.add_argument(

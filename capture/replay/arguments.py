@@ -15,6 +15,7 @@ from vla_attention.capture.policies.model_arguments import POLICY_THREADS
 from vla_attention.capture.policies.robot import NONE
 from vla_attention.capture.rollout.recording_arguments import add_recording_arguments
 from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.options import add_option
 from vla_attention.schemas.threads import add_threads, use_threads
 
 REPLAY_EXAMPLES = """\
@@ -131,8 +132,14 @@ def _add_frame_arguments(parser: argparse.ArgumentParser, every: str) -> None:
         metavar="N",
         help=f"a policy call at frame 0, N, 2N ... of each episode (default: {every})",
     )
-    group.add_argument(
-        "--episodes", nargs="+", metavar="N", help="numbers of episodes, and ranges as 3-7 (default: all)"
+    add_option(
+        group,
+        "--episode",
+        was=("--episodes",),
+        dest="episodes",
+        nargs="+",
+        metavar="N",
+        help="numbers of episodes, and ranges as 3-7 (default: all)",
     )
     group.add_argument("--num-episodes", type=int, metavar="N", help="the first N of these (default: all)")
     group.add_argument("--seed", type=int, default=7, metavar="N", help="seed of all noise (default: %(default)s)")
@@ -151,7 +158,15 @@ def _add_change_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_output_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("output")
-    group.add_argument("--store", type=Path, metavar="NAME.zarr", help="store to write (default: runs/DATASET.zarr)")
+    add_option(
+        group,
+        "--output",
+        was=("--store",),
+        dest="store",
+        type=Path,
+        metavar="NAME.zarr",
+        help="store to write (default: runs/DATASET.zarr)",
+    )
     existing = group.add_mutually_exclusive_group()
     existing.add_argument("--resume", action="store_true", help="continue an existing store with what is missing")
     existing.add_argument("--overwrite", action="store_true", help="delete an existing store first")

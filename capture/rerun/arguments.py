@@ -13,6 +13,7 @@ from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import family_of_kind
 from vla_attention.capture.rollout.recording_arguments import add_recording_arguments
 from vla_attention.schemas.errors import BadArgument, UnknownName, UserError
+from vla_attention.schemas.options import add_capture_output, add_task
 from vla_attention.schemas.threads import use_threads
 
 if TYPE_CHECKING:
@@ -122,18 +123,11 @@ def _add_series_arguments(parser: argparse.ArgumentParser) -> None:
         "--knockout-queries is given",
     )
     group.add_argument("--objects", action="store_true", help="with --series: every object of the scenes, too")
-    group.add_argument(
-        "--output-dir",
-        type=Path,
-        metavar="DIR",
-        help="with --series: folder of the stores, one for each condition; those that are whole are skipped (default: "
-        "the base's name and _reruns, beside it)",
-    )
 
 
 def _add_selection_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("which policy calls")
-    group.add_argument("--task-id", type=int, nargs="+", metavar="N", help="one or several tasks (default: all)")
+    add_task(group, "task_id", "tasks of the store")
     group.add_argument("--num-episodes", type=int, metavar="N", help="the first N episodes of each task (default: all)")
     group.add_argument(
         "--check",
@@ -149,11 +143,12 @@ def _add_output_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--name", metavar="NAME", default="", help="name of the condition, for tables (default: made of the options)"
     )
-    group.add_argument(
-        "--store",
-        type=Path,
-        metavar="OUT.zarr",
-        help="store to write (default: beside the base, with the name of the condition)",
+    add_capture_output(
+        group,
+        "PATH",
+        "the store to write, NAME.zarr (default: beside the base, with the name of the condition); with --series the "
+        "folder of the stores, one for each condition, of which those that are whole are skipped (default: the base's "
+        "name and _reruns, beside it)",
     )
     existing = group.add_mutually_exclusive_group()
     existing.add_argument("--resume", action="store_true", help="continue an existing store with what is missing")

@@ -12,6 +12,7 @@ from vla_attention.capture.rerun.stored_calls import StoreWithoutInputs
 from vla_attention.schemas.errors import BadArgument, UserError, listing
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.options import resolve_tasks
 from vla_attention.schemas.stores.damaged_episodes import look_at
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.store_format import (
@@ -23,10 +24,10 @@ from vla_attention.schemas.stores.store_format import (
 )
 
 
-def open_base(path: Path, task_ids: Sequence[int] | None = None, num_episodes: int | None = None) -> Store:
+def open_base(path: Path, chosen: Sequence[int | str] | None = None, num_episodes: int | None = None) -> Store:
     """Open a store with the wanted episodes only, all of them whole as far as a look tells.
 
-    num_episodes: so many of each task, those with the lowest indices.
+    chosen: tasks, by number or by instruction. num_episodes: so many of each task, those with the lowest indices.
 
     Raises:
         StoreWithoutInputs: it was captured without pictures.
@@ -36,6 +37,11 @@ def open_base(path: Path, task_ids: Sequence[int] | None = None, num_episodes: i
     store = open_store(path)
     if num_episodes is not None and num_episodes < 1:
         raise BadArgument(f"Cannot use --num-episodes {num_episodes}; expected at least 1.")
+    task_ids = None
+    if chosen is not None:
+        named = any(isinstance(task, str) for task in chosen)
+        known = {one.attributes.task_id: one.attributes.instruction for one in store.episodes} if named else {}
+        task_ids = resolve_tasks(chosen, known, str(path))
     for task_id in task_ids or ():
         if task_id not in store.task_ids:
             raise BadArgument(

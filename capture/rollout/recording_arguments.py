@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
+from vla_attention.schemas.options import Numbers, add_option, number_range
 from vla_attention.schemas.precision import DEFAULT_MANTISSA_BITS
 
 
@@ -14,14 +16,18 @@ def add_recording_arguments(parser: argparse.ArgumentParser, layers: str, *, rer
         return "" if rerun else f" (default: {text})"
 
     group = parser.add_argument_group(f"what is recorded{' (default: as in the store)' if rerun else ''}")
-    group.add_argument("--layers", type=int, nargs="+", metavar="N", help=layers)
-    group.add_argument(
-        "--denoise-steps",
+    numbers: dict[str, Any] = {"type": number_range, "nargs": "+", "action": Numbers, "metavar": "N"}
+    group.add_argument("--layers", **numbers, help=layers)
+    add_option(
+        group,
+        "--denoise",
+        was=("--denoise-steps",),
+        dest="denoise_steps",
         nargs="+",
         metavar="STEP",
         help=f"numbers, first, last or all{default('first last')}",
     )
-    group.add_argument("--heads", type=int, nargs="+", metavar="N", help=f"attention heads{default('all')}")
+    group.add_argument("--heads", **numbers, help=f"attention heads{default('all')}")
     group.add_argument(
         "--queries",
         default="mean",

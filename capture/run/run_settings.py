@@ -6,6 +6,7 @@ Imports nothing heavy: mistakes in the arguments are reported before torch is lo
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,13 +14,14 @@ from typing import TYPE_CHECKING
 from vla_attention.capture.budget.budget import Fixed, parse_budget
 from vla_attention.capture.environments.base import Suite, check_task_id
 from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
-from vla_attention.capture.environments.suites import find_suite
+from vla_attention.capture.environments.suites import find_suite, list_tasks
 from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.machine.memory import memory_left
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.rollout.recording_plan import RecordingSettings, recording_settings
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.options import resolve_tasks
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX
 from vla_attention.schemas.stores.store_place import check_place
 from vla_attention.schemas.threads import available_cores
@@ -71,8 +73,7 @@ class RunSettings:
 def run_settings(arguments: argparse.Namespace) -> RunSettings:
     """Return the settings of parsed arguments; checks everything that needs no policy."""
     suite = find_suite(arguments.task_suite)
-    for task_id in arguments.task_id or ():
-        check_task_id(suite, task_id)
+    task_ids = None if arguments.task_id is None else _task_ids(suite, arguments.task_id)
     if arguments.num_episodes < 1:
         raise BadArgument(f"Cannot use --num-episodes {arguments.num_episodes}; expected at least 1.")
     if arguments.num_envs is not None and arguments.num_envs < 1:
@@ -87,7 +88,7 @@ def run_settings(arguments: argparse.Namespace) -> RunSettings:
     check_place(store, "write a store at")
     return RunSettings(
         suite=suite,
-        task_ids=None if arguments.task_id is None else tuple(sorted(set(arguments.task_id))),
+        task_ids=task_ids,
         num_episodes=arguments.num_episodes,
         protocol=_protocol(arguments),
         seed=arguments.seed,
@@ -110,6 +111,16 @@ def run_settings(arguments: argparse.Namespace) -> RunSettings:
         ),
         policy_batch=arguments.policy_batch,
     )
+
+
+def _task_ids(suite: Suite, chosen: Sequence[int | str]) -> tuple[int, ...]:
+    """Return the tasks that were chosen by number or by instruction, ascending; the latter opens the suite."""
+    named = any(isinstance(task, str) for task in chosen)
+    instructions = {task.task_id: task.instruction for task in list_tasks(suite)} if named else {}
+    task_ids = resolve_tasks(chosen, instructions, f"the suite {suite.name}")
+    for task_id in task_ids:
+        check_task_id(suite, task_id)
+    return tuple(sorted(task_ids))
 
 
 def _protocol(arguments: argparse.Namespace) -> EvaluationProtocol | None:

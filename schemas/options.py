@@ -1,0 +1,146 @@
+"""Options that both command lines share: names that they had before, ranges of numbers, and tasks. Nothing heavy."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from vla_attention.schemas.errors import Note, listing, unknown_name
+
+_RANGE = re.compile(r"(\d+)-(\d+)")
+#: Numbers that a range may name; axes of stores are far shorter.
+_MOST_IN_RANGE = 10_000
+TASK_HELP = "task ids, ranges as 0-3, or the instruction in quotes"
+
+
+def add_option(
+    group: argparse._ActionsContainer,
+    name: str,
+    *,
+    was: Sequence[str] = (),
+    published: Sequence[str] = (),
+    **options: Any,
+) -> argparse.Action:
+    """Add an option that is also accepted by other names, which no help shows.
+
+    Args:
+        group: the parser, or a group of it.
+        name: its name.
+        was: names that it had in earlier versions; each use says the new one, once.
+        published: names of the published scripts, accepted in silence.
+        options: as `add_argument` takes them; `action` may be a class.
+    """
+    action = group.add_argument(name, **options)
+    hidden = {key: value for key, value in options.items() if key not in ("help", "default", "dest", "required")}
+    hidden |= {"dest": action.dest, "default": argparse.SUPPRESS, "help": argparse.SUPPRESS}
+    for other in published:
+        group.add_argument(other, **hidden)
+    for other in was:
+        group.add_argument(other, **hidden | {"action": _renamed(type(action), name)})
+    return action
+
+
+def _renamed(action: type[argparse.Action], name: str) -> type[argparse.Action]:
+    """An action that does the same and says the new name."""
+
+    class Renamed(action):  # type: ignore[misc, valid-type]
+        def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+            warnings.warn(Note(f"{option_string} is called {name} now."), stacklevel=2)
+            super().__call__(parser, namespace, values, option_string)
+
+    return Renamed
+
+
+class Numbers(argparse.Action):
+    """An action for values of `number_range` or `task_choice`: one list of them all."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        """Keep the numbers, and texts as they are."""
+        chosen = [one for value in values for one in (value if isinstance(value, list) else [value])]
+        setattr(namespace, self.dest, chosen)
+
+
+def number_range(text: str) -> list[int]:
+    """The type of an option of numbers: `3`, or the range `0-2`."""
+    if matched := _RANGE.fullmatch(text):
+        first, last = int(matched[1]), int(matched[2])
+        if last < first or last - first >= _MOST_IN_RANGE:
+            raise argparse.ArgumentTypeError(f"'{text}' is no range of numbers; write the smaller one first, as 0-2")
+        return list(range(first, last + 1))
+    try:
+        return [int(text)]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is neither a number nor a range as 0-2") from None
+
+
+def task_choice(text: str) -> list[int] | str:
+    """The type of `--task`: numbers, or the instruction of a task."""
+    return number_range(text) if re.fullmatch(r"-?\d+(-\d+)?", text) else text
+
+
+def add_task(group: argparse._ActionsContainer, dest: str, which: str, *, was: Sequence[str] = ()) -> None:
+    """`--task`, which the published scripts call `--task-id`; which: what it chooses, for the help."""
+    add_option(
+        group,
+        "--task",
+        was=was,
+        published=("--task-id",),
+        dest=dest,
+        type=task_choice,
+        nargs="+",
+        action=Numbers,
+        metavar="TASK",
+        help=f"{which}: {TASK_HELP} (default: all)",
+    )
+
+
+class OutputPath(argparse.Action):
+    """`--output` of a capture: `NAME.zarr` is the store, anything else a folder."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        """Keep the path as `store` or as `output_dir`."""
+        path = Path(values)
+        setattr(namespace, "store" if path.suffix == ".zarr" else "output_dir", path)
+
+
+def add_capture_output(group: argparse._ActionsContainer, store: str, text: str) -> None:
+    """`--output` of a command that writes stores. store: the metavar; text: the help."""
+    group.add_argument("--output", action=OutputPath, default=argparse.SUPPRESS, metavar=store, help=text)
+    group.add_argument("--output-dir", type=Path, dest="output_dir", help=argparse.SUPPRESS)
+    renamed = _renamed(argparse._StoreAction, "--output")
+    group.add_argument("--store", action=renamed, type=Path, dest="store", help=argparse.SUPPRESS)
+
+
+def resolve_tasks(chosen: Sequence[int | str], instructions: Mapping[int, str], where: str) -> tuple[int, ...]:
+    """The numbers of tasks that were chosen by number or by instruction, in that order, each once.
+
+    Args:
+        chosen: numbers, which are not checked, and instructions, in any case.
+        instructions: of the tasks that exist, by number.
+        where: what has them, for a sentence.
+
+    Raises:
+        UnknownName: no task has an instruction.
+    """
+    numbers: list[int] = []
+    for one in chosen:
+        if isinstance(one, int):
+            numbers.append(one)
+            continue
+        named = [number for number, text in instructions.items() if _folded(text) == _folded(one)]
+        if not named:
+            raise unknown_name(f"task of {where} with the instruction", one, instructions.values())
+        if len(named) > 1:
+            warnings.warn(
+                Note(f"Tasks {listing(named)} of {where} have the instruction '{one}': all of them."), stacklevel=2
+            )
+        numbers += named
+    return tuple(dict.fromkeys(numbers))
+
+
+def _folded(text: str) -> str:
+    return " ".join(text.casefold().split())
