@@ -52,6 +52,8 @@ class EffectMeasurement:
     planned: EffectsRecorded
     siblings: Mapping[int, Sequence[str]]
     say: Callable[[str], None]
+    #: Said where no word has another one that could stand in its place.
+    no_siblings: str = "No other task of a family has other words in the same places: none is exchanged."
     #: Replans whose effects were refused.
     refused: int = field(default=0, init=False)
     #: What each replan with effects took.
@@ -68,6 +70,10 @@ class EffectMeasurement:
         """How far 1 of the normalised actions moves the robot, (action dim,); 1 for what the policy never moves."""
         units = cast(UnitsPolicy, self.policy).action_units()
         return np.where(units == 0, 1.0, units)
+
+    def allowed_difference(self, actions: NDArray[np.float64]) -> float:
+        """Return how far the unchanged call may be from actions (horizon, action dim), in their units."""
+        return MOST_DIFFERENCE
 
     @cached_property
     def is_float32(self) -> bool:
@@ -89,7 +95,8 @@ class EffectMeasurement:
         while True:
             try:
                 together = policy.act_variants(list(variants.values()), self.planned.denoise_steps, self._batch)
-                return dict(zip(variants, together, strict=True))
+                pairs = zip(variants, together, strict=True)
+                return {number: actions for number, actions in pairs if actions is not None}
             except torch.OutOfMemoryError:
                 if self._batch == 1:
                     self.say_once("The memory does not suffice for the effects of a single call: they are left out.")
@@ -152,7 +159,7 @@ class EpisodeEffectsMeasured:
             siblings = self.run.siblings.get(context.task_id, ())
             self.conditions = conditions_of(planned, policy, policy_input, tokens, vocabularies, siblings)
             if "text" in planned.items and not any(condition.prompt for condition in self.conditions):
-                self.run.say_once("No other task of a family has other words in the same places: none is exchanged.")
+                self.run.say_once(self.run.no_siblings)
             if "objects" in planned.items and not context.objects:
                 self.run.say_once("The scene's objects are not known here: effects of objects are not measured.")
         variants: dict[int, CallVariant] = {}
@@ -166,7 +173,7 @@ class EpisodeEffectsMeasured:
             unchanged = self.conditions.index(UNCHANGED)
             actions = made.pop(unchanged, actions)
         changes = {number: ((given - actions) / self.run.units).astype(np.float32) for number, given in made.items()}
-        measured = self._refused_if_unlike(changes, context)
+        measured = self._refused_if_unlike(changes, context, self.run.allowed_difference(actions))
         cut = {
             site.name: np.stack([_cut(variants[number], site.name, site.num_keys) for number in measured])
             if measured
@@ -203,8 +210,8 @@ class EpisodeEffectsMeasured:
             if not editors:
                 return None
         if condition.changes_input:
-            changed = changed_inputs(policy_input.given, condition, policy.sites, context)
             try:
+                changed = changed_inputs(policy_input.given, condition, policy.sites, context)
                 exchanged = policy.prepare_again(changed)
             except UserError as error:  # a prompt that the policy has no encoding of
                 self.run.say_once(f"'{condition.name}' is left out of the effects: {error}")
@@ -221,7 +228,9 @@ class EpisodeEffectsMeasured:
             )
         return CallVariant(policy_input, noise_seed, editors)
 
-    def _refused_if_unlike(self, changes: Mapping[int, NDArray[np.float32]], context: CallContext) -> list[int]:
+    def _refused_if_unlike(
+        self, changes: Mapping[int, NDArray[np.float32]], context: CallContext, allowed: float
+    ) -> list[int]:
         """Return the numbers of the conditions whose changes are kept, ascending."""
         assert self.conditions is not None
         finite = [number for number, change in changes.items() if np.isfinite(change).all()]
@@ -232,13 +241,13 @@ class EpisodeEffectsMeasured:
         if unchanged is None or not self.run.is_float32:
             return finite
         difference = float(np.abs(changes[unchanged]).max(initial=0.0))
-        if difference <= MOST_DIFFERENCE:
+        if difference <= allowed:
             return finite
         if not self.run.refused:
             self.run.say(
                 f"The effects of replan {context.replan} of {episode_name(context.task_id, context.episode_index)} are "
                 f"refused: among the changed calls the unchanged one differs by {difference:.2g} of normalised "
-                f"actions, allowed is {MOST_DIFFERENCE:g}. Of further ones the store alone says so."
+                f"actions, allowed is {allowed:g}. Of further ones the store alone says so."
             )
         self.run.refused += 1
         return [unchanged]

@@ -1,0 +1,365 @@
+"""Effects beside the attention of a policy of the caller: a callable repeats each call under every condition.
+
+The calls are made again one by one, after the recorded one, from the state in which it found the policy and the random
+numbers. Nothing of them is recorded, and afterwards the state is the one that the recorded call left.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from vla_attention.capture.effects.arguments import EffectSettings, settings_of
+from vla_attention.capture.effects.measurement import MOST_DIFFERENCE, EffectMeasurement
+from vla_attention.capture.interventions.attention_edits import SiteEdit, SiteEditor
+from vla_attention.capture.interventions.changed_inputs import GREY
+from vla_attention.capture.policies.noise import noise_seed
+from vla_attention.capture.policies.policy import CallVariant, GivenInputs, Policy, PolicyInput
+from vla_attention.capture.torch_policies.added_updates import OutputWay
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
+from vla_attention.capture.torch_policies.call_order import CallPlace, KnownCalls
+from vla_attention.capture.torch_policies.call_state import CallState
+from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
+from vla_attention.capture.torch_policies.knockouts import edits_at, logit_bias, prefix_bias
+from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
+from vla_attention.capture.torch_policies.policy_modules import FoundPolicy
+from vla_attention.capture.torch_policies.replan_inputs import Repeat, RepeatedCall, read_actions
+from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder
+from vla_attention.capture.torch_policies.watch import watch_attention
+from vla_attention.schemas.effects import EffectsRecorded
+from vla_attention.schemas.errors import BadArgument, Note, UserError
+from vla_attention.schemas.stores.store_format import PolicyIdentity, Recording
+
+#: Of random keys and of the other noise; a run of `va.record` has the seed 0.
+_SEED = 1
+#: Stands for the noise of the recorded call, whose seed may not be known.
+OWN_NOISE = -1
+
+_NO_SIBLINGS = "No word is exchanged: no instruction of run.episode(siblings=[...]) has other words in the same places."
+_TAKES_NO_CALL = (
+    "The callable given as repeat takes no argument: no word and no picture is exchanged. Give lambda call: ..., which "
+    "makes the call with call.instruction and call.frames."
+)
+_OTHER_ACTIONS = (
+    "The callable given as repeat gives other actions than the recorded call when nothing is changed: it must return "
+    "what replan.actions is set to, and what it draws at random or keeps must be torch's, numpy's, Python's, the "
+    "policy's, or named in it. The effects of such replans are refused."
+)
+
+
+class NotRepeated(BadArgument):
+    """A callable that does not make the policy call again."""
+
+
+def effects_of_layout(effects: str | EffectSettings | None, layout: PolicyLayout) -> EffectsRecorded | None:
+    """Return which effects a run measures; raise `BadArgument` for what the layout or a repeated call has not."""
+    settings = settings_of(effects)
+    if settings is None:
+        return None
+    if settings.denoise_steps is not None:
+        raise BadArgument(
+            f"Cannot measure effects with {settings.denoise_steps} denoise steps: a call of your own is repeated as it "
+            "is. Leave denoise_steps out."
+        )
+    tokens = [rule for rule in layout.rules if rule.tokens is not None]
+    for reader in settings.readers:
+        if reader == "action" or any(rule.is_prefix or reader == "all" for rule in tokens):
+            continue
+        calls = "its tokens" if reader == "all" else "a prefix"
+        raise BadArgument(
+            f"Cannot measure effects by the reader '{reader}': no rule of the layout '{layout.name}' says which calls "
+            f"are passes over {calls}, in which keys would be cut off too. Say it with CallRule(..., tokens=SITE), or "
+            "use EffectSettings(..., readers=('action',)), as --effects-readers action."
+        )
+    return EffectsRecorded(settings.items, settings.readers, settings.every, layout.num_denoise_steps, _SEED)
+
+
+@dataclass(frozen=True)
+class CallInput(PolicyInput):
+    """What a call was given by its caller, in `call`; prompt and pictures are here as they are stored."""
+
+    call: RepeatedCall = field(default_factory=lambda: RepeatedCall("", {}))
+
+    @property
+    def given(self) -> GivenInputs:
+        """What a condition changes: the caller's instruction, and which pictures."""
+        return GivenInputs(self.frames, {}, self.state, self.call.instruction)
+
+
+@dataclass(frozen=True)
+class RecordedCall:
+    """What is known of a recorded call that is to be repeated.
+
+    before: the state before it. actions: (horizon, action dim). present: site -> (key,) bool, the keys that its calls
+    had. every_function: see `watch_attention`. where: the replan, in words.
+    """
+
+    repeat: Repeat
+    given: CallInput
+    before: CallState
+    actions: NDArray[np.float64]
+    present: Mapping[str, NDArray[np.bool_]]
+    every_function: bool
+    where: str
+
+
+class RepeatedPolicy:
+    """A policy of the caller, as far as `EffectMeasurement` needs one; `call` is the one that is repeated.
+
+    found, known: the policy's modules, and what was found out about its calls. recording: of the run.
+
+    Attributes:
+        measurement: measures the effects of a run.
+        siblings: by task id, instructions whose words are exchanged for the task's own.
+    """
+
+    def __init__(self, found: FoundPolicy, known: KnownCalls, identity: PolicyIdentity, recording: Recording) -> None:
+        assert recording.effects is not None
+        self.name, self.family = identity.name, identity.family
+        self.num_denoise_steps = identity.num_denoise_steps
+        self.cameras = identity.cameras
+        self.sites = tuple(site.keys for site in known.layout.sites)
+        self.siblings: dict[int, Sequence[str]] = {}
+        # It has what is needed of policies whose variants are made together.
+        self.measurement = _Measurement(cast(Policy, self), recording.effects, self.siblings, _say, _NO_SIBLINGS)
+        self.call: RecordedCall | None = None
+        self._found = found
+        self._known = known
+        self._identity = identity
+        self._recording = recording
+        #: Whether calls whose attention is not changed get a mask that changes nothing: they then take the kernels of
+        #: the others, and what these round otherwise is seen.
+        self._masks = True
+
+    def identity(self) -> PolicyIdentity:
+        """Return the policy's description in the store."""
+        return self._identity
+
+    def action_units(self) -> NDArray[np.float64]:
+        """Return ones, (action dim,): actions are in the caller's units."""
+        return np.ones(self._now.actions.shape[1])
+
+    def replan_noise_seed(self, run_seed: int, task_id: int, episode_index: int, replan: int) -> int:
+        """Return the seed of another noise."""
+        return noise_seed(run_seed, task_id, episode_index, replan)
+
+    def prepare_again(self, given: GivenInputs) -> PolicyInput:
+        """Return the call's input with another instruction, and grey pictures where they are others."""
+        base = self._now.given
+        frames = {
+            camera: _grey(picture)
+            if camera in base.frames and given.frames[camera] is not base.frames[camera]
+            else picture
+            for camera, picture in base.call.frames.items()
+        }
+        return replace(base, call=RepeatedCall(given.instruction, frames))
+
+    def act_variants(
+        self, variants: Sequence[CallVariant], num_steps: int, batch: int
+    ) -> list[NDArray[np.float64] | None]:
+        """Repeat the call for each variant, the first of which is the unchanged one; None for what cannot be made."""
+        call, nothing = self._now, [None] * (len(variants) - 1)
+        after = CallState(self._found.policy, call.repeat.call)
+        try:
+            unchanged = self._made(variants[0])
+            if unchanged is None:
+                return [None, *nothing]
+            if self.measurement.differs(unchanged.actions, call.actions):
+                self.measurement.say_once(_OTHER_ACTIONS)
+                return [unchanged.actions, *nothing]
+            made = [self._compared(variant, unchanged) for variant in variants[1:]]
+            return [unchanged.actions, *made]
+        finally:
+            after.again()
+
+    @property
+    def _now(self) -> RecordedCall:
+        assert self.call is not None
+        return self.call
+
+    def _compared(self, variant: CallVariant, unchanged: _Repeated) -> NDArray[np.float64] | None:
+        """Return the actions of a variant; None, and a line, where it is not the variant that it should be."""
+        say, exchanged = self.measurement.say_once, variant.policy_input is not self._now.given
+        if exchanged and not self._now.repeat.takes_call:
+            say(_TAKES_NO_CALL)
+            return None
+        made = self._made(variant)
+        if made is None:
+            return None
+        if exchanged and any((made.seen[site] != seen).any() for site, seen in unchanged.seen.items()):
+            say("A call with an exchanged word is not measured where its prompt has another number of tokens.")
+            return None
+        if variant.noise_seed != OWN_NOISE and np.array_equal(made.actions, unchanged.actions):
+            say("The repeated call draws no noise from a generator that is known: another noise is not measured.")
+            return None
+        return made.actions
+
+    def _made(self, variant: CallVariant) -> _Repeated | None:
+        """Repeat the call for one variant; None, and a line, where that fails: an episode never does."""
+        try:
+            try:
+                return self._repeated(variant)
+            except ChangeRefused:
+                if variant.editors or not self._masks:
+                    raise
+                self._masks = False
+                return self._repeated(variant)
+        except Exception as error:
+            kind = "" if isinstance(error, UserError) else f"{type(error).__name__}: "
+            self.measurement.say_once(f"Left out of the effects: a repeated call failed. {kind}{error}")
+            return None
+
+    def _repeated(self, variant: CallVariant) -> _Repeated:
+        call, given = self._now, cast(CallInput, variant.policy_input).call
+        call.before.again()
+        if variant.noise_seed != OWN_NOISE:
+            call.before.reseed(variant.noise_seed)
+        edits = {site: cast(SiteEditor, editor).edits for site, editor in variant.editors.items()}
+        bias = _RepeatBias(self._known.layout, edits, call.present) if edits or self._masks else None
+        watcher = _RepeatWatcher(self._known, self._identity.name, self._recording, bias)
+        with watch_attention(self._found, watcher, every_function=call.every_function):
+            result = call.repeat.call(given) if call.repeat.takes_call else call.repeat.call()
+        if not watcher.saw_attention:
+            raise NotRepeated(
+                "The callable given as repeat made no attention call: a policy that answers from a queue must be reset "
+                "in it, as lambda call: (policy.reset(), policy.select_action(batch))[1]."
+            )
+        watcher.order.check(f"the repeated call of {call.where}")
+        actions = read_actions(result)
+        if actions is None or actions.shape != call.actions.shape:
+            shape = None if actions is None else actions.shape
+            raise NotRepeated(
+                f"The callable given as repeat returned actions of the shape {shape}; expected {call.actions.shape}, "
+                "as replan.actions is set to."
+            )
+        return _Repeated(actions, watcher.seen)
+
+
+@dataclass(frozen=True)
+class _Repeated:
+    """actions: (horizon, action dim). seen: site -> (key,) bool, the keys that its first call could see."""
+
+    actions: NDArray[np.float64]
+    seen: Mapping[str, NDArray[np.bool_]]
+
+
+class _Measurement(EffectMeasurement):
+    """Allows for the size of the caller's units: 1e-4 of an angle of 180 degrees is less than float32 holds."""
+
+    def allowed_difference(self, actions: NDArray[np.float64]) -> float:
+        return MOST_DIFFERENCE * max(1.0, float(np.abs(actions).max()))
+
+    def differs(self, unchanged: NDArray[np.float64], actions: NDArray[np.float64]) -> bool:
+        """Whether a repeat without a change gives other actions than rounding explains; see `is_float32`."""
+        return self.is_float32 and not float(np.abs(unchanged - actions).max()) <= self.allowed_difference(actions)
+
+
+@dataclass
+class _RepeatBias:
+    """What edits add to the logits of one repeated call, zeros where they change nothing; see `LogitBias`.
+
+    edits: by site. present: site -> (key,) bool, the keys that the recorded call had.
+    """
+
+    layout: PolicyLayout
+    edits: Mapping[str, Sequence[SiteEdit]]
+    present: Mapping[str, NDArray[np.bool_]]
+    _known: dict[tuple[Any, ...], NDArray[np.float32]] = field(default_factory=dict)
+
+    def __call__(self, row: int, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
+        """Return what is added, (head or 1, query, key). Calls to which the same is added get the same array."""
+        rule = self.layout.rules[place.rule]
+        if place.site is None and not rule.is_prefix:
+            return None
+        edits = self.edits.get(place.site or rule.tokens or "", ())
+        edits = edits_at(edits, place) if place.site else [edit for edit in edits if edit.queries != "action"]
+        if self.edits and not edits:
+            return None
+        token = -1 if place.keys is None else place.step
+        sizes = shape.heads, shape.queries, shape.keys, place.queries.start, place.queries.stop, token
+        call = place.rule, place.site, tuple(id(edit) for edit in edits), *sizes
+        if call not in self._known:
+            if place.site is None:
+                self._known[call] = prefix_bias(edits, self._tokens(rule.tokens or "", shape), shape)
+            else:
+                self._known[call] = logit_bias(edits, place, shape, self._own_keys(place.site, shape))
+        return self._known[call]
+
+    def _tokens(self, site: str, shape: CallShape) -> NDArray[np.int64]:
+        """The site's keys that are queries and keys of a pass over the prefix."""
+        tokens = np.flatnonzero(self.present[site])[: shape.keys]
+        actions = [span for span in self.layout.site(site).keys.spans if span.kind == "action"]
+        first_action = min((span.start for span in actions), default=self.layout.site(site).keys.num_keys)
+        if shape.queries != shape.keys or len(tokens) < shape.keys or (tokens >= first_action).any():
+            raise ChangeRefused(
+                f"The attention call {shape} is no pass over the first keys of site '{site}', of which {first_action} "
+                "stand before the actions: expected as many queries as keys, and no more than these. Change the rule "
+                "with these tokens in the layout."
+            )
+        return tokens
+
+    def _own_keys(self, site: str, shape: CallShape) -> slice | None:
+        """The keys of the call's own queries, the last ones; None for a site without keys of actions."""
+        spans = self.layout.site(site).keys.spans
+        if shape.keys < shape.queries or not any(span.kind == "action" for span in spans):
+            return None
+        return slice(shape.keys - shape.queries, shape.keys)
+
+
+class _RepeatWatcher(ReplanRecorder):
+    """Changes the calls of a repeat and records none. seen: see `_Repeated`."""
+
+    def __init__(self, known: KnownCalls, policy: str, recording: Recording, bias: _RepeatBias | None) -> None:
+        super().__init__(known, policy, recording, 1, [0], {}, _no_roles, bias)
+        self.seen: dict[str, NDArray[np.bool_]] = {}
+
+    def change(self, shape: CallShape) -> Tensor | None:
+        """See `Watcher`; a call of several rows cannot be changed."""
+        if self.bias is not None and shape.batch != self.batch and self.changed_place(shape) is not None:
+            raise ChangeRefused(
+                f"The attention call {shape} has a batch of {shape.batch}, and effects are of calls of one row."
+            )
+        return super().change(shape)
+
+    def passes(self, shape: CallShape) -> bool:
+        """See `Watcher`; of the first call of each site the mask is looked at."""
+        place = self.order.place(shape)
+        if place is not None and place.site is not None and place.site not in self.seen:
+            return False
+        return super().passes(shape)
+
+    def saw(self, call: AttentionCall) -> OutputWay | None:
+        """See `Watcher`."""
+        place = self.order.place(call.shape)
+        if place is not None and place.site is not None and place.site not in self.seen:
+            allowed = call.allowed(place.queries).any(dim=2).any(dim=1).any(dim=0).cpu().numpy()
+            seen = np.zeros(self.order.known.sites[place.site].keys.num_keys, dtype=bool)
+            seen[slice(None) if place.keys is None else place.keys] = allowed
+            self.seen[place.site] = seen
+        return super().saw(call)
+
+    def _wanted(self, place: CallPlace) -> bool:
+        return False
+
+
+def _no_roles(row: int, site: Any, present: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    raise AssertionError("A repeated call has no contributions.")
+
+
+def _grey(picture: Any) -> Any:
+    """Return a picture of one grey in the caller's form: whole grey levels, or numbers from 0 to 1."""
+    if isinstance(picture, Tensor):
+        return torch.full_like(picture, GREY / 255 if picture.is_floating_point() else GREY)
+    values = np.asarray(picture)
+    return np.full_like(values, GREY / 255 if values.dtype.kind == "f" else GREY)
+
+
+def _say(line: str) -> None:
+    warnings.warn(line, Note, stacklevel=2)
