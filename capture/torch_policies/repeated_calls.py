@@ -232,6 +232,7 @@ class RepeatedPolicy:
                 "in it, as lambda call: (policy.reset(), policy.select_action(batch))[1]."
             )
         watcher.order.check(f"the repeated call of {call.where}")
+        self._check_prefix(watcher, [edit for of_site in edits.values() for edit in of_site])
         actions = read_actions(result)
         if actions is None or actions.shape != call.actions.shape:
             shape = None if actions is None else actions.shape
@@ -240,6 +241,18 @@ class RepeatedPolicy:
                 "as replan.actions is set to."
             )
         return _Repeated(actions, watcher.seen)
+
+
+    def _check_prefix(self, watcher: _RepeatWatcher, edits: Sequence[SiteEdit]) -> None:
+        """Raise `ChangeRefused` if edits of the prefix's queries reached no call."""
+        passes = [number for number, rule in enumerate(self._known.layout.rules) if rule.is_prefix]
+        if not passes or all(edit.queries == "action" for edit in edits):
+            return
+        if not any(watcher.order.calls_of_rule[number] for number in passes):
+            raise ChangeRefused(
+                f"No call was a pass over the prefix, as the layout '{self._known.layout.name}' says with tokens=SITE: "
+                "keys cannot be cut off there. Change its rules, or measure with readers=('action',)."
+            )
 
 
 @dataclass(frozen=True)
