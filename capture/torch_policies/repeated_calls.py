@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vla_attention.capture.effects.arguments import EffectSettings, settings_of
-from vla_attention.capture.effects.measurement import MOST_DIFFERENCE, EffectMeasurement
+from vla_attention.capture.effects.measurement import MOST_DIFFERENCE, EffectMeasurement, EpisodeEffectsMeasured
 from vla_attention.capture.interventions.attention_edits import SiteEdit, SiteEditor
-from vla_attention.capture.interventions.changed_inputs import GREY
+from vla_attention.capture.interventions.changed_inputs import GREY, CallContext
 from vla_attention.capture.policies.noise import noise_seed
 from vla_attention.capture.policies.policy import CallVariant, GivenInputs, Policy, PolicyInput
+from vla_attention.capture.store.replan_records import ReplanEffects
 from vla_attention.capture.torch_policies.added_updates import OutputWay
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
 from vla_attention.capture.torch_policies.call_order import CallPlace, KnownCalls
@@ -40,7 +41,7 @@ from vla_attention.schemas.stores.store_format import PolicyIdentity, Recording
 #: Of random keys and of the other noise; a run of `va.record` has the seed 0.
 _SEED = 1
 #: Stands for the noise of the recorded call, whose seed may not be known.
-OWN_NOISE = -1
+_OWN_NOISE = -1
 
 _NO_SIBLINGS = "No word is exchanged: no instruction of run.episode(siblings=[...]) has other words in the same places."
 _TAKES_NO_CALL = (
@@ -138,6 +139,15 @@ class RepeatedPolicy:
         #: the others, and what these round otherwise is seen.
         self._masks = True
 
+    def measure(
+        self, episode: EpisodeEffectsMeasured, call: RecordedCall, context: CallContext
+    ) -> ReplanEffects | None:
+        """Return the effects of a call that was just recorded."""
+        self.call = call
+        if "cameras" in self.measurement.planned.items and call.repeat.takes_call and not call.repeat.given.frames:
+            self.measurement.say_once("No picture is exchanged: replan(frames=...) was given none.")
+        return episode.measure(call.given, _OWN_NOISE, call.actions, context)
+
     def identity(self) -> PolicyIdentity:
         """Return the policy's description in the store."""
         return self._identity
@@ -196,7 +206,7 @@ class RepeatedPolicy:
         if exchanged and any((made.seen[site] != seen).any() for site, seen in unchanged.seen.items()):
             say("A call with an exchanged word is not measured where its prompt has another number of tokens.")
             return None
-        if variant.noise_seed != OWN_NOISE and np.array_equal(made.actions, unchanged.actions):
+        if variant.noise_seed != _OWN_NOISE and np.array_equal(made.actions, unchanged.actions):
             say("The repeated call draws no noise from a generator that is known: another noise is not measured.")
             return None
         return made.actions
@@ -219,7 +229,7 @@ class RepeatedPolicy:
     def _repeated(self, variant: CallVariant) -> _Repeated:
         call, given = self._now, cast(CallInput, variant.policy_input).call
         call.before.again()
-        if variant.noise_seed != OWN_NOISE:
+        if variant.noise_seed != _OWN_NOISE:
             call.before.reseed(variant.noise_seed)
         edits = {site: cast(SiteEditor, editor).edits for site, editor in variant.editors.items()}
         bias = _RepeatBias(self._known.layout, edits, call.present) if edits or self._masks else None
@@ -241,7 +251,6 @@ class RepeatedPolicy:
                 "as replan.actions is set to."
             )
         return _Repeated(actions, watcher.seen)
-
 
     def _check_prefix(self, watcher: _RepeatWatcher, edits: Sequence[SiteEdit]) -> None:
         """Raise `ChangeRefused` if edits of the prefix's queries reached no call."""

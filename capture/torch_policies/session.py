@@ -37,7 +37,7 @@ from vla_attention.capture.torch_policies.recorded_episodes import (
     check_length,
     rows_of_batch,
 )
-from vla_attention.capture.torch_policies.repeated_calls import OWN_NOISE, CallInput, RecordedCall, RepeatedPolicy
+from vla_attention.capture.torch_policies.repeated_calls import CallInput, RecordedCall, RepeatedPolicy
 from vla_attention.capture.torch_policies.replan_inputs import (
     EpisodeFacts,
     ReplanInputs,
@@ -416,14 +416,14 @@ class RecordedRun:
         state = np.zeros(0) if record.state is None else record.state
         given = CallInput(inputs.frames, roles, record.prompt, state, {}, call=inputs.repeat.given)
         every_function = self.every_function or self._names_unknown
-        self._repeats.call = RecordedCall(inputs.repeat, given, before, record.actions, present, every_function, where)
+        call = RecordedCall(inputs.repeat, given, before, record.actions, present, every_function, where)
         facts = episode.facts
         context = CallContext(
             facts.task_id, facts.episode_index, episode.num_replans, {}, facts.objects, inputs.coverage
         )
         self._in_block = True
         try:
-            return episode._effects.measure(given, OWN_NOISE, record.actions, context)
+            return self._repeats.measure(episode._effects, call, context)
         finally:
             self._in_block = False
 

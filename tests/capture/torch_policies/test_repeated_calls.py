@@ -389,15 +389,21 @@ def test_calls_whose_queries_are_all_tokens(tmp_path, monkeypatch):
         policy.act(picture, text)
         return torch.cat(logits).detach()
 
-    settings = {"layout": layout, "tokenizer": policy.tokenizer, "effects": "text", "durable": False}
+    settings = {"layout": layout, "tokenizer": policy.tokenizer, "effects": "text,cameras", "durable": False}
     with (
-        pytest.warns(Note, match="draws no noise"),
+        pytest.warns(Note) as said,
         va.record(tmp_path / "a.zarr", policy, **settings) as run,
         run.episode(task_id=0, episode_index=0, instruction=TEXT, siblings=["pick up bowl"]) as episode,
         episode.replan(env_step=0, repeat=lambda call: act(call.instruction)) as replan,
     ):
         replan.actions = act()
+    assert [str(one.message).split(":")[0] for one in said] == [
+        "No picture is exchanged",
+        "The repeated call draws no noise from a generator that is known",
+    ]
     changes = changes_of(open_store(tmp_path / "a.zarr"))
+    # The first patch sees itself only, and still does.
+    assert {"without_visual_queries_all", "only_linguistic_queries_all"} <= set(changes)
     the, attend = PATCHES + 2, nn.functional.scaled_dot_product_attention
     for name, readers in (("without_word_the_queries_all", "all"), ("without_word_the", "action")):
 
