@@ -160,7 +160,7 @@ class EpisodeEffectsMeasured:
             self.conditions = conditions_of(planned, policy, policy_input, tokens, vocabularies, siblings)
             if "text" in planned.items and not any(condition.prompt for condition in self.conditions):
                 self.run.say_once(self.run.no_siblings)
-            if "objects" in planned.items and not context.objects:
+            if "objects" in planned.items and not (context.objects and context.coverage):
                 self.run.say_once("The scene's objects are not known here: effects of objects are not measured.")
         variants: dict[int, CallVariant] = {}
         for number, condition in enumerate(self.conditions):
