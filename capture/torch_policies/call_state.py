@@ -155,24 +155,28 @@ def _numbers_of(part: Any) -> Callable[[], None]:
     return put_back
 
 
-def _named_by(call: Callable[..., Any]) -> Iterator[object]:
-    """What a callable names: arguments that it holds, `self`, the variables around it, and global ones."""
+def _named_by(call: Callable[..., Any], depth: int = _DEPTH_OF_CALL) -> Iterator[object]:
+    """What a callable names: arguments that it holds, `self`, the variables around it, and global ones.
+
+    Functions that it names name more, down to `depth`.
+    """
     if isinstance(call, partial):
         yield from (*call.args, *call.keywords.values())
-        yield from _named_by(call.func)
+        yield from _named_by(call.func, depth)
         return
     if isinstance(call, types.MethodType):
         yield call.__self__
         call = call.__func__
-    code = getattr(call, "__code__", None)
-    if code is None:
+    if not isinstance(call, types.FunctionType):
         yield call
         return
-    for cell in getattr(call, "__closure__", None) or ():
-        if cell is not None and _is_filled(cell):
-            yield cell.cell_contents
-    names = getattr(call, "__globals__", {})
-    yield from (names[name] for name in code.co_names if name in names)
+    named = [cell.cell_contents for cell in call.__closure__ or () if _is_filled(cell)]
+    named += [call.__globals__[name] for name in call.__code__.co_names if name in call.__globals__]
+    for value in named:
+        if not isinstance(value, types.FunctionType):
+            yield value
+        elif depth:
+            yield from _named_by(value, depth - 1)
 
 
 def _is_filled(cell: types.CellType) -> bool:

@@ -53,10 +53,12 @@ def test_what_a_repeated_call_names_is_put_back(kind):
     assert call() == first
 
 
-def test_global_generators_that_a_call_names_are_put_back_and_seeded():
-    def call():
-        return torch.rand(1, generator=NOISE).item()
+def drawn() -> float:
+    return torch.rand(1, generator=NOISE).item()
 
+
+@pytest.mark.parametrize("call", [drawn, lambda: drawn(), lambda: torch.rand(1, generator=NOISE).item()])
+def test_global_generators_that_a_call_names_are_put_back_and_seeded(call):
     state = CallState(nn.Linear(1, 1), call)
     first = call()
     state.again()

@@ -12,8 +12,8 @@ import torch
 from torch import nn
 
 import vla_attention as va
-from tests.kit.small_torch_policy import HORIZON, PROMPT, SmallPolicy, given, small_layout
-from tests.kit.small_torch_variants import PATCHES, TokenPolicy, token_layout
+from tests.kit.small_torch_policy import HORIZON, PROMPT, WIDTH, SmallPolicy, given, small_layout
+from tests.kit.small_torch_variants import PATCHES, OneModulePolicy, TokenPolicy, one_module_layout, token_layout
 from tests.kit.stateful_policies import GeneratorPolicy, QueuePolicy, SamplingPolicy, layout_with_prefix
 from vla_attention.analyze.__main__ import main
 from vla_attention.capture.policies.noise import noise_seed
@@ -424,6 +424,37 @@ def test_calls_whose_queries_are_all_tokens(tmp_path, monkeypatch):
         assert np.abs(changes[name]).max() > 1e-3
     exchanged = act("pick up bowl") - replan.actions
     np.testing.assert_allclose(changes["prompt_synonyms_the_up"], exchanged, atol=1e-5)
+
+
+def test_sites_of_which_nothing_is_recorded_are_changed_too(tmp_path, monkeypatch):
+    policy, layout = OneModulePolicy(), one_module_layout()
+    first = (va.Span("front", "image", 0, 4, "front", va.PatchGrid(2, 2, 8, 8)), va.Span("rest", "text", 4, 5))
+    roles = {"front": "image", "rest": "text"}
+    own = va.SiteLayout("self", (*first, va.Span("actions", "action", 5, 8)), layers=(0, 2))
+    cross = va.SiteLayout("cross", first, layers=(1, 3))
+    sites = (va.RecordedSite(own, (0, 3), roles | {"actions": "action"}), va.RecordedSite(cross, (0, 3), roles))
+    prefix, noise = torch.randn(1, 5, WIDTH), torch.randn(1, 3, WIDTH)
+    settings = {"layers": [0], "effects": va.EffectSettings(("cameras",), ("action",)), "durable": False}
+    with (
+        pytest.warns(Note) as said,
+        va.record(tmp_path / "a.zarr", policy, layout=replace(layout, sites=sites), **settings) as run,
+        run.episode(task_id=0, episode_index=0, instruction="") as episode,
+        episode.replan(
+            env_step=0, frames={"front": np.zeros((8, 8, 3), np.uint8)}, repeat=lambda: policy.act(prefix, noise)
+        ) as replan,
+    ):
+        replan.actions = policy.act(prefix, noise)
+    store = open_store(tmp_path / "a.zarr")
+    assert [site.name for site in store.attributes.sites] == ["self"]
+    assert ["draws no noise" in str(said[0].message), "takes no argument" in str(said[1].message)] == [True, True]
+    attend = nn.functional.scaled_dot_product_attention
+
+    def without(q, k, v):
+        return attend(q, k, v, attn_mask=(torch.arange(k.shape[2]) >= 4).expand(q.shape[2], -1))
+
+    monkeypatch.setattr(nn.functional, "scaled_dot_product_attention", without)
+    expected = policy.act(prefix, noise) - replan.actions
+    np.testing.assert_allclose(changes_of(store)["without_camera_front"], expected[0], atol=1e-5)
 
 
 def test_keys_of_another_kernel_that_takes_no_mask(tmp_path):
