@@ -23,16 +23,13 @@ from vla_attention.capture.interventions.changed_inputs import GREY, CallContext
 from vla_attention.capture.policies.noise import noise_seed
 from vla_attention.capture.policies.policy import CallVariant, GivenInputs, Policy, PolicyInput
 from vla_attention.capture.store.replan_records import ReplanEffects
-from vla_attention.capture.torch_policies.added_updates import OutputWay
-from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
-from vla_attention.capture.torch_policies.call_order import CallPlace, KnownCalls
+from vla_attention.capture.torch_policies.call_order import KnownCalls
 from vla_attention.capture.torch_policies.call_state import CallState
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
-from vla_attention.capture.torch_policies.knockouts import edits_at, logit_bias, prefix_bias
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
 from vla_attention.capture.torch_policies.policy_modules import FoundPolicy
+from vla_attention.capture.torch_policies.repeat_watcher import RepeatBias, RepeatWatcher
 from vla_attention.capture.torch_policies.replan_inputs import Repeat, RepeatedCall, read_actions
-from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder
 from vla_attention.capture.torch_policies.watch import watch_attention
 from vla_attention.schemas.effects import EffectsRecorded
 from vla_attention.schemas.errors import BadArgument, Note, UserError
@@ -179,12 +176,13 @@ class RepeatedPolicy:
         after = CallState(self._found.policy, call.repeat.call)
         try:
             unchanged = self._made(variants[0])
-            if unchanged is None:
-                return [None, *nothing]
-            if self.measurement.differs(unchanged.actions, call.actions):
-                self.measurement.say_once(_OTHER_ACTIONS)
-                return [unchanged.actions, *nothing]
+            if unchanged is None or self._is_another(unchanged):
+                return [None if unchanged is None else unchanged.actions, *nothing]
             made = [self._compared(variant, unchanged) for variant in variants[1:]]
+            # Once more: what the repeats before it left behind would be in them, too.
+            last = self._made(variants[0])
+            if last is None or self._is_another(last):
+                return [None if last is None else last.actions, *nothing]
             return [unchanged.actions, *made]
         finally:
             after.again()
@@ -193,6 +191,13 @@ class RepeatedPolicy:
     def _now(self) -> RecordedCall:
         assert self.call is not None
         return self.call
+
+    def _is_another(self, unchanged: _Repeated) -> bool:
+        """Whether a repeat without a change gives other actions than rounding explains, which is said once."""
+        is_another = self.measurement.differs(unchanged.actions, self._now.actions)
+        if is_another:
+            self.measurement.say_once(_OTHER_ACTIONS)
+        return is_another
 
     def _compared(self, variant: CallVariant, unchanged: _Repeated) -> NDArray[np.float64] | None:
         """Return the actions of a variant; None, and a line, where it is not the variant that it should be."""
@@ -232,8 +237,8 @@ class RepeatedPolicy:
         if variant.noise_seed != _OWN_NOISE:
             call.before.reseed(variant.noise_seed)
         edits = {site: cast(SiteEditor, editor).edits for site, editor in variant.editors.items()}
-        bias = _RepeatBias(self._known.layout, edits, call.present) if edits or self._masks else None
-        watcher = _RepeatWatcher(self._known, self._identity.name, self._recording, bias)
+        bias = RepeatBias(self._known.layout, edits, call.present) if edits or self._masks else None
+        watcher = RepeatWatcher(self._known, self._identity.name, self._recording, bias)
         with watch_attention(self._found, watcher, every_function=call.every_function):
             result = call.repeat.call(given) if call.repeat.takes_call else call.repeat.call()
         if not watcher.saw_attention:
@@ -252,7 +257,7 @@ class RepeatedPolicy:
             )
         return _Repeated(actions, watcher.seen)
 
-    def _check_prefix(self, watcher: _RepeatWatcher, edits: Sequence[SiteEdit]) -> None:
+    def _check_prefix(self, watcher: RepeatWatcher, edits: Sequence[SiteEdit]) -> None:
         """Raise `ChangeRefused` if edits of the prefix's queries reached no call."""
         passes = [number for number, rule in enumerate(self._known.layout.rules) if rule.is_prefix]
         if not passes or all(edit.queries == "action" for edit in edits):
@@ -279,100 +284,8 @@ class _Measurement(EffectMeasurement):
         return MOST_DIFFERENCE * max(1.0, float(np.abs(actions).max()))
 
     def differs(self, unchanged: NDArray[np.float64], actions: NDArray[np.float64]) -> bool:
-        """Whether a repeat without a change gives other actions than rounding explains; see `is_float32`."""
+        """Whether these are other actions; see `is_float32`."""
         return self.is_float32 and not float(np.abs(unchanged - actions).max()) <= self.allowed_difference(actions)
-
-
-@dataclass
-class _RepeatBias:
-    """What edits add to the logits of one repeated call, zeros where they change nothing; see `LogitBias`.
-
-    edits: by site. present: site -> (key,) bool, the keys that the recorded call had.
-    """
-
-    layout: PolicyLayout
-    edits: Mapping[str, Sequence[SiteEdit]]
-    present: Mapping[str, NDArray[np.bool_]]
-    _known: dict[tuple[Any, ...], NDArray[np.float32]] = field(default_factory=dict)
-
-    def __call__(self, row: int, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
-        """Return what is added, (head or 1, query, key). Calls to which the same is added get the same array."""
-        rule = self.layout.rules[place.rule]
-        if place.site is None and not rule.is_prefix:
-            return None
-        edits = self.edits.get(place.site or rule.tokens or "", ())
-        edits = edits_at(edits, place) if place.site else [edit for edit in edits if edit.queries != "action"]
-        if self.edits and not edits:
-            return None
-        token = -1 if place.keys is None else place.step
-        sizes = shape.heads, shape.queries, shape.keys, place.queries.start, place.queries.stop, token
-        call = place.rule, place.site, tuple(id(edit) for edit in edits), *sizes
-        if call not in self._known:
-            if place.site is None:
-                self._known[call] = prefix_bias(edits, self._tokens(rule.tokens or "", shape), shape)
-            else:
-                self._known[call] = logit_bias(edits, place, shape, self._own_keys(place.site, shape))
-        return self._known[call]
-
-    def _tokens(self, site: str, shape: CallShape) -> NDArray[np.int64]:
-        """The site's keys that are queries and keys of a pass over the prefix."""
-        tokens = np.flatnonzero(self.present[site])[: shape.keys]
-        actions = [span for span in self.layout.site(site).keys.spans if span.kind == "action"]
-        first_action = min((span.start for span in actions), default=self.layout.site(site).keys.num_keys)
-        if shape.queries != shape.keys or len(tokens) < shape.keys or (tokens >= first_action).any():
-            raise ChangeRefused(
-                f"The attention call {shape} is no pass over the first keys of site '{site}', of which {first_action} "
-                "stand before the actions: expected as many queries as keys, and no more than these. Change the rule "
-                "with these tokens in the layout."
-            )
-        return tokens
-
-    def _own_keys(self, site: str, shape: CallShape) -> slice | None:
-        """The keys of the call's own queries, the last ones; None for a site without keys of actions."""
-        spans = self.layout.site(site).keys.spans
-        if shape.keys < shape.queries or not any(span.kind == "action" for span in spans):
-            return None
-        return slice(shape.keys - shape.queries, shape.keys)
-
-
-class _RepeatWatcher(ReplanRecorder):
-    """Changes the calls of a repeat and records none. seen: see `_Repeated`."""
-
-    def __init__(self, known: KnownCalls, policy: str, recording: Recording, bias: _RepeatBias | None) -> None:
-        super().__init__(known, policy, recording, 1, [0], {}, _no_roles, bias)
-        self.seen: dict[str, NDArray[np.bool_]] = {}
-
-    def change(self, shape: CallShape) -> Tensor | None:
-        """See `Watcher`; a call of several rows cannot be changed."""
-        if self.bias is not None and shape.batch != self.batch and self.changed_place(shape) is not None:
-            raise ChangeRefused(
-                f"The attention call {shape} has a batch of {shape.batch}, and effects are of calls of one row."
-            )
-        return super().change(shape)
-
-    def passes(self, shape: CallShape) -> bool:
-        """See `Watcher`; of the first call of each site the mask is looked at."""
-        place = self.order.place(shape)
-        if place is not None and place.site is not None and place.site not in self.seen:
-            return False
-        return super().passes(shape)
-
-    def saw(self, call: AttentionCall) -> OutputWay | None:
-        """See `Watcher`."""
-        place = self.order.place(call.shape)
-        if place is not None and place.site is not None and place.site not in self.seen:
-            allowed = call.allowed(place.queries).any(dim=2).any(dim=1).any(dim=0).cpu().numpy()
-            seen = np.zeros(self.order.known.sites[place.site].keys.num_keys, dtype=bool)
-            seen[slice(None) if place.keys is None else place.keys] = allowed
-            self.seen[place.site] = seen
-        return super().saw(call)
-
-    def _wanted(self, place: CallPlace) -> bool:
-        return False
-
-
-def _no_roles(row: int, site: Any, present: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    raise AssertionError("A repeated call has no contributions.")
 
 
 def _grey(picture: Any) -> Any:

@@ -108,7 +108,8 @@ def _as_float64(what: str, given: Any) -> NDArray[np.float64]:
     """Return numbers as float64, or raise `BadArgument`."""
     values = given.detach().float().cpu().numpy() if hasattr(given, "detach") else given
     try:
-        return np.asarray(values, dtype=np.float64)
+        # A copy: the policy may write its next actions to the same array.
+        return np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
         raise BadArgument(f"The {what} of a replan is no array of numbers (given: {type(given).__name__}).") from None
 

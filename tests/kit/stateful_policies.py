@@ -47,6 +47,18 @@ class GeneratorPolicy(SamplingPolicy):
         return torch.randn(1, HORIZON, 2, generator=self.generator) + drawn
 
 
+class BufferPolicy(SamplingPolicy):
+    """Returns the same array at every call, with other numbers."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.buffer = np.zeros((HORIZON, 2))
+
+    def sample(self, pictures: Tensor, texts: list[str], states: Tensor) -> Any:
+        self.buffer[:] = super().sample(pictures, texts, states)[0].numpy()
+        return self.buffer
+
+
 class QueuePolicy(SamplingPolicy):
     """Answers from a queue, as LeRobot's policies do; counts its calls in a buffer, in a list and in an attribute."""
 

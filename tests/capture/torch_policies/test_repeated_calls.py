@@ -14,7 +14,13 @@ from torch import nn
 import vla_attention as va
 from tests.kit.small_torch_policy import HORIZON, PROMPT, WIDTH, SmallPolicy, given, small_layout
 from tests.kit.small_torch_variants import PATCHES, OneModulePolicy, TokenPolicy, one_module_layout, token_layout
-from tests.kit.stateful_policies import GeneratorPolicy, QueuePolicy, SamplingPolicy, layout_with_prefix
+from tests.kit.stateful_policies import (
+    BufferPolicy,
+    GeneratorPolicy,
+    QueuePolicy,
+    SamplingPolicy,
+    layout_with_prefix,
+)
 from vla_attention.analyze.__main__ import main
 from vla_attention.capture.policies.noise import noise_seed
 from vla_attention.schemas.errors import BadArgument, Note
@@ -63,7 +69,7 @@ def fill(path, policy, repeat=repeat_of, replans=2, say="default", episodes=1, s
                         repeats = None if repeat is None else repeat(policy, replan)
                         with episode.replan(env_step=replan, frames=frames, repeat=repeats) as block:
                             block.actions = policy.sample(**inputs(replan))
-                        actions.append(block.actions)
+                        actions.append(torch.as_tensor(block.actions).clone())
     store = open_store(path)
     assert verify_store(store) == []
     return store, actions, [str(one.message) for one in said if issubclass(one.category, Note)]
@@ -167,7 +173,7 @@ def state_of_everything(policy):
     return found
 
 
-@pytest.mark.parametrize("kind", [SamplingPolicy, GeneratorPolicy, QueuePolicy])
+@pytest.mark.parametrize("kind", [SamplingPolicy, GeneratorPolicy, QueuePolicy, BufferPolicy])
 def test_actions_rows_and_states_are_those_of_a_run_without_effects(tmp_path, kind):
     results = []
     for effects in (None, TEXT_AND_CAMERAS):
@@ -299,6 +305,20 @@ def test_a_repeat_of_another_call_is_refused(tmp_path):
     for replan in range(2):
         assert list(changes_of(store, replan)) == ["unchanged"]
         np.testing.assert_allclose(changes_of(store, replan)["unchanged"], 1e-3, rtol=0.01)
+
+
+def test_what_repeats_leave_where_nothing_sees_it_is_noticed(tmp_path):
+    class Tiring(SamplingPolicy):
+        calls = 0
+
+        def sample(self, **inputs):
+            type(self).calls += 1
+            return super().sample(**inputs) * (1 if self.calls < 10 else 1.1)
+
+    store, _, said = fill(tmp_path / "a.zarr", Tiring(), replans=1)
+    assert "gives other actions than the recorded call when nothing is changed" in said[0]
+    assert "are refused" in said[1]
+    assert list(changes_of(store)) == ["unchanged"]
 
 
 def test_a_repeat_without_an_argument_measures_knockouts_only(tmp_path):
