@@ -132,7 +132,7 @@ class RepeatedPolicy:
             self.siblings,
             _say,
             no_siblings=_NO_SIBLINGS,
-            no_pictures=_NO_PICTURES,
+            no_pictures="",
         )
         self.call: RecordedCall | None = None
         self._found = found
