@@ -8,10 +8,11 @@
     with va.record("run.zarr", policy, layout=va.layouts.smolvla(policy)) as run:    # docs/your-policy.md
         ...
 
-Public names: `open`, `workers` and `OpenStores` (stage two); `record`, `inspect`, `check_layout`, `layouts` and the
-parts of a `PolicyLayout` (stage one, from your own code; they need torch); `UserError` (the base of every error that a
-user can cause) and `__version__`. `vla_attention.datasets` reads data sets of robots. `vla_attention.testing` makes
-small stores with known content. This import loads neither torch nor zarr, polars or numpy.
+Public names: `open`, `workers` and `OpenStores` (stage two); `record`, `inspect`, `check_layout`, `layouts`, the parts
+of a `PolicyLayout` and `EffectSettings` (stage one, from your own code; they need torch); `UserError` (the base of
+every error that a user can cause) and `__version__`. `vla_attention.datasets` reads data sets of robots.
+`vla_attention.testing` makes small stores with known content. This import loads neither torch nor zarr, polars or
+numpy.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     # What `__getattr__` gives, for type checkers and editors.
     from vla_attention import datasets as datasets
     from vla_attention.analyze.api import OpenStores as OpenStores
+    from vla_attention.capture.effects.arguments import EffectSettings as EffectSettings
     from vla_attention.capture.torch_policies import layouts as layouts
     from vla_attention.capture.torch_policies.inspect_calls import CallTable
     from vla_attention.capture.torch_policies.layout_check import check_layout as check_layout
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
 
 #: Public names of the recorder by module. They are imported when they are used: the recorder needs torch.
 _RECORDER = {
+    "capture.effects.arguments": ("EffectSettings",),
     "capture.torch_policies.record": ("record",),
     "capture.torch_policies.layout_check": ("check_layout",),
     "capture.torch_policies.policy_layout": (

@@ -28,6 +28,17 @@ class EffectSettings:
     denoise_steps: int | None = None
     pictures: StorePlace | None = None
 
+    def __post_init__(self) -> None:
+        """Check the words and numbers, and bring the words into their order."""
+        for name, known in (("items", get_args(EffectItems)), ("readers", get_args(EffectReaders))):
+            words = list(getattr(self, name))
+            _check(f"EffectSettings.{name}", words, known)
+            object.__setattr__(self, name, tuple(word for word in known if word in words))
+        for name in ("every", "denoise_steps"):
+            number = getattr(self, name)
+            if number is not None and number < 1:
+                raise BadArgument(f"EffectSettings.{name} is {number}; expected at least 1.")
+
 
 def add_effect_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the group."""
@@ -78,12 +89,19 @@ def effect_settings(arguments: argparse.Namespace) -> EffectSettings | None:
         if number is not None and number < 1:
             raise BadArgument(f"Cannot use --effects-{name} {number}; expected at least 1.")
     return EffectSettings(
-        cast("tuple[EffectItems, ...]", tuple(item for item in get_args(EffectItems) if item in words)),
-        cast("tuple[EffectReaders, ...]", tuple(reader for reader in get_args(EffectReaders) if reader in readers)),
+        cast("tuple[EffectItems, ...]", tuple(words)),
+        cast("tuple[EffectReaders, ...]", tuple(readers)),
         given["every"] or 1,
         given["steps"],
         given["pictures"],
     )
+
+
+def settings_of(effects: str | EffectSettings | None) -> EffectSettings | None:
+    """Return the settings of items with commas between; settings as they are."""
+    if not isinstance(effects, str):
+        return effects
+    return EffectSettings(cast("tuple[EffectItems, ...]", tuple(word.strip() for word in effects.split(","))))
 
 
 def _check(option: str, words: list[str], known: tuple[str, ...]) -> None:

@@ -58,6 +58,12 @@ class EffectMeasurement:
     siblings: Mapping[int, Sequence[str]]
     say: Callable[[str], None]
     pictures: MeanPictures | None = None
+    #: Said where no word has another one that could stand in its place.
+    no_siblings: str = "No other task of a family has other words in the same places: none is exchanged."
+    #: Said where no mean pictures are known; empty where nothing could be done about it.
+    no_pictures: str = (
+        "Cameras' pictures are exchanged for grey ones; --effects-pictures STORE takes the task's mean ones."
+    )
     #: Replans whose effects were refused.
     refused: int = field(default=0, init=False)
     #: What each replan with effects took.
@@ -79,6 +85,10 @@ class EffectMeasurement:
         units = cast(UnitsPolicy, self.policy).action_units()
         return np.where(units == 0, 1.0, units)
 
+    def allowed_difference(self, actions: NDArray[np.float64]) -> float:
+        """Return how far the unchanged call may be from actions (horizon, action dim), in their units."""
+        return MOST_DIFFERENCE
+
     @cached_property
     def is_float32(self) -> bool:
         """Whether the model computes in float32."""
@@ -99,7 +109,8 @@ class EffectMeasurement:
         while True:
             try:
                 together = policy.act_variants(list(variants.values()), self.planned.denoise_steps, self._batch)
-                return dict(zip(variants, together, strict=True))
+                pairs = zip(variants, together, strict=True)
+                return {number: actions for number, actions in pairs if actions is not None}
             except torch.OutOfMemoryError:
                 if self._batch == 1:
                     self.say_once("The memory does not suffice for the effects of a single call: they are left out.")
@@ -194,8 +205,8 @@ class EpisodeEffectsMeasured:
                 planned, policy, policy_input, tokens, vocabularies, siblings, context.mean_pictures
             )
             if "text" in planned.items and not any(condition.prompt for condition in self.conditions):
-                self.run.say_once("No other task of a family has other words in the same places: none is exchanged.")
-            if "objects" in planned.items and not context.objects:
+                self.run.say_once(self.run.no_siblings)
+            if "objects" in planned.items and not (context.objects and context.coverage):
                 self.run.say_once("The scene's objects are not known here: effects of objects are not measured.")
         variants: dict[int, CallVariant] = {}
         for number, condition in enumerate(self.conditions):
@@ -208,7 +219,7 @@ class EpisodeEffectsMeasured:
             unchanged = self.conditions.index(UNCHANGED)
             actions = made.pop(unchanged, actions)
         changes = {number: ((given - actions) / self.run.units).astype(np.float32) for number, given in made.items()}
-        measured = self._refused_if_unlike(changes, context)
+        measured = self._refused_if_unlike(changes, context, self.run.allowed_difference(actions))
         cut = {
             site.name: np.stack([_cut(variants[number], site.name, site.num_keys) for number in measured])
             if measured
@@ -228,9 +239,8 @@ class EpisodeEffectsMeasured:
     def _mean_pictures(self, context: CallContext) -> Mapping[str, NDArray[np.uint8]]:
         pictures = self.run.pictures
         if pictures is None:
-            self.run.say_once(
-                "Cameras' pictures are exchanged for grey ones; --effects-pictures STORE takes the task's mean ones."
-            )
+            if self.run.no_pictures:
+                self.run.say_once(self.run.no_pictures)
             return {}
         known = pictures.of_task(context.task_id)
         if not known:
@@ -259,8 +269,8 @@ class EpisodeEffectsMeasured:
             if not editors:
                 return None
         if condition.changes_input:
-            changed = changed_inputs(policy_input.given, condition, policy.sites, context)
             try:
+                changed = changed_inputs(policy_input.given, condition, policy.sites, context)
                 exchanged = policy.prepare_again(changed)
             except UserError as error:  # a prompt that the policy has no encoding of
                 self.run.say_once(f"'{condition.name}' is left out of the effects: {error}")
@@ -277,7 +287,9 @@ class EpisodeEffectsMeasured:
             )
         return CallVariant(policy_input, noise_seed, editors)
 
-    def _refused_if_unlike(self, changes: Mapping[int, NDArray[np.float32]], context: CallContext) -> list[int]:
+    def _refused_if_unlike(
+        self, changes: Mapping[int, NDArray[np.float32]], context: CallContext, allowed: float
+    ) -> list[int]:
         """Return the numbers of the conditions whose changes are kept, ascending."""
         assert self.conditions is not None
         finite = [number for number, change in changes.items() if np.isfinite(change).all()]
@@ -288,13 +300,13 @@ class EpisodeEffectsMeasured:
         if unchanged is None or not self.run.is_float32:
             return finite
         difference = float(np.abs(changes[unchanged]).max(initial=0.0))
-        if difference <= MOST_DIFFERENCE:
+        if difference <= allowed:
             return finite
         if not self.run.refused:
             self.run.say(
                 f"The effects of replan {context.replan} of {episode_name(context.task_id, context.episode_index)} are "
                 f"refused: among the changed calls the unchanged one differs by {difference:.2g} of normalised "
-                f"actions, allowed is {MOST_DIFFERENCE:g}. Of further ones the store alone says so."
+                f"actions, allowed is {allowed:g}. Of further ones the store alone says so."
             )
         self.run.refused += 1
         return [unchanged]

@@ -104,7 +104,7 @@ class SiteEditor(FactorEditor):
 
         def operands(number: int, logits: Tensor) -> _Operands:
             heads, count, keys = logits.shape[1:]
-            stays = _stays_at_step(self.edits[number], count, action_queries, own_keys, keys)
+            stays = stays_at_step(self.edits[number], count, action_queries, own_keys, keys)
             return _operands_of(self.edits[number], self.edits[number].values, stays, heads, logits.device)
 
         return self._change(numbers, ("step", kind), operands, where)
@@ -117,7 +117,7 @@ class SiteEditor(FactorEditor):
 
         def operands(number: int, logits: Tensor) -> _Operands:
             edit, keys = self.edits[number], tokens.cpu().numpy()
-            return _operands_of(edit, edit.values[keys], _stays_in_prefix(edit, keys), logits.shape[1], logits.device)
+            return _operands_of(edit, edit.values[keys], stays_in_prefix(edit, keys), logits.shape[1], logits.device)
 
         return self._change(numbers, ("prefix", len(tokens)), operands, f"the prefix's layer {layer}")
 
@@ -129,7 +129,7 @@ class SiteEditor(FactorEditor):
     def prefix_factors(self, tokens: NDArray[np.int64]) -> NDArray[np.float64] | None:
         """See `FactorEditor`."""
         edits = [edit for edit in self._everywhere() if edit.queries != "action"]
-        factors = [np.where(_stays_in_prefix(edit, tokens), 1.0, edit.values[tokens]) for edit in edits]
+        factors = [np.where(stays_in_prefix(edit, tokens), 1.0, edit.values[tokens]) for edit in edits]
         return np.prod(factors, axis=0) if factors else None
 
     def step_factors(
@@ -138,7 +138,7 @@ class SiteEditor(FactorEditor):
         """See `FactorEditor`."""
         edits = [edit for edit in self._everywhere() if edit.queries != "prefix"]
         factors = [
-            np.where(_stays_at_step(edit, queries, action_queries, own_keys, num_keys), 1.0, edit.values)
+            np.where(stays_at_step(edit, queries, action_queries, own_keys, num_keys), 1.0, edit.values)
             for edit in edits
         ]
         return np.prod(factors, axis=0) if factors else None
@@ -183,7 +183,7 @@ class SiteEditor(FactorEditor):
             )
 
 
-def _stays_at_step(
+def stays_at_step(
     edit: SiteEdit, count: int, action_queries: slice, own_keys: slice | None, num_keys: int
 ) -> NDArray[np.bool_]:
     """Return where an edit changes nothing in a call of a denoise step, (query, key)."""
@@ -197,7 +197,7 @@ def _stays_at_step(
     return stays
 
 
-def _stays_in_prefix(edit: SiteEdit, tokens: NDArray[np.int64]) -> NDArray[np.bool_]:
+def stays_in_prefix(edit: SiteEdit, tokens: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Return where an edit changes nothing in the prefix, (query, key); both are the tokens."""
     stays = np.eye(len(tokens), dtype=bool)
     if edit.readers is not None:

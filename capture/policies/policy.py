@@ -189,8 +189,10 @@ class CallVariant:
 class VariantPolicy(Protocol):
     """A policy that makes variants of one call together, for less than a call each."""
 
-    def act_variants(self, variants: Sequence[CallVariant], num_steps: int, batch: int) -> list[NDArray[np.float64]]:
-        """Return what `act` gives for each variant, equal but for rounding.
+    def act_variants(
+        self, variants: Sequence[CallVariant], num_steps: int, batch: int
+    ) -> Sequence[NDArray[np.float64] | None]:
+        """Return what `act` gives for each variant, equal but for rounding; None for what cannot be made.
 
         num_steps: denoise steps. batch: variants that are made at a time, at most.
         """

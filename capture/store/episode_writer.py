@@ -12,7 +12,7 @@ import zarr
 from numpy.typing import NDArray
 
 from vla_attention.capture.store.codecs import write_whole
-from vla_attention.capture.store.replan_records import EpisodeStart, ReplanEffects, ReplanRecord
+from vla_attention.capture.store.replan_records import EpisodeStart, ReplanRecord
 from vla_attention.capture.store.site_writer import SiteWriter
 from vla_attention.capture.store.store_root import check_same_run, read_existing_root
 from vla_attention.schemas.effects import CHANGE, CUT, EpisodeEffects
@@ -145,14 +145,14 @@ class EpisodeWriter:
             yield from camera_picture_problems(sites, camera, frame.shape, frame.dtype)
         for camera, coverage in record.coverage.items():
             yield from coverage_problems(sites, camera, coverage[None], len(self.start.objects), replan)
-        yield from self._effect_problems(record.effects, replan)
+        yield from self._effect_problems(record, replan)
         steps = [*(earlier.env_step for earlier in self.records[-1:]), record.env_step]
         seeds = [] if record.noise_seed is None else [record.noise_seed]
         yield from counter_problems(np.array(steps), np.array(seeds, dtype=np.int64))
 
-    def _effect_problems(self, given: ReplanEffects | None, replan: int) -> Iterator[str]:
+    def _effect_problems(self, record: ReplanRecord, replan: int) -> Iterator[str]:
         """Effects at the replans that the run says, of the conditions that the episode has."""
-        planned = self.run.recording.effects
+        planned, given = self.run.recording.effects, record.effects
         wanted = planned is not None and replan % planned.every == 0
         if wanted is not (given is not None):
             yield f"it has {'no ' if wanted else ''}effects, other than the run says"
@@ -161,7 +161,7 @@ class EpisodeWriter:
         first = next((earlier.effects for earlier in self.records if earlier.effects is not None), given)
         if (given.conditions, given.units) != (first.conditions, first.units):
             yield "its effects are of other conditions, or in other units, than those of the replans before it"
-        horizon = self.run.policy.action_horizon
+        horizon = self.run.policy.action_horizon if record.actions is None else len(record.actions)
         shapes: dict[str, tuple[NDArray[np.float32], tuple[int, ...]]]
         shapes = {CHANGE: (given.change, (horizon, len(given.units)))}
         shapes |= {f"{name}/{CUT}": (given.cut[name], (site.layout.num_keys,)) for name, site in self.sites.items()}

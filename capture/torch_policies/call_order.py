@@ -88,9 +88,9 @@ class CallOrder:
         self.seen: list[CallShape] = []
         self.problems: dict[str, None] = {}
         self.fired: Counter[tuple[str, int]] = Counter()
+        self.calls_of_rule: Counter[int] = Counter()
         #: Site -> (key,) bool: the keys that some call had.
         self.present: dict[str, NDArray[np.bool_]] = {}
-        self._calls_of_rule: Counter[int] = Counter()
         self._variable: dict[str, int] = {}
         #: Kind, queries and keys of calls that no rule names -> their modules.
         self._unnamed: dict[tuple[str, int, int], dict[str, None]] = {}
@@ -106,7 +106,7 @@ class CallOrder:
             return None
         rule = self.layout.rules[number]
         if rule.sequence:
-            name, block = rule.sequence[self._calls_of_rule[number] % len(rule.sequence)]
+            name, block = rule.sequence[self.calls_of_rule[number] % len(rule.sequence)]
         elif rule.site is None:
             return CallPlace(number)
         else:
@@ -139,7 +139,7 @@ class CallOrder:
         if place is None:
             self._unnamed.setdefault((shape.kind, shape.queries, shape.keys), {})[shape.module] = None
             return
-        self._calls_of_rule[place.rule] += 1
+        self.calls_of_rule[place.rule] += 1
         if place.fired is not None:
             self.fired[place.fired] += 1
 

@@ -9,7 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.interventions.attention_edits import SiteEdit, log_factors
+from vla_attention.capture.interventions.attention_edits import (
+    SiteEdit,
+    log_factors,
+    stays_at_step,
+    stays_in_prefix,
+)
 from vla_attention.capture.interventions.resolution import (
     ReplanPlace,
     check_selectors,
@@ -141,28 +146,45 @@ class SessionKnockouts:
 
 
 def edits_at(edits: Sequence[SiteEdit], place: CallPlace) -> list[SiteEdit]:
-    """Return the edits that change one call."""
+    """Return the edits that change one call of a site."""
     return [
         edit
         for edit in edits
-        if (edit.layers is None or place.block in edit.layers)
+        if edit.queries != "prefix"
+        and (edit.layers is None or place.block in edit.layers)
         and (edit.denoise_steps is None or place.step in edit.denoise_steps)
         and not (edit.values == 1).all()
     ]
 
 
-def logit_bias(edits: Sequence[SiteEdit], place: CallPlace, shape: CallShape) -> NDArray[np.float32]:
-    """Return what edits add to the logits of one call, (head or 1, query, key).
+def logit_bias(
+    edits: Sequence[SiteEdit], place: CallPlace, shape: CallShape, own_keys: slice | None = None
+) -> NDArray[np.float32]:
+    """Return what edits add to the logits of one call of a site, (head or 1, query, key).
 
-    The logarithm of a key's factor, and -infinity where it is 0, at the action queries.
+    own_keys: the keys of the call's own queries, where it has them; others than action queries keep theirs.
     """
-    heads = shape.heads if any(edit.heads is not None for edit in edits) else 1
-    total = np.zeros((heads, shape.queries, shape.keys), dtype=np.float32)
+    factors = []
     for edit in edits:
         values = edit.values if place.keys is None else edit.values[place.keys]
-        added = np.where(values == 0, -np.inf, log_factors(values)).astype(np.float32)
+        stays = stays_at_step(edit, shape.queries, place.queries, own_keys, shape.keys)
+        factors.append(np.where(stays, 1.0, values))
+    return _log_of(edits, factors, shape)
+
+
+def prefix_bias(edits: Sequence[SiteEdit], tokens: NDArray[np.int64], shape: CallShape) -> NDArray[np.float32]:
+    """Return what edits add to the logits of a call whose queries and keys are the site's keys `tokens`."""
+    factors = [np.where(stays_in_prefix(edit, tokens), 1.0, edit.values[tokens]) for edit in edits]
+    return _log_of(edits, factors, shape)
+
+
+def _log_of(edits: Sequence[SiteEdit], factors: Sequence[NDArray[np.float64]], shape: CallShape) -> NDArray[np.float32]:
+    """Sum the logarithms of factors (query, key), -infinity where they are 0, over edits: (head or 1, query, key)."""
+    heads = shape.heads if any(edit.heads is not None for edit in edits) else 1
+    total = np.zeros((heads, shape.queries, shape.keys), dtype=np.float32)
+    for edit, of_edit in zip(edits, factors, strict=True):
         chosen = slice(None) if edit.heads is None else list(edit.heads)
-        total[chosen, place.queries] += added
+        total[chosen] += np.where(of_edit == 0, -np.inf, log_factors(of_edit)).astype(np.float32)
     return total
 
 
@@ -187,9 +209,11 @@ class ReplanEdits:
 
         Calls to which the same is added get the same array.
         """
+        if place.site is None:
+            return None
         if row not in self._of_row:
             self._of_row[row] = self._edits(row)
-        edits = edits_at(self._of_row[row].get(place.site or "", ()), place)
+        edits = edits_at(self._of_row[row].get(place.site, ()), place)
         if not edits:
             return None
         # Where the keys of calls differ, they differ from token to token.

@@ -40,6 +40,9 @@ class CallRule:
         kind, queries, keys: further conditions on the call: its kind, and its numbers of queries and keys.
         sequence: where one module makes the calls of all blocks: (site, block) in the order of the calls of one denoise
             step. `site` is None then.
+        tokens: the site whose first keys are queries and keys of these calls, token by token: with the site None a pass
+            over the prefix; with a site, and the same one here, calls whose queries are all tokens. Effects for all
+            queries need it: keys are cut off in these calls too.
     """
 
     modules: str
@@ -48,6 +51,7 @@ class CallRule:
     queries: int | None = None
     keys: int | None = None
     sequence: tuple[tuple[str, int], ...] = ()
+    tokens: str | None = None
 
     def __post_init__(self) -> None:
         """Check the expression, and that site, block and sequence go together."""
@@ -57,6 +61,11 @@ class CallRule:
             raise BadArgument(f"The rule '{self.modules}' is no regular expression: {error}.") from None
         if self.site is not None and self.sequence:
             raise BadArgument(f"The rule '{self.modules}' has both a site and a sequence; give one of them.")
+        if self.tokens is not None and (self.sequence or self.site not in (None, self.tokens)):
+            raise BadArgument(
+                f"The rule '{self.modules}' has the tokens of site '{self.tokens}': expected the site None (a pass "
+                "over the prefix) or the same site, and no sequence."
+            )
         if self.site is not None and "block" not in groups:
             raise BadArgument(
                 f"The rule '{self.modules}' of site '{self.site}' does not say which block a call is of: expected a "
@@ -67,6 +76,11 @@ class CallRule:
     def sites(self) -> tuple[str, ...]:
         """The sites that calls of this rule may have; none for calls that are not recorded."""
         return tuple(dict.fromkeys(site for site, _ in self.sequence)) or ((self.site,) if self.site else ())
+
+    @property
+    def is_prefix(self) -> bool:
+        """Whether its calls are passes over the tokens of a site, before its action queries."""
+        return self.tokens is not None and self.site is None
 
     def fits(self, module: str, kind: str, queries: int, keys: int) -> re.Match[str] | None:
         """Return the match of the module's path if the rule is for this call."""
@@ -84,6 +98,7 @@ class CallRule:
         """The rule on one line."""
         named = (("kind", self.kind), ("queries", self.queries), ("keys", self.keys))
         conditions = "".join(f", {name} {value}" for name, value in named if value is not None)
+        conditions += f", tokens of '{self.tokens}'" if self.tokens else ""
         what = f"site '{self.site}'" if self.site else f"{len(self.sequence)} blocks" if self.sequence else "no site"
         return f"{self.modules}{conditions}: {what}"
 
@@ -273,6 +288,8 @@ class PolicyLayout:
         ruled = {site for rule in self.rules for site in rule.sites}
         for name in sorted(ruled - set(names)):
             yield f"a rule gives calls to the site '{name}', which does not exist (sites: {listing(names)})"
+        for name in sorted({rule.tokens for rule in self.rules if rule.tokens} - set(names)):
+            yield f"a rule has the tokens of site '{name}', which does not exist (sites: {listing(names)})"
         for name in names:
             if name not in ruled:
                 yield f"no rule gives calls to the site '{name}'"

@@ -8,6 +8,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
+from vla_attention.capture.effects.arguments import EffectSettings
+from vla_attention.capture.effects.conditions import refuse_both
 from vla_attention.capture.machine.provenance import describe_machine
 from vla_attention.capture.rollout.recording_plan import RecordingSettings, recording_of, root_attributes
 from vla_attention.capture.torch_policies.knockouts import SessionKnockouts, interventions_of, with_name
@@ -20,6 +22,7 @@ from vla_attention.capture.torch_policies.policy_layout import (
 )
 from vla_attention.capture.torch_policies.policy_modules import device_and_dtype, policy_digest, projections_of
 from vla_attention.capture.torch_policies.prompts import TokenText
+from vla_attention.capture.torch_policies.repeated_calls import effects_of_layout
 from vla_attention.capture.torch_policies.session import RecordedRun
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.interventions import Interventions
@@ -54,6 +57,7 @@ def record(
     bits: int = 10,
     contributions: bool | None = None,
     frames: bool = True,
+    effects: str | EffectSettings | None = None,
     knockout: str | Sequence[str] | Interventions | None = None,
     keep: str | None = None,
     knockout_layers: Sequence[int] | None = None,
@@ -97,6 +101,9 @@ def record(
             where the layout names projections and the first policy call shows it (docs/your-policy.md,
             "Contributions").
         frames: store the pictures that replans are given.
+        effects: what is taken away from each call, one at a time, to see how the action changes: `text`, `cameras`,
+            `objects`, `tokens`, with commas between, or `EffectSettings`. Each replan then needs `repeat`
+            (docs/your-policy.md, "Effects").
         knockout, keep: keys that the action queries do not read, or that alone they read, in the grouping language; or
             `Interventions`.
         knockout_layers, knockout_heads, knockout_denoise_steps, knockout_weight: where, and which share of the weights.
@@ -142,6 +149,10 @@ def record(
         ),
         condition,
     )
+    planned = effects_of_layout(effects, layout)
+    if planned is not None:
+        refuse_both(changes)
+        recording = replace(recording, effects=planned)
     device, dtype = device_and_dtype(policy)
     projections = projections_of(policy, layout, recording.layers) if recording.contributions else {}
     facts = describe_machine(device)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,9 +10,15 @@ from typing import TYPE_CHECKING, Any, Never, SupportsIndex, overload
 
 import numpy as np
 
+from vla_attention.capture.effects.measurement import EpisodeEffectsMeasured
 from vla_attention.capture.store.episode_writer import EpisodeWriter
 from vla_attention.capture.store.replan_records import ReplanRecord
-from vla_attention.capture.torch_policies.replan_inputs import EpisodeFacts, read_inputs, whole_number
+from vla_attention.capture.torch_policies.replan_inputs import (
+    EpisodeFacts,
+    RepeatedCall,
+    read_inputs,
+    whole_number,
+)
 from vla_attention.capture.torch_policies.unseen_attention import no_attention
 from vla_attention.schemas.errors import BadArgument, UserError, listing
 from vla_attention.schemas.layout import Prompt
@@ -64,6 +70,8 @@ class Episode:
     _stack: ExitStack = field(default_factory=ExitStack, repr=False)
     #: None before the first policy call is recorded.
     _writer: EpisodeWriter | None = field(default=None, repr=False)
+    #: What measures the effects of its calls, where the run does.
+    _effects: EpisodeEffectsMeasured | None = field(default=None, repr=False)
 
     @property
     def name(self) -> str:
@@ -94,6 +102,7 @@ class Episode:
         masks: Mapping[str, Any] | None = None,
         coverage: Mapping[str, Any] | None = None,
         dataset_actions: Any = None,
+        repeat: Callable[[RepeatedCall], Any] | Callable[[], Any] | None = None,
         # No type fits: for a type checker these are errors, and for `read_inputs` names that do not exist.
         **unknown: Never,
     ) -> Iterator[Replan]:
@@ -114,6 +123,9 @@ class Episode:
             coverage: camera -> (patch, object), the share of each patch that each object covers; instead of masks.
             dataset_actions: (step, action_dim), the actions that a data set has from this call on; no more of them are
                 stored than the policy gives actions.
+            repeat: makes the policy call again and returns its actions, to measure effects: `lambda call:
+                policy.act(..., call.instruction, call.frames)`. Without an argument no word and no picture is
+                exchanged. Unused where the run measures no effects.
 
         Raises:
             BadArgument: an argument or a camera does not exist, or a value has another shape or type.
@@ -125,7 +137,7 @@ class Episode:
             raise RecordingStopped("This episode is one of several; use the replan of run.episodes(...).")
         inputs = dict(
             frames=frames, state=state, instruction=instruction, prompt=prompt, roles=roles, noise_seed=noise_seed,
-            masks=masks, coverage=coverage, dataset_actions=dataset_actions, **unknown,
+            masks=masks, coverage=coverage, dataset_actions=dataset_actions, repeat=repeat, **unknown,
         )  # fmt: skip
         given = read_inputs(self.run.layout, self.facts, env_step, inputs)
         with self.run._replan([self], [given], batch=1, rows=[0]) as replan:

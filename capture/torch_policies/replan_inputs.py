@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from inspect import Parameter, signature
 from typing import Any, SupportsIndex
 
 import numpy as np
@@ -30,6 +31,7 @@ class EpisodeFacts:
     task_name: str | None = None
     objects: tuple[SceneObject, ...] = ()
     task_family: str = ""
+    siblings: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         """Check the numbers and the texts."""
@@ -43,6 +45,28 @@ class EpisodeFacts:
         if not isinstance(self.task_family, str):
             raise BadArgument(f"The task_family of an episode is {self.task_family!r}; expected a text, or none.")
         check_text("task family", self.task_family)
+        if isinstance(self.siblings, str) or not all(isinstance(text, str) for text in self.siblings):
+            raise BadArgument(f"The siblings of an episode are {self.siblings!r}; expected a list of instructions.")
+
+
+@dataclass(frozen=True)
+class RepeatedCall:
+    """What a policy call is repeated with, to measure an effect.
+
+    instruction: that of the call, or with another word. frames: camera -> picture as given to `replan`, or a grey one.
+    """
+
+    instruction: str
+    frames: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Repeat:
+    """A callable that makes the policy call again; takes_call: it is given a `RepeatedCall`. given: the call's own."""
+
+    call: Callable[..., Any]
+    takes_call: bool
+    given: RepeatedCall
 
 
 @dataclass(frozen=True)
@@ -62,6 +86,7 @@ class ReplanInputs:
     masks: Mapping[str, NDArray[np.integer]] = field(default_factory=dict)
     coverage: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
     dataset_actions: NDArray[np.float64] | None = None
+    repeat: Repeat | None = None
 
 
 def whole_number(what: str, given: Any) -> int:
@@ -83,11 +108,14 @@ def _as_float64(what: str, given: Any) -> NDArray[np.float64]:
     """Return numbers as float64, or raise `BadArgument`."""
     values = given.detach().float().cpu().numpy() if hasattr(given, "detach") else given
     try:
-        return np.asarray(values, dtype=np.float64)
+        # A copy: the policy may write its next actions to the same array.
+        return np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
         raise BadArgument(f"The {what} of a replan is no array of numbers (given: {type(given).__name__}).") from None
 
 
+#: Parameters that take any number of arguments.
+_REST = (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD)
 _NAMES = tuple(part.name for part in fields(ReplanInputs) if part.name != "env_step")
 
 
@@ -144,7 +172,26 @@ def read_inputs(
         noise_seed=None if seed is None else _seed(seed),
         coverage={camera: coverage[camera] for camera in cameras if camera in coverage},
         dataset_actions=_dataset_actions(values.get("dataset_actions")),
+        repeat=_repeat(values, facts),
     )
+
+
+def _repeat(values: Mapping[str, Any], facts: EpisodeFacts) -> Repeat | None:
+    call = values.get("repeat")
+    if call is None:
+        return None
+    try:
+        parameters = list(signature(call).parameters.values())
+    except (TypeError, ValueError):
+        raise BadArgument(f"The repeat of a replan is {call!r}; expected a callable, as lambda call: ....") from None
+    needed = [one for one in parameters if one.default is one.empty and one.kind not in _REST]
+    if len(needed) > 1 or any(one.kind is one.KEYWORD_ONLY for one in needed):
+        raise BadArgument(
+            f"The repeat of a replan needs the arguments {listing(one.name for one in needed)}; expected one, the call "
+            "with its instruction and frames, or none."
+        )
+    given = RepeatedCall(values.get("instruction", facts.instruction), dict(values.get("frames", {})))
+    return Repeat(call, bool(needed), given)
 
 
 def _dataset_actions(given: Any) -> NDArray[np.float64] | None:

@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.store.episode_writer import EpisodeWriter
-from vla_attention.capture.store.replan_records import EpisodeStart, ReplanRecord
+from vla_attention.capture.store.replan_records import EpisodeStart, ReplanEffects, ReplanRecord
 from vla_attention.capture.store.store_root import read_existing_root
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, make_way, open_run
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit, KnownCalls
+from vla_attention.capture.torch_policies.call_state import CallState
 from vla_attention.capture.torch_policies.knockouts import ReplanEdits, SessionKnockouts
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
 from vla_attention.capture.torch_policies.policy_modules import (
@@ -35,6 +37,7 @@ from vla_attention.capture.torch_policies.recorded_episodes import (
     check_length,
     rows_of_batch,
 )
+from vla_attention.capture.torch_policies.repeated_calls import CallInput, RecordedCall, RepeatedPolicy
 from vla_attention.capture.torch_policies.replan_inputs import (
     EpisodeFacts,
     ReplanInputs,
@@ -43,7 +46,7 @@ from vla_attention.capture.torch_policies.replan_inputs import (
 from vla_attention.capture.torch_policies.replan_text import PromptIds, ReplanText, embeddings_of
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder, SiteRows, final_contribution
 from vla_attention.capture.torch_policies.watch import watch_attention
-from vla_attention.schemas.errors import Note, UserError
+from vla_attention.schemas.errors import BadArgument, Note, UserError
 from vla_attention.schemas.stores.store_format import EPISODES_GROUP, RootAttributes, StoreExists, episode_name
 
 #: More replans than any episode has; the writer collects rows in blocks of two megabytes.
@@ -119,6 +122,9 @@ class RecordedRun:
         #: Whether it is not known yet that names are enough.
         self._names_unknown = True
         self._sites = tuple(layout.site(site.name) for site in attributes.sites)
+        self._repeats: RepeatedPolicy | None = None
+        if attributes.recording.effects is not None:
+            self._repeats = RepeatedPolicy(self._known_policy, self._known, attributes.policy, attributes.recording)
 
     def __enter__(self) -> RecordedRun:
         self._entered = True
@@ -167,6 +173,7 @@ class RecordedRun:
         task_name: str | None = None,
         objects: Sequence[Any] = (),
         task_family: str = "",
+        siblings: Sequence[str] = (),
     ) -> Iterator[Episode]:
         """Record an episode; leaving the block stores it, an exception drops it.
 
@@ -178,13 +185,17 @@ class RecordedRun:
             objects: `SceneObject` of the scene, for masks and coverage.
             task_family: what tasks of one sentence template share, for instance "put A on B": they are not counted as
                 independent; empty: not known.
+            siblings: instructions of the other tasks of its family: for effects, each word is exchanged for those that
+                stand in its place in them.
 
         Raises:
             StoreExists: the episode is in the store already.
             NothingRecorded: no attention was seen in the block.
             WeightsChanged: the policy has other weights than when the run began.
         """
-        facts = EpisodeFacts(task_id, episode_index, instruction, seed, task_name, tuple(objects), task_family)
+        facts = EpisodeFacts(
+            task_id, episode_index, instruction, seed, task_name, tuple(objects), task_family, siblings
+        )
         with ExitStack() as stack:
             episode = self._begin(stack, facts)
             try:
@@ -208,6 +219,11 @@ class RecordedRun:
         Raises:
             BadArgument: rows that the batch does not have, or that two episodes share.
         """
+        if self._repeats is not None:
+            raise BadArgument(
+                "Cannot measure effects of several environments in one call, whose repeats would be of all of them: "
+                "record one at a time with run.episode, or leave effects out."
+            )
         chosen, size = rows_of_batch(len(episodes), rows, batch)
         with ExitStack() as stack:
             joined = EpisodeBatch(self, stack, chosen, size)
@@ -246,7 +262,11 @@ class RecordedRun:
             )
         self.knockouts.check_names(self.attributes.sites, facts.instruction, facts.objects)
         self._names_unknown = True
-        return Episode(self, facts, _stack=stack)
+        episode = Episode(self, facts, _stack=stack)
+        if self._repeats is not None:
+            self._repeats.siblings[facts.task_id] = facts.siblings
+            episode._effects = self._repeats.measurement.begin()
+        return episode
 
     def _writer_of(self, facts: EpisodeFacts) -> AbstractContextManager[EpisodeWriter]:
         """Return the writer of an episode whose first policy call was recorded."""
@@ -305,6 +325,7 @@ class RecordedRun:
         edits.recorder = recorder
         text.present = recorder.order.present
         replan = Replan()
+        before = self._state_before(episodes[0], given[0])
         self._in_block = True
         try:
             every_function = self.every_function or self._names_unknown
@@ -316,7 +337,7 @@ class RecordedRun:
         if recorder.saw_attention:
             self._names_unknown = not functions.by_names
         try:
-            self._store_replan(replan, recorder, text, episodes, given, rows, places, count)
+            self._store_replan(replan, recorder, text, episodes, given, rows, places, count, before)
         except CallsDoNotFit as error:
             raise error if every_function else CallsDoNotFit(f"{error}\n{_BY_NAMES}") from None
 
@@ -330,6 +351,7 @@ class RecordedRun:
         rows: Sequence[int],
         places: Sequence[int],
         count: int,
+        before: CallState | None,
     ) -> None:
         if not recorder.saw_attention:
             self.num_dropped += 1
@@ -353,7 +375,57 @@ class RecordedRun:
             if actions is not None and count > 1:
                 actions = actions[places[position]]
             record = self._record(rows_of_sites[position], text, row, inputs, read_actions(actions))
+            if before is not None:
+                record = replace(record, effects=self._effects(episode, inputs, record, recorder, text, before, where))
             episode._append(record)
+
+    def _state_before(self, episode: Episode, inputs: ReplanInputs) -> CallState | None:
+        """Return the state before a policy call whose effects are measured; None where they are not."""
+        planned = self.attributes.recording.effects
+        if planned is None or episode.num_replans % planned.every:
+            return None
+        if inputs.repeat is None:
+            raise BadArgument(
+                f"Cannot measure effects at environment step {inputs.env_step} of {episode.name}: the call cannot be "
+                "made again. Give episode.replan(repeat=lambda call: ...), which makes it with call.instruction and "
+                "call.frames, or record without effects."
+            )
+        return CallState(self.policy, inputs.repeat.call)
+
+    def _effects(
+        self,
+        episode: Episode,
+        inputs: ReplanInputs,
+        record: ReplanRecord,
+        recorder: ReplanRecorder,
+        text: ReplanText,
+        before: CallState,
+        where: str,
+    ) -> ReplanEffects | None:
+        """Return the effects of the policy call that was just recorded, from calls that are made again."""
+        assert self._repeats is not None
+        assert episode._effects is not None
+        assert inputs.repeat is not None
+        if record.actions is None:
+            raise BadArgument(f"Cannot measure effects at {where}: its actions are not known. Set replan.actions.")
+        present = recorder.order.present
+        # Sites of which no layer is recorded are changed, too.
+        roles = {
+            site.name: text.roles(0, site, record.prompt, present.get(site.name), None) for site in self.layout.sites
+        } | dict(record.key_role)
+        state = np.zeros(0) if record.state is None else record.state
+        given = CallInput(inputs.frames, roles, record.prompt, state, {}, call=inputs.repeat.given)
+        every_function = self.every_function or self._names_unknown
+        call = RecordedCall(inputs.repeat, given, before, record.actions, present, every_function, where)
+        facts = episode.facts
+        context = CallContext(
+            facts.task_id, facts.episode_index, episode.num_replans, {}, facts.objects, inputs.coverage
+        )
+        self._in_block = True
+        try:
+            return self._repeats.measure(episode._effects, call, context)
+        finally:
+            self._in_block = False
 
     def _check_contributions(self, recorder: ReplanRecorder) -> None:
         """Raise `ContributionsUnknown` if a call's contributions are not known; at the first one, decide about them."""

@@ -116,11 +116,7 @@ class ReplanRecorder:
 
     def change(self, shape: CallShape) -> Tensor | None:
         """Return what is added to the logits of a call, (batch, head or 1, query, key), or None for nothing."""
-        # What is asked about may turn out to be no attention: what does not fit here is no problem yet.
-        problems = dict(self.order.problems)
-        place = None if self.bias is None else self.order.place(shape)
-        self.order.problems = problems
-        if self.bias is None or place is None or place.site is None or shape.batch != self.batch:
+        if self.bias is None or (place := self.changed_place(shape)) is None or shape.batch != self.batch:
             return None
         added = {row: self.bias(row, place, shape) for row in self.rows}
         changed = [values for values in added.values() if values is not None]
@@ -136,6 +132,16 @@ class ReplanRecorder:
                     total[row] = torch.from_numpy(values)
             self._changes[call] = total
         return self._changes[call]
+
+    def changed_place(self, shape: CallShape) -> CallPlace | None:
+        """Return the place of a call that may be changed; None for others."""
+        # What is asked about may turn out to be no attention: what does not fit here is no problem yet.
+        problems = dict(self.order.problems)
+        place = self.order.place(shape)
+        self.order.problems = problems
+        if place is None or (place.site is None and not self.layout.rules[place.rule].is_prefix):
+            return None
+        return place
 
     def passes(self, shape: CallShape) -> bool:
         """Return whether a call that has run is not recorded; it is counted then, and `saw` not called."""
@@ -155,11 +161,11 @@ class ReplanRecorder:
         shape = call.shape
         place = self.order.place(shape)
         self.order.ran(shape, place)
-        if place is None or place.site is None:
+        if place is None:
             return None
         if self.bias is not None and call.asked is not None:
             self._check_changed(call.asked, shape, place)
-        if not self._wanted(place):
+        if place.site is None or not self._wanted(place):
             return None
         site, recording = self.order.known.sites[place.site], self.recordings[place.site]
         if shape.batch != self.batch:
@@ -180,8 +186,9 @@ class ReplanRecorder:
         """Raise `ChangeRefused` if a knockout of a call could not be made: the softmax showed other axes."""
         if self.bias is None or all(self.bias(row, place, shape) is None for row in self.rows):
             return
+        site = place.site or self.layout.rules[place.rule].tokens
         raise ChangeRefused(
-            f"The attention call {shape} of site '{place.site}' cannot be changed: its softmax has {asked.heads} heads "
+            f"The attention call {shape} of site '{site}' cannot be changed: its softmax has {asked.heads} heads "
             f"and {asked.queries} x {asked.keys} queries and keys, and not those of its product with the values. Leave "
             "the call out of the knockout (knockout_layers)."
         )

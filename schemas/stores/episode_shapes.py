@@ -26,7 +26,10 @@ def expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dict
         shapes |= dict.fromkeys(("noise_seed", "state", "actions"), (replans,))
     if attributes.effects is not None and attributes.effects.replan:
         entries = len(attributes.effects.replan)
-        shapes[CHANGE] = (entries, root.policy.action_horizon, len(attributes.effects.units))
+        actions = attributes.arrays.get("actions")
+        # The caller's own loop may give one action of a chunk.
+        horizon = root.policy.action_horizon if actions is None else actions.shape[1]
+        shapes[CHANGE] = (entries, horizon, len(attributes.effects.units))
         shapes |= {f"{site.name}/{CUT}": (entries, site.num_keys) for site in root.sites}
     if "dataset_actions" in attributes.arrays:
         shapes["dataset_action_count"] = (replans,)

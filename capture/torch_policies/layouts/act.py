@@ -52,7 +52,8 @@ def act(policy: object) -> PolicyLayout:
         rules=(
             CallRule(rule_path(path, r"model\.decoder\.layers\.(?P<block>\d+)\.multihead_attn"), "cross"),
             CallRule(rule_path(path, r"model\.decoder\.layers\.(?P<block>\d+)\.self_attn"), "self"),
-            CallRule(rule_path(path, r"model\.(vae_)?encoder\..*"), None),
+            CallRule(rule_path(path, r"model\.encoder\..*"), None, tokens="cross"),
+            CallRule(rule_path(path, r"model\.vae_encoder\..*"), None),
         ),
         num_layers=config.n_decoder_layers,
         num_heads=config.n_heads,

@@ -143,7 +143,7 @@ def _layout(
         family=name,
         sites=(site,),
         rules=(
-            CallRule(rule_path(llama, r"layers\.(?P<block>\d+)\.self_attn"), "joint"),
+            CallRule(rule_path(llama, r"layers\.(?P<block>\d+)\.self_attn"), "joint", tokens="joint"),
             CallRule(rule_path(path, r"vision_backbone(\..*)?"), None),
         ),
         num_layers=text.num_hidden_layers,

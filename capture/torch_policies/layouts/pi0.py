@@ -49,7 +49,7 @@ def pi0_pytorch(policy: object, *, cameras: Sequence[str] = (), num_steps: int =
     keys.add("prompt", "text", prompt, "instruction")
     keys.add("state", "state", int(not five), "state")
     keys.add("actions", "action", chunk, "action")
-    decoder = "paligemma_with_expert.gemma_expert.model.layers"
+    decoder, prefix = "paligemma_with_expert.gemma_expert.model.layers", r"paligemma_with_expert\.paligemma"
     site = keys.site(
         "joint",
         (-chunk, None),
@@ -63,7 +63,8 @@ def pi0_pytorch(policy: object, *, cameras: Sequence[str] = (), num_steps: int =
         sites=(site,),
         rules=(
             CallRule(rule_path(path, decoder.replace(".", r"\.") + r"\.(?P<block>\d+)\.self_attn"), "joint"),
-            CallRule(rule_path(path, r"paligemma_with_expert\.paligemma\..*"), None),
+            CallRule(rule_path(path, rf"{prefix}\.model\.language_model\..*"), None, tokens="joint"),
+            CallRule(rule_path(path, rf"{prefix}\..*"), None),
         ),
         num_layers=expert.num_hidden_layers,
         num_heads=expert.num_attention_heads,
@@ -105,7 +106,7 @@ def pi0_fast(policy: object) -> PolicyLayout:
         family="pi0_fast",
         sites=(site,),
         rules=(
-            CallRule(rule_path(decoder, r"layers\.(?P<block>\d+)\.self_attn"), "joint"),
+            CallRule(rule_path(decoder, r"layers\.(?P<block>\d+)\.self_attn"), "joint", tokens="joint"),
             CallRule(rule_path(path, r".*vision_tower\..*"), None),
         ),
         num_layers=text.num_hidden_layers,
@@ -160,6 +161,7 @@ def pi0_transformers(
         sites=(site,),
         rules=(
             CallRule(rule_path(path, r"model\.dit\.layers\.(?P<block>\d+)\.self_attn"), "joint"),
+            CallRule(rule_path(path, r"model\.vlm\.language_model\..*"), None, tokens="joint"),
             CallRule(rule_path(path, r"model\.vlm\..*"), None),
         ),
         num_layers=dit.num_hidden_layers,

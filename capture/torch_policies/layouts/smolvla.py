@@ -68,7 +68,7 @@ def smolvla(policy: object) -> PolicyLayout:
         sites=both,
         rules=(
             CallRule(rule_path("", _escaped(expert)), None, queries=config.chunk_size, sequence=tuple(order)),
-            CallRule(_escaped(expert), None),
+            CallRule(_escaped(expert), None, tokens="self" if "self" in kinds else "cross"),
             CallRule(_escaped(expert) + r"\.vlm\..*", None),
         ),
         num_layers=max(block for _, block in order) + 1,

@@ -1,0 +1,543 @@
+"""Effects of `va.record`: what single calls give that are changed by hand, and nothing of them in the run."""
+
+from __future__ import annotations
+
+import random
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import vla_attention as va
+from tests.kit.small_torch_policy import HORIZON, PROMPT, WIDTH, SmallPolicy, given, small_layout
+from tests.kit.small_torch_variants import PATCHES, OneModulePolicy, TokenPolicy, one_module_layout, token_layout
+from tests.kit.stateful_policies import (
+    BufferPolicy,
+    GeneratorPolicy,
+    QueuePolicy,
+    SamplingPolicy,
+    layout_with_prefix,
+)
+from vla_attention.analyze.__main__ import main
+from vla_attention.capture.policies.noise import noise_seed
+from vla_attention.schemas.errors import BadArgument, Note
+from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import RunMismatch
+from vla_attention.schemas.stores.verify import verify_store
+
+TEXT, SIBLINGS = "pick the bowl", ["pick the plate", "pick up"]
+PREFIX, KEYS, BOWL = 5 + PROMPT, 5 + PROMPT + HORIZON, 7
+ALL_READERS = va.EffectSettings(("text", "cameras", "objects", "tokens"), ("all", "action", "pictures", "text"))
+TEXT_AND_CAMERAS = va.EffectSettings(("text", "cameras"), ("all", "action"))
+
+
+def inputs(replan, text=TEXT):
+    """What one call of a sampling policy is given."""
+    return {name: value for name, value in given(seed=replan, text=text).items() if name != "noise"}
+
+
+def repeat_of(policy, replan):
+    def again(call):
+        return policy.sample(**{**inputs(replan, call.instruction), "pictures": call.frames["front"]})
+
+    return again
+
+
+def fill(path, policy, repeat=repeat_of, replans=2, say="default", episodes=1, siblings=SIBLINGS, **settings):
+    """Record episodes; returns the store, the actions, and what was said."""
+    settings = {
+        "layout": layout_with_prefix(),
+        "tokenizer": policy.tokenizer,
+        "denoise_steps": "all",
+        "durable": False,
+        "bits": 23,
+        "effects": TEXT_AND_CAMERAS,
+    } | settings
+    actions = []
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        with va.record(path, policy, **settings) as run:
+            for number in range(episodes):
+                facts = {"task_id": 0, "episode_index": number, "instruction": TEXT, "siblings": siblings}
+                with run.episode(**facts) as episode:
+                    for replan in range(replans):
+                        frames = {"front": inputs(replan)["pictures"]}
+                        repeats = None if repeat is None else repeat(policy, replan)
+                        with episode.replan(env_step=replan, frames=frames, repeat=repeats) as block:
+                            block.actions = policy.sample(**inputs(replan))
+                        actions.append(torch.as_tensor(block.actions).clone())
+    store = open_store(path)
+    assert verify_store(store) == []
+    return store, actions, [str(one.message) for one in said if issubclass(one.category, Note)]
+
+
+def changes_of(store, replan=0, episode=0):
+    """The changes of actions by the name of their condition."""
+    episode = store.episodes[episode]
+    effects = episode.attributes.effects
+    if not effects.replan:
+        return {}
+    entries = zip(effects.replan, effects.condition, episode.read("effects/change"), strict=True)
+    return {effects.conditions[number].name: change for of, number, change in entries if of == replan}
+
+
+def by_hand(monkeypatch, policy, cut, readers, replan, noise):
+    """Actions of a call whose masks were changed in the policy's own code.
+
+    cut: keys that are not read. readers: the queries, by their keys, that do not read them; other than action queries
+    keep their own.
+    """
+    attend = nn.functional.scaled_dot_product_attention
+
+    def without(q, k, v, attn_mask):
+        queries = q.shape[2]
+        first = 0 if queries == PREFIX else PREFIX
+        mask = attn_mask.clone().expand(-1, -1, queries, -1).clone()
+        for query in range(queries):
+            for key in cut:
+                if first + query in readers and key < k.shape[2] and not (first == 0 and query == key):
+                    mask[:, :, query, key] = False
+        return attend(q, k, v, attn_mask=mask)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(nn.functional, "scaled_dot_product_attention", without)
+        return policy.act(**inputs(replan), noise=noise)
+
+
+def in_plain_torch(q, k, v, attn_mask):
+    """Attention by hand, as SmolVLA computes it."""
+    logits = (q @ k.transpose(2, 3) * q.shape[-1] ** -0.5).masked_fill(~attn_mask, torch.finfo(q.dtype).min)
+    return torch.softmax(logits, dim=-1) @ v
+
+
+@pytest.mark.parametrize("kernel", [nn.functional.scaled_dot_product_attention, in_plain_torch])
+def test_every_effect_is_that_of_a_call_that_is_changed_by_hand(tmp_path, monkeypatch, kernel):
+    monkeypatch.setattr(nn.functional, "scaled_dot_product_attention", kernel)
+    policy = SamplingPolicy()
+    torch.manual_seed(5)
+    noise = torch.randn(2, 1, HORIZON, 2)
+    torch.manual_seed(5)
+    store, actions, said = fill(tmp_path / "a.zarr", policy, effects=ALL_READERS)
+    assert said == ["The scene's objects are not known here: effects of objects are not measured."]
+    action, prefix = set(range(PREFIX, KEYS)), set(range(PREFIX))
+    pictures, text = {0, 1, 2, 3}, {4, 5, 6, 7, 10}
+    by_name = {
+        "without_word_bowl_queries_all": ({BOWL}, action | prefix),
+        "without_word_bowl": ({BOWL}, action),
+        "without_word_bowl_queries_prefix_of_role_image": ({BOWL}, pictures),
+        "without_visual_queries_all": (pictures, action | prefix),
+        "without_visual_queries_prefix_of_role_bos_or_role_template_or_role_instruction_or_role_state": (
+            pictures,
+            text | {8},
+        ),
+        "only_visual_queries_all": ({4, 5, 6, 7, 8, 10}, action | prefix),
+        "without_camera_front": (pictures, action),
+    }
+    for replan in range(2):
+        changes = changes_of(store, replan)
+        assert np.abs(changes["unchanged"]).max() < 1e-5
+        for name, (cut, readers) in by_name.items():
+            expected = by_hand(monkeypatch, policy, cut, readers, replan, noise=noise[replan]) - actions[replan]
+            np.testing.assert_allclose(changes[name], expected[0], atol=1e-5, err_msg=name)
+            assert np.abs(changes[name]).max() > 1e-3
+        exchanged = policy.act(**inputs(replan, "pick the plate"), noise=noise[replan]) - actions[replan]
+        np.testing.assert_allclose(changes["prompt_synonyms_bowl_plate"], exchanged[0], atol=1e-5)
+        grey = torch.full((1, 3, 8, 8), 128 / 255)
+        blank = policy.act(**{**inputs(replan), "pictures": grey, "noise": noise[replan]}) - actions[replan]
+        np.testing.assert_allclose(changes["front_blank"], blank[0], atol=1e-5)
+        with torch.random.fork_rng():
+            torch.manual_seed(noise_seed(1, 0, 0, replan))
+            other = policy.sample(**inputs(replan)) - actions[replan]
+        np.testing.assert_allclose(changes["noise"], other[0], atol=1e-5)
+    effects = store.episodes[0].attributes.effects
+    assert effects.units == (1.0, 1.0)
+    names = [effects.conditions[number].name for number in effects.condition]
+    cut = dict(zip(names, store.episodes[0].read("joint/cut"), strict=True))
+    assert np.flatnonzero(cut["without_word_bowl_queries_all"]).tolist() == [BOWL]
+    assert not cut["unchanged"].any()
+    assert cut["random_word_pick"].sum() == 1
+
+
+def state_of_everything(policy):
+    found = [torch.random.get_rng_state().tolist(), np.random.get_state()[1].tolist(), random.getstate()]  # noqa: NPY002
+    if isinstance(policy, GeneratorPolicy):
+        found += [policy.generator.get_state().tolist(), policy.others["numpy"][0].bit_generator.state]
+        found += [policy.others["old"].get_state()[1].tolist(), policy.python.getstate()]
+    if isinstance(policy, QueuePolicy):
+        found += [float(policy.count), policy.calls, [action.tolist() for action in policy.queues["action"]]]
+        found += [policy.last.tolist()]
+    return found
+
+
+@pytest.mark.parametrize("kind", [SamplingPolicy, GeneratorPolicy, QueuePolicy, BufferPolicy])
+def test_actions_rows_and_states_are_those_of_a_run_without_effects(tmp_path, kind):
+    results = []
+    for effects in (None, TEXT_AND_CAMERAS):
+        policy = kind()
+        torch.manual_seed(5)
+        np.random.seed(5)  # noqa: NPY002
+        random.seed(5)
+        store, actions, said = fill(tmp_path / f"{effects is None}.zarr", policy, replans=5, effects=effects)
+        assert said == []
+        results.append((store, actions, state_of_everything(policy)))
+    (plain, plain_actions, plain_state), (measured, actions, state) = results
+    assert all(map(torch.equal, actions, plain_actions))
+    assert state == plain_state
+    # A queue answers twice of three times.
+    replans = 2 if kind is QueuePolicy else 5
+    for episode, other in zip(plain.episodes, measured.episodes, strict=True):
+        assert episode.attributes.num_replans == other.attributes.num_replans == replans
+        for name in ("joint/rows", "joint/row_sum", "joint/uniform", "joint/contribution", "actions", "joint/key_role"):
+            assert np.array_equal(episode.read(name), other.read(name)), name
+    for replan in range(replans):
+        changes = changes_of(measured, replan)
+        assert np.abs(changes["unchanged"]).max() < 1e-5
+        assert np.abs(changes["noise"]).max() > 1e-2
+        assert np.abs(changes["without_word_bowl"]).max() > 1e-4
+
+
+def test_one_action_of_a_chunk_is_what_its_effect_is_of(tmp_path):
+    store, _, _ = fill(tmp_path / "a.zarr", QueuePolicy(), replans=1)
+    assert store.episodes[0].read("actions").shape == (1, 1, 2)
+    assert store.episodes[0].read("effects/change").shape[1:] == (1, 2)
+    assert store.attributes.policy.action_horizon == HORIZON
+
+
+def test_commands_read_the_store(tmp_path, capsys):
+    store, _, _ = fill(tmp_path / "a.zarr", SamplingPolicy(), episodes=3)
+    arguments = [str(tmp_path / "a.zarr"), "--output", str(tmp_path / "out"), "--no-plots"]
+    assert main(["effects", *arguments[:3]]) == 0
+    assert "'bowl'" in capsys.readouterr().out
+    table = va.open(store.path).effects()
+    assert {"without_word_bowl", "front_blank", "prompt_synonyms_bowl_plate"} <= set(table["condition"])
+
+
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"effects": "word"}, "EffectSettings.items has no 'word'; expected text, cameras, objects, tokens"),
+        ({"layout": small_layout()}, "by the reader 'all': no rule of the layout 'small' says which calls are passes"),
+        ({"layout": small_layout()}, "use EffectSettings(..., readers=('action',))"),
+        (
+            {"layout": small_layout(), "effects": va.EffectSettings(("text",), ("pictures",))},
+            "by the reader 'pictures': no rule of the layout 'small' says which calls are passes over a prefix",
+        ),
+        (
+            {"effects": va.EffectSettings(("text",), denoise_steps=2)},
+            "with 2 denoise steps: a call of your own is repeated as it is",
+        ),
+        ({"knockout": "word:bowl"}, "Cannot measure effects beside interventions on attention"),
+        ({"repeat": None}, "Cannot measure effects at environment step 0 of task000_episode000: the call cannot be"),
+        ({"repeat": lambda *_: lambda call, more: None}, "needs the arguments call, more; expected one"),
+        ({"repeat": lambda *_: 3}, "The repeat of a replan is 3; expected a callable"),
+        ({"siblings": "pick the plate"}, "The siblings of an episode are 'pick the plate'; expected a list"),
+    ],
+)
+def test_what_cannot_be_measured_is_a_sentence(tmp_path, settings, sentence):
+    with pytest.raises(BadArgument) as caught:
+        fill(tmp_path / "a.zarr", SamplingPolicy(), **settings)
+    assert sentence in str(caught.value)
+
+
+def test_several_environments_and_calls_without_actions_are_refused(tmp_path):
+    policy = SamplingPolicy()
+    settings = {"layout": layout_with_prefix(), "effects": "text", "durable": False}
+    with va.record(tmp_path / "a.zarr", policy, **settings) as run:
+        facts = {"task_id": 0, "episode_index": 0, "instruction": ""}
+        with pytest.raises(BadArgument, match="of several environments in one call"), run.episodes([facts]):
+            pass
+        with (
+            pytest.raises(BadArgument, match=r"its actions are not known. Set replan.actions"),
+            run.episode(**facts) as episode,
+            episode.replan(env_step=0, repeat=lambda: policy.sample(**inputs(0))),
+        ):
+            policy.sample(**inputs(0))
+
+
+def test_a_repeat_that_raises_is_said_once_and_its_entries_are_absent(tmp_path):
+    def failing(policy, replan):
+        def again(call):
+            if "plate" in call.instruction:
+                raise TypeError("no plates here")
+            return repeat_of(policy, replan)(call)
+
+        return again
+
+    torch.manual_seed(5)
+    store, actions, said = fill(tmp_path / "a.zarr", SamplingPolicy(), failing)
+    assert said == ["Left out of the effects: a repeated call failed. TypeError: no plates here"]
+    torch.manual_seed(5)
+    _, expected, _ = fill(tmp_path / "b.zarr", SamplingPolicy(), effects=None)
+    assert all(map(torch.equal, actions, expected))
+    for replan in range(2):
+        assert "prompt_synonyms_bowl_plate" not in changes_of(store, replan)
+        assert {"front_blank", "without_word_bowl_queries_all"} <= set(changes_of(store, replan))
+
+
+def test_a_repeat_that_never_works_leaves_a_whole_episode_without_entries(tmp_path):
+    store, _, said = fill(tmp_path / "a.zarr", SamplingPolicy(), lambda *_: lambda call: np.zeros((3, 2)))
+    (sentence,) = said
+    assert "made no attention call: a policy that answers from a queue must be reset in it" in sentence
+    assert "(policy.reset(), policy.select_action(batch))[1]" in sentence
+    assert store.episodes[0].attributes.num_replans == 2
+    assert changes_of(store) == {}
+    assert "effects/change" not in store.episodes[0].attributes.arrays
+    _, _, said = fill(
+        tmp_path / "b.zarr",
+        SamplingPolicy(),
+        lambda policy, replan: lambda call: repeat_of(policy, replan)(call)[:, :2],
+    )
+    assert "returned actions of the shape (2, 2); expected (3, 2)" in said[0]
+
+
+def test_a_repeat_of_another_call_is_refused(tmp_path):
+    def other(policy, replan):
+        return lambda call: repeat_of(policy, replan)(call) + 1e-3
+
+    store, _, said = fill(tmp_path / "a.zarr", SamplingPolicy(), other)
+    assert "gives other actions than the recorded call when nothing is changed" in said[0]
+    assert "The effects of replan 0 of task000_episode000 are refused" in said[1]
+    assert len(said) == 2
+    for replan in range(2):
+        assert list(changes_of(store, replan)) == ["unchanged"]
+        np.testing.assert_allclose(changes_of(store, replan)["unchanged"], 1e-3, rtol=0.01)
+
+
+def test_what_repeats_leave_where_nothing_sees_it_is_noticed(tmp_path):
+    class Tiring(SamplingPolicy):
+        calls = 0
+
+        def sample(self, **inputs):
+            type(self).calls += 1
+            return super().sample(**inputs) * (1 if self.calls < 10 else 1.1)
+
+    store, _, said = fill(tmp_path / "a.zarr", Tiring(), replans=1)
+    assert "gives other actions than the recorded call when nothing is changed" in said[0]
+    assert "are refused" in said[1]
+    assert list(changes_of(store)) == ["unchanged"]
+
+
+def test_a_repeat_without_an_argument_measures_knockouts_only(tmp_path):
+    store, _, said = fill(
+        tmp_path / "a.zarr", SamplingPolicy(), lambda policy, replan: lambda: policy.sample(**inputs(replan))
+    )
+    (sentence,) = said
+    assert "takes no argument: no word and no picture is exchanged. Give lambda call: ..." in sentence
+    names = set(changes_of(store, 1))
+    assert {"unchanged", "noise", "without_word_bowl", "without_visual_queries_all"} <= names
+    assert not {"prompt_synonyms_bowl_plate", "front_blank"} & names
+
+
+def test_noise_that_is_given_has_no_floor_and_without_siblings_no_word_is_exchanged(tmp_path):
+    class Given(SmallPolicy):
+        def sample(self, **inputs):
+            return self.act(**inputs, noise=given()["noise"])
+
+    store, _, said = fill(tmp_path / "a.zarr", Given(), siblings=())
+    assert [line.split(":")[0] for line in said] == [
+        "No word is exchanged",
+        "The repeated call draws no noise from a generator that is known",
+    ]
+    assert "noise" not in changes_of(store)
+    assert "without_word_bowl" in changes_of(store)
+
+
+def test_a_prompt_of_another_length_is_not_exchanged(tmp_path):
+    policy = SamplingPolicy()
+    encode = policy.tokenizer.encode
+    policy.tokenizer.encode = lambda text: [one for number in encode(text) for one in [number] * (1 + (number == 7))]
+    store, _, said = fill(tmp_path / "a.zarr", policy)
+    assert said == ["A call with an exchanged word is not measured where its prompt has another number of tokens."]
+    assert "prompt_synonyms_bowl_plate" not in changes_of(store)
+    assert "front_blank" in changes_of(store)
+
+
+def test_replans_between_and_resuming(tmp_path):
+    settings = va.EffectSettings(("text",), ("action",), every=2)
+    store, _, _ = fill(tmp_path / "a.zarr", SamplingPolicy(), replans=4, effects=settings)
+    assert sorted(set(store.episodes[0].attributes.effects.replan)) == [0, 2]
+    assert store.attributes.recording.effects.readers == ("action",)
+    for other in (None, "text", va.EffectSettings(("text",), ("action",))):
+        with pytest.raises(RunMismatch, match="recording"):
+            fill(tmp_path / "a.zarr", SamplingPolicy(), effects=other, resume=True)
+
+
+def test_objects_are_cut_by_the_share_that_they_cover(tmp_path, monkeypatch):
+    policy = SamplingPolicy()
+    share = np.array([[0.25, 0.75], [1, 0], [0, 1], [0, 1]], dtype=np.float32)
+    things = [SceneObject("bowl", "object", of_interest=True), SceneObject("table", "object", of_interest=False)]
+    settings = {"layout": layout_with_prefix(), "effects": va.EffectSettings(("objects",), ("action",))}
+    torch.manual_seed(5)
+    noise = torch.randn(1, HORIZON, 2)
+    torch.manual_seed(5)
+    with va.record(tmp_path / "a.zarr", policy, durable=False, **settings) as run:
+        facts = {"task_id": 0, "episode_index": 0, "instruction": TEXT, "objects": things}
+        with run.episode(**facts) as episode:
+            call = repeat_of(policy, 0)
+            frames = {"front": inputs(0)["pictures"]}
+            with episode.replan(env_step=0, frames=frames, coverage={"front": share}, repeat=call) as replan:
+                replan.actions = policy.sample(**inputs(0))
+    attend = nn.functional.scaled_dot_product_attention
+
+    def without(q, k, v, attn_mask):
+        bias = torch.zeros(attn_mask.shape).masked_fill(~attn_mask, -torch.inf)
+        if q.shape[2] == HORIZON:
+            bias[..., 0] += float(np.log(0.75))
+            bias[..., 1] = -torch.inf
+        return attend(q, k, v, attn_mask=bias)
+
+    monkeypatch.setattr(nn.functional, "scaled_dot_product_attention", without)
+    expected = policy.act(**inputs(0), noise=noise) - replan.actions
+    change = changes_of(open_store(tmp_path / "a.zarr"))["without_object_bowl"]
+    np.testing.assert_allclose(change, expected[0], atol=1e-5)
+
+
+def test_calls_whose_queries_are_all_tokens(tmp_path, monkeypatch):
+    """A policy that generates tokens: the prompt is read by the first call, whose last query is the action's."""
+    policy, layout = TokenPolicy(), token_layout()
+    layout = replace(layout, rules=(replace(layout.rules[0], tokens="joint"),))
+    picture = torch.rand(3, 8, 8, generator=torch.Generator().manual_seed(0))
+    logits = []
+    policy.head.register_forward_hook(lambda *given: logits.append(given[2]))
+
+    def act(text=TEXT):
+        logits.clear()
+        policy.act(picture, text)
+        return torch.cat(logits).detach()
+
+    settings = {"layout": layout, "tokenizer": policy.tokenizer, "effects": "text,cameras", "durable": False}
+    with (
+        pytest.warns(Note) as said,
+        va.record(tmp_path / "a.zarr", policy, **settings) as run,
+        run.episode(task_id=0, episode_index=0, instruction=TEXT, siblings=["pick up bowl"]) as episode,
+        episode.replan(env_step=0, repeat=lambda call: act(call.instruction)) as replan,
+    ):
+        replan.actions = act()
+    assert [str(one.message).split(":")[0] for one in said] == [
+        "No picture is exchanged",
+        "The repeated call draws no noise from a generator that is known",
+    ]
+    changes = changes_of(open_store(tmp_path / "a.zarr"))
+    # The first patch sees itself only, and still does.
+    assert {"without_visual_queries_all", "only_linguistic_queries_all"} <= set(changes)
+    the, attend = PATCHES + 2, nn.functional.scaled_dot_product_attention
+    for name, readers in (("without_word_the_queries_all", "all"), ("without_word_the", "action")):
+
+        def without(q, k, v, attn_mask, readers=readers):
+            mask, queries = attn_mask.clone(), q.shape[2]
+            if readers == "action":
+                mask[-1, the] = False
+            else:
+                mask[:, the] = False
+                if queries > 1:
+                    mask[the, the] = True
+            return attend(q, k, v, attn_mask=mask)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(nn.functional, "scaled_dot_product_attention", without)
+            expected = act() - replan.actions
+        np.testing.assert_allclose(changes[name], expected, atol=1e-5, err_msg=name)
+        assert np.abs(changes[name]).max() > 1e-3
+    exchanged = act("pick up bowl") - replan.actions
+    np.testing.assert_allclose(changes["prompt_synonyms_the_up"], exchanged, atol=1e-5)
+
+
+def test_sites_of_which_nothing_is_recorded_are_changed_too(tmp_path, monkeypatch):
+    policy, layout = OneModulePolicy(), one_module_layout()
+    first = (va.Span("front", "image", 0, 4, "front", va.PatchGrid(2, 2, 8, 8)), va.Span("rest", "text", 4, 5))
+    roles = {"front": "image", "rest": "text"}
+    own = va.SiteLayout("self", (*first, va.Span("actions", "action", 5, 8)), layers=(0, 2))
+    cross = va.SiteLayout("cross", first, layers=(1, 3))
+    sites = (va.RecordedSite(own, (0, 3), roles | {"actions": "action"}), va.RecordedSite(cross, (0, 3), roles))
+    prefix, noise = torch.randn(1, 5, WIDTH), torch.randn(1, 3, WIDTH)
+    settings = {"layers": [0], "effects": va.EffectSettings(("cameras",), ("action",)), "durable": False}
+    with (
+        pytest.warns(Note) as said,
+        va.record(tmp_path / "a.zarr", policy, layout=replace(layout, sites=sites), **settings) as run,
+        run.episode(task_id=0, episode_index=0, instruction="") as episode,
+        episode.replan(
+            env_step=0, frames={"front": np.zeros((8, 8, 3), np.uint8)}, repeat=lambda: policy.act(prefix, noise)
+        ) as replan,
+    ):
+        replan.actions = policy.act(prefix, noise)
+    store = open_store(tmp_path / "a.zarr")
+    assert [site.name for site in store.attributes.sites] == ["self"]
+    assert ["draws no noise" in str(said[0].message), "takes no argument" in str(said[1].message)] == [True, True]
+    attend = nn.functional.scaled_dot_product_attention
+
+    def without(q, k, v):
+        return attend(q, k, v, attn_mask=(torch.arange(k.shape[2]) >= 4).expand(q.shape[2], -1))
+
+    monkeypatch.setattr(nn.functional, "scaled_dot_product_attention", without)
+    expected = policy.act(prefix, noise) - replan.actions
+    np.testing.assert_allclose(changes_of(store)["without_camera_front"], expected[0], atol=1e-5)
+
+
+def test_keys_of_another_kernel_that_takes_no_mask(tmp_path):
+    """Attention that allows no change: what is exchanged is measured, and what is cut off is said to be left out."""
+
+    class Added(nn.Module):
+        tokenizer = SmallPolicy().tokenizer
+
+        def __init__(self):
+            super().__init__()
+            torch.manual_seed(0)
+            self.words = nn.Embedding(9, 8)
+            self.blocks = nn.ModuleList(nn.MultiheadAttention(8, 2, batch_first=True, add_zero_attn=True) for _ in "ab")
+
+        @torch.no_grad()
+        def sample(self, texts, **_):
+            tokens, hidden = self.words(torch.tensor([self.tokenizer.encode(texts[0])])), torch.randn(1, 3, 8)
+            for block in self.blocks:
+                hidden = hidden + block(hidden, tokens, tokens)[0]
+            return hidden
+
+    keys = va.SiteLayout("cross", (va.Span("prompt", "text", 0, 5), va.Span("zero", "state", 5, 6)))
+    site = va.RecordedSite(keys, (0, 3), {"prompt": "instruction", "zero": "learned"})
+    layout = va.PolicyLayout(
+        name="added",
+        family="added",
+        num_layers=2,
+        num_heads=2,
+        sites=(site,),
+        rules=(va.CallRule(r"blocks\.(?P<block>\d+)", "cross"),),
+        text=va.PromptText(("prompt",), "words"),
+    )
+    policy = Added()
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        settings = {"effects": va.EffectSettings(("text",), ("action",)), "tokenizer": policy.tokenizer}
+        with (
+            va.record(tmp_path / "a.zarr", policy, layout=layout, durable=False, **settings) as run,
+            run.episode(task_id=0, episode_index=0, instruction=TEXT, siblings=SIBLINGS) as episode,
+            episode.replan(env_step=0, repeat=lambda call: policy.sample([call.instruction])) as replan,
+        ):
+            replan.actions = policy.sample([TEXT])
+    assert ["cannot be changed" in str(one.message) for one in said if one.category is Note] == [True] * len(said)
+    changes = changes_of(open_store(tmp_path / "a.zarr"))
+    assert list(changes) == ["unchanged", "noise", "prompt_synonyms_bowl_plate"]
+    assert not changes["unchanged"].any()
+
+
+def test_a_prefix_that_is_no_pass_over_the_sites_keys(tmp_path):
+    """Cut off for the action queries alone, and a line says so."""
+    layout = small_layout()
+    never = replace(layout, rules=(*layout.rules, va.CallRule("patches", None, tokens="joint")))
+    store, _, said = fill(tmp_path / "a.zarr", SamplingPolicy(), layout=never)
+    assert len(said) == 1
+    assert "No call was a pass over the prefix, as the layout 'small' says with tokens=SITE" in said[0]
+    assert not any(name.endswith("_queries_all") for name in changes_of(store))
+    assert "without_word_bowl" in changes_of(store)
+    prefix = replace(layout.rules[0], site=None, tokens="joint")
+    wrong = va.CallRule(r"blocks\.(?P<block>\d+)\.attention", "joint", queries=PREFIX)
+    keys = va.SiteLayout("joint", layout.sites[0].keys.spans[:3])
+    roles = {"image_front": "image", "prompt": "instruction", "state": "state"}
+    site = va.RecordedSite(keys, (0, PREFIX), roles)
+    other = replace(layout, rules=(wrong, prefix), sites=(site,), num_denoise_steps=1, denoise_times=())
+    store, _, said = fill(tmp_path / "b.zarr", SamplingPolicy(), layout=other)
+    assert "is no pass over the first keys of site 'joint', of which 11 stand before the actions" in said[0]
+    assert not any(name.endswith("_queries_all") for name in changes_of(store))
