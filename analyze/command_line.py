@@ -13,6 +13,7 @@ from pathlib import Path
 from vla_attention.analyze.commands import COMMANDS, DEFAULT_COMMAND
 from vla_attention.schemas.command_line import run_command
 from vla_attention.schemas.errors import BadArgument, UnknownName, UserError, did_you_mean, listing
+from vla_attention.schemas.former_commands import as_of_today
 from vla_attention.schemas.threads import add_threads, use_threads
 
 #: Episodes are measured in threads (`stores.parallel`); matrix products that start threads too make them slower.
@@ -25,9 +26,14 @@ _OBJECTS_BETWEEN_COLLECTIONS = 5_000_000
 def run_command_line(given: Sequence[str], if_stopped: str) -> int:
     """Run the command that the arguments name; returns the exit code. if_stopped: what is said after a stop."""
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
-    name = given[0] if given[:1] and given[0] in COMMANDS else ""
-    prog = f"vla-analyze {name}".strip()
-    return run_command(prog, lambda: _run(name, given[1:] if name else given), if_stopped)
+    prog = f"vla-analyze {given[0]}" if given[:1] and given[0] in COMMANDS else "vla-analyze"
+
+    def run() -> int:
+        words = as_of_today(given)
+        name = words[0] if words[:1] and words[0] in COMMANDS else ""
+        return _run(name, words[1:] if name else words)
+
+    return run_command(prog, run, if_stopped)
 
 
 def _run(name: str, arguments: Sequence[str]) -> int:

@@ -20,10 +20,8 @@ COMMANDS: dict[str, str] = {
     "report": "one self-contained HTML file",
     "view": "a page on which to explore attention: episodes, words, patches, heads, groups",
     "export": "tables as CSV or Parquet, masses or rows as NetCDF",
-    "copy": "a copy of a store: smaller, or packed into few files, or from or to elsewhere",
-    "merge": "one store of the episodes of several stores of one run",
-    "verify": "read everything back and check it; --quick looks at presence and sizes",
-    "repair": "move damaged episodes aside, and remove what killed processes left",
+    "copy": "a copy of a store: smaller, packed, from or to elsewhere; or one store of several",
+    "verify": "read everything back and check it; --repair moves damaged episodes aside",
     "cache": "what is kept of earlier analyses: where, how much; --clear removes it",
 }
 #: The command of `vla-analyze STORE`.

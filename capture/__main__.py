@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 #: What is said after Ctrl-C.
 IF_STOPPED = "complete episodes are kept, continue with --resume."
 #: Commands that record nothing, and what is said of them.
-_RECORD_NOTHING = ("doctor", "parity", "repair", "status", "tasks", "verify")
+_RECORD_NOTHING = ("doctor", "parity", "status", "tasks", "verify")
 _IF_LOOKING = "nothing was left half written."
 
 
@@ -36,8 +36,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(given: Sequence[str], termination: Termination) -> int:
     from vla_attention.capture.commands.arguments import build_parser
+    from vla_attention.schemas.former_commands import as_of_today
 
-    arguments = build_parser(given).parse_args(given)
+    words = as_of_today(given)
+    arguments = build_parser(words).parse_args(words)
     exit_code: int = arguments.command(arguments, termination)
     return exit_code
 

@@ -41,9 +41,9 @@ def select_layers(numbers: Sequence[int] | None, num_layers: int, family: str) -
             raise BadArgument(f"There is no layer {number}; expected block indices 0 to {num_layers - 1}{also}.")
     if accepts_call_numbers and any(pair == (num_layers - 1, num_layers) for pair in pairwise(numbers)):
         raise BadArgument(
-            f"Layers {num_layers - 1} and {num_layers} do not follow each other: {num_layers - 1} is the last block, and "
-            f"{num_layers} the published scripts' number of block 0. A range stays on one side: 0-{num_layers - 1}, or "
-            f"{num_layers}-{last}."
+            f"Layers {num_layers - 1} and {num_layers} do not follow each other: {num_layers - 1} is the last block, "
+            f"and {num_layers} the published scripts' number of block 0. A range stays on one side: "
+            f"0-{num_layers - 1}, or {num_layers}-{last}."
         )
     if len(set(numbers)) != len(numbers):
         raise BadArgument(f"Layers {listing(numbers, 40)} name one of them twice; give each number once.")

@@ -7,13 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vla_attention.analyze.arguments import add_workers
 from vla_attention.analyze.show.numbers import format_percent, plural
 from vla_attention.schemas.command_line import command_parser, format_bytes
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.schemas.stores.store_url import store_place
+from vla_attention.schemas.stores.store_url import local_path, store_place
 
 if TYPE_CHECKING:
     from vla_attention.schemas.stores.reader import Store
+    from vla_attention.schemas.stores.store_url import StorePlace
 
 _EXAMPLES = """examples:
   vla-analyze copy libero_10.zarr                               how large each part is
@@ -23,24 +25,37 @@ _EXAMPLES = """examples:
   vla-analyze copy libero_10.zarr packed.zarr --packed          one file an episode
   vla-analyze copy libero_10.zarr packed.zarr --packed --push hf://datasets/ORG/NAME/libero_10.zarr
   vla-analyze copy hf://datasets/ORG/NAME/libero_10.zarr here.zarr
+  vla-analyze copy node1/libero_10.zarr node2/libero_10.zarr --output libero_10.zarr     one store of several
 
 frames: the cameras' pictures (overlays and reruns need them). objects: what each patch shows (object: groups need it).
 contributions: norms of what keys add. effects: changes of the action without an item. Rows, and everything else that
 groupings of keys, words, cameras and roles need, are always copied. The copy passes verify, and its provenance names
 the omitted parts.
+
+Several stores have to be of one run configuration: what differs is named. No two of them may hold the same episode. The
+one store shares the files of the given ones (hard links), so that it takes no space; a damage of one is then a damage
+of both, and --copy makes files of its own. What comes from a zip or from elsewhere is always copied.
 """
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-analyze copy STORE DEST`."""
+    """The parser of `vla-analyze copy STORE ... --output DEST`."""
     parser = command_parser(
         "vla-analyze copy",
-        "Copy a store, for instance without its pictures or packed into few files; without DEST, print how large each\n"
-        "part is.",
+        "Copy a store, for instance without its pictures or packed into few files, or make one store of several of\n"
+        "one run. Without a place to copy to, print how large each part is.",
         _EXAMPLES,
     )
-    parser.add_argument("store", type=store_place, metavar="STORE", help="NAME.zarr, or its address")
-    parser.add_argument("target", type=Path, nargs="?", metavar="DEST", help="where the copy goes, NAME.zarr")
+    parser.add_argument(
+        "stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses; several become one store"
+    )
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="DEST",
+        help="where the copy goes, NAME.zarr; of two names without --output the second one is DEST",
+    )
     parser.add_argument(
         "--without",
         nargs="+",
@@ -58,39 +73,64 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="hf://datasets/ORG/NAME/FILE.zarr",
         help="upload the packed copy to the Hugging Face hub, with a card that says what it holds",
     )
+    parser.add_argument(
+        "--copy", action="store_true", help="of several stores: copy every file, instead of sharing it (hard links)"
+    )
+    add_workers(parser)
     return parser
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Copy the store, or print how large its parts are."""
-    from vla_attention.analyze.copy.copying import check_parts, copy_store
+    """Copy the store, make one of several, or print how large the parts are."""
+    from vla_attention.analyze.copy.copying import check_parts
+
+    stores, target = list(arguments.stores), arguments.output
+    if target is None and len(stores) == 2:
+        target = local_path(stores.pop())
+    if target is None and len(stores) > 2:
+        raise BadArgument(f"{len(stores)} stores and no place for the one that they become; add --output DEST.zarr.")
+    without = check_parts(arguments.without)
+    if target is None:
+        if arguments.packed or arguments.push:
+            raise BadArgument("--packed and --push need a DEST: the packed copy is made here first; give DEST.zarr.")
+        from vla_attention.schemas.stores.reader import open_store
+
+        print(_sizes_text(open_store(stores[0]), without))
+        return 0
+    if len(stores) > 1:
+        if without or arguments.push:
+            raise BadArgument("--without and --push are for one store; make one of the several first, then copy that.")
+        from vla_attention.analyze.merge.command import merge
+
+        return merge(stores, target, copy=arguments.copy, packed=arguments.packed)
+    if arguments.copy:
+        raise BadArgument("--copy is for several stores: the copy of one has files of its own anyway.")
+    return _copy(stores[0], target, without, packed=arguments.packed, push=arguments.push)
+
+
+def _copy(place: StorePlace, target: Path, without: Sequence[str], *, packed: bool, push: str | None) -> int:
+    from vla_attention.analyze.copy.copying import copy_store
     from vla_attention.schemas.progress_bar import progress_bar
     from vla_attention.schemas.stores.reader import open_store
 
-    store = open_store(arguments.store)
-    without = check_parts(arguments.without)
-    if arguments.target is None:
-        if arguments.packed or arguments.push:
-            raise BadArgument("--packed and --push need a DEST: the packed copy is made here first; give DEST.zarr.")
-        print(_sizes_text(store, without))
-        return 0
-    if arguments.push and not arguments.packed:
+    if push and not packed:
         raise BadArgument("--push uploads a packed copy: a hub takes few files only; add --packed.")
-    push = None
-    if arguments.push:
+    pushed = None
+    if push:
         from vla_attention.analyze.copy.pushing import check_push
 
-        push = check_push(arguments.push)
+        pushed = check_push(push)
+    store = open_store(place)
     with progress_bar(len(store.episodes), "episodes") as advance:
-        copied = copy_store(store, arguments.target, without, advance, packed=arguments.packed)
+        copied = copy_store(store, target, without, advance, packed=packed)
     already = f" ({copied.present} were there already)" if copied.present else ""
     left = f", {format_bytes(copied.left_bytes)} left behind: {', '.join(without)}" if without else ""
     added = plural(copied.added, "episode")
-    print(f"{arguments.target}: {added} added{already}, {format_bytes(copied.copied_bytes)}{left}.")
-    if push is not None:
+    print(f"{target}: {added} added{already}, {format_bytes(copied.copied_bytes)}{left}.")
+    if pushed is not None:
         from vla_attention.analyze.copy.pushing import push_store
 
-        print(push_store(arguments.target, push))
+        print(push_store(target, pushed))
     return 0
 
 

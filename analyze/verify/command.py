@@ -1,4 +1,4 @@
-"""`vla-analyze verify`: read everything back and check it."""
+"""`vla-analyze verify`: read everything back and check it, and with --repair move damaged episodes aside."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import argparse
 
 from vla_attention.analyze.arguments import add_workers
 from vla_attention.schemas.command_line import command_parser
-from vla_attention.schemas.stores.verify_command import DESCRIPTION, EXAMPLES, add_verify_arguments, run_verify
+from vla_attention.schemas.stores.verify_command import DESCRIPTION, EXAMPLES, add_verify_arguments, run_verify_command
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -18,7 +18,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Verify every store; 1 if anything is wrong."""
+    """Verify every store; 1 if anything is wrong, or with --repair if a damaged episode is left."""
     from vla_attention.analyze.stores.checking import reports_of_store
 
-    return run_verify(arguments.stores, quick=arguments.quick, as_json=arguments.json, reports=reports_of_store)
+    return run_verify_command(arguments, reports_of_store)

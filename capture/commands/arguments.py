@@ -22,14 +22,13 @@ from vla_attention.capture.run.command import run_capture_of_family
 from vla_attention.schemas.command_line import OneSentenceParser
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.options import add_capture_output, add_task
-from vla_attention.schemas.stores import repair_command, verify_command
+from vla_attention.schemas.stores import verify_command
 from vla_attention.schemas.stores.repair_command import VERIFY_HELP
 from vla_attention.schemas.threads import add_threads
 
 _FURTHER_EXAMPLES = """\
   vla-capture status runs/libero_10.zarr                     what is there, what is missing, who is writing
-  vla-capture repair runs/libero_10.zarr                     move damaged episodes aside; --resume records them again
-  vla-capture verify runs/libero_10.zarr                     read everything back and check it
+  vla-capture verify runs/libero_10.zarr                     check everything; --repair moves damaged episodes aside
   vla-capture doctor                                         what this machine can do, and what is missing
   vla-capture parity CASE                                    our numbers against a reference's, on your own checkpoint
 """
@@ -66,15 +65,6 @@ def build_parser(given: Sequence[str] = ()) -> argparse.ArgumentParser:
         "differences. Exit code 0: all within the limit, 1: beyond it, 2: the case cannot be used.",
     )
     _add_parity_arguments(parity, families)
-    repair = commands.add_parser(
-        "repair",
-        help="move damaged episodes of a store aside, so that --resume records them again",
-        description=repair_command.DESCRIPTION,
-        epilog=repair_command.EXAMPLES.replace("NAME", "vla-capture"),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    repair_command.add_repair_arguments(repair)
-    repair.set_defaults(command=_run_repair)
     replay = commands.add_parser(
         "replay",
         help="make policy calls on the frames of a data set of a robot",
@@ -311,12 +301,8 @@ def _run_status(arguments: argparse.Namespace, termination: Termination) -> int:
     )
 
 
-def _run_repair(arguments: argparse.Namespace, termination: Termination) -> int:
-    return repair_command.run_repair(arguments.stores, verify=arguments.verify, dry_run=arguments.dry_run)
-
-
 def _run_verify(arguments: argparse.Namespace, termination: Termination) -> int:
-    return verify_command.run_verify(arguments.stores, quick=arguments.quick, as_json=arguments.json)
+    return verify_command.run_verify_command(arguments)
 
 
 def _run_tasks(arguments: argparse.Namespace, termination: Termination) -> int:

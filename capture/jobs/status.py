@@ -250,7 +250,7 @@ def _text(status: StoreStatus) -> str:
     lines += ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     lines += status.lacking_lines()
     if any(task.damaged for task in tasks):
-        lines.append(f"Damaged episodes are moved aside by: vla-capture repair {status.store}")
+        lines.append(f"Damaged episodes are moved aside by: vla-capture verify {status.store} --repair")
     if status.complete is None:
         lines.append("The expected number of episodes is unknown; give it with --expected N.")
     elif status.complete:

@@ -65,6 +65,6 @@ def what_to_do(path: Path, damaged: Collection[DamagedEpisode]) -> str:
     others = listing((episode.name for episode in list(damaged)[3:]), 20)
     return (
         f"{count} of the episodes asked for {'is' if count == 1 else 'are'} damaged: {described}"
-        f"{f' Damaged too: {others}.' if count > 3 else ''} A capture moves no data; run vla-capture repair {path}, "
-        "which moves damaged episodes aside, and then this capture again with --resume."
+        f"{f' Damaged too: {others}.' if count > 3 else ''} A capture moves no data; run vla-capture verify {path} "
+        "--repair, which moves damaged episodes aside, and then this capture again with --resume."
     )

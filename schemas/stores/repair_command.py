@@ -1,8 +1,7 @@
-"""`repair` of both command lines: its arguments, and what is printed."""
+"""`verify --repair` of both command lines: what is done, and what is printed."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,24 +11,8 @@ from vla_attention.schemas.safe_text import print_line, visible
 if TYPE_CHECKING:
     from vla_attention.schemas.stores.repair import Finding
 
-DESCRIPTION = (
-    "Look for damaged episodes and move each into NAME.zarr.damaged, beside the store, with the reason; remove what "
-    "killed processes of this machine left in NAME.zarr.partial. No episode is deleted, and episodes that another "
-    "process is writing are left alone. Exit code 1 when a damaged episode is left in a store."
-)
-EXAMPLES = """examples:
-  NAME repair runs/libero_10.zarr --dry-run     what would be done
-  NAME repair runs/libero_10.zarr --verify      read every byte to find damage, as verify does
-"""
-#: Of `repair` and of `vla-capture status`.
+#: Of `vla-capture status`.
 VERIFY_HELP = "read every byte, instead of only seals, presence and sizes of files"
-
-
-def add_repair_arguments(parser: argparse.ArgumentParser) -> None:
-    """The arguments of `repair`."""
-    parser.add_argument("stores", nargs="+", type=Path, metavar="STORE", help="one or several NAME.zarr")
-    parser.add_argument("--verify", action="store_true", help=VERIFY_HELP)
-    parser.add_argument("--dry-run", action="store_true", help="list what would be done, and do none of it")
 
 
 def run_repair(stores: Sequence[Path], *, verify: bool, dry_run: bool) -> int:
@@ -78,7 +61,7 @@ def _lines(path: Path, findings: Sequence[Finding], total: int, verify: bool, dr
     from vla_attention.schemas.stores.repair import is_packed
 
     if not findings:
-        looked = "every byte was read" if verify else "seals, presence and sizes; --verify reads every byte"
+        looked = "every byte was read" if verify else "seals, presence and sizes; without --quick every byte is read"
         return [f"{path}: none of {total} episodes is damaged ({looked})."]
     lines = [f"{path}: {len(findings)} of {total} episodes {'is' if len(findings) == 1 else 'are'} damaged."]
     for finding in findings:

@@ -11,10 +11,11 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from vla_attention.schemas.command_line import format_bytes
-from vla_attention.schemas.errors import Note
+from vla_attention.schemas.errors import BadArgument, Note
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.safe_text import plain_stderr, print_line, visible
-from vla_attention.schemas.stores.store_url import StorePlace, store_place
+from vla_attention.schemas.stores.repair_command import run_repair
+from vla_attention.schemas.stores.store_url import StorePlace, local_path, store_place
 
 if TYPE_CHECKING:
     from vla_attention.schemas.stores.reader import Store
@@ -28,6 +29,8 @@ EXAMPLES = """examples:
   NAME verify libero_10.zarr                      every byte of every episode
   NAME verify libero_10.zarr --quick              seals, metadata, presence and sizes of files: milliseconds an episode
   NAME verify *.zarr --json > report.json         for programs
+  NAME verify libero_10.zarr --repair --dry-run   what would be moved aside
+  NAME verify libero_10.zarr --repair --quick     move aside what a quick look finds; --resume captures it again
 """
 #: Reports of the episodes of a store, in their order, looked at quickly or not.
 Reports = Callable[["Store", bool], Iterable["EpisodeReport"]]
@@ -42,6 +45,29 @@ def add_verify_arguments(parser: argparse.ArgumentParser) -> None:
         help="look at seals, metadata, and the presence and size of every file, and read no array",
     )
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
+    parser.add_argument(
+        "--repair",
+        action="store_true",
+        help="move damaged episodes into NAME.zarr.damaged, beside the store, with the reason, and remove what killed "
+        "processes of this machine left; no episode is deleted, and those that are being written are left alone",
+    )
+    parser.add_argument(
+        "--dry-run", action="store_true", help="with --repair: list what would be done, and do none of it"
+    )
+
+
+def run_verify_command(arguments: argparse.Namespace, reports: Reports | None = None) -> int:
+    """Check the stores of parsed arguments, or repair them; returns the exit code."""
+    if arguments.repair:
+        if arguments.json:
+            raise BadArgument("Cannot use --json with --repair, which prints what it did; verify again with --json.")
+        places = [local_path(place) for place in arguments.stores]
+        return run_repair(places, verify=not arguments.quick, dry_run=arguments.dry_run)
+    if arguments.dry_run:
+        raise BadArgument("--dry-run goes with --repair: without it nothing is changed anyway.")
+    return run_verify(
+        arguments.stores, quick=arguments.quick, as_json=arguments.json, reports=reports or one_after_the_other
+    )
 
 
 def one_after_the_other(store: Store, quick: bool) -> Iterator[EpisodeReport]:

@@ -1,1 +1,0 @@
-"""`vla-analyze repair`: moves damaged episodes out of a store."""
