@@ -15,16 +15,19 @@ from vla_attention.schemas.stop_signals import end_program, run_until_stopped
 IF_STOPPED = "nothing was left half written."
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code (2: an argument or a store is wrong, and one sentence says how)."""
+def main(argv: Sequence[str] | None = None, program: str = "vla-analyze") -> int:
+    """Run the command line; returns the exit code (2: an argument or a store is wrong, and one sentence says how).
+
+    program: the name that it was called by: this, or vla-attention.
+    """
     given = sys.argv[1:] if argv is None else list(argv)
 
     def run() -> int:
         from vla_attention.analyze.command_line import run_command_line
 
-        return run_command_line(given, IF_STOPPED)
+        return run_command_line(given, IF_STOPPED, program)
 
-    return run_until_stopped("vla-analyze", run, IF_STOPPED)
+    return run_until_stopped(program, run, IF_STOPPED)
 
 
 def program() -> NoReturn:

@@ -23,26 +23,39 @@ _ONE_THREAD_EACH = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _OBJECTS_BETWEEN_COLLECTIONS = 5_000_000
 
 
-def run_command_line(given: Sequence[str], if_stopped: str) -> int:
+def run_command_line(given: Sequence[str], if_stopped: str, program: str = "vla-analyze") -> int:
     """Run the command that the arguments name; returns the exit code. if_stopped: what is said after a stop."""
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
-    prog = f"vla-analyze {given[0]}" if given[:1] and given[0] in COMMANDS else "vla-analyze"
-
-    def run() -> int:
-        words = as_of_today(given)
-        name = words[0] if words[:1] and words[0] in COMMANDS else ""
-        return _run(name, words[1:] if name else words)
-
-    return run_command(prog, run, if_stopped)
+    name = given[0] if given[:1] and given[0] in COMMANDS else ""
+    prog = f"{program} {name}" if name else "vla-attention analyze" if program == "vla-attention" else program
+    return run_command(prog, lambda: _run(_words(given), program), if_stopped)
 
 
-def _run(name: str, arguments: Sequence[str]) -> int:
-    if any(argument.partition("=")[0] == "--seed" for argument in arguments):
+def is_store(word: str) -> bool:
+    """Whether a word of a command line is the place of a store."""
+    return word.rstrip("/").endswith(".zarr") or "://" in word
+
+
+def _words(given: Sequence[str]) -> list[str]:
+    """What was typed, with the words of today and the command first."""
+    words = as_of_today(given)
+    if words[:1] and words[0] not in COMMANDS and is_store(words[0]) and words[1:2] and words[1] in COMMANDS:
+        return [words[1], words[0], *words[2:]]  # STORE words
+    return words
+
+
+def _run(words: Sequence[str], program: str) -> int:
+    if any(word.partition("=")[0] == "--seed" for word in words):
         raise BadArgument("Intervals have no random draws any more: leave --seed out.")
+    name = words[0] if words[:1] and words[0] in COMMANDS else ""
+    arguments = words[1:] if name else words
     if not name:
         _refuse_misspelt_command(arguments)
     command = import_module(f"vla_attention.analyze.{name or DEFAULT_COMMAND}.command")
-    parsed = build_parser(name).parse_args(arguments)
+    parser = build_parser(name)
+    if program == "vla-attention":
+        parser.prog = f"{program} {name or 'analyze'}"
+    parsed = parser.parse_args(arguments)
     # The libraries read the numbers when they are imported, which the command does.
     use_threads(parsed.threads)
     os.environ.update(dict.fromkeys(_ONE_THREAD_EACH, "1"))

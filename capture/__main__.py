@@ -21,25 +21,30 @@ _RECORD_NOTHING = ("doctor", "parity", "status", "tasks", "verify")
 _IF_LOOKING = "nothing was left half written."
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code, which is 2 after a mistake in the arguments."""
+def main(argv: Sequence[str] | None = None, program: str = "vla-capture") -> int:
+    """Run the command line; returns the exit code, which is 2 after a mistake in the arguments.
+
+    program: the name that it was called by.
+    """
     given = sys.argv[1:] if argv is None else list(argv)
     if_stopped = _IF_LOOKING if given and given[0] in _RECORD_NOTHING else IF_STOPPED
 
     def run() -> int:
         from vla_attention.capture.commands.command_line import run_capture_command
 
-        return run_capture_command("vla-capture", lambda termination: _run(given, termination), lambda: 0, if_stopped)
+        return run_capture_command(
+            program, lambda termination: _run(given, program, termination), lambda: 0, if_stopped
+        )
 
-    return run_until_stopped("vla-capture", run, if_stopped)
+    return run_until_stopped(program, run, if_stopped)
 
 
-def _run(given: Sequence[str], termination: Termination) -> int:
+def _run(given: Sequence[str], program: str, termination: Termination) -> int:
     from vla_attention.capture.commands.arguments import build_parser
     from vla_attention.schemas.former_commands import as_of_today
 
     words = as_of_today(given)
-    arguments = build_parser(words).parse_args(words)
+    arguments = build_parser(words, program).parse_args(words)
     exit_code: int = arguments.command(arguments, termination)
     return exit_code
 

@@ -22,8 +22,56 @@ if TYPE_CHECKING:
 _HELP_WIDTH = 100
 
 
+#: What `--help` shows of a command with more options than these; `--help-all` shows all.
+_MOST_OPTIONS = 12
+_MAIN_OPTIONS = {
+    *("--checkpoint", "--task-suite", "--task", "--num-episodes", "--layers", "--denoise", "--effects", "--knockout"),
+    *("--output", "--resume", "--budget", "--series", "--policy", "--every", "--accept"),
+    *("--grouping", "--group", "--ratio", "--episode", "--allow-mismatch", "--reruns", "--open", "--bins", "--video"),
+    *("--csv", "--parquet", "--netcdf", "--table", "--no-plots", "--dimensions", "--per-head", "--help-all"),
+}
+
+
+class _HelpAll(argparse.Action):
+    """Prints the help with every option."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
+        parser.shows_all = True
+        parser.print_help()
+        parser.exit()
+
+
 class OneSentenceParser(argparse.ArgumentParser):
-    """An argument parser whose mistakes read like all the others."""
+    """An argument parser whose mistakes read like all the others, and whose help fits a screen."""
+
+    shows_all = False
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        if self.add_help:
+            self.add_argument("--help-all", action=_HelpAll, nargs=0, default=argparse.SUPPRESS, help="every option")
+
+    def format_help(self) -> str:
+        """The help: the main options, where there are many."""
+        options = [one for one in self._actions if one.option_strings and one.help != argparse.SUPPRESS]
+        rest = [one for one in options if not {*one.option_strings} & _MAIN_OPTIONS]
+        if self.shows_all or len(options) <= _MOST_OPTIONS:
+            return super().format_help()
+        kept, usage = [one.help for one in rest], self.usage
+        places = " ".join(
+            f"{one.metavar or one.dest}{' ...' if one.nargs == '+' else ''}"
+            for one in self._actions
+            if not one.option_strings
+        )
+        try:
+            for one in rest:
+                one.help = argparse.SUPPRESS
+            self.usage = usage or f"%(prog)s {places} [options]".replace("  ", " ")
+            return super().format_help()
+        finally:
+            self.usage = usage
+            for one, text in zip(rest, kept, strict=True):
+                one.help = text
 
     def error(self, message: str) -> NoReturn:
         """Print the problem and where help is; exit code 2."""

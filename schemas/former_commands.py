@@ -7,6 +7,9 @@ from collections.abc import Sequence
 
 from vla_attention.schemas.errors import Note
 
+#: The commands of before.
+FORMER = ("merge", "repair")
+
 
 def as_of_today(given: Sequence[str]) -> list[str]:
     """A command line with the words of today, for one that begins with a command of before."""

@@ -1,13 +1,13 @@
 """`vla-attention`: one name for every command of the package, so that `uvx vla-attention ...` reaches all of them.
 
-`vla-attention analyze ...` is `vla-analyze ...`, and `vla-attention capture ...` is `vla-capture ...`. What they need
-is imported when they are called.
+`vla-attention analyze STORE` and `vla-attention words STORE` are `vla-analyze STORE` and `vla-analyze words STORE`, and
+`vla-attention capture ...` is `vla-capture ...`. What they need is imported when they are called.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NoReturn
 
 from vla_attention.schemas.stop_signals import end_program
@@ -17,22 +17,39 @@ usage: vla-attention COMMAND ...
 
 Does a vision-language-action policy look, or does it read?
 
-  example [FOLDER]           copy the small stores that come along, and say what to ask them
-  analyze STORE ...          questions to a store: ratios, words, objects, report ... (the same as vla-analyze)
-  view STORE                 look at a store in the browser (the same as vla-analyze view)
-  capture POLICY ...         run a policy and record its attention (the same as vla-capture; needs the extra [capture])
-  completion bash|zsh        completion of commands and options for a shell
-  --version                  the version
+  example [FOLDER]   copy the small stores that come along, and say what to ask them
+  capture POLICY     run a policy and record its attention into a store (needs the extra [capture])
 
-vla-attention COMMAND --help says more. From Python: import vla_attention as va; va.open(STORE).
+questions to a store (vla-attention COMMAND STORE)
+{questions}
+
+keeping stores
+{keeping}
+
+  completion         completion of commands and options for a shell
+  help, --version
+
+vla-attention COMMAND --help says more, --help-all everything. From Python: import vla_attention as va; va.open(STORE).
 """
+
+
+def usage() -> str:
+    """The help text."""
+    from vla_attention.analyze.commands import DEFAULT_COMMAND, KEEPING, QUESTIONS
+
+    questions = {"analyze" if name == DEFAULT_COMMAND else name: answer for name, answer in QUESTIONS.items()}
+    return _USAGE.format(questions=_lines(questions), keeping=_lines(KEEPING))
+
+
+def _lines(commands: Mapping[str, str]) -> str:
+    return "\n".join(f"  {name:<18} {answer}" for name, answer in commands.items())
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code of the command, 2 for a command that does not exist."""
     given = sys.argv[1:] if argv is None else list(argv)
     if not given or given[0] in ("-h", "--help", "help"):
-        print(_USAGE, end="")
+        print(usage(), end="")
         return 0
     if given[0] in ("-V", "--version"):
         from vla_attention import __version__
@@ -42,32 +59,36 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = COMMANDS.get(given[0])
     if command is not None:
         return command(given[1:])
+    from vla_attention.analyze.commands import COMMANDS as ANALYSES
+    from vla_attention.schemas.former_commands import FORMER
+
+    if given[0] in ANALYSES or given[0] in FORMER:
+        return _analyses(given)
+    from vla_attention.analyze.command_line import is_store
     from vla_attention.schemas.errors import did_you_mean, listing
     from vla_attention.schemas.safe_text import visible
 
-    name = visible(given[0])
+    name, known = visible(given[0]), [*COMMANDS, *ANALYSES]
+    if is_store(given[0]):
+        return _analyses(given)
     print(
-        f"vla-attention: There is no command '{name}'.{did_you_mean(name, COMMANDS)} "
-        f"Commands: {listing(COMMANDS)}. See vla-attention --help.",
+        f"vla-attention: There is no command '{name}'.{did_you_mean(name, known)} "
+        f"Commands: {listing(known, 40)}. See vla-attention --help.",
         file=sys.stderr,
     )
     return 2
 
 
-def _analyze(given: Sequence[str]) -> int:
+def _analyses(given: Sequence[str]) -> int:
     from vla_attention.analyze.__main__ import main as analyze
 
-    return analyze(given)
-
-
-def _view(given: Sequence[str]) -> int:
-    return _analyze(["view", *given])
+    return analyze(given, "vla-attention")
 
 
 def _capture(given: Sequence[str]) -> int:
     from vla_attention.capture.__main__ import main as capture
 
-    return capture(given)
+    return capture(given, "vla-attention capture")
 
 
 def _example(given: Sequence[str]) -> int:
@@ -82,11 +103,10 @@ def _completion(given: Sequence[str]) -> int:
     return completion(given)
 
 
-#: Command -> what runs it.
+#: Command -> what runs it; besides these, the commands of `vla-analyze`.
 COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "example": _example,
-    "analyze": _analyze,
-    "view": _view,
+    "analyze": _analyses,
     "capture": _capture,
     "completion": _completion,
 }

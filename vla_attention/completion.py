@@ -121,16 +121,19 @@ def commands_of_all_programs() -> Iterator[Command]:
     """Every command of the three programs, from their parsers."""
     from vla_attention.__main__ import COMMANDS
 
-    yield Command("vla-attention", tuple(COMMANDS), ("--help", "--version"), {})
+    analyses = list(_analyze_commands())
+    names = [command.words.removeprefix("vla-analyze").strip() for command in analyses]
+    yield Command("vla-attention", (*COMMANDS, *filter(None, names)), ("--help", "--version"), {})
     yield Command("vla-attention example", (), ("--help",), {})
     yield Command("vla-attention completion", ("bash", "zsh"), ("--help",), {})
-    for name, under in (("analyze", "vla-analyze"), ("capture", "vla-capture")):
-        for command in _analyze_commands() if name == "analyze" else _capture_commands():
-            yield command
-            rest = command.words.removeprefix(under)
-            yield Command(f"vla-attention {name}{rest}", command.commands, command.options, command.values)
-            if rest == " view":
-                yield Command("vla-attention view", command.commands, command.options, command.values)
+    for command, name in zip(analyses, names, strict=True):
+        yield command
+        for words in dict.fromkeys((f"vla-attention analyze {name}".strip(), f"vla-attention {name or 'analyze'}")):
+            yield Command(words, command.commands, command.options, command.values)
+    for command in _capture_commands():
+        yield command
+        rest = command.words.removeprefix("vla-capture")
+        yield Command(f"vla-attention capture{rest}", command.commands, command.options, command.values)
 
 
 def _analyze_commands() -> Iterator[Command]:

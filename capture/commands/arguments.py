@@ -34,7 +34,7 @@ _FURTHER_EXAMPLES = """\
 """
 
 
-def build_parser(given: Sequence[str] = ()) -> argparse.ArgumentParser:
+def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> argparse.ArgumentParser:
     """Return the parser of `vla-capture`. In parsed arguments, `command` is the function to call.
 
     given: what will be parsed; `rerun` takes the model options of the family whose store is among it.
@@ -42,7 +42,7 @@ def build_parser(given: Sequence[str] = ()) -> argparse.ArgumentParser:
     families = policy_families()
     examples = "".join(family.examples for family in families)
     parser = OneSentenceParser(
-        prog="vla-capture",
+        prog=program,
         description="Run a policy in simulation and record the attention rows of its action queries.",
         epilog=f"examples:\n{examples}{_FURTHER_EXAMPLES}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
