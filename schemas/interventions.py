@@ -168,13 +168,13 @@ class PromptChange:
 
     def describe(self) -> str:
         """The intervention in words."""
-        pairs = [f"{visible(word)} by {visible(synonym)}" for word, synonym in self.synonyms.items()]
+        pairs = [f"'{visible(word)}' replaced by '{visible(synonym)}'" for word, synonym in self.synonyms.items()]
         return {
             "empty": "the instruction empty",
             "shuffled": f"the instruction's words shuffled (seed {self.seed})",
             "task": f"the instruction of task {self.task_id}",
             "text": f"the instruction '{visible(self.text)}'",
-            "synonyms": f"{len(self.synonyms)} words replaced by synonyms ({listing(pairs, 6)})",
+            "synonyms": listing(pairs, 6),
         }[self.kind]
 
 

@@ -5,10 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from vla_attention.analyze.effects.conditions import FLOORS, Kind
 from vla_attention.analyze.effects.effect_study import EffectStudy
 from vla_attention.analyze.effects.group_rows import GroupRow, group_rows, readers_of
 from vla_attention.analyze.effects.item_rows import MODALITIES, ItemRow, item_rows, ratio_of_effects
+from vla_attention.analyze.effects.over_time import shares_of_dimensions
+from vla_attention.analyze.measures.alignment import GRIPPER
 from vla_attention.analyze.ratios.answer import ratio_sentence
 from vla_attention.analyze.show.findings import findings
 from vla_attention.analyze.show.numbers import format_interval, format_number, row_interval
@@ -46,11 +50,19 @@ def answer_lines(study: EffectStudy) -> list[str]:
 
 def item_lines(study: EffectStudy, items: Sequence[ItemRow]) -> list[str]:
     """The sentences about effects that were recorded: which word decides, by which way, and how much pictures do."""
+    return [*word_lines(study, items), *side_lines(study, items)]
+
+
+def word_lines(study: EffectStudy, items: Sequence[ItemRow]) -> list[str]:
+    """Which word decides, by which way, what attention says, and what another noise seed does."""
     words = [item for item in items if item.kind == "word"]
-    lines = [_deciding(words)] if words else []
-    lines += [_unlike_attention(words)] if words else []
-    lines.append(_ratios(study))
-    lines.append(noise_sentence(study))
+    of_words = [_deciding(words), mostly_one_dimension(study, words[0]), _unlike_attention(words)] if words else []
+    return [line for line in (*of_words, noise_sentence(study)) if line]
+
+
+def side_lines(study: EffectStudy, items: Sequence[ItemRow]) -> list[str]:
+    """Pictures against text, and which items exceed the noise."""
+    lines = [_ratios(study)]
     known = [item for item in items if item.strongest["minus_noise"] is not None]
     if known:
         q_values = [1.0 if item.strongest["minus_noise"] <= 0 else item.strongest["minus_noise_q"] for item in known]
@@ -90,8 +102,8 @@ def _deciding(words: Sequence[ItemRow]) -> str:
     said = f"{first.name} has the largest effect of {plural(len(words), 'word')}: "
     said += f"{'without it' if total else 'hidden from the action queries,'} the action changes by "
     said += f"{_effect(first.strongest)} of its spread."
-    large = [word for word in words if _at_least_half(word.strongest["effect"], first.strongest["effect"])]
-    large = [word for word in large if (word.strongest["minus_noise"] or 0.0) > 0]
+    # Every word beyond the noise: the largest effect may be one that each task has, and another word may choose.
+    large = [word for word in words if (word.strongest["minus_noise"] or 0.0) > 0]
     if not large:
         return f"{said} Another noise seed changes it as much."
     large = [word for word in large if {"total", "direct"} <= set(word.by_reader)]
@@ -111,6 +123,33 @@ def _deciding(words: Sequence[ItemRow]) -> str:
         parts.append(f"hidden from the action queries alone, {these} it by {span}")
     text = "; ".join(parts)
     return f"{said} {text[:1].upper()}{text[1:]}." if text else said
+
+
+#: So much of a squared effect in one dimension is said: the size is then that of this dimension's unit.
+_MOST_OF_IT = 0.8
+
+
+def mostly_one_dimension(study: EffectStudy, item: ItemRow) -> str:
+    """That an effect is nearly all in one dimension of the action, with what the movement does; empty where not."""
+    row = item.strongest
+    shares = shares_of_dimensions(study, row["condition"])
+    used = study.spread.used.sum()
+    if used < 2 or shares.max(initial=0.0) < _MOST_OF_IT:
+        return ""
+    dimension = int(shares.argmax())
+    known = row["angle"] is not None
+    gripper = " (the gripper)" if known and dimension == len(shares) + GRIPPER else ""
+    said = (
+        f"Of this, {shares[dimension]:.0%} is dimension {dimension}{gripper} of the action, whose spread in this store "
+        f"is {format_number(study.spread.spread[dimension])}: "
+    )
+    others = " ".join(str(i) for i in np.flatnonzero(study.spread.used) if i != dimension)
+    if known:
+        said += (
+            f"the gripper's command is reversed in {row['gripper_flips']:.0%} of the steps, and the movement turns by "
+            f"{format_number(row['angle'])} degrees. "
+        )
+    return f"{said}Without that dimension: --dimensions {others}."
 
 
 def _at_least_half(part: float | None, whole: float | None) -> bool:
@@ -184,8 +223,8 @@ def noise_sentence(study: EffectStudy) -> str:
         return f"{said}: make one with vla-capture {command}."
     texts = [f"{format_number(row['effect'])}{_interval(row, 'effect')}" for row in rows]
     return (
-        f"Another noise seed on the same inputs changes the action by {', '.join(texts)} of its spread: the floor of "
-        "every effect."
+        f"Another noise seed on the same inputs changes the action by {', '.join(texts)} of its spread: a smaller "
+        "effect cannot be told from chance."
     )
 
 

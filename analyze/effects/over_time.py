@@ -10,6 +10,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.effects.action_changes import counted
 from vla_attention.analyze.effects.conditions import Condition, Kind, reader_of
 from vla_attention.analyze.effects.effect_study import EffectStudy, recorded_study
 from vla_attention.analyze.effects.item_rows import MODALITIES, item_rows
@@ -124,6 +125,25 @@ def early_and_late(study: EffectStudy) -> str:
         if None not in ends:
             parts.append(f"{word.name} {' and '.join(map(format_number, ends))}")
     return f"Without it the action changes in the first and in the last third by: {', '.join(parts)}." if parts else ""
+
+
+def shares_of_dimensions(study: EffectStudy, name: str) -> Array:
+    """How the squared effect of a recorded condition is shared by the dimensions of the action, (dimension,).
+
+    name: of the condition. 0 for dimensions that are not compared, and everywhere where nothing changed.
+    """
+    condition = next(one for one in study.conditions if one.name == name)
+    used, squares = study.spread.used, np.zeros(len(study.spread.spread))
+    for item in study.question.selected:
+        effects = item.episode.attributes.effects
+        if effects is None or not condition.recorded:
+            continue
+        base = BaseEpisode.of(item)
+        change = actions_of(base, item.episode, condition) - base.actions
+        change = np.where(np.isfinite(change), change, 0.0) * counted(base.executed, change.shape[1])[..., None]
+        squares[used] += ((change[..., used] / study.spread.spread[used]) ** 2).sum(axis=(0, 1))
+    total = squares.sum()
+    return squares / total if total > 0 else squares
 
 
 def _changes(study: EffectStudy) -> Iterator[tuple[BaseEpisode, Condition, Array]]:

@@ -35,7 +35,7 @@ _STYLES: dict[str, dict[str, Any]] = {
     "other": {"color": "#009E73", "marker": "D", "label": "other change"},
 }
 #: Points of one row stand a little apart.
-_OFFSETS = {"without": -0.16, "direct": 0.0, "only": 0.16, "random": 0.0, "other": 0.0}
+_OFFSETS = {"without": -0.2, "direct": -0.07, "only": 0.2, "random": 0.07, "other": 0.0}
 _NOISE_COLOR = "#C9B8D8"
 #: Rows in the picture; the tables have all.
 _MOST = 40
@@ -43,6 +43,8 @@ _MOST = 40
 _MOST_REACH = 3.0
 #: The same of effects.
 _MOST_EFFECT = 1.5
+#: Effects that differ by a larger factor are drawn on a logarithmic axis.
+_WIDE = 50
 
 
 @dataclass(frozen=True)
@@ -136,8 +138,14 @@ def _effects_panel(axes: Axes, rows: list[_Row], noise: list[dict[str, Any]]) ->
     points = [point for row in rows for point in row.points.values()]
     most = max(point["effect"] for point in [*points, *noise])
     ends = [min(point["effect_high"] or 0.0, _MOST_EFFECT * most) for point in points]
-    axes.set_xlim(0, 1.05 * max([most, *ends]) or 1.0)
-    axes.set_xlabel("effect: change of the action in standard deviations of the base's actions")
+    values = [point["effect"] for point in [*points, *noise] if point["effect"] > 0]
+    wide = bool(values) and max(values) > _WIDE * min(values)
+    if wide:  # a linear axis would draw all but the largest ones at its end
+        ratio_axis(axes.xaxis, np.array([*values, *[end for end in ends if end > 0]]))
+    else:
+        axes.set_xlim(0, 1.05 * max([most, *ends]) or 1.0)
+    log = " (log)" if wide else ""
+    axes.set_xlabel(f"effect: change of the action in standard deviations of the base's actions{log}")
     axes.grid(axis="x")
     _legend(axes, {kind for row in rows for kind in row.points}, bool(noise))
 

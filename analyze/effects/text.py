@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from vla_attention.analyze.effects.action_changes import MOSTLY_NOISE
-from vla_attention.analyze.effects.answer import answer_lines, beyond
+from vla_attention.analyze.effects.answer import answer_lines, beyond, side_lines, word_lines
 from vla_attention.analyze.effects.conditions import FLOORS, READERS, Condition, Kind, Reader
 from vla_attention.analyze.effects.effect_study import EffectStudy, recorded_study
 from vla_attention.analyze.effects.group_rows import GroupRow, group_rows
@@ -51,8 +51,9 @@ _EFFECT_NOTE = (
 
 _READER_NAMES: dict[Reader, str] = {"total": "all", "direct": "action", "pictures": "pictures", "text": "text"}
 _ITEM_NOTE = (
-    "Change of the {which} actions, in their spread, when nobody reads the item (all), or only these do not: the "
-    "action queries, pictures, text. direct/all: the action queries' share. lift: of the base's attention."
+    "Change of the {which} actions, in their spread. all: nobody reads it; action (queries), pictures, text: these "
+    "alone do not. lift: of attention. turn: of the movement, degrees; grip: steps with the gripper reversed. {about} "
+    "Effects do not add up."
 )
 
 
@@ -79,7 +80,8 @@ def _header(study: EffectStudy) -> list[Section]:
     title = "EFFECTS: what the action does without what it could look at or read"
     lines = study.question.header(title, study.analysis.overall["layer"])
     measured = f"Effects were measured in {of_tasks(*study.measured)}." if study.conditions else ""
-    return [Section([lines, measured]), Section(answer_lines(study))]
+    items = item_rows(study) if study.is_recorded else []
+    return [Section([lines, measured]), Section(word_lines(study, items) if items else answer_lines(study))]
 
 
 def group_table(study: EffectStudy, caption: str = "") -> Table:
@@ -134,7 +136,7 @@ def recorded_sections(stores: Sequence[Store], settings: AnalysisSettings, kind:
     if study is None:
         return []
     table = item_table(study, kind)
-    note = f"{_ITEM_NOTE.format(which=counted_actions(study))} More: vla-analyze effects {stores[0].path}"
+    note = f"{_item_note(study)} More: vla-analyze effects {stores[0].path}"
     return [Section([table, note], title)] if table.rows else []
 
 
@@ -144,7 +146,10 @@ def item_table(study: EffectStudy, kind: str | None = None) -> Table:
     kind: only those with such a selector.
     """
     items = [item for item in item_rows(study) if kind in (None, item.kind)]
+    # Words first: they are what one asks for, and a screen has room for few rows.
+    items.sort(key=lambda item: item.kind != "word")
     shown = [reader for reader in READERS if any(reader in item.by_reader for item in items)]
+    moves = any(item.strongest["angle"] is not None for item in items)
 
     def of(reader: Reader) -> Column:
         return number(_READER_NAMES[reader], lambda item: item.effect(reader))
@@ -154,15 +159,14 @@ def item_table(study: EffectStudy, kind: str | None = None) -> Table:
 
     columns = [
         texts("item", lambda item: broken(item.name, 24), left=True),
-        number("keys", strongest("keys")),
         number("lift", strongest("lift"), "lift"),
         of(shown[0]) if shown else number("effect", strongest("effect")),
         interval("effect", INTERVAL, of=lambda item: item.strongest),
         *map(of, shown[1:]),
-        percent("direct/all", lambda item: item.direct_share, decimals=0),
         number("x noise", strongest("over_noise"), "times the noise"),
-        number("random", strongest("random"), "random keys"),
     ]
+    if moves:
+        columns += [number("turn", strongest("angle"), "turn"), percent("grip", strongest("gripper_flips"), decimals=0)]
     return Table(columns, items)
 
 
@@ -170,9 +174,12 @@ def _items(study: EffectStudy) -> list[Section]:
     table = item_table(study)
     if not table.rows:
         return _groups(study)
-    note = _ITEM_NOTE.format(which=counted_actions(study))
-    about = f"{interval_note(DEFAULT_LEVEL, study.question.units.words)} Effects do not add up."
-    return [Section([table, note, about], "WITHOUT IT  effect on the action, by who no longer reads it")]
+    return [Section([table, _item_note(study)], "WITHOUT IT  effect on the action, by who no longer reads it")]
+
+
+def _item_note(study: EffectStudy) -> str:
+    about = interval_note(DEFAULT_LEVEL, study.question.units.words)
+    return _ITEM_NOTE.format(which=counted_actions(study), about=about)
 
 
 #: Rows of the printed course of effects; the table and the picture have every bin.
@@ -323,7 +330,7 @@ def _tasks(study: EffectStudy) -> list[Section]:
 
 
 def _families(study: EffectStudy) -> list[Section]:
-    """All pictures against all text, by family of tasks."""
+    """All pictures against all text, over everything and by family of tasks."""
     columns = [
         texts("family", lambda row: broken(row["family"] or "(none)", 40), left=True),
         count("tasks", "num_tasks"),
@@ -337,8 +344,10 @@ def _families(study: EffectStudy) -> list[Section]:
         "Effect without all pictures, without all text, and their quotient. attention: the ratio visual / linguistic "
         "of the same episodes, geometric mean."
     )
-    rows = ratios_by_family(study)
-    return [Section([Table(columns, rows), note], "BY FAMILY OF TASKS  pictures against text")] if rows else []
+    rows, items = ratios_by_family(study), item_rows(study)
+    said = side_lines(study, items) if items else []
+    parts: list[Table | str] = [*said, *((Table(columns, rows), note) if rows else ())]
+    return [Section(parts, "PICTURES AGAINST TEXT")] if parts else []
 
 
 def _most_telling(study: EffectStudy) -> list[Condition]:

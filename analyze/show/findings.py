@@ -32,10 +32,14 @@ def findings(
     named = [name for name, q in zip(names, q_values, strict=True) if q is not None and q <= level]
     shared = f": {NAMED_AT:g} shared by {num_sentences} sentences" if num_sentences > 1 else ""
     bound = f"(q <= {level:g}{shared})"
+    # Items of a single task, or without a second episode, have no interval.
+    of = plural(len(tested), kind)
+    if len(tested) < len(names):
+        of = f"the {len(tested)} of {plural(len(names), kind)} that can be tested"
     if not named:
-        return f"Of {plural(len(tested), kind)}, none shows {what} {bound}."
+        return f"Of {of}, none shows {what} {bound}."
     verb = "shows" if len(named) == 1 else "show"
-    return f"Of {plural(len(tested), kind)}, {len(named)} {verb} {what} {bound}: {listing(named, 8)}."
+    return f"Of {of}, {len(named)} {verb} {what} {bound}: {listing(named, 8)}."
 
 
 def apart_note(leaders: Sequence[NamedLeader], column: str) -> str:

@@ -58,8 +58,8 @@ def test_in_words():
         "the keys of 'word:bowl | camera:base' knocked out with the weight 0.5 for the action queries, layers 0, 3, "
         "denoise steps 9; random keys (seed 3), as many as all keys but 'camera:base' knocked out for all queries, "
         "heads 1; the keys of 'role:image' knocked out for the prefix's queries of 'role:instruction'; attention made "
-        "uniform inside 'camera:base'; attention to 'role:image' times 0.25; 1 words replaced by synonyms (bowl by "
-        "dish); camera 'base' shifted by 3, -2 patches; camera 'base' masked 'bowl_1'; the noise of seed 4"
+        "uniform inside 'camera:base'; attention to 'role:image' times 0.25; 'bowl' replaced by "
+        "'dish'; camera 'base' shifted by 3, -2 patches; camera 'base' masked 'bowl_1'; the noise of seed 4"
     )
 
 

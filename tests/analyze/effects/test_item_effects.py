@@ -9,10 +9,13 @@ import polars as pl
 import pytest
 
 from tests.kit.planted_effects import FIRST, ITEMS, RANDOM, READERS, WORDS, conditions, planted_effects
-from vla_attention.analyze.effects.answer import item_lines
+from vla_attention.analyze.effects.answer import item_lines, mostly_one_dimension
 from vla_attention.analyze.effects.effect_study import study_effects
 from vla_attention.analyze.effects.item_rows import item_rows, ratio_of_effects, ratios_by_family
+from vla_attention.analyze.effects.over_time import shares_of_dimensions
+from vla_attention.analyze.effects.text import item_table
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.show.findings import findings
 from vla_attention.testing.stores import StoreSpec, write_store
 from vla_attention.testing.tokens import INSTRUCTIONS
 
@@ -147,3 +150,40 @@ def test_each_family_has_its_ratio_of_effects(tmp_path):
 
 def test_one_family_is_no_table(study):
     assert ratios_by_family(study) == []
+
+
+def in_one_dimension(task, episode, replan, tokens):
+    """The effects of the first word are all in the gripper's dimension; those of others in every dimension."""
+    given = planted_effects()(task, episode, replan, tokens)
+    change = given.change.copy()
+    for row, number in zip(change, given.measured, strict=True):
+        if given.conditions[number].name.startswith(f"without_word_{FIRST}"):
+            row[:, :-1] = 0.0
+    return replace(given, change=change)
+
+
+def test_an_effect_in_one_dimension_is_said_with_what_the_movement_does(tmp_path):
+    path = write_store(tmp_path / "one.zarr", tasks=(0,), episodes=3, replans=3, plant_effects=in_one_dimension)
+    study = study_effects(path, [], AnalysisSettings(intervals="these-tasks"))
+    items = [item for item in item_rows(study) if item.name == f"'{FIRST}'"]
+    np.testing.assert_allclose(shares_of_dimensions(study, items[0].strongest["condition"]), [0] * 6 + [1], atol=1e-9)
+    said = mostly_one_dimension(study, items[0])
+    assert "100% is dimension 6" in said
+    assert "--dimensions 0 1 2 3 4 5" in said
+    (other,) = [item for item in item_rows(study) if item.name == "visual"]
+    squares = (1 / study.spread.spread) ** 2
+    np.testing.assert_allclose(
+        shares_of_dimensions(study, other.strongest["condition"]), squares / squares.sum(), rtol=1e-6
+    )
+    assert mostly_one_dimension(study, other) == ""
+
+
+def test_words_stand_before_parts_and_pictures(study):
+    kinds = [row.kind == "word" for row in item_table(study).rows]
+    assert kinds == sorted(kinds, reverse=True)
+
+
+def test_items_that_cannot_be_tested_are_counted():
+    said = findings([0.01, None, 0.2], ["a", "b", "c"], "item", "an effect")
+    assert said == "Of the 2 of 3 items that can be tested, 1 shows an effect (q <= 0.05): a."
+    assert findings([None], ["a"], "item", "an effect") == "None of 1 item can be tested."

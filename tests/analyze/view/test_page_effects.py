@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -311,3 +312,23 @@ def test_as_many_steps_count_as_were_executed(tmp_path):
         )
         expected.append([min(6, replan_steps, int(n)) for n in np.diff([*starts, end])])
     assert json.loads(run_in_node("page_executed.mjs", tmp_path, cases)) == expected
+
+
+def test_an_effect_in_one_dimension_is_said(tmp_path):
+    """As `mostly_one_dimension` of analyze/effects/answer.py."""
+
+    def in_the_last(task: int, episode: int, replan: int, tokens: EpisodeTokens) -> ReplanEffects:
+        sizes: Sizes = {"noise": (0.1, 0, 0, 0), "bowl": (5.0, 5.0, 0, 0), "put": (1.0, 0, 0, 0)}
+        given = planted(sizes, task, episode, replan, tokens)
+        change = given.change.copy()
+        for row, number in zip(change, given.measured, strict=True):
+            if "word_bowl" in given.conditions[number].name:
+                row[:, :-1] = 0.0
+        return replace(given, change=change)
+
+    store = write_store(tmp_path / "a.zarr", spec=StoreSpec(tasks=(0,), episodes=1, plant_effects=in_the_last))
+    (answer,) = answers_of([store])
+    sentence, _ = answer["effects"]["sentences"]
+    study = study_effects(store, [], AnalysisSettings())
+    said = "Of the effect of 'bowl' in this episode, 100% is dimension 6 of the action, whose spread in the store is "
+    assert f"{said}{study.spread.spread[6]:.3f}." in sentence

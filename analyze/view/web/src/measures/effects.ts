@@ -17,6 +17,8 @@ export interface Item {
   /** The one part of its selector; null for a composed one. */
   readonly atom: Atom | null;
   readonly by: Partial<Record<Reader, Float64Array>>;
+  /** How its squared effect is shared by the dimensions of the action, over the episode: (dimension). */
+  readonly shares: Partial<Record<Reader, Float64Array>>;
 }
 
 export interface EpisodeEffects {
@@ -27,6 +29,8 @@ export interface EpisodeEffects {
   readonly noise: Float64Array | null;
   /** The unchanged call, made again among the changed ones. */
   readonly unchanged: Float64Array | null;
+  /** The unit of each dimension; null for what is not compared. */
+  readonly spread: readonly (number | null)[];
 }
 
 /** Effects over some replans: their mean, the smallest and the largest, and how many there are. */
@@ -67,8 +71,8 @@ export function executedSteps({ protocol }: RootDocument, document: EpisodeDocum
   return [...lasts, last].map((count) => Math.min(horizon, count, protocol.replan_steps));
 }
 
-/** Size of each entry's change (entry): `root_mean_square_change` of analyze/effects/action_changes.py. */
-function changeSizes(
+/** Squares of each entry's change (entry, dimension), of the executed steps; NaN for an entry that was not measured. */
+function changeSquares(
   change: { values: ArrayLike<number>; shape: readonly number[] },
   { units, replan }: EffectsDocument,
   spread: readonly (number | null)[],
@@ -76,16 +80,27 @@ function changeSizes(
 ): Float64Array {
   const [entries, horizon, size] = change.shape as [number, number, number];
   const used = spread.flatMap((one, i) => (one === null ? [] : [{ i, factor: units[i]! / one }]));
-  return Float64Array.from({ length: entries }, (_, entry) => {
+  const squares = new Float64Array(entries * size);
+  for (let entry = 0; entry < entries; entry++) {
     const first = entry * horizon * size;
-    // As in Python, a chunk with a value that is no number was not measured.
-    for (let at = first; at < first + horizon * size; at++) if (!Number.isFinite(change.values[at]!)) return NaN;
     const steps = executed[replan[entry]!] ?? 0;
-    let sum = 0;
-    for (let step = 0; step < steps; step++) {
-      for (const { i, factor } of used) sum += (change.values[first + step * size + i]! * factor) ** 2;
+    // As in Python, a chunk with a value that is no number was not measured.
+    let measured = steps > 0;
+    for (let at = first; at < first + horizon * size; at++) measured &&= Number.isFinite(change.values[at]!);
+    if (!measured) squares.fill(NaN, entry * size, (entry + 1) * size);
+    for (let step = 0; measured && step < steps; step++) {
+      for (const { i, factor } of used) squares[entry * size + i]! += (change.values[first + step * size + i]! * factor) ** 2;
     }
-    return steps > 0 && used.length ? Math.sqrt(sum / used.length / steps) : NaN;
+  }
+  return squares;
+}
+
+/** Size of each entry's change (entry): `root_mean_square_change` of analyze/effects/action_changes.py. */
+function changeSizes(squares: Float64Array, size: number, { replan }: EffectsDocument, spread: readonly (number | null)[], executed: readonly number[]): Float64Array {
+  const used = spread.filter((one) => one !== null).length;
+  return Float64Array.from(replan, (at, entry) => {
+    const sum = squares.subarray(entry * size, (entry + 1) * size).reduce((a, b) => a + b, 0);
+    return used ? Math.sqrt(sum / used / executed[at]!) : NaN;
   });
 }
 
@@ -119,7 +134,17 @@ export function episodeEffects(
   spread: readonly (number | null)[],
   executed: readonly number[],
 ): EpisodeEffects {
-  const sizes = changeSizes(change, effects, spread, executed);
+  const size = change.shape[2]!;
+  const squares = changeSquares(change, effects, spread, executed);
+  const sizes = changeSizes(squares, size, effects, spread, executed);
+  const shares = effects.conditions.map(() => new Float64Array(size));
+  effects.condition.forEach((which, entry) => {
+    for (let i = 0; i < size; i++) shares[which]![i]! += squares[entry * size + i] || 0;
+  });
+  for (const each of shares) {
+    const total = each.reduce((a, b) => a + b, 0);
+    each.forEach((part, i) => (each[i] = total > 0 ? part / total : 0));
+  }
   const values = effects.conditions.map(() => new Float64Array(executed.length).fill(NaN));
   effects.condition.forEach((which, entry) => (values[which]![effects.replan[entry]!] = sizes[entry]!));
   const found = { items: new Map<string, Item>(), random: new Map<string, Item>() };
@@ -137,9 +162,10 @@ export function episodeEffects(
     const of = knockout.random_seed === null ? found.items : found.random;
     const atom = onlyAtom(knockout.selector);
     const name = itemName(condition, atom);
-    if (!of.has(name)) of.set(name, { name, atom, by: {} });
+    if (!of.has(name)) of.set(name, { name, atom, by: {}, shares: {} });
     of.get(name)!.by[reader] = values[i]!;
+    of.get(name)!.shares[reader] = shares[i]!;
   });
   const known = ({ by }: Item): boolean => by.total !== undefined || by.direct !== undefined;
-  return { items: [...found.items.values()].filter(known), random: [...found.random.values()], noise, unchanged };
+  return { items: [...found.items.values()].filter(known), random: [...found.random.values()], noise, unchanged, spread };
 }

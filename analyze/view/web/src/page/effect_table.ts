@@ -4,7 +4,7 @@ import { element } from "./dom";
 import { formatNumber } from "./number_text";
 import type { Shown } from "./shown";
 
-const HEADS = { total: "all", direct: "action", pictures: "pictures", text: "text" } as const;
+const HEADS = { total: "hidden from everybody", direct: "action queries", pictures: "pictures", text: "text" } as const;
 
 export class EffectTable {
   readonly host = element("details", { class: "effects", hidden: true }, element("summary", {}, "Effects of words, parts and cameras"));
@@ -51,7 +51,7 @@ export class EffectTable {
     const where = at === null ? "Means over the replans at which the item was measured" : `At replan ${at}`;
     this.#about.textContent =
       `${where}: root mean square change of the executed actions, each dimension in units of its spread in the store, when no query ` +
-      "reads the item (all), or these alone do not: the action queries, the pictures, the text. Effects do not add up. " +
+      "reads the item, or these alone do not: the action queries, the pictures, the text. Effects do not add up. " +
       "vla-analyze effects has intervals over episodes, and exchanged words and pictures.";
   }
 }

@@ -1,9 +1,11 @@
 /** What recorded effects say of the words, in sentences: the wording of analyze/effects/answer.py. */
 import { findPhrase, type Word } from "../grouping/words";
 import { type EpisodeEffects, type Item, type Reader, READERS, sizesOf, type Sizes, strongest } from "../measures/effects";
-import { formatNumber, plural } from "./number_text";
+import { formatNumber, formatPercent, plural } from "./number_text";
 
 const MOST_NAMED = 8;
+/** So much of a squared effect in one dimension is said, as in analyze/effects/answer.py. */
+const MOST_OF_IT = 0.8;
 const ALONE: Readonly<Partial<Record<Reader, string>>> = { direct: "the action queries", pictures: "the pictures", text: "the text" };
 
 /** The item of each word, null without one. All places of a word in the instruction are one item. */
@@ -57,9 +59,7 @@ export function decidingWord(effects: EpisodeEffects, replan: number | null): st
   const without = first.by.total ? "without it" : "hidden from the action queries,";
   const said = `${first.name} has the largest effect of ${plural(words.length, "word")}${where}: ${without} the action changes by ${largest} of its spread.`;
   const of = (item: Item, reader: Reader): number => sizesOf(item.by[reader], replan).mean;
-  const large = words.filter(
-    (item) => item.by.total && item.by.direct && atLeastHalf(size(item), size(first)) && !(size(item) <= floor),
-  );
+  const large = words.filter((item) => item.by.total && item.by.direct && !(size(item) <= floor));
   const own = large.filter((item) => atLeastHalf(of(item, "direct"), of(item, "total")));
   const others = large.filter((item) => !own.includes(item));
   const through = others.filter((item) => atLeastHalf(of(item, "pictures"), of(item, "total")));
@@ -74,9 +74,15 @@ export function decidingWord(effects: EpisodeEffects, replan: number | null): st
     const span = [...new Set([amounts[0], amounts.at(-1)].map(formatNumber))].join(" to ");
     ways.push(`hidden from the action queries alone, ${others.length === 1 ? "that one changes" : "these change"} it by ${span}`);
   }
+  const shares = first.shares.total ?? first.shares.direct!;
+  const dimension = shares.indexOf(Math.max(...shares));
+  const mostly =
+    shares[dimension]! >= MOST_OF_IT && effects.spread.filter((one) => one !== null).length > 1
+      ? `Of the effect of ${first.name} in this episode, ${formatPercent(shares[dimension]!, 0)} is dimension ${dimension} of the action, whose spread in the store is ${formatNumber(effects.spread[dimension]!)}.`
+      : "";
   const text = ways.join("; ");
   const noise = Number.isNaN(floor)
     ? `No other noise seed was tried${where}, so nobody knows the floor of these effects.`
-    : `Another noise seed on the same inputs changes the action by ${formatNumber(floor)} of its spread: the floor of every effect.`;
-  return [said, text ? `${text[0]!.toUpperCase()}${text.slice(1)}.` : "", noise].filter(Boolean).join(" ");
+    : `Another noise seed on the same inputs changes the action by ${formatNumber(floor)} of its spread: a smaller effect cannot be told from chance.`;
+  return [said, text ? `${text[0]!.toUpperCase()}${text.slice(1)}.` : "", mostly, noise].filter(Boolean).join(" ");
 }

@@ -4,6 +4,7 @@ import type { HeadRows } from "../store/episode";
 import { sentenceOf } from "../store/errors";
 import { uniformKeys } from "./baselines";
 import { element } from "./dom";
+import { itemsOfWords, wordEffect } from "./effect_words";
 import { formatNumber, formatPercent } from "./number_text";
 import type { PictureBoard } from "./picture_board";
 import type { Shown } from "./shown";
@@ -108,13 +109,20 @@ export class Inspector {
     );
   }
 
+  /** What the word does to the action, where words are shaded by that; else nothing. */
+  #effect({ effects, state, replan, words }: Shown, place: number): string {
+    if (!effects?.known || state.words === "attention") return "";
+    const item = itemsOfWords(effects.known, words)[place] ?? null;
+    return `${wordEffect(item, effects.known, state.words === "replan" ? replan : null).said}. `;
+  }
+
   async #word(place: number): Promise<void> {
     const shown = this.#shown;
     const word = shown?.words[place];
     if (!shown || !word) return;
     const asked = ++this.#asked;
     const { mass, lift } = measuresOfKeys(word.keys, shown);
-    const start = `"${word.text}": ${formatPercent(mass, 2)} of all attention, lift ${formatNumber(lift)}`;
+    const start = `"${word.text}": ${this.#effect(shown, place)}${formatPercent(mass, 2)} of all attention, lift ${formatNumber(lift)}`;
     this.host.textContent = `${start}.`;
     try {
       const { site, episode, selection, replan } = shown;

@@ -42,6 +42,8 @@ export function otherSites(episode: Episode, has: (span: SpanDocument) => boolea
 const LEAST_TOP = 4;
 /** Opacity of a full shade in per cent: the word stays legible on it. */
 const MOST_SHADE = 52;
+/** Part of a full shade of an effect that is just above the noise floor. */
+const LEAST_PART = 0.25;
 
 export class WordStrip {
   readonly host = element("div", { class: "words" });
@@ -123,17 +125,21 @@ export class WordStrip {
     const items = itemsOfWords(effects, words);
     const found = items.map((item) => wordEffect(item, effects, replan));
     const top = Math.max(...found.filter(({ below }) => !below).map(({ size }) => size.mean || 0), 0);
+    const from = sizesOf(effects.noise, replan).mean;
+    // By factors above the floor: a single huge effect would leave the others without a shade.
+    const part = (mean: number): number =>
+      from > 0 && top > from ? LEAST_PART + (1 - LEAST_PART) * (Math.log(mean / from) / Math.log(top / from)) : mean / top;
     found.forEach(({ size, below, said }, i) => {
       const together = items[i] && items.indexOf(items[i]) !== items.lastIndexOf(items[i]) ? ", all its places together" : "";
       const attention = attentionText(measures[i]!);
-      this.#shade(i, below ? 0 : size.mean / top, formatNumber(size.mean), `${said}${together}`, `${said}${together}. ${attention}.`);
+      this.#shade(i, below ? 0 : part(size.mean), formatNumber(size.mean), `${said}${together}`, `${said}${together}. ${attention}.`);
       this.#buttons[i]!.classList.toggle("below", below);
       this.#buttons[i]!.dataset.effect = String(size.mean);
     });
     const full = top > 0 ? ` (full shade ${formatNumber(top)})` : "";
     const floor = formatNumber(sizesOf(effects.noise, replan).mean);
     const below = found.some((one) => one.below) ? ` Dashed and without a shade: below the noise floor, ${floor}.` : "";
-    return `Shade and number of a word: how far the action changes without it, in units of its spread in the store${full}.${below}`;
+    return `Shade and number of a word: how far the action changes without it, in units of its spread in the store${full}; shades go by factors.${below}`;
   }
 
   #build({ prompt, words, episode }: Shown): void {
