@@ -52,8 +52,8 @@ _EFFECT_NOTE = (
 _READER_NAMES: dict[Reader, str] = {"total": "all", "direct": "action", "pictures": "pictures", "text": "text"}
 _ITEM_NOTE = (
     "Change of the {which} actions, in their spread. all: nobody reads it; action (queries), pictures, text: these "
-    "alone do not. lift: of attention. turn: of the movement, degrees; grip: steps with the gripper reversed. {about} "
-    "Effects do not add up."
+    "alone do not; direct: action / all. lift: of attention. turn: of the movement, degrees; grip: steps with the "
+    "gripper reversed. {about} Effects do not add up."
 )
 
 
@@ -163,6 +163,7 @@ def item_table(study: EffectStudy, kind: str | None = None) -> Table:
         of(shown[0]) if shown else number("effect", strongest("effect")),
         interval("effect", INTERVAL, of=lambda item: item.strongest),
         *map(of, shown[1:]),
+        percent("direct", lambda item: item.direct_share, decimals=0),
         number("x noise", strongest("over_noise"), "times the noise"),
     ]
     if moves:
