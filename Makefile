@@ -46,8 +46,8 @@ PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 .PHONY: capture analyze test test-policies test-remote test-slurm notebooks fuzz test-thorough check unit package audit setup setup-analyze schemas docs pictures screenshots viewer clean
 
 capture: .venv/capture-installed
-	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --store $(STORE) \
-	  $(CAPTURE_ARGS) $(if $(SEED),--seed $(SEED)) $(if $(TASK_ID),--task-id $(TASK_ID)) $(if $(LAYERS),--layers $(LAYERS)) $(ARGS)
+	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --output $(STORE) \
+	  $(CAPTURE_ARGS) $(if $(SEED),--seed $(SEED)) $(if $(TASK_ID),--task $(TASK_ID)) $(if $(LAYERS),--layers $(LAYERS)) $(ARGS)
 
 analyze: .venv/analyze-installed
 	$(BIN)/vla-analyze $(STORE) --grouping $(GROUPING) --output $(OUTPUT) $(if $(LAYERS),--layers $(LAYERS)) $(ARGS)

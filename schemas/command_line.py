@@ -18,17 +18,18 @@ from vla_attention.schemas.stop_signals import run_until_stopped
 if TYPE_CHECKING:
     from _typeshed import SupportsWrite
 
-#: Columns of a help text's description.
+#: Columns of a help text.
 _HELP_WIDTH = 100
 
 
 #: What `--help` shows of a command with more options than these; `--help-all` shows all.
-_MOST_OPTIONS = 12
+_MOST_OPTIONS = 6
+_MOST_EXAMPLES = 3
 _MAIN_OPTIONS = {
-    *("--checkpoint", "--task-suite", "--task", "--num-episodes", "--layers", "--denoise", "--effects", "--knockout"),
-    *("--output", "--resume", "--budget", "--series", "--policy", "--every", "--accept"),
-    *("--grouping", "--group", "--ratio", "--episode", "--allow-mismatch", "--reruns", "--open", "--bins", "--video"),
-    *("--csv", "--parquet", "--netcdf", "--table", "--no-plots", "--dimensions", "--per-head", "--help-all"),
+    *("--checkpoint", "--task-suite", "--task", "--num-episodes", "--effects", "--knockout", "--series", "--policy"),
+    *("--layers", "--grouping", "--group", "--ratio", "--episode", "--reruns", "--open", "--video", "--accept"),
+    *("--csv", "--parquet", "--netcdf", "--table", "--output", "--resume", "--budget", "--repair", "--packed"),
+    *("--without", "--push", "--help-all"),
 }
 
 
@@ -39,6 +40,11 @@ class _HelpAll(argparse.Action):
         parser.shows_all = True
         parser.print_help()
         parser.exit()
+
+
+class _WideHelp(argparse.RawDescriptionHelpFormatter):
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=26, width=_HELP_WIDTH)
 
 
 class OneSentenceParser(argparse.ArgumentParser):
@@ -57,7 +63,7 @@ class OneSentenceParser(argparse.ArgumentParser):
         rest = [one for one in options if not {*one.option_strings} & _MAIN_OPTIONS]
         if self.shows_all or len(options) <= _MOST_OPTIONS:
             return super().format_help()
-        kept, usage = [one.help for one in rest], self.usage
+        kept, usage, epilog, formatter = [one.help for one in rest], self.usage, self.epilog, self.formatter_class
         places = " ".join(
             f"{one.metavar or one.dest}{' ...' if one.nargs == '+' else ''}"
             for one in self._actions
@@ -67,9 +73,10 @@ class OneSentenceParser(argparse.ArgumentParser):
             for one in rest:
                 one.help = argparse.SUPPRESS
             self.usage = usage or f"%(prog)s {places} [options]".replace("  ", " ")
+            self.epilog, self.formatter_class = _first_examples(epilog), _WideHelp
             return super().format_help()
         finally:
-            self.usage = usage
+            self.usage, self.epilog, self.formatter_class = usage, epilog, formatter
             for one, text in zip(rest, kept, strict=True):
                 one.help = text
 
@@ -85,6 +92,21 @@ class OneSentenceParser(argparse.ArgumentParser):
             sys.stdout.flush()
         else:
             super()._print_message(message, file)
+
+
+def _first_examples(epilog: str | None) -> str | None:
+    """The first examples of a text below the arguments; --help-all has it whole."""
+    lines = (epilog or "").splitlines()
+    if "examples:" not in lines:
+        return epilog
+    first = lines.index("examples:")
+    last, count = first + 1, 0
+    while last < len(lines) and lines[last].startswith(" "):
+        count += not lines[last - 1].endswith("\\")
+        if count > _MOST_EXAMPLES:
+            break
+        last += 1
+    return "\n".join(lines[first:last])
 
 
 def command_parser(prog: str, description: str, examples: str = "", usage: str | None = None) -> OneSentenceParser:

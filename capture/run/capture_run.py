@@ -23,6 +23,7 @@ from vla_attention.capture.jobs.worker_records import (
 )
 from vla_attention.capture.machine.provenance import POLICY_BATCH, describe_machine
 from vla_attention.capture.policies.identity import announcement, downloads_of
+from vla_attention.capture.policies.pi.family import CUBES_POLICY
 from vla_attention.capture.policies.policy import BatchPolicy, Policy, is_compiled, stored_picture_sizes
 from vla_attention.capture.rollout.episode import EpisodeRun, check_protocol, max_replans
 from vla_attention.capture.rollout.episode_faults import EpisodesMissing, Faults, describe_missing
@@ -252,6 +253,11 @@ def _announce(
         say(line)
     if not identity.untrained:
         say(_checkpoint_line(identity))
+    if identity.checkpoint == CUBES_POLICY and not protocol.suite.startswith("cubes"):
+        say(
+            f"WARNING: {CUBES_POLICY} was trained on the suite cubes alone; in {protocol.suite} its numbers say "
+            "nothing about any policy."
+        )
     say(
         f"Protocol: {protocol.name} (docs/protocol.md), seed {protocol.seed}, pictures of {protocol.image_size} "
         f"pixels, {protocol.wait_steps} waiting steps, at most {protocol.max_steps} steps after them."

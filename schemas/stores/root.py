@@ -62,7 +62,9 @@ def read_run(path: StorePlace) -> tuple[RootAttributes, str]:
                 f"There is no store at {path}: no zarr.json was found there. Give the address of the NAME.zarr itself; "
                 "private places need the credentials of their service in the environment."
             ) from None
-        raise StoreError(f"{path} is not a store: it has no zarr.json.") from None
+        inside = sorted(entry.name for entry in path.iterdir() if entry.suffix == ".zarr") if path.is_dir() else []
+        held = f" The folder holds the stores {listing(inside, 10)}: name one, or several." if inside else ""
+        raise StoreError(f"{path} is not a store: it has no zarr.json.{held}") from None
     except (OSError, ValueError) as error:
         reason = f"its zarr.json: {error.strerror or error}" if isinstance(error, OSError) else error
         raise StoreError(f"The store {path} cannot be read: {reason}.") from None

@@ -1,0 +1,34 @@
+"""Typical first words that are none of ours, with what to type instead."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from vla_attention.schemas.errors import BadArgument
+
+#: Names of policies that are no command, and the command for them.
+_POLICIES = {
+    "pi0": "pi --checkpoint PATH",
+    "pi05": "pi --checkpoint PATH",
+    "pi0.5": "pi --checkpoint PATH",
+    "cosmos-policy": "cosmos --checkpoint PATH",
+}
+#: Policies that are called from their user's own code.
+_OWN_CODE = ("smolvla", "openvla", "openvla-oft", "act", "xvla", "x-vla", "gr00t", "groot", "diffusion", "tinyvla")
+
+
+def refuse_other_tools_words(words: Sequence[str]) -> None:
+    """Raise `BadArgument` for a policy's name in the place of a command, and for --episodes."""
+    first = words[0].casefold() if words else ""
+    if first in _POLICIES:
+        raise BadArgument(
+            f"There is no command '{words[0]}': use vla-capture {_POLICIES[first]}, or pi alone for a small one."
+        )
+    if first in _OWN_CODE:
+        raise BadArgument(
+            f"There is no command '{words[0]}': policies other than pi and Cosmos are recorded from your own code, "
+            "with va.record, or over a data set, with vla-capture replay DATASET --policy FILE.py (docs/your-policy.md)."
+        )
+    named = [word.partition("=")[0] for word in words]
+    if first not in ("replay", "doctor", "tasks") and "--episodes" in named:
+        raise BadArgument("There is no --episodes: --num-episodes N is how many of each task, --task which tasks.")
