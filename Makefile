@@ -6,7 +6,7 @@
 #   make test-thorough   more cases of attacks and damages, and ten times as many random examples (an hour or more)
 #   make test-policies   policies of transformers 5 and LeRobot, in environments of their own (.venv-transformers, .venv-lerobot)
 #   make test-remote stores in S3, on moto's server on this machine, in an environment of its own (.venv-remote)
-#   make viewer      the page of `vla-analyze view` from its sources in analyze/view/web (needs node and npm)
+#   make viewer      the page of `vla-attention view` from its sources in analyze/view/web (needs node and npm)
 #   make notebooks   the notebooks of examples/, run from beginning to end, in an environment of its own (.venv-notebooks)
 #   make fuzz        made-up bytes for every parser of files, for SECONDS=3600, in an environment of its own (.venv-fuzz)
 #   make docs        the documentation site, into site/, in an environment of its own (.venv-docs)
@@ -50,7 +50,7 @@ capture: .venv/capture-installed
 	  $(CAPTURE_ARGS) $(if $(SEED),--seed $(SEED)) $(if $(TASK_ID),--task $(TASK_ID)) $(if $(LAYERS),--layers $(LAYERS)) $(ARGS)
 
 analyze: .venv/analyze-installed
-	$(BIN)/vla-analyze $(STORE) --grouping $(GROUPING) --output $(OUTPUT) $(if $(LAYERS),--layers $(LAYERS)) $(ARGS)
+	$(BIN)/vla-attention analyze $(STORE) --grouping $(GROUPING) --output $(OUTPUT) $(if $(LAYERS),--layers $(LAYERS)) $(ARGS)
 
 test: check
 	$(MAKE) unit ARGS="--slow $(ARGS)"

@@ -104,7 +104,7 @@ class OpenStores:
         return self._analyses[wanted]
 
     def ratios(self, level: LevelName = "tasks", **settings: Unpack[SettingKeywords]) -> pl.DataFrame:
-        """Ratios as `vla-analyze ratios` gives them: one row per cell. Masses of the groups are in `masses`.
+        """Ratios as `vla-attention ratios` gives them: one row per cell. Masses of the groups are in `masses`.
 
         `level`: "tasks" (per task and over all, with intervals), "episodes", "replans" or "steps" (every replan, layer
         and denoise step). docs/python.md lists the columns.
@@ -134,7 +134,7 @@ class OpenStores:
         return tables
 
     def summary(self, **settings: Unpack[SettingKeywords]) -> str:
-        """The text that `vla-analyze STORE` prints.
+        """The text that `vla-attention analyze STORE` prints.
 
         >>> va.open(store).summary().splitlines()[0]
         'ATTENTION SUMMARY'
@@ -142,7 +142,7 @@ class OpenStores:
         return self.analysis(**settings).summary
 
     def describe(self) -> str:
-        """What the stores hold: run, layout, words, objects, tasks; the text of `vla-analyze STORE --list`.
+        """What the stores hold: run, layout, words, objects, tasks; the text of `vla-attention analyze STORE --list`.
 
         >>> "akita_black_bowl_1" in va.open(store).describe()
         True
@@ -398,7 +398,7 @@ class OpenStores:
         """Attention on the pictures of one episode: one row per (replan, camera, patch).
 
         With `folder`, a strip of pictures is drawn there, with outlines around `groups`. Without `task`, `episode` and
-        `replans`: the first episode, every replan. `vla-analyze overlay` can also make videos.
+        `replans`: the first episode, every replan. `vla-attention overlay` can also make videos.
 
         >>> patches = va.open(store).overlay(task=1, replans=0, folder=folder)
         >>> patches.height, sorted(file.suffix for file in folder.iterdir())
@@ -428,7 +428,7 @@ class OpenStores:
         replans: int | None = None,
         **settings: Unpack[SettingKeywords],
     ) -> Path:
-        """Write the self-contained HTML page of `vla-analyze report`; returns its path.
+        """Write the self-contained HTML page of `vla-attention report`; returns its path.
 
         `path`: a folder, in which `report.html` is written, or a file that ends with .html.
         `episodes`: how many are shown with pictures; `replans`: how many of each.

@@ -68,10 +68,14 @@ def _run(words: Sequence[str], program: str) -> int:
 
 
 def build_parser(name: str) -> argparse.ArgumentParser:
-    """The parser of one command with what all commands share; `""` is `vla-analyze STORE`."""
+    """The parser of one command with what all commands share; `""` is `vla-attention analyze STORE`."""
     command = import_module(f"vla_attention.analyze.{name or DEFAULT_COMMAND}.command")
     parser: argparse.ArgumentParser
-    parser = command.build_parser(prog=f"vla-analyze {name}") if name == DEFAULT_COMMAND else command.build_parser()
+    parser = (
+        command.build_parser(prog=f"vla-attention analyze {name}")
+        if name == DEFAULT_COMMAND
+        else command.build_parser()
+    )
     add_threads(
         parser,
         "threads that measure episodes, at most 4 (default: OMP_NUM_THREADS, else the cores of this process)",
@@ -80,7 +84,7 @@ def build_parser(name: str) -> argparse.ArgumentParser:
         parser.add_argument(
             "--no-cache",
             action="store_true",
-            help="measure again what was measured before (see vla-analyze cache; VLA_CACHE=off does the same)",
+            help="measure again what was measured before (see vla-attention cache; VLA_CACHE=off does the same)",
         )
     return parser
 
@@ -121,7 +125,7 @@ def _with_way_out(error: UserError, can_skip: bool) -> UserError:
     if not isinstance(error, CorruptEpisode):
         return error
     skip = "; leave such episodes out with --skip-corrupt" if can_skip else ""
-    return CorruptEpisode(f"{error} See all faults with vla-analyze verify{skip}.")
+    return CorruptEpisode(f"{error} See all faults with vla-attention verify{skip}.")
 
 
 def _refuse_misspelt_command(arguments: Sequence[str]) -> None:

@@ -28,7 +28,7 @@ KEEPING: dict[str, str] = {
     "cache": "what is kept of earlier analyses: where, how much; --clear removes it",
 }
 COMMANDS: dict[str, str] = QUESTIONS | KEEPING
-#: The command of `vla-analyze STORE`.
+#: The command of `vla-attention analyze STORE`.
 DEFAULT_COMMAND = "ratios"
 
 

@@ -47,7 +47,7 @@ from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 
 WORDS = ("--group", "soup=word:soup", "--group", "v=role:image", "--ratio", "v/soup")
 SETTINGS = AnalysisSettings(groups=("soup=word:soup", "v=role:image"), ratio="v/soup")
-#: The command of each row of the part `processes`, after `vla-analyze STORE`.
+#: The command of each row of the part `processes`, after `vla-attention analyze STORE`.
 COMMANDS = {
     "default: tables, results file, summary, pictures": (),
     "default, --no-plots": ("--no-plots",),
@@ -250,7 +250,7 @@ def measure_processes(
             row |= {f"seconds{of}": measured([cost.seconds for cost in costs])}
             row |= {f"peak{of}": max(cost.peak_mb for cost in costs)}
         rows.append(row)
-    columns = {"what": "vla-analyze STORE ..."}
+    columns = {"what": "vla-attention analyze STORE ..."}
     for name in rows[0]:
         if name != "what":
             columns[name] = name.replace("peak", "peak MB").replace(" of ", ", ")

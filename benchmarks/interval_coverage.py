@@ -19,7 +19,7 @@ Families: tasks of one family share a part of their deviation, as many per cent 
 Deviations of families and tasks are normal, or skewed (exponential, skewness 2). Coverage of the population's ratio by
 the interval of "tasks like these", whose units are the families, and by that of "independent tasks".
 
-Power: how often a paired comparison of two runs, as `vla-analyze compare` makes it, excludes 0, beside a t test over
+Power: how often a paired comparison of two runs, as `vla-attention compare` makes it, excludes 0, beside a t test over
 the task means of the differences.
 """
 

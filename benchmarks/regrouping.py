@@ -97,7 +97,7 @@ def command_table(store: Path, rounds: int, cache: Path, out: Path) -> Table:
         one("a group of words, nothing in the cache", words)
         one("a group of words, all in the cache", words)
     rows = [{"what": name, "seconds": measured(values)} for name, values in seconds.items()]
-    return Table({"what": "`vla-analyze STORE`, fifty episodes", "seconds": "seconds"}, rows)
+    return Table({"what": "`vla-attention analyze STORE`, fifty episodes", "seconds": "seconds"}, rows)
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ sys.path.insert(0, str(ROOT))
 TASKS = 10
 #: What is listed, by its name in the table; {} is the store.
 LISTINGS = {
-    "`vla-analyze STORE --list`": ("-m", "vla_attention.analyze", "{}", "--list"),
+    "`vla-attention analyze STORE --list`": ("-m", "vla_attention.analyze", "{}", "--list"),
     "`va.open(STORE).episodes`": ("-c", "import vla_attention as va; print(va.open('{}').episodes.height)"),
 }
 
@@ -157,7 +157,7 @@ def parts_rows(store: Path, rounds: int) -> Table:
     questions = {
         "spans (`--grouping cameras`)": (AnalysisSettings(grouping="cameras"), analyse),
         "words (`--group soup=word:soup --group v=role:image`)": (words, analyse),
-        "`vla-analyze words`": (AnalysisSettings(), words_table),
+        "`vla-attention words`": (AnalysisSettings(), words_table),
     }
 
     def costs_of(settings: AnalysisSettings, compute: Any) -> Costs:

@@ -46,7 +46,7 @@ def printed(*arguments: str) -> str:
         plots = () if arguments[0] == "groups" else ("--no-plots", "--output", "out")
         code = analyze([*arguments, *plots])
     if code:
-        raise SystemExit(f"vla-analyze {' '.join(arguments)} failed")
+        raise SystemExit(f"vla-attention analyze {' '.join(arguments)} failed")
     return output.getvalue()
 
 

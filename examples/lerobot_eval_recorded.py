@@ -3,7 +3,7 @@
     python lerobot_eval_recorded.py runs/smolvla_libero.zarr \\
         --policy.path=HuggingFaceVLA/smolvla_libero --env.type=libero --env.task=libero_spatial \\
         --eval.n_episodes=10 --eval.batch_size=5
-    vla-analyze runs/smolvla_libero.zarr
+    vla-attention analyze runs/smolvla_libero.zarr
 
 lerobot-eval runs a batch of environments with one policy call for all of them, and the policy answers from a queue most
 of the time: `run.episodes` splits the call by row, and blocks in which no attention ran are dropped. Rows whose episode

@@ -14,7 +14,7 @@ in containers or not; it knows nothing of the recording.
 
     vla-eval serve --config server.yaml
     vla-eval run --config benchmark.yaml        # --no-docker where the simulator is installed here
-    vla-analyze runs/smolvla_libero.zarr
+    vla-attention analyze runs/smolvla_libero.zarr
 
 vla-eval predicts in a thread of its own and answers from a buffer between policy calls: the replan block stands inside
 `predict`, where the policy is called. Several shards share one server: each has its episode, and their calls come one

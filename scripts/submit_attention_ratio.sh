@@ -67,4 +67,4 @@ job=${job%%;*} # on federated clusters: JOB;CLUSTER
 analysis=$("${analyse[@]}" --dependency="afterok:$job" "$folder/$script") ||
   die "job $job was submitted, and its analysis was not; when the job is done, run: STAGE=analyze bash scripts/$script"
 echo "Job $job captures ($array), job ${analysis%%;*} analyses when all of it is done." \
-  "See: squeue --me, and vla-capture status STORE"
+  "See: squeue --me, and vla-attention capture status STORE"

@@ -148,7 +148,7 @@ def test_pictures_have_a_text_and_are_small(document):
 
 def test_samples_are_found_and_cut_as_their_comments_say(tmp_path):
     page = tmp_path / "a.md"
-    comment = "<!-- sample: vla-analyze heads --help :: 1 3-4 -->\n\n```\nold\n```\n"
+    comment = "<!-- sample: vla-attention heads --help :: 1 3-4 -->\n\n```\nold\n```\n"
     page.write_text(f"before\n\n{comment}after\n")
     program = [sys.executable, ROOT / "docs" / "make_samples.py", page]
     assert subprocess.run(program, check=True, capture_output=True, text=True).stdout == f"{page}: 1 samples\n"

@@ -1,4 +1,4 @@
-"""`vla-analyze cache`: what is kept of earlier analyses, and removing it."""
+"""`vla-attention cache`: what is kept of earlier analyses, and removing it."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import argparse
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
-  vla-analyze cache
-  vla-analyze cache --clear
-  VLA_CACHE=/scratch/me/cache VLA_CACHE_SIZE=10GB vla-analyze runs/libero_10.zarr
-  VLA_CACHE=off vla-analyze runs/libero_10.zarr
+  vla-attention cache
+  vla-attention cache --clear
+  VLA_CACHE=/scratch/me/cache VLA_CACHE_SIZE=10GB vla-attention analyze runs/libero_10.zarr
+  VLA_CACHE=off vla-attention analyze runs/libero_10.zarr
 """
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-analyze cache`."""
+    """The parser of `vla-attention cache`."""
     parser = command_parser(
-        "vla-analyze cache",
+        "vla-attention cache",
         "Shows what is kept of earlier analyses: masses of episodes, so that another plot or one more episode costs "
         "only what is new. It is in results/.cache unless VLA_CACHE names another folder; VLA_CACHE=off, or "
         "--no-cache with a command, measures everything anew. VLA_CACHE_SIZE is the most it takes (default: 2GB): what "

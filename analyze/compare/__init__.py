@@ -1,1 +1,1 @@
-"""`vla-analyze compare`: runs paired by initial state and seed."""
+"""`vla-attention compare`: runs paired by initial state and seed."""

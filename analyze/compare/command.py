@@ -1,4 +1,4 @@
-"""`vla-analyze compare`: two or more runs, paired where they share initial states and seeds."""
+"""`vla-attention compare`: two or more runs, paired where they share initial states and seeds."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from vla_attention.analyze.arguments import add_output, add_question, settings_o
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
-  vla-analyze compare runs/base.zarr runs/finetuned.zarr
-  vla-analyze compare base=runs/base.zarr tuned=runs/finetuned.zarr other=runs/other.zarr --layers 8 9
-  vla-analyze compare base=runs/b_spatial.zarr,runs/b_goal.zarr tuned=runs/t_spatial.zarr,runs/t_goal.zarr
-  vla-analyze compare runs/libero_spatial.zarr runs/libero_goal.zarr --allow-mismatch suite
+  vla-attention compare runs/base.zarr runs/finetuned.zarr
+  vla-attention compare base=runs/base.zarr tuned=runs/finetuned.zarr other=runs/other.zarr --layers 8 9
+  vla-attention compare base=runs/b_spatial.zarr,runs/b_goal.zarr tuned=runs/t_spatial.zarr,runs/t_goal.zarr
+  vla-attention compare runs/libero_spatial.zarr runs/libero_goal.zarr --allow-mismatch suite
 
 Episodes pair when suite, task, initial state and seed are equal, and a rerun of the first run (vla-capture
-rerun) at every replan; vla-analyze effects tells how its actions change. Everything but the weights and their
+rerun) at every replan; vla-attention effects tells how its actions change. Everything but the weights and their
 names must agree, or be allowed by name: family, suite, seed, protocol, image_size, wait_steps, replan_steps, max_steps,
 layers, denoise_steps, heads, queries, depth, layout, cameras, processing, simulator.
 """
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-analyze compare RUN RUN ...`."""
+    """The parser of `vla-attention compare RUN RUN ...`."""
     parser = command_parser(
-        "vla-analyze compare",
+        "vla-attention compare",
         "Differences of other runs to the first one, per task, layer and overall, with intervals;\n"
         "paired where runs share initial states and seeds.",
         _EXAMPLES,

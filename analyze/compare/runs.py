@@ -75,7 +75,7 @@ def parse_runs(texts: Sequence[str]) -> list[RunArgument]:
     unnamed = [run.paths[0] for run in runs if not run.name]
     runs = [run if run.name else RunArgument(_name_among(run.paths[0], unnamed), run.paths) for run in runs]
     if len(runs) < 2:
-        raise BadArgument("A comparison needs two runs or more; look at one with vla-analyze ratios.")
+        raise BadArgument("A comparison needs two runs or more; look at one with vla-attention ratios.")
     _refuse_twice(runs)
     return runs
 
@@ -246,7 +246,7 @@ def _refuse_families(stores: Sequence[tuple[str, Store]], allowed: bool) -> None
         if not set(sites) & set(other_sites):
             raise MixedPolicies(
                 f"{what}, which have no site in common ({listing(sites)}; {listing(other_sites)}): their softmaxes are "
-                "over different keys, and their masses cannot be compared; analyse each with vla-analyze ratios."
+                "over different keys, and their masses cannot be compared; analyse each with vla-attention ratios."
             )
         if not allowed:
             raise MixedPolicies(

@@ -1,4 +1,4 @@
-"""The text of `vla-analyze compare`."""
+"""The text of `vla-attention compare`."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""`vla-analyze copy`: a copy of a store: smaller, packed, from elsewhere, or uploaded."""
+"""`vla-attention copy`: a copy of a store: smaller, packed, from elsewhere, or uploaded."""

@@ -1,4 +1,4 @@
-"""`vla-analyze copy`: a copy of a store: smaller, packed, from elsewhere, or uploaded."""
+"""`vla-attention copy`: a copy of a store: smaller, packed, from elsewhere, or uploaded."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from vla_attention.schemas.stores.store_url import StorePlace
 
 _EXAMPLES = """examples:
-  vla-analyze copy libero_10.zarr                               how large each part is
-  vla-analyze copy libero_10.zarr slim.zarr --without frames
-  vla-analyze copy libero_10.zarr slim.zarr --without frames objects contributions effects
-  vla-analyze copy libero_10.zarr slim.zarr --without frames    again: adds what was captured meanwhile
-  vla-analyze copy libero_10.zarr packed.zarr --packed          one file an episode
-  vla-analyze copy libero_10.zarr packed.zarr --packed --push hf://datasets/ORG/NAME/libero_10.zarr
-  vla-analyze copy hf://datasets/ORG/NAME/libero_10.zarr here.zarr
-  vla-analyze copy node1/libero_10.zarr node2/libero_10.zarr --output libero_10.zarr     one store of several
+  vla-attention copy libero_10.zarr                               how large each part is
+  vla-attention copy libero_10.zarr slim.zarr --without frames
+  vla-attention copy libero_10.zarr slim.zarr --without frames objects contributions effects
+  vla-attention copy libero_10.zarr slim.zarr --without frames    again: adds what was captured meanwhile
+  vla-attention copy libero_10.zarr packed.zarr --packed          one file an episode
+  vla-attention copy libero_10.zarr packed.zarr --packed --push hf://datasets/ORG/NAME/libero_10.zarr
+  vla-attention copy hf://datasets/ORG/NAME/libero_10.zarr here.zarr
+  vla-attention copy node1/libero_10.zarr node2/libero_10.zarr --output libero_10.zarr     one store of several
 
 frames: the cameras' pictures (overlays and reruns need them). objects: what each patch shows (object: groups need it).
 contributions: norms of what keys add. effects: changes of the action without an item. Rows, and everything else that
@@ -39,9 +39,9 @@ of both, and --copy makes files of its own. What comes from a zip or from elsewh
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-analyze copy STORE ... --output DEST`."""
+    """The parser of `vla-attention copy STORE ... --output DEST`."""
     parser = command_parser(
-        "vla-analyze copy",
+        "vla-attention copy",
         "Copy a store, for instance without its pictures or packed into few files, or make one store of several of\n"
         "one run. Without a place to copy to, print how large each part is.",
         _EXAMPLES,

@@ -45,7 +45,7 @@ def push_store(path: Path, place: HubAddress) -> str:
     """
     store = open_store(path)
     if not (path / INDEX_FILE).is_file():
-        raise StoreError(f"{path} is not packed; vla-analyze copy --packed makes a packed copy.")
+        raise StoreError(f"{path} is not packed; vla-attention copy --packed makes a packed copy.")
     hub = _client()
     api = hub.HfApi()
     files = [
@@ -131,8 +131,8 @@ def dataset_card(store: Store, place: HubAddress) -> str:
         "",
         "```bash",
         "pip install 'vla-attention[remote]'",
-        f"vla-analyze {place}             # only the bytes that the question needs are fetched",
-        f"vla-analyze verify {place}",
+        f"vla-attention analyze {place}             # only the bytes that the question needs are fetched",
+        f"vla-attention verify {place}",
         "```",
         "",
     ]

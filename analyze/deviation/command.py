@@ -1,4 +1,4 @@
-"""`vla-analyze deviation`: how far the policy's actions are from the data set's, beside attention."""
+"""`vla-attention deviation`: how far the policy's actions are from the data set's, beside attention."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ from vla_attention.analyze.arguments import (
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
-  vla-analyze deviation runs/droid.zarr
-  vla-analyze deviation runs/droid.zarr --grouping cameras --layers 10 11 12
-  vla-analyze deviation runs/droid.zarr --group bowl=word:bowl --ratio visual/bowl
+  vla-attention deviation runs/droid.zarr
+  vla-attention deviation runs/droid.zarr --grouping cameras --layers 10 11 12
+  vla-attention deviation runs/droid.zarr --group bowl=word:bowl --ratio visual/bowl
 
-The store needs the data set's own actions: vla-capture replay stores them.
+The store needs the data set's own actions: vla-attention capture replay stores them.
 """
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-analyze deviation STORE ...`."""
+    """The parser of `vla-attention deviation STORE ...`."""
     parser = command_parser(
-        "vla-analyze deviation",
+        "vla-attention deviation",
         "How far the policy's actions are from those of the data set that it was replayed over:\n"
         "by dimension in units of the data set's spread, first action and chunk, by task and phase,\n"
         "and whether the deviation goes with where the policy looks.",

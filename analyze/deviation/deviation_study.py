@@ -195,7 +195,7 @@ def _check_has_both(store: Store, episode: StoredEpisode) -> None:
     if not episode.has("dataset_actions"):
         raise BadArgument(
             f"{episode.name} of {store.path} holds no actions of a data set to compare the policy's with; stores of "
-            "vla-capture replay hold them, and replan(dataset_actions=...) of va.record stores them."
+            "vla-attention capture replay hold them, and replan(dataset_actions=...) of va.record stores them."
         )
     if not episode.has("actions"):
         raise BadArgument(

@@ -1,4 +1,4 @@
-"""The text of `vla-analyze deviation`."""
+"""The text of `vla-attention deviation`."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""`vla-analyze effects`: how much actions change under interventions, beside the attention of the same replans."""
+"""`vla-attention effects`: how much actions change under interventions, beside the attention of the same replans."""

@@ -1,4 +1,4 @@
-"""`vla-analyze effects`: how much actions change under interventions, beside the attention of the same replans."""
+"""`vla-attention effects`: how much actions change under interventions, beside the attention of the same replans."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from vla_attention.schemas.command_line import command_parser
 from vla_attention.schemas.stores.store_url import store_place
 
 _EXAMPLES = """examples:
-  vla-analyze effects runs/cubes.zarr
-  vla-analyze effects runs/cubes.zarr reruns/cubes
-  vla-analyze effects runs/cubes.zarr reruns/without_visual.zarr reruns/noise.zarr --layers 0 1 2
-  vla-analyze effects runs/cubes.zarr rollouts/without_language.zarr --intervals these-tasks
+  vla-attention effects runs/cubes.zarr
+  vla-attention effects runs/cubes.zarr reruns/cubes
+  vla-attention effects runs/cubes.zarr reruns/without_visual.zarr reruns/noise.zarr --layers 0 1 2
+  vla-attention effects runs/cubes.zarr rollouts/without_language.zarr --intervals these-tasks
 
 An effect is the root mean square over the executed steps of the change of the action, each dimension
 in units of its standard deviation in BASE. Give a rerun with another noise seed (--noise-seed) and one
@@ -22,9 +22,9 @@ with random keys (--random-keys): without them nobody knows how much of an effec
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-analyze effects BASE RERUN ...`."""
+    """The parser of `vla-attention effects BASE RERUN ...`."""
     parser = command_parser(
-        "vla-analyze effects",
+        "vla-attention effects",
         "How much the actions of a run change without what it sees, reads, or any group of keys, beside\n"
         "its attention to that group in the same replans, another noise seed and random keys.",
         _EXAMPLES,
@@ -35,7 +35,7 @@ def build_parser() -> argparse.ArgumentParser:
         nargs="*",
         type=store_place,
         metavar="RERUN",
-        help="stores of vla-capture rerun BASE, rollouts with interventions, or folders of them; without "
+        help="stores of vla-attention capture rerun BASE, rollouts with interventions, or folders of them; without "
         "one, the effects that BASE holds (vla-capture --effects)",
     )
     add_grouping(parser)

@@ -79,7 +79,7 @@ def over_time_of_stores(stores: Sequence[Store], settings: AnalysisSettings, num
     """The effects over time that a store measured beside its calls; None where there are none that can be shown."""
     try:
         study = recorded_study(stores, settings)
-    except BadArgument:  # `vla-analyze effects` says why
+    except BadArgument:  # `vla-attention effects` says why
         return None
     course = None if study is None else effects_over_time(study, num_bins)
     return None if study is None or course is None or course.is_empty() else EffectsOverTime(study, course)

@@ -128,7 +128,7 @@ def pair_episodes(condition: Condition, base: Sequence[BaseEpisode], all_names: 
     if not any(name in reruns for name in all_names):
         raise BadArgument(
             f"The rerun {condition.store.path} holds none of the {len(all_names)} episodes of its base "
-            f"({listing(all_names, 3)}); it holds {listing(reruns, 3)}: let vla-capture rerun finish."
+            f"({listing(all_names, 3)}); it holds {listing(reruns, 3)}: let vla-attention capture rerun finish."
         )
     missing = tuple(one.name for one in base if one.name not in reruns)
     return Pairing(condition, pairs, missing, tuple(name for name in reruns if name not in all_names))

@@ -1,4 +1,4 @@
-"""The stores of `vla-analyze effects`: the base, its reruns, and rollouts with interventions."""
+"""The stores of `vla-attention effects`: the base, its reruns, and rollouts with interventions."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def open_reruns(base: Store, given: Sequence[StorePlace]) -> BaseAndReruns:
         elif other.attributes.rerun_of is not None:
             reruns.append(other)
             if other.attributes.interventions.is_none and recorded_conditions(other):
-                notes.append(f"{path} holds effects of its own: vla-analyze effects {path} shows them.")
+                notes.append(f"{path} holds effects of its own: vla-attention effects {path} shows them.")
         else:
             rollouts.append(other)
     if len(notes) == len(reruns) == 1 and not rollouts and recorded_conditions(reruns[0]):
@@ -98,7 +98,7 @@ def recorded_conditions(base: Store) -> tuple[Condition, ...]:
 
 
 def _what_fits(base: StorePlace) -> str:
-    return f"make reruns with vla-capture rerun {base}, or roll out with its settings and an intervention"
+    return f"make reruns with vla-attention capture rerun {base}, or roll out with its settings and an intervention"
 
 
 def _problem(base: Store, other: Store) -> str:
@@ -138,7 +138,8 @@ def _paths(given: Sequence[StorePlace]) -> list[tuple[StorePlace, bool]]:
             inside = sorted(entry for entry in path.iterdir() if entry.suffix == STORE_SUFFIX and entry.is_dir())
             if not inside:
                 raise StoreNotFound(
-                    f"The folder {path} holds no store; expected those of vla-capture rerun --series --output-dir "
+                    f"The folder {path} holds no store; expected those of vla-attention capture rerun --series "
+                    "--output-dir "
                     f"{path}, or the path of a NAME.zarr."
                 )
             paths += [(entry, False) for entry in inside]

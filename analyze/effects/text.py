@@ -136,7 +136,7 @@ def recorded_sections(stores: Sequence[Store], settings: AnalysisSettings, kind:
     if study is None:
         return []
     table = item_table(study, kind)
-    note = f"{_item_note(study)} More: vla-analyze effects {stores[0].path}"
+    note = f"{_item_note(study)} More: vla-attention effects {stores[0].path}"
     return [Section([table, note], title)] if table.rows else []
 
 
@@ -188,7 +188,7 @@ _BINS = 10
 
 
 def over_time_sections(effects: EffectsOverTime) -> list[Section]:
-    """Effects over an episode's time, for `vla-analyze time`."""
+    """Effects over an episode's time, for `vla-attention time`."""
     course = effects.course
     items = course["item"].unique(maintain_order=True).to_list()
     bins = course.partition_by("position", maintain_order=True)
@@ -203,7 +203,7 @@ def over_time_sections(effects: EffectsOverTime) -> list[Section]:
     ]
     note = (
         f"Change of the {counted_actions(effects.study)} actions without it, in their spread; noise: by another noise "
-        f"seed. The table has intervals. More: vla-analyze effects {effects.study.given.base.path}"
+        f"seed. The table has intervals. More: vla-attention effects {effects.study.given.base.path}"
     )
     return [Section([early_and_late(effects.study), Table(columns, rows), note], "EFFECTS OVER THE EPISODE'S TIME")]
 
@@ -397,7 +397,7 @@ def _sums(study: EffectStudy) -> list[Section]:
     ]
     note = (
         "Single effects do not add up: of whole instructions of a small policy the size of the summed changes was 0.99 "
-        "[0.79, 1.36] times the exact effect, the sum of sizes 1.38 [1.07, 1.97]. Exact: vla-capture rerun "
+        "[0.79, 1.36] times the exact effect, the sum of sizes 1.38 [1.07, 1.97]. Exact: vla-attention capture rerun "
         f"{study.given.base.path} --knockout GROUP --knockout-queries all."
     )
     return [Section([Table(columns, rows), note], "NOT MEASURED TOGETHER  sums of single effects")]

@@ -1,1 +1,1 @@
-"""`vla-analyze export`: tables as CSV or Parquet, masses and rows as NetCDF."""
+"""`vla-attention export`: tables as CSV or Parquet, masses and rows as NetCDF."""

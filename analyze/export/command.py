@@ -1,4 +1,4 @@
-"""`vla-analyze export`: tables as CSV or Parquet, masses and rows as NetCDF."""
+"""`vla-attention export`: tables as CSV or Parquet, masses and rows as NetCDF."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from vla_attention.schemas.errors import BadArgument
 _TABLES = ("steps", "replans", "episodes", "tasks", "contributions", "effects")
 _DEFAULT_TABLES = ("episodes", "tasks", "steps")
 _EXAMPLES = """examples:
-  vla-analyze export runs/libero_10.zarr --csv
-  vla-analyze export runs/libero_10.zarr --parquet --table steps --per-head --grouping cameras
-  vla-analyze export runs/libero_10.zarr --netcdf --group bowl=word:bowl --group rest='*'
-  vla-analyze export runs/libero_10.zarr --netcdf --rows --layers 25 --tasks 0
+  vla-attention export runs/libero_10.zarr --csv
+  vla-attention export runs/libero_10.zarr --parquet --table steps --per-head --grouping cameras
+  vla-attention export runs/libero_10.zarr --netcdf --group bowl=word:bowl --group rest='*'
+  vla-attention export runs/libero_10.zarr --netcdf --rows --layers 25 --tasks 0
 
 Tables: steps (every replan, layer and denoise step), replans, episodes, tasks (with intervals); contributions
 (norms) and effects (of every replan and condition), where recorded. The NetCDF file, attention.nc, has (episode,
@@ -26,9 +26,9 @@ reads HDF5.
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-analyze export STORE ...`."""
+    """The parser of `vla-attention export STORE ...`."""
     parser = command_parser(
-        "vla-analyze export",
+        "vla-attention export",
         "Numbers for other programs: tables as CSV or Parquet; masses, and rows if wanted, as NetCDF.",
         _EXAMPLES,
     )

@@ -123,7 +123,7 @@ def rows_array(
     if most_bytes is not None and size.num_bytes > most_bytes:
         raise BadArgument(
             f"The rows would take {size}, more than the {format_bytes(most_bytes)} that are allowed; choose fewer "
-            "layers, denoise steps, heads or tasks, allow more, or write them to a file with vla-analyze export "
+            "layers, denoise steps, heads or tasks, allow more, or write them to a file with vla-attention export "
             "--netcdf --rows."
         )
     rows = np.empty(size.shape, dtype=np.float32)

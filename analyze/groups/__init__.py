@@ -1,1 +1,1 @@
-"""`vla-analyze groups`: what a grouping takes, before any number."""
+"""`vla-attention groups`: what a grouping takes, before any number."""

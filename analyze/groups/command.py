@@ -1,4 +1,4 @@
-"""`vla-analyze groups`: what a grouping takes, before any number is computed."""
+"""`vla-attention groups`: what a grouping takes, before any number is computed."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from vla_attention.analyze.arguments import (
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
-  vla-analyze groups runs/libero_10.zarr --grouping cameras
-  vla-analyze groups runs/libero_10.zarr --grouping mine.toml --task 3 --episode 1 --replan 5
-  vla-analyze groups runs/libero_10.zarr --group nouns='word:bowl | word:plate' --group bowl=object:akita_black_bowl_1
-  vla-analyze groups runs/libero_10.zarr --group content=words:content --group stop=words:stop
-  vla-analyze groups runs/cosmos.zarr --site cross --group content=words:content
+  vla-attention groups runs/libero_10.zarr --grouping cameras
+  vla-attention groups runs/libero_10.zarr --grouping mine.toml --task 3 --episode 1 --replan 5
+  vla-attention groups runs/libero_10.zarr --group nouns='word:bowl | word:plate' --group bowl=object:akita_black_bowl_1
+  vla-attention groups runs/libero_10.zarr --group content=words:content --group stop=words:stop
+  vla-attention groups runs/cosmos.zarr --site cross --group content=words:content
 
 The language of selectors is in docs/groupings.md.
 """
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-analyze groups STORE ...`."""
+    """The parser of `vla-attention groups STORE ...`."""
     parser = command_parser(
-        "vla-analyze groups",
+        "vla-attention groups",
         "What a grouping takes, before any number is computed: keys by span and role, words with their pieces, "
         "overlaps, what no group takes, and a picture of the patches. Reads no attention.",
         _EXAMPLES,

@@ -1,1 +1,1 @@
-"""`vla-analyze heads`: heads, layers, depth and denoise steps; entropy, largest keys and sinks of single rows."""
+"""`vla-attention heads`: heads, layers, depth and denoise steps; entropy, largest keys and sinks of single rows."""

@@ -1,4 +1,4 @@
-"""`vla-analyze heads`: heads, layers and denoise steps; entropy, sinks, depth."""
+"""`vla-attention heads`: heads, layers and denoise steps; entropy, sinks, depth."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from vla_attention.analyze.arguments import (
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
-  vla-analyze heads runs/libero_10.zarr
-  vla-analyze heads runs/libero_10.zarr --layers 5 6 7 --top 10
-  vla-analyze heads runs/libero_10.zarr --group bowl=object:akita_black_bowl_1 --group words=role:instruction \\
+  vla-attention heads runs/libero_10.zarr
+  vla-attention heads runs/libero_10.zarr --layers 5 6 7 --top 10
+  vla-attention heads runs/libero_10.zarr --group bowl=object:akita_black_bowl_1 --group words=role:instruction \\
       --ratio bowl/words
-  vla-analyze heads runs/libero_10.zarr --sink-factor 20 --sink-share 0.25
-  vla-analyze heads runs/libero_10.zarr --no-rows     (masses only: a moment, also for large stores)
+  vla-attention heads runs/libero_10.zarr --sink-factor 20 --sink-share 0.25
+  vla-attention heads runs/libero_10.zarr --no-rows     (masses only: a moment, also for large stores)
 
 A sink of a head is a key that takes more than --sink-factor times its uniform share in at least --sink-share of the
 head's rows, or more than --sink-mass of a row on average (then also more than twice its uniform share); sinks are
@@ -32,9 +32,9 @@ found task by task.
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-analyze heads STORE ...`."""
+    """The parser of `vla-attention heads STORE ...`."""
     parser = command_parser(
-        "vla-analyze heads",
+        "vla-attention heads",
         "Who looks and who reads: the most visual and most linguistic heads, how much heads differ, layers, depth and "
         "denoise steps, with intervals; and of single rows entropy, effective number of keys, "
         "mass of the largest keys and sinks.",

@@ -1,4 +1,4 @@
-"""The text that `vla-analyze heads` prints."""
+"""The text that `vla-attention heads` prints."""
 
 from __future__ import annotations
 
@@ -262,7 +262,8 @@ def sinks_section(search: SinkSearch, rule: SinkRule) -> Section:
         "latter. mass: mean share of the valid keys' mass; most: in the head where it is largest. values: length of "
         f"what the key adds per unit of mass, beside all other valid keys together (small: below {SMALL_VALUES:g}); ?: "
         "not recorded, or the key is one of several in a segment, and contributions are of whole segments. *: in at "
-        f"least {rule.heads:.0%} of the heads; vla-analyze ratios --without-sinks (with the same --sink options) takes "
+        f"least {rule.heads:.0%} of the heads; vla-attention ratios --without-sinks (with the same --sink options) "
+        "takes "
         f"these out. {beyond}"
     )
     left = [f"{more} more in sinks.parquet."] if more > 0 else []

@@ -31,7 +31,7 @@ def measured_once(
 
     Args:
         what: the kind of numbers.
-        about: the same in words, for `vla-analyze cache`.
+        about: the same in words, for `vla-attention cache`.
         selected: the episodes.
         selection: layers, denoise steps and heads.
         site: the softmax family.

@@ -1,4 +1,4 @@
-"""Printing what `vla-analyze copy A B --output C` made: one store of the episodes of several."""
+"""Printing what `vla-attention copy A B --output C` made: one store of the episodes of several."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""`vla-analyze objects`: which objects are looked at, and how well attention finds them."""
+"""`vla-attention objects`: which objects are looked at, and how well attention finds them."""

@@ -1,4 +1,4 @@
-"""`vla-analyze objects`: which objects are looked at, and how well attention finds them."""
+"""`vla-attention objects`: which objects are looked at, and how well attention finds them."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from vla_attention.analyze.arguments import (
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
-  vla-analyze objects runs/libero_10.zarr
-  vla-analyze objects runs/libero_10.zarr --task 3 --episode 1
-  vla-analyze objects runs/libero_10.zarr --layers 5 6 7 --per-head
-  vla-analyze objects runs/libero_10.zarr --percentiles 75 90 --mask-coverage 0.3 --tolerance 0
-  vla-analyze objects runs/libero_10.zarr --no-iou
+  vla-attention objects runs/libero_10.zarr
+  vla-attention objects runs/libero_10.zarr --task 3 --episode 1
+  vla-attention objects runs/libero_10.zarr --layers 5 6 7 --per-head
+  vla-attention objects runs/libero_10.zarr --percentiles 75 90 --mask-coverage 0.3 --tolerance 0
+  vla-attention objects runs/libero_10.zarr --no-iou
 
 Shares, enrichment and control of 50 episodes take seconds; pointing game and IoU several times as long, and with
 --per-head that times the number of heads.
@@ -31,9 +31,9 @@ Shares, enrichment and control of 50 episodes take seconds; pointing game and Io
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-analyze objects STORE ...`."""
+    """The parser of `vla-attention objects STORE ...`."""
     parser = command_parser(
-        "vla-analyze objects",
+        "vla-attention objects",
         "Which objects are looked at: share of the image attention, enrichment over covered area and over the object's "
         "masks of other episodes (a control for attention that is fixed to a place), per object and class (of "
         "interest, other, robot, background); centre of attention, pointing game and IoU with the objects' masks, with "

@@ -1,1 +1,1 @@
-"""`vla-analyze overlay`: attention on the stored pictures, as strips and videos."""
+"""`vla-attention overlay`: attention on the stored pictures, as strips and videos."""

@@ -1,4 +1,4 @@
-"""`vla-analyze overlay`: attention on the stored pictures, as strips and as a video."""
+"""`vla-attention overlay`: attention on the stored pictures, as strips and as a video."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from vla_attention.schemas.command_line import command_parser
 from vla_attention.schemas.errors import BadArgument
 
 _EXAMPLES = """examples:
-  vla-analyze overlay runs/libero_10.zarr
-  vla-analyze overlay runs/libero_10.zarr --task 3 --episode 1 --layers 13 --heads 5
-  vla-analyze overlay runs/libero_10.zarr --group bowl=object:akita_black_bowl_1 --video gif
-  vla-analyze overlay runs/libero_10.zarr --replans 0 5 10 --camera base_0_rgb --measure share
-  vla-analyze overlay runs/cosmos.zarr --site self --video mp4 --fps 4
+  vla-attention overlay runs/libero_10.zarr
+  vla-attention overlay runs/libero_10.zarr --task 3 --episode 1 --layers 13 --heads 5
+  vla-attention overlay runs/libero_10.zarr --group bowl=object:akita_black_bowl_1 --video gif
+  vla-attention overlay runs/libero_10.zarr --replans 0 5 10 --camera base_0_rgb --measure share
+  vla-attention overlay runs/cosmos.zarr --site self --video mp4 --fps 4
 
 --group outlines the patches of which a group takes at least half; the ratio is that of --grouping.
 """
@@ -33,9 +33,9 @@ _DEFAULT_FPS = 4.0
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-analyze overlay STORE ...`."""
+    """The parser of `vla-attention overlay STORE ...`."""
     parser = command_parser(
-        "vla-analyze overlay",
+        "vla-attention overlay",
         "Attention laid over the stored pictures of one episode, right way round, with one scale for all "
         "of them: a "
         "strip of some replans (PNG, and the numbers as CSV), and a video with the ratio's curve beside it.",

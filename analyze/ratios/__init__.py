@@ -1,1 +1,1 @@
-"""`vla-analyze STORE`: masses, fractions and ratios with intervals, the summary and the default plots."""
+"""`vla-attention analyze STORE`: masses, fractions and ratios with intervals, the summary and the default plots."""

@@ -1,4 +1,4 @@
-"""The analysis of `vla-analyze ratios`: the tables of one question, the summary, and the files with both."""
+"""The analysis of `vla-attention ratios`: the tables of one question, the summary, and the files with both."""
 
 from __future__ import annotations
 

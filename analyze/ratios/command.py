@@ -1,4 +1,4 @@
-"""`vla-analyze ratios`, and `vla-analyze STORE` alone: masses, fractions and ratios with intervals."""
+"""`vla-attention ratios`, and `vla-attention analyze STORE` alone: masses, fractions and ratios with intervals."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from vla_attention.analyze.show.output_files import files_lines
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
-  vla-analyze runs/libero_10.zarr
-  vla-analyze runs/libero_10.zarr --list
-  vla-analyze runs/libero_10.zarr --grouping cameras --layers 25 26 27
+  vla-attention analyze runs/libero_10.zarr
+  vla-attention analyze runs/libero_10.zarr --list
+  vla-attention analyze runs/libero_10.zarr --grouping cameras --layers 25 26 27
   vla-analyze runs/libero_10.zarr --group bowl='object:akita_black_bowl_1' --group noun=word:bowl --ratio bowl/noun
-  vla-analyze runs/libero_10.zarr --without-sinks
-  vla-analyze heads runs/libero_10.zarr
-  vla-analyze compare runs/base.zarr runs/finetuned.zarr
+  vla-attention analyze runs/libero_10.zarr --without-sinks
+  vla-attention heads runs/libero_10.zarr
+  vla-attention compare runs/base.zarr runs/finetuned.zarr
 
 `vla-analyze COMMAND --help` explains each command.
 """
@@ -36,7 +36,7 @@ _DRAWING = ("vla_attention.analyze.ratios.default_plots", "matplotlib.figure", "
 
 
 def build_parser(prog: str = "vla-analyze") -> argparse.ArgumentParser:
-    """The parser of `vla-analyze STORE ...` and `vla-analyze ratios STORE ...`."""
+    """The parser of `vla-attention analyze STORE ...` and `vla-attention ratios STORE ...`."""
     parser = command_parser(
         prog,
         "Masses, fractions and ratios from stored attention rows, for any grouping of tokens. Without the model.",

@@ -1,4 +1,4 @@
-"""The pictures that `vla-analyze ratios` draws by default, and those of single episodes (`--save-viz`)."""
+"""The pictures that `vla-attention ratios` draws by default, and those of single episodes (`--save-viz`)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `vla-analyze STORE` prints: the answer in three sentences, then one compact table per question.
+"""What `vla-attention analyze STORE` prints: the answer in three sentences, then one compact table per question.
 
 At most `SCREEN_LINES` lines with those about the files; `summary_text` has the whole, for summary.txt.
 """

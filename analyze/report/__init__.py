@@ -1,1 +1,1 @@
-"""`vla-analyze report`: one self-contained HTML file."""
+"""`vla-attention report`: one self-contained HTML file."""

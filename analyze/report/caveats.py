@@ -98,9 +98,12 @@ def _dependence(question: Question) -> list[Caveat]:
     if question.untrained:
         return []
     recorded = any(store.attributes.protocol.name == "recorded" for store in question.stores)
-    how = "vla-capture rerun with --prompt, or with --knockout and --knockout-queries all"
+    how = "vla-attention capture rerun with --prompt, or with --knockout and --knockout-queries all"
     if any(store.attributes.policy.checkpoint_format == CALLERS_MODULES for store in question.stores):
-        how = "vla-capture replay with another --instruction, or with --knockout and --rerun-of (docs/data-sets.md)"
+        how = (
+            "vla-attention capture replay with another --instruction, or with --knockout and --rerun-of "
+            "(docs/data-sets.md)"
+        )
     if recorded:
         how = "va.record with another instruction, or with knockout=... (docs/your-policy.md)"
     sentence = (
@@ -214,7 +217,7 @@ def _beginning(masses: Mapping[str, float]) -> list[Caveat]:
 def _sinks(question: Question, sinks: pl.DataFrame | None) -> list[Caveat]:
     if sinks is None:
         sentence = (
-            "This report did not look for keys that take far more than their share; vla-analyze heads lists them."
+            "This report did not look for keys that take far more than their share; vla-attention heads lists them."
         )
         return [Caveat("Sinks", sentence)]
     sinks = merged_sinks(sinks_of_sides(question, sinks.filter("widespread")))

@@ -1,4 +1,4 @@
-"""`vla-analyze report`: one self-contained HTML file."""
+"""`vla-attention report`: one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from vla_attention.schemas.command_line import command_parser
 from vla_attention.schemas.options import add_option
 
 _EXAMPLES = """examples:
-  vla-analyze report runs/libero_10.zarr --open
-  vla-analyze report runs/libero_10.zarr --grouping instruction --layers 9 13 17 --output paper/report.html
-  vla-analyze report runs/a.zarr runs/b.zarr --num-episodes 8 --num-replans 10 --output results/both
-  vla-analyze report runs/cosmos.zarr --site self
-  vla-analyze report runs/cubes.zarr --reruns reruns/cubes
+  vla-attention report runs/libero_10.zarr --open
+  vla-attention report runs/libero_10.zarr --grouping instruction --layers 9 13 17 --output paper/report.html
+  vla-attention report runs/a.zarr runs/b.zarr --num-episodes 8 --num-replans 10 --output results/both
+  vla-attention report runs/cosmos.zarr --site self
+  vla-attention report runs/cubes.zarr --reruns reruns/cubes
 
 The file needs no network and nothing beside it: open it with a double click, mail it, print it.
 """
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-analyze report STORE ...`."""
+    """The parser of `vla-attention report STORE ...`."""
     from pathlib import Path
 
     parser = command_parser(
-        "vla-analyze report",
+        "vla-attention report",
         "One self-contained HTML file: what was run, the ratio with its interval and its caveats, tasks, layers, "
         "contributions, overlays of some episodes, methods.",
         _EXAMPLES,
@@ -61,7 +61,8 @@ def build_parser() -> argparse.ArgumentParser:
         nargs="+",
         default=[],
         metavar="RERUN",
-        help="reruns of the store with interventions (vla-capture rerun), or folders of them; without one, the effects "
+        help="reruns of the store with interventions (vla-attention capture rerun), or folders of them; without one, the "
+        "effects "
         "that the store holds",
     )
     content.add_argument("--quick", action="store_true", help="leave out what reads every row: sinks, words, objects")

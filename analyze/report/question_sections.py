@@ -88,11 +88,12 @@ def sink_section(search: SinkSearch) -> Section:
     sentence = (
         f"{'One key is a sink' if len(rows) == 1 else f'{len(rows)} keys are sinks'} here; the first, "
         f"{rows[0]['description']}, takes {format_percent(rows[0]['mean_mass'])} of the attention to valid keys. "
-        "vla-analyze ratios --without-sinks computes everything without those of many heads. Values: what the key adds "
+        "vla-attention ratios --without-sinks computes everything without those of many heads. Values: what the key "
+        "adds "
         f"per unit of mass, beside all other keys (small: less than {SMALL_VALUES:g} of it; ?: it cannot be told)."
     )
     left = len(rows) - _MOST_ROWS
-    caption = f"Sinks, the first {_MOST_ROWS}; vla-analyze heads lists {left} more" if left > 0 else "Sinks"
+    caption = f"Sinks, the first {_MOST_ROWS}; vla-attention heads lists {left} more" if left > 0 else "Sinks"
     table = replace(sink_table(search, caption), rows=rows[:_MOST_ROWS])
     return Section("sinks", "Sinks", [explanation, Paragraph(sentence), PageTable(table)])
 
@@ -136,7 +137,7 @@ def object_section(question: Question, folder: Path) -> Section | None:
         "which is what uniform attention would give. Dotted: the control, the same maps on the objects' masks of other "
         "episodes.",
     )
-    more = f" (the first {_MOST_ROWS}; vla-analyze objects has all)" if whole.height > _MOST_ROWS else ""
+    more = f" (the first {_MOST_ROWS}; vla-attention objects has all)" if whole.height > _MOST_ROWS else ""
     caption = (
         f"Objects, all cameras together{more}. No value over control: there is none, or it cannot tell because the "
         "object hardly moves. q: p of 1 over control, adjusted (Benjamini-Hochberg)"

@@ -1,1 +1,1 @@
-"""`vla-analyze time`: the course of an episode, the gripper's first closing, success against failure."""
+"""`vla-attention time`: the course of an episode, the gripper's first closing, success against failure."""

@@ -1,4 +1,4 @@
-"""`vla-analyze time`: over the course of an episode, around the first gripper closing, success against failure."""
+"""`vla-attention time`: over the course of an episode, around the first gripper closing, success against failure."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from vla_attention.analyze.arguments import add_output, add_question, add_stores
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
-  vla-analyze time runs/libero_10.zarr
-  vla-analyze time runs/libero_10.zarr --layers 25 --bins 10
-  vla-analyze time runs/libero_10.zarr --grouping objects --window 5
-  vla-analyze time runs/libero_goal.zarr runs/libero_10.zarr --no-plots
+  vla-attention time runs/libero_10.zarr
+  vla-attention time runs/libero_10.zarr --layers 25 --bins 10
+  vla-attention time runs/libero_10.zarr --grouping objects --window 5
+  vla-attention time runs/libero_goal.zarr runs/libero_10.zarr --no-plots
 
 A replan's value holds until the next replan, as its actions do; a bin of the episode's time is the
 mean of that step function. The gripper closes at the first replan one of whose executed actions has a
@@ -21,9 +21,9 @@ last number above 0 (robosuite's Panda gripper, which every suite of vla-capture
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-analyze time STORE ...`."""
+    """The parser of `vla-attention time STORE ...`."""
     parser = command_parser(
-        "vla-analyze time",
+        "vla-attention time",
         "Ratio and fractions over the course of an episode and around the first gripper closing,\n"
         "success against failure with effect sizes, and how many independent replans an episode is worth.",
         _EXAMPLES,

@@ -1,4 +1,4 @@
-"""The text of `vla-analyze time`."""
+"""The text of `vla-attention time`."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""`vla-analyze verify`: reads a store back and checks it."""
+"""`vla-attention verify`: reads a store back and checks it."""

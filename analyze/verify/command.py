@@ -1,4 +1,4 @@
-"""`vla-analyze verify`: read everything back and check it, and with --repair move damaged episodes aside."""
+"""`vla-attention verify`: read everything back and check it, and with --repair move damaged episodes aside."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from vla_attention.schemas.stores.verify_command import DESCRIPTION, EXAMPLES, a
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-analyze verify STORE ...`."""
-    parser = command_parser("vla-analyze verify", DESCRIPTION, EXAMPLES.replace("NAME", "vla-analyze"))
+    """The parser of `vla-attention verify STORE ...`."""
+    parser = command_parser("vla-attention verify", DESCRIPTION, EXAMPLES.replace("NAME", "vla-analyze"))
     add_verify_arguments(parser)
     add_workers(parser)
     return parser

@@ -1,1 +1,1 @@
-"""`vla-analyze view`: a local page on which the attention of a store is explored."""
+"""`vla-attention view`: a local page on which the attention of a store is explored."""

@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from vla_attention.schemas.stores.store_url import StorePlace
 
 _EXAMPLES = """examples:
-  vla-analyze view runs/cubes.zarr
-  vla-analyze view runs/cubes.zarr reruns/cubes/no_text.zarr         a run beside its rerun
-  vla-analyze view hf://datasets/ORG/NAME/libero_10.zarr
-  vla-analyze view runs/cubes.zarr --port 8765 --no-open             on another machine, with ssh -L 8765:127.0.0.1:8765
-  vla-analyze view runs/cubes.zarr --output public/cubes             a folder for a web server
+  vla-attention view runs/cubes.zarr
+  vla-attention view runs/cubes.zarr reruns/cubes/no_text.zarr         a run beside its rerun
+  vla-attention view hf://datasets/ORG/NAME/libero_10.zarr
+  vla-attention view runs/cubes.zarr --port 8765 --no-open           on another machine, with ssh -L 8765:127.0.0.1:8765
+  vla-attention view runs/cubes.zarr --output public/cubes             a folder for a web server
 
 The page is served to this machine only, to whoever has the printed link, until Ctrl-C. It asks nothing of any other
 place. With the same stores and the same --port the link stays the same.
@@ -28,11 +28,11 @@ place. With the same stores and the same --port the link stays the same.
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-analyze view STORE ...`."""
+    """The parser of `vla-attention view STORE ...`."""
     from pathlib import Path
 
     parser = command_parser(
-        "vla-analyze view",
+        "vla-attention view",
         "Explore attention in the browser: episodes, pictures, words, layers and heads, groups, two runs side by side.",
         _EXAMPLES,
     )

@@ -94,7 +94,7 @@ class Summary:
                 self._take(json.loads(line))
         code = process.wait()
         if process is self._process and code:
-            self._fail("The numbers of the episodes could not be computed; vla-analyze STORE says why.")
+            self._fail("The numbers of the episodes could not be computed; vla-attention analyze STORE says why.")
         with self._lock:
             self._complete = self._complete or process is self._process
 

@@ -1,1 +1,1 @@
-"""`vla-analyze words`: which words of the instruction are read."""
+"""`vla-attention words`: which words of the instruction are read."""

@@ -1,4 +1,4 @@
-"""`vla-analyze words`: which words of the instruction are read."""
+"""`vla-attention words`: which words of the instruction are read."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from vla_attention.analyze.arguments import (
 from vla_attention.schemas.command_line import command_parser
 
 _EXAMPLES = """examples:
-  vla-analyze words runs/libero_10.zarr
-  vla-analyze words runs/libero_10.zarr --task 3
-  vla-analyze words runs/libero_10.zarr --layers 5 6 7 --per-head
-  vla-analyze words runs/cosmos.zarr
+  vla-attention words runs/libero_10.zarr
+  vla-attention words runs/libero_10.zarr --task 3
+  vla-attention words runs/libero_10.zarr --layers 5 6 7 --per-head
+  vla-attention words runs/cosmos.zarr
 
 A word is measured by all its pieces. Stop words are those of a shipped list of function words (docs/groupings.md),
 content words all others.
@@ -31,9 +31,9 @@ content words all others.
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-analyze words STORE ...`."""
+    """The parser of `vla-attention words STORE ...`."""
     parser = command_parser(
-        "vla-analyze words",
+        "vla-attention words",
         "Which words of the instruction are read: mass, lift over uniform attention and share of the linguistic mass "
         "of every word, with intervals; content and stop words, bos, template and state beside "
         "them.",

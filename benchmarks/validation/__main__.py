@@ -182,7 +182,9 @@ def _arguments(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--shipped", metavar="PATH", help="policy of questions 2 and 3 (default: the first of POLICIES that must read)"
     )
-    parser.add_argument("--checkpoint", help="a policy of your own, as for vla-capture pi, instead of POLICIES")
+    parser.add_argument(
+        "--checkpoint", help="a policy of your own, as for vla-attention capture pi, instead of POLICIES"
+    )
     parser.add_argument("--family", default="pi", help="its family: pi (default) or cosmos")
     parser.add_argument("--suite", default="cubes", help="its suite (default: cubes)")
     parser.add_argument("--work", type=Path, required=True, metavar="DIR", help="folder of stores and results")

@@ -62,7 +62,7 @@ class ChangedEpisode:
     executed: NDArray[np.int64]
 
     def effect(self, name: str, spread: ActionSpread, against: str | None = None) -> Array:
-        """Effects (replan,) as `vla-analyze effects` measures them; against: another change instead of the store."""
+        """Effects (replan,) as `vla-attention effects` measures them; against: another change instead of the store."""
         base = self.base if against is None else self.actions[against]
         return root_mean_square_change(base, self.actions[name], spread, self.executed)
 
@@ -73,7 +73,7 @@ def spread_of(store: Store) -> ActionSpread:
 
 
 def units_of(policy: Any, store: Store, folder: Path, say: Callable[[str], None]) -> ActionSpread:
-    """The units of effects, those of `vla-analyze effects` with a rerun under another noise seed.
+    """The units of effects, those of `vla-attention effects` with a rerun under another noise seed.
 
     All policy calls of the store are made again with that seed, and dimensions of the action that it changes by more
     than their spread are left out: they would drown every effect.

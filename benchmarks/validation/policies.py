@@ -69,7 +69,7 @@ def record(
 
 
 def load_policy(store: Path) -> Any:
-    """The policy of a store, rebuilt as `vla-capture rerun` does it."""
+    """The policy of a store, rebuilt as `vla-attention capture rerun` does it."""
     import argparse
 
     from vla_attention.capture.machine.device import load_torch

@@ -27,10 +27,10 @@ from vla_attention.schemas.stores.repair_command import VERIFY_HELP
 from vla_attention.schemas.threads import add_threads
 
 _FURTHER_EXAMPLES = """\
-  vla-capture status runs/libero_10.zarr                     what is there, what is missing, who is writing
-  vla-capture verify runs/libero_10.zarr                     check everything; --repair moves damaged episodes aside
-  vla-capture doctor                                         what this machine can do, and what is missing
-  vla-capture parity CASE                                    our numbers against a reference's, on your own checkpoint
+  vla-attention capture status runs/libero_10.zarr                     what is there, what is missing, who is writing
+  vla-attention capture verify runs/libero_10.zarr               check everything; --repair moves damaged episodes aside
+  vla-attention capture doctor                                         what this machine can do, and what is missing
+  vla-attention capture parity CASE                            our numbers against a reference's, on your own checkpoint
 """
 
 

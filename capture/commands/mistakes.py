@@ -27,7 +27,8 @@ def refuse_other_tools_words(words: Sequence[str]) -> None:
     if first in _OWN_CODE:
         raise BadArgument(
             f"There is no command '{words[0]}': policies other than pi and Cosmos are recorded from your own code, "
-            "with va.record, or over a data set, with vla-capture replay DATASET --policy FILE.py (docs/your-policy.md)."
+            "with va.record, or over a data set, with vla-attention capture replay DATASET --policy FILE.py "
+            "(docs/your-policy.md)."
         )
     named = [word.partition("=")[0] for word in words]
     if first not in ("replay", "doctor", "tasks") and "--episodes" in named:

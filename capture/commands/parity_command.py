@@ -1,4 +1,4 @@
-"""`vla-capture parity CASE`: compare a policy with what a reference implementation computed."""
+"""`vla-attention capture parity CASE`: compare a policy with what a reference implementation computed."""
 
 from __future__ import annotations
 

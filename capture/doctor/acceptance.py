@@ -136,7 +136,7 @@ def judge(solved: int, episodes: int, published: PublishedRate, failed: Sequence
         lines.append(
             "NOT accepted: the interval is below the published one. Look at the lines above for what was loaded "
             "(format, configuration, precision, normalisation, prompt, cameras), at the protocol (docs/protocol.md), "
-            "and run vla-capture parity on a case of the reference implementation."
+            "and run vla-attention capture parity on a case of the reference implementation."
         )
     if too_few >= 0:
         rate = rate_found_in_nine_of_ten(episodes, too_few)

@@ -1,4 +1,4 @@
-"""The arguments of `vla-capture doctor`: those of the capture that is described, and `--accept`."""
+"""The arguments of `vla-attention capture doctor`: those of the capture that is described, and `--accept`."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from vla_attention.capture.policies.families import default_family, policy_famil
 from vla_attention.capture.policies.family import PolicyFamily
 
 DOCTOR_EXAMPLES = """\
-  vla-capture doctor                                         this machine, for a run of the policy that comes along
+  vla-attention capture doctor                                    this machine, for a run of the policy that comes along
   vla-capture doctor pi --checkpoint gs://openpi-assets/checkpoints/pi05_libero --task-suite libero_10 --budget 20GB
-  vla-capture doctor --no-trial --task-suite libero_10       look only: loads no policy, runs no simulator
-  vla-capture doctor --accept pi05_cubes                     ten episodes, held against the published success rate
+  vla-attention capture doctor --no-trial --task-suite libero_10       look only: loads no policy, runs no simulator
+  vla-attention capture doctor --accept pi05_cubes                 ten episodes, held against the published success rate
 """
 
 

@@ -1,4 +1,4 @@
-"""`vla-capture doctor`: a line for everything that the described run needs, and `--accept`."""
+"""`vla-attention capture doctor`: a line for everything that the described run needs, and `--accept`."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 def run_doctor(arguments: argparse.Namespace, termination: Termination) -> int:
-    """Run `vla-capture doctor` on parsed arguments.
+    """Run `vla-attention capture doctor` on parsed arguments.
 
     Returns 1 when something that the described run needs is missing, or `--accept` does not accept; otherwise 0.
     """

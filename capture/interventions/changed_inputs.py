@@ -90,7 +90,8 @@ def changed_picture(
     if change.kind == "mean":
         if change.camera not in context.mean_pictures:
             raise BadArgument(
-                f"No mean picture of camera '{change.camera}' is known: only effects use it (vla-capture rerun STORE "
+                f"No mean picture of camera '{change.camera}' is known: only effects use it (vla-attention capture "
+                "rerun STORE "
                 "--effects cameras)."
             )
         return context.mean_pictures[change.camera]

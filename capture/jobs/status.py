@@ -1,4 +1,4 @@
-"""`vla-capture status`: the episodes of a store, the missing ones, and their writers. Reads only."""
+"""`vla-attention capture status`: the episodes of a store, the missing ones, and their writers. Reads only."""
 
 from __future__ import annotations
 
@@ -250,7 +250,7 @@ def _text(status: StoreStatus) -> str:
     lines += ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     lines += status.lacking_lines()
     if any(task.damaged for task in tasks):
-        lines.append(f"Damaged episodes are moved aside by: vla-capture verify {status.store} --repair")
+        lines.append(f"Damaged episodes are moved aside by: vla-attention capture verify {status.store} --repair")
     if status.complete is None:
         lines.append("The expected number of episodes is unknown; give it with --expected N.")
     elif status.complete:

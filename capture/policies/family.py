@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ParityCases:
-    """The cases of a family that `vla-capture parity CASE` runs.
+    """The cases of a family that `vla-attention capture parity CASE` runs.
 
     recognises: tells from the content of a case.json whether the case is of this family. run: takes the parsed
     arguments and the device, prints the differences, and returns the exit code. formats: the names that `--format`

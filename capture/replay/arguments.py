@@ -19,10 +19,10 @@ from vla_attention.schemas.options import add_option
 from vla_attention.schemas.threads import add_threads, use_threads
 
 REPLAY_EXAMPLES = """\
-  vla-capture replay data/so101_pick --checkpoint my/pi05_so101 --every 15 --episodes 0 1 2-5
-  vla-capture replay lerobot/droid_100 --checkpoint gs://openpi-assets/checkpoints/pi05_droid \\
+  vla-attention capture replay data/so101_pick --checkpoint my/pi05_so101 --every 15 --episodes 0 1 2-5
+  vla-attention capture replay lerobot/droid_100 --checkpoint gs://openpi-assets/checkpoints/pi05_droid \\
       --action action.joint_velocity action.gripper_position
-  vla-capture replay data/so101_pick --policy my_smolvla.py --every 15
+  vla-attention capture replay data/so101_pick --policy my_smolvla.py --every 15
   vla-capture replay data/bimanual --checkpoint my/pi0 --camera left_wrist_0_rgb=wrist --camera right_wrist_0_rgb=none
 """
 
@@ -151,7 +151,7 @@ def _add_change_arguments(parser: argparse.ArgumentParser) -> None:
         "--rerun-of",
         type=Path,
         metavar="BASE.zarr",
-        help="the replay of the same frames without interventions, with which `vla-analyze effects` then pairs the "
+        help="the replay of the same frames without interventions, with which `vla-attention effects` then pairs the "
         "calls of this one, replan by replan",
     )
 

@@ -1,4 +1,4 @@
-"""`vla-capture replay`: make policy calls on the frames of a data set, and record them into a store."""
+"""`vla-attention capture replay`: make policy calls on the frames of a data set, and record them into a store."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vla_attention.schemas.threads import Threads
 
 
 def run_replay(arguments: argparse.Namespace, threads: Threads, termination: Termination) -> int:
-    """Run `vla-capture replay` on parsed arguments; returns the exit code."""
+    """Run `vla-attention capture replay` on parsed arguments; returns the exit code."""
     file = check_policy_file(arguments.policy) if is_policy_file(arguments.policy) else None
     plan = plan_replay(arguments, termination)
     say(threads.describe())
@@ -31,5 +31,9 @@ def run_replay(arguments: argparse.Namespace, threads: Threads, termination: Ter
     say(f"{plural(added, 'episode')} added. Store: {plan.store}")
     plan.faults.raise_missing()
     base = getattr(arguments, "rerun_of", None)
-    say(f"Next: vla-analyze {plan.store}" if base is None else f"Next: vla-analyze effects {base} {plan.store}")
+    say(
+        f"Next: vla-attention analyze {plan.store}"
+        if base is None
+        else f"Next: vla-attention effects {base} {plan.store}"
+    )
     return 0

@@ -21,7 +21,7 @@ FUNCTION = "load"
 
 @dataclass(frozen=True)
 class ReplayPolicy:
-    """A policy for `vla-capture replay`: what is recorded, and how it is called on a frame.
+    """A policy for `vla-attention capture replay`: what is recorded, and how it is called on a frame.
 
     Attributes:
         policy: an `nn.Module`, or an object that has modules as attributes.

@@ -219,7 +219,7 @@ def announce(
     if len(todo) < len(plan.wanted):
         say(f"{len(plan.wanted) - len(todo)} of {len(plan.wanted)} episodes are complete already; {len(todo)} to run.")
     for fault in find_damaged(plan.store, set(stored), False) if stored else []:
-        say(f"Not recorded again without vla-capture verify --repair: {fault.describe()}")
+        say(f"Not recorded again without vla-attention capture verify --repair: {fault.describe()}")
     return todo
 
 

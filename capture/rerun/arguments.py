@@ -21,12 +21,12 @@ if TYPE_CHECKING:
     from vla_attention.schemas.stores.store_format import RootAttributes
 
 RERUN_EXAMPLES = """\
-  vla-capture rerun runs/libero_10.zarr                      how far the calls of one episode are from the stored ones
-  vla-capture rerun runs/libero_10.zarr --knockout camera:base_0_rgb       without one camera
-  vla-capture rerun runs/libero_10.zarr --keep role:instruction            with the words of the instruction alone
-  vla-capture rerun runs/libero_10.zarr --prompt empty --image left_wrist_0_rgb=blank
-  vla-capture rerun runs/libero_10.zarr --series default --words           every group and word, with controls
-  vla-capture rerun runs/libero_10.zarr --store more.zarr --layers 0 1 2 --queries all    more of the same calls
+  vla-attention capture rerun runs/libero_10.zarr              how far the calls of one episode are from the stored ones
+  vla-attention capture rerun runs/libero_10.zarr --knockout camera:base_0_rgb       without one camera
+  vla-attention capture rerun runs/libero_10.zarr --keep role:instruction        with the words of the instruction alone
+  vla-attention capture rerun runs/libero_10.zarr --prompt empty --image left_wrist_0_rgb=blank
+  vla-attention capture rerun runs/libero_10.zarr --series default --words           every group and word, with controls
+  vla-attention capture rerun runs/libero_10.zarr --store more.zarr --layers 0 1 2 --queries all  more of the same calls
 """
 
 
@@ -57,7 +57,7 @@ def _refuse_own_loop(root: RootAttributes) -> None:
     if root.protocol.name == "recorded":
         raise BadArgument(
             f"Cannot rerun a store that va.record made: the policy '{root.policy.name}' is called by your own code. "
-            "Run that again with va.record(..., knockout=...) into another store; vla-analyze compare pairs the two."
+            "Run that again with va.record(..., knockout=...) into another store; vla-attention compare pairs the two."
         )
 
 
@@ -68,7 +68,8 @@ def _family_of(root: RootAttributes) -> PolicyFamily:
     except UnknownName:
         raise BadArgument(
             f"Cannot rerun a store of '{root.policy.family}', a policy of the caller's own code, which vla-capture "
-            "cannot load; use vla-capture replay DATASET --policy FILE.py --knockout SELECTOR --rerun-of STORE, or "
+            "cannot load; use vla-attention capture replay DATASET --policy FILE.py --knockout SELECTOR --rerun-of "
+            "STORE, or "
             "va.record(..., knockout=SELECTOR) (docs/your-policy.md)."
         ) from None
 

@@ -65,7 +65,8 @@ def open_base(path: Path, chosen: Sequence[int | str] | None = None, num_episode
         damaged = look_at(store, episode, read_only=True)
         if damaged is not None:
             raise CorruptEpisode(
-                f"Cannot rerun {path}: {damaged.describe().rstrip('.')}; vla-capture verify --repair moves such ones "
+                f"Cannot rerun {path}: {damaged.describe().rstrip('.')}; vla-attention capture verify --repair moves "
+                "such ones "
                 "aside."
             )
     return replace(store, episodes=tuple(kept))

@@ -33,7 +33,7 @@ from vla_attention.schemas.threads import Threads
 
 
 def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Termination) -> int:
-    """Run `vla-capture rerun` on parsed arguments; returns the exit code."""
+    """Run `vla-attention capture rerun` on parsed arguments; returns the exit code."""
     if arguments.check is not None and arguments.check < 0:
         raise BadArgument(f"Cannot use --check {arguments.check}; expected 0 or more policy calls.")
     base = open_base(arguments.base, arguments.task_id, arguments.num_episodes)
@@ -76,9 +76,13 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
     say(f"{plural(added, 'episode')} added. Store: {target}")
     rerun.faults.raise_missing()
     if rerun.recording.effects is not None:
-        say(f"Next: vla-analyze effects {target}")
+        say(f"Next: vla-attention effects {target}")
         return 0
-    say(f"Next: vla-analyze {target}" if interventions.is_none else f"Next: vla-analyze effects {base.path} {target}")
+    say(
+        f"Next: vla-attention analyze {target}"
+        if interventions.is_none
+        else f"Next: vla-attention effects {base.path} {target}"
+    )
     return 0
 
 

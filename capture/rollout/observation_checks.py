@@ -69,7 +69,8 @@ class ObservationChecks:
             warnings.warn(
                 f"The picture of {camera} at {where}, the first of its task, is "
                 f"{'of one colour' if camera in lit else 'black'}: the camera shows nothing. If it should, stop and "
-                "look at it with vla-capture doctor. Episodes in which it never shows anything name it in their "
+                "look at it with vla-attention capture doctor. Episodes in which it never shows anything name it in "
+                "their "
                 f"provenance ({CONSTANT_CAMERAS}).",
                 Note,
                 stacklevel=3,

@@ -165,7 +165,7 @@ def _record_missing(
     damaged = find_damaged(store.path, names, settings.verify) if done else []
     _announce(policy, store, len(names), len(todo), len(damaged), estimate)
     for fault in damaged:
-        say(f"Not recorded again without vla-capture verify --repair: {fault.describe()}")
+        say(f"Not recorded again without vla-attention capture verify --repair: {fault.describe()}")
     damaged_names = [fault.name for fault in damaged]
     expected = {task.task_id: task for task in (*wanted, *(tasks[index] for index in settings.array_task_ids))}
     plan = tuple(

@@ -43,7 +43,7 @@ def run_capture_of_family(arguments: argparse.Namespace, termination: Terminatio
     policy = family.build(arguments, device)
     run_capture(settings, policy, device, termination)
     if arguments.output_dir is None and not arguments.save_viz:
-        say(f"Next: vla-analyze {settings.store}")
+        say(f"Next: vla-attention analyze {settings.store}")
         return 0
     return run_analysis(arguments, settings.store, arguments.output_dir)
 

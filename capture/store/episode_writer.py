@@ -312,6 +312,6 @@ class EpisodeWriter:
         self.write("dataset_actions", stacked, ("replan", "horizon", "action_dim"))
 
     def _read_back(self, run: str) -> None:
-        """Read everything back from disk, with the checks of `vla-analyze verify`."""
+        """Read everything back from disk, with the checks of `vla-attention verify`."""
         for problem in content_problems(self.run, StoredEpisode(self.folder, self.name, run, self.run.store_version)):
             raise CorruptEpisode(f"Episode {self.name}, read back from {self.folder}, is damaged: {problem.text}.")

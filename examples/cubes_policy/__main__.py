@@ -18,7 +18,7 @@ PROGRAM = "python -m examples.cubes_policy"
 COMMANDS: dict[str, str] = {
     "demonstrate": "record demonstrations of scripted experts",
     "train": "train the policy, or a control, on demonstrations",
-    "export": "write a training's averaged weights as a checkpoint folder for vla-capture pi",
+    "export": "write a training's averaged weights as a checkpoint folder for vla-attention capture pi",
     "controls": "make all policies whose dependence is known: demonstrations, trainings, checkpoints",
     "evaluate": "measure how often a policy solves the tasks",
 }

@@ -89,7 +89,9 @@ def export(training: Path, folder: Path, name: str) -> dict[str, Any]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument("training", type=Path, metavar="OUTPUT", help="folder of `train`, also while it runs")
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="new folder for vla-capture pi --checkpoint")
+    parser.add_argument(
+        "folder", type=Path, metavar="FOLDER", help="new folder for vla-attention capture pi --checkpoint"
+    )
     parser.add_argument("--name", metavar="NAME", help="name of the policy in stores (default: that of FOLDER)")
 
 

@@ -42,8 +42,8 @@ def look_at(
     """
     if episode.place is not None and not read_only:
         raise StoreError(
-            f"{store.path} is packed, and captures add nothing to packed stores; vla-analyze verify {store.path} "
-            f"checks it, and vla-analyze copy {store.path} NAME.zarr makes a store of folders."
+            f"{store.path} is packed, and captures add nothing to packed stores; vla-attention verify {store.path} "
+            f"checks it, and vla-attention copy {store.path} NAME.zarr makes a store of folders."
         )
     problems = [problem.text for problem in check_presence(replace(episode))]
     if verify and not problems:
@@ -65,6 +65,7 @@ def what_to_do(path: Path, damaged: Collection[DamagedEpisode]) -> str:
     others = listing((episode.name for episode in list(damaged)[3:]), 20)
     return (
         f"{count} of the episodes asked for {'is' if count == 1 else 'are'} damaged: {described}"
-        f"{f' Damaged too: {others}.' if count > 3 else ''} A capture moves no data; run vla-capture verify {path} "
+        f"{f' Damaged too: {others}.' if count > 3 else ''} A capture moves no data; run vla-attention capture verify "
+        f"{path} "
         "--repair, which moves damaged episodes aside, and then this capture again with --resume."
     )

@@ -11,7 +11,7 @@ from vla_attention.schemas.safe_text import print_line, visible
 if TYPE_CHECKING:
     from vla_attention.schemas.stores.repair import Finding
 
-#: Of `vla-capture status`.
+#: Of `vla-attention capture status`.
 VERIFY_HELP = "read every byte, instead of only seals, presence and sizes of files"
 
 
@@ -72,7 +72,7 @@ def _lines(path: Path, findings: Sequence[Finding], total: int, verify: bool, dr
             lines.append(f"    left in the store, because it is claimed: {finding.holder.describe()}")
     if not dry_run and any(finding.moved_to is not None for finding in findings):
         lines.append(
-            "Run the same vla-analyze copy --packed to pack what was moved aside again."
+            "Run the same vla-attention copy --packed to pack what was moved aside again."
             if is_packed(path)
             else "Run the same capture with --resume to record what was moved aside again."
         )

@@ -112,7 +112,7 @@ def list_episodes(path: StorePlace) -> tuple[list[StorePlace], list[str]]:
         is_episode_of = {name: is_episode_name(name) for name in names}
     elif (path / INDEX_FILE).is_file():
         raise StoreError(
-            f"{path} is packed: its episodes are zip files, and nothing is added to them or moved. vla-analyze copy "
+            f"{path} is packed: its episodes are zip files, and nothing is added to them or moved. vla-attention copy "
             f"{path} NAME.zarr makes a store of folders."
         )
     else:

@@ -1,4 +1,4 @@
-"""`vla-capture doctor` on this machine: what it finds, what it misses, and which policies it accepts."""
+"""`vla-attention capture doctor` on this machine: what it finds, what it misses, and which policies it accepts."""
 
 from __future__ import annotations
 

@@ -139,9 +139,11 @@ PACKED_CASES = [
     Case("zip: a link out of the store", _linked, ZIP + ".*it is a link that leads out of the store"),
     Case("zip: a FIFO", _fifo_zip, ZIP + ".*it is a FIFO and no regular file"),
     Case("zip: 20,000 files", _zip(_many_members), ZIP + ".*has more than 10,000 files"),
-    Case("zip: compressed", _zip(_compressed), ZIP + ".*in another way than vla-analyze copy --packed writes it"),
-    Case("zip: a seal of 4 GB", _zip(_large_member), ZIP + ".*in another way than vla-analyze copy --packed writes it"),
+    Case("zip: compressed", _zip(_compressed), ZIP + ".*in another way than vla-attention copy --packed writes it"),
+    Case(
+        "zip: a seal of 4 GB", _zip(_large_member), ZIP + ".*in another way than vla-attention copy --packed writes it"
+    ),
     Case("zip: a directory elsewhere", _zip(_directory_elsewhere), ZIP + ".*cannot be read: "),
-    Case("zip: a link", _zip(_link_member), ZIP + ".*in another way than vla-analyze copy --packed writes it"),
+    Case("zip: a link", _zip(_link_member), ZIP + ".*in another way than vla-attention copy --packed writes it"),
     Case("zip: two seals", _zip(_twice), ZIP + ".*names a file twice"),
 ]

@@ -1,6 +1,6 @@
 """Random damage to the files of a store, one file at a time and undone again, and what notices it.
 
-A damage follows from the store, the kind of file and a number. `vla-analyze verify` must name the file. An analysis
+A damage follows from the store, the kind of file and a number. `vla-attention verify` must name the file. An analysis
 that reads the file must refuse or give the same numbers: `tried` says which, and `benchmarks/reliability.py` counts.
 """
 
@@ -169,7 +169,7 @@ class Noticed:
     """What came of a damage.
 
     Attributes:
-        verify: what `vla-analyze verify` printed, and its exit code.
+        verify: what `vla-attention verify` printed, and its exit code.
         named: whether it found a fault and named the file.
         analyses: by name: "refused", "same", "different", or the error that is no sentence.
     """
@@ -314,7 +314,7 @@ def tried(subject: Subject, damage: Damage) -> Noticed:
 
 
 def verified(store: Path) -> tuple[int, str]:
-    """Exit code and text of `vla-analyze verify`."""
+    """Exit code and text of `vla-attention verify`."""
     text = io.StringIO()
     with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text):
         code = analyze(["verify", str(store)])

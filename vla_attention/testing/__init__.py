@@ -16,7 +16,7 @@
   `reseal_root`: the digest in the root, too.
 - `SiteStoreSpec`, `write_site_store`: stores of other policies: sites in some of the blocks, absent keys, generated
   tokens, unknown outcomes, a data set's actions.
-- `assert_whole`: read a store back and fail on everything that `vla-analyze verify` would report.
+- `assert_whole`: read a store back and fail on everything that `vla-attention verify` would report.
 - `vla_attention.testing.strategies`: random layouts, tokens and groupings for hypothesis (to be installed beside it).
 """
 

@@ -28,8 +28,8 @@ PUBLISHED_RATES = tuple(
 )
 
 _EXAMPLES = f"""\
-  vla-capture cosmos                                         untrained policy, built-in tasks
-  vla-capture cosmos --ckpt-path {CHECKPOINT} --task-suite libero_10
+  vla-attention capture cosmos                                         untrained policy, built-in tasks
+  vla-attention capture cosmos --ckpt-path {CHECKPOINT} --task-suite libero_10
 """
 
 

@@ -41,11 +41,11 @@ PUBLISHED_RATES = (
 )
 
 _EXAMPLES = """\
-  vla-capture pi                                             a small trained policy and its tasks, docs/cubes.md
-  vla-capture pi --checkpoint ~/.cache/openpi/openpi-assets/checkpoints/pi05_libero \\
+  vla-attention capture pi                                           a small trained policy and its tasks, docs/cubes.md
+  vla-attention capture pi --checkpoint ~/.cache/openpi/openpi-assets/checkpoints/pi05_libero \\
       --task-suite libero_10 --num-episodes 5 --output-dir results/attention_ratio
-  vla-capture pi --checkpoint lerobot/pi05_libero_finetuned --tokenizer PATH --task-suite libero_10
-  vla-capture pi --task-suite libero_10 --task-id 0 --num-episodes 1 --max-steps 40 --libero-assets PATH
+  vla-attention capture pi --checkpoint lerobot/pi05_libero_finetuned --tokenizer PATH --task-suite libero_10
+  vla-attention capture pi --task-suite libero_10 --task-id 0 --num-episodes 1 --max-steps 40 --libero-assets PATH
 """
 
 

@@ -300,7 +300,7 @@ def test_capture_refuses_a_packed_store_with_a_sentence(packed, tmp_path, capsys
     assert capture(["status", str(tmp_path / "b.zarr")]) == 2
     said = capsys.readouterr().err
     assert "is packed" in said
-    assert "vla-analyze copy" in said
+    assert "vla-attention copy" in said
     assert said.count("\n") == 1
     with pytest.raises(Exception, match="is packed") as caught:
         write_store(tmp_path / "b.zarr", mode="resume", spec=SPEC)

@@ -102,7 +102,13 @@ def test_the_card_says_what_the_store_holds(store, client, tmp_path):
     assert analyze(["copy", str(store), str(tmp_path / "a.zarr"), "--packed", "--push", ADDRESS]) == 0
     card = client.commits[-1]["README.md"].decode()
     assert card.startswith("---\n")
-    for text in ("4 episodes of 2 tasks", "8 replans", "UNTRAINED", f"vla-analyze {ADDRESS}", "| pictures | yes |"):
+    for text in (
+        "4 episodes of 2 tasks",
+        "8 replans",
+        "UNTRAINED",
+        f"vla-attention analyze {ADDRESS}",
+        "| pictures | yes |",
+    ):
         assert text in card, text
     assert "<i>" not in card.partition("\n---\n")[2]
     assert "suite a&#124;b&#60;i&#62;" in card

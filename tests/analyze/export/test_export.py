@@ -1,4 +1,4 @@
-"""`vla-analyze export`: files that other programs read, against the raw Zarr arrays."""
+"""`vla-attention export`: files that other programs read, against the raw Zarr arrays."""
 
 from __future__ import annotations
 

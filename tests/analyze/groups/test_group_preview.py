@@ -1,4 +1,4 @@
-"""What `vla-analyze groups` says of a grouping, against counts made by hand from the tokens."""
+"""What `vla-attention groups` says of a grouping, against counts made by hand from the tokens."""
 
 from __future__ import annotations
 

@@ -381,4 +381,4 @@ def test_the_help_has_examples_and_needs_no_library():
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip() == "False"
-    assert "vla-analyze heads runs/" in heads_command.build_parser().format_help()
+    assert "vla-attention heads runs/" in heads_command.build_parser().format_help()

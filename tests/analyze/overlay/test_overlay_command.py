@@ -1,4 +1,4 @@
-"""`vla-analyze overlay` on stores made by the real writer: numbers from raw arrays, pictures, a planted follower, bad
+"""`vla-attention overlay` on stores made by the real writer: numbers from raw arrays, pictures, a planted follower, bad
 input.
 """
 

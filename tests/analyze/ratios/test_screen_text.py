@@ -1,4 +1,4 @@
-"""`vla-analyze STORE` fits a screen, begins with the answer, and leaves the rest to summary.txt."""
+"""`vla-attention analyze STORE` fits a screen, begins with the answer, and leaves the rest to summary.txt."""
 
 from __future__ import annotations
 

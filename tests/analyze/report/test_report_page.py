@@ -195,9 +195,9 @@ def test_untrained_weights_and_compute_types_are_caveats(analysis: Analysis) -> 
         other = replace(store, attributes=of_file)
         file = caveats(replace(analysis, question=replace(analysis.question, stores=(other,))), {})
         for given, how in (
-            (notes, "vla-capture rerun with --prompt"),
+            (notes, "vla-attention capture rerun with --prompt"),
             (own_code, "va.record with another instruction"),
-            (file, "vla-capture replay with another --instruction"),
+            (file, "vla-attention capture replay with another --instruction"),
         ):
             assert how in next(note.sentence for note in given if note.topic == "Attention and dependence")
 

@@ -1,4 +1,4 @@
-"""Effects on the page are those of `vla-analyze effects`: by item, reader and replan, in the same units and words."""
+"""Effects on the page are those of `vla-attention effects`: by item, reader and replan, in the same units and words."""
 
 from __future__ import annotations
 

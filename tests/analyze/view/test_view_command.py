@@ -1,4 +1,4 @@
-"""`vla-analyze view`: the numbers of its summary, the static site, its link, and its end."""
+"""`vla-attention view`: the numbers of its summary, the static site, its link, and its end."""
 
 from __future__ import annotations
 
@@ -285,10 +285,10 @@ def test_the_analysis_ends_by_naming_the_report_and_the_viewer(store, tmp_path, 
     shutil.copytree(store, long)
     assert main([str(long), *words]) == 0
     assert capsys.readouterr().out.endswith(
-        "One page of it: vla-analyze report STORE --open; to explore it: vla-analyze view STORE\n"
+        "One page of it: vla-attention report STORE --open; to explore it: vla-attention view STORE\n"
     )
     monkeypatch.chdir(store.parent)
     assert main(["a.zarr", *words]) == 0
     assert capsys.readouterr().out.endswith(
-        "One page of it: vla-analyze report a.zarr --open\nTo explore it: vla-analyze view a.zarr\n"
+        "One page of it: vla-attention report a.zarr --open\nTo explore it: vla-attention view a.zarr\n"
     )

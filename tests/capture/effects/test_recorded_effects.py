@@ -148,7 +148,7 @@ def test_a_budget_counts_them(tmp_path, monkeypatch, capsys):
 
 def test_a_store_without_effects_says_how_to_get_them(pi_store, capsys):
     assert analyze(["effects", str(pi_store)]) == 2
-    assert "vla-capture rerun" in capsys.readouterr().err
+    assert "vla-attention capture rerun" in capsys.readouterr().err
 
 
 def test_a_rerun_adds_effects_to_stored_calls(pi_store, with_effects, tmp_path, capsys):
@@ -276,4 +276,4 @@ def test_a_rerun_that_only_measured_effects_is_named_as_what_to_ask(pi_store, tm
     words = ["--check", "0", "--task-id", "0", "--effects", "text", "--effects-every", "9"]
     assert main(["rerun", str(pi_store), "--store", str(target), *words]) == 0
     assert analyze(["effects", str(pi_store), str(target), "--no-plots", "--output", str(tmp_path / "out")]) == 2
-    assert f"vla-analyze effects {target} shows them." in capsys.readouterr().err.replace("\n  ", " ")
+    assert f"vla-attention effects {target} shows them." in capsys.readouterr().err.replace("\n  ", " ")

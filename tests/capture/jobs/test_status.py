@@ -1,4 +1,4 @@
-"""The output of `vla-capture status`: counts, missing episodes, and their writers."""
+"""The output of `vla-attention capture status`: counts, missing episodes, and their writers."""
 
 from __future__ import annotations
 

@@ -135,7 +135,7 @@ def test_knockouts_are_paired_with_the_unchanged_replay(tmp_path, data, file, ca
     assert run(*replay, *knockout, "--store", changed) == 0
     said = capsys.readouterr().out
     assert "Interventions: " in said
-    assert f"Next: vla-analyze effects {base} {changed}" in said
+    assert f"Next: vla-attention effects {base} {changed}" in said
     for name in ("task000_episode000", "task001_episode001"):
         one, other = (zarr.open_group(store / "episodes" / name, mode="r") for store in (base, changed))
         assert one.attrs["noise_seed"] == other.attrs["noise_seed"]
@@ -146,7 +146,7 @@ def test_knockouts_are_paired_with_the_unchanged_replay(tmp_path, data, file, ca
     assert analyze(["effects", str(base), str(changed), "--output", str(tmp_path / "effects"), "--no-plots"]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "Effects were measured in 3 episodes of 2 tasks." in said
-    assert f"make one with vla-capture replay ... --noise-seed 1 --rerun-of {base}." in said
+    assert f"make one with vla-attention capture replay ... --noise-seed 1 --rerun-of {base}." in said
     assert "without_front" in said
     # another noise seed is the scale of the effects
     noise = tmp_path / "noise.zarr"

@@ -1,4 +1,4 @@
-"""One checkpoint of pi0.5 through `vla-capture pi` and `va.layouts.pi0_pytorch`: the same contributions."""
+"""One checkpoint of pi0.5 through `vla-attention capture pi` and `va.layouts.pi0_pytorch`: the same contributions."""
 
 from __future__ import annotations
 

@@ -250,7 +250,7 @@ def test_another_kind_of_zip_is_refused(path, recorded, way):
             struct.pack_into("<H", whole, at + 8, flags | (1 if way == "encrypted" else 8))
             at = whole.find(b"PK\x01\x02", at + 4)
         (path / FIRST).write_bytes(bytes(whole))
-    assert "in another way than vla-analyze copy --packed" in " ".join(check_refused(path, recorded))
+    assert "in another way than vla-attention copy --packed" in " ".join(check_refused(path, recorded))
 
 
 def test_members_that_point_elsewhere_in_the_zip_are_refused(path, recorded):

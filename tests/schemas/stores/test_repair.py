@@ -494,7 +494,7 @@ def test_damaged_zips_are_moved_aside_and_packed_again(store, tmp_path, capsys, 
     assert main(["repair", str(packed), *options]) == 0
     said = capsys.readouterr().out
     assert f"{packed}: 1 of 4 episodes is damaged." in said
-    assert "Run the same vla-analyze copy --packed to pack what was moved aside again." in said
+    assert "Run the same vla-attention copy --packed to pack what was moved aside again." in said
     (entry,) = damaged_folder(packed).iterdir()
     assert json.loads((entry / "reason.json").read_text())["episode"] == DAMAGED
     assert names(packed) == WHOLE

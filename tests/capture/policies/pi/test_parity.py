@@ -1,4 +1,4 @@
-"""`vla-capture parity`: cases pass in each of their formats, and every damaged case fails."""
+"""`vla-attention capture parity`: cases pass in each of their formats, and every damaged case fails."""
 
 import json
 import shutil
