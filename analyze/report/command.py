@@ -61,8 +61,8 @@ def build_parser() -> argparse.ArgumentParser:
         nargs="+",
         default=[],
         metavar="RERUN",
-        help="reruns of the store with interventions (vla-attention capture rerun), or folders of them; without one, the "
-        "effects "
+        help="reruns of the store with interventions (vla-attention capture rerun), or folders of them; without "
+        "one, the effects "
         "that the store holds",
     )
     content.add_argument("--quick", action="store_true", help="leave out what reads every row: sinks, words, objects")

@@ -40,7 +40,7 @@ EPISODE_FAULTS = (SimulationFailed, NumbersNotFinite, ReplanRefused, CorruptEpis
 #: Faults that the machine makes, not the episode, if they come in a row, and what to do then.
 _OF_THE_MACHINE: dict[type[Exception], str] = {
     CameraBlack: "drawing fails on this machine: look at it with vla-attention capture doctor",
-    SimulatorDied: "simulators cannot run here: use a smaller --num-envs, and see vla-attention capture doctor for memory",
+    SimulatorDied: "simulators cannot run here: use a smaller --num-envs; see vla-attention capture doctor for memory",
 }
 
 
