@@ -5,9 +5,11 @@ from vla_attention.analyze.show.findings import findings
 
 def test_what_is_named_shares_the_level_between_sentences():
     names, q_values = ["a", "b", "c"], [0.03, 0.01, None]
-    assert findings(q_values, names, "task", "a difference") == ("Of 2 tasks, 2 show a difference (q <= 0.05): a, b.")
+    assert findings(q_values, names, "task", "a difference") == (
+        "Of the 2 of 3 tasks that can be tested, 2 show a difference (q <= 0.05): a, b."
+    )
     assert findings(q_values, names, "task", "a difference", 2) == (
-        "Of 2 tasks, 1 shows a difference (q <= 0.025: 0.05 shared by 2 sentences): b."
+        "Of the 2 of 3 tasks that can be tested, 1 shows a difference (q <= 0.025: 0.05 shared by 2 sentences): b."
     )
 
 
