@@ -52,7 +52,7 @@ CASES = {
 
 def samples_of(case: Case, assets: Path | None) -> tuple[list[SampleOfReplans], list[SampleOfReplans], list[int]]:
     """Return the replans of the trial, those of the longer episodes, and the bytes of the pictures of a call."""
-    arguments = build_parser().parse_args([*case.words.split(), "--store", "none.zarr"])
+    arguments = build_parser().parse_args([*case.words.split(), "--output", "none.zarr"])
     settings = run_settings(arguments)
     policy = arguments.family.build(arguments, "cpu")
     plan = plan_run(settings, policy, {"made": "by a benchmark"})

@@ -67,7 +67,7 @@ class Run:
         else:
             words = [*_ARGUMENTS.split(), "--task-id", *map(str, self.tasks), "--num-episodes", str(_EPISODES)]
             words += ["--num-envs", str(self.calls or 1)]
-        return main([*words, "--store", str(self.store), "--resume"])
+        return main([*words, "--output", str(self.store), "--resume"])
 
 
 @dataclass

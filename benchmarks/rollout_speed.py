@@ -95,7 +95,7 @@ def measure(policy: Policy, arguments: argparse.Namespace, num_envs: int, writte
     with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
         words = ["pi", "--checkpoint", arguments.checkpoint, "--task-suite", arguments.suite, "--task-id", "0"]
         words += ["--num-episodes", str(arguments.episodes), "--max-steps", str(arguments.max_steps)]
-        words += ["--store", str(Path(folder) / "run.zarr"), "--num-envs", str(num_envs)]
+        words += ["--output", str(Path(folder) / "run.zarr"), "--num-envs", str(num_envs)]
         settings = run_settings(build_parser().parse_args(words))
         commits: list[tuple[float, float]] = []
         note, made = episode_loop.EpisodeLoop.note_commit, pipeline.BackgroundWriting.episode

@@ -158,7 +158,7 @@ def use_packages(laptop: Path, node: Path, folder: Path) -> None:
     short = ("--task-id", 0, "--num-episodes", 1, "--replan-steps", 4, "--max-steps", 8)
     capture = (node / "python", "-m", f"{PACKAGE}.capture", "pi")
     # The default: the trained policy that is part of the package, and its suite.
-    run(*capture, *short, "--store", store, cwd=folder, quiet=True)
+    run(*capture, *short, "--output", store, cwd=folder, quiet=True)
     code = json.loads((store / "zarr.json").read_text())["attributes"]["provenance"]["code"]
     check(code == project["version"], f"the store was made by code version {code}, expected {project['version']}")
     run(laptop / "vla-analyze", store, "--output", output, cwd=folder, quiet=True)

@@ -61,8 +61,8 @@ def make(folder: Path) -> None:
     """Record here, and put packed copies into `folder`."""
     store, other, reruns = Path("cubes.zarr"), Path("cubes_one_colour.zarr"), Path("cubes_reruns")
     rollouts = ("--task-suite", "cubes", "--task-id", *TASKS, "--num-episodes", "2", "--max-steps", MOST_STEPS)
-    must(capture, "pi", *rollouts, "--store", store)
-    must(capture, "pi", "--checkpoint", one_colour(Path("one_colour")), *rollouts, "--no-frames", "--store", other)
+    must(capture, "pi", *rollouts, "--output", store)
+    must(capture, "pi", "--checkpoint", one_colour(Path("one_colour")), *rollouts, "--no-frames", "--output", other)
     grouping = Path("see-read.toml")
     grouping.write_text(GROUPING)
     # The layers, heads and denoise steps of the base: the viewer compares what both recorded.
@@ -70,7 +70,15 @@ def make(folder: Path) -> None:
     must(capture, "rerun", store, "--series", grouping, "--num-episodes", "1", *recorded, "--output-dir", reruns)
     unread = ("--knockout", "role:instruction", "--knockout-queries", "all", "--name", "unread_linguistic")
     must(
-        capture, "rerun", store, *unread, "--num-episodes", "1", *recorded, "--store", reruns / "unread_linguistic.zarr"
+        capture,
+        "rerun",
+        store,
+        *unread,
+        "--num-episodes",
+        "1",
+        *recorded,
+        "--output",
+        reruns / "unread_linguistic.zarr",
     )
     pack(store, folder / store.name)
     pack(other, folder / other.name, "--without", "objects", "contributions")

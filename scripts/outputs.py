@@ -58,43 +58,43 @@ QUESTIONS = {
 def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
     """Names and words of all calls, in the order in which they are made; each may read what an earlier one wrote."""
     cubes = "stores/cubes.zarr"
-    yield "capture_cubes", ["vla-capture", "pi", *TWO_TASKS, "--store", cubes]
-    yield "capture_resume", ["vla-capture", "pi", *TWO_TASKS, "--store", cubes, "--resume"]
-    yield "capture_exists", ["vla-capture", "pi", *TWO_TASKS, "--store", cubes]
+    yield "capture_cubes", ["vla-capture", "pi", *TWO_TASKS, "--output", cubes]
+    yield "capture_resume", ["vla-capture", "pi", *TWO_TASKS, "--output", cubes, "--resume"]
+    yield "capture_exists", ["vla-capture", "pi", *TWO_TASKS, "--output", cubes]
     yield "capture_two_simulators", [
         "vla-capture", "pi", *TWO_TASKS[:-4], "--num-envs", "2", "--policy-batch", "1", "--threads", "1",
-        "--store", "stores/two.zarr",
+        "--output", "stores/two.zarr",
     ]  # fmt: skip
-    yield "capture_task", ["vla-capture", "pi", "--task-id", "1", *TWO_TASKS[3:], "--store", "stores/task.zarr"]
-    budget = ["--budget", "3MB", "--store", "stores/budget.zarr"]
+    yield "capture_task", ["vla-capture", "pi", "--task-id", "1", *TWO_TASKS[3:], "--output", "stores/task.zarr"]
+    budget = ["--budget", "3MB", "--output", "stores/budget.zarr"]
     yield "capture_budget", ["vla-capture", "pi", *TWO_TASKS, *budget]
     yield "capture_cosmos", [
         "vla-capture", "cosmos", "--task-suite", "robosuite", "--task-id", "0", "--num-episodes", "1", "--max-steps",
-        "6", "--threads", "1", "--num-envs", "1", "--store", "stores/cosmos.zarr",
+        "6", "--threads", "1", "--num-envs", "1", "--output", "stores/cosmos.zarr",
     ]  # fmt: skip
     yield "capture_knockout", [
         "vla-capture", "pi", *TWO_TASKS, "--knockout", "word:cube", "--prompt", "text:touch the blue cube",
-        "--store", "stores/changed.zarr",
+        "--output", "stores/changed.zarr",
     ]  # fmt: skip
     if os.environ.get("VLA_LIBERO_ASSETS"):
         yield "capture_libero", [
             "vla-capture", "pi", "--checkpoint", "untrained-tiny", "--task-suite", "libero_spatial", "--task-id", "0",
             "--num-episodes", "1", "--max-steps", "10", "--threads", "1", "--num-envs", "1",
-            "--store", "stores/libero.zarr",
+            "--output", "stores/libero.zarr",
         ]  # fmt: skip
     rerun = ["vla-capture", "rerun", cubes, "--check", "1", "--threads", "1"]
-    yield "rerun", [*rerun, "--noise-seed", "3", "--store", "stores/noise.zarr"]
-    yield "rerun_knockout", [*rerun, "--knockout", "role:instruction", "--store", "stores/unread.zarr"]
+    yield "rerun", [*rerun, "--noise-seed", "3", "--output", "stores/noise.zarr"]
+    yield "rerun_knockout", [*rerun, "--knockout", "role:instruction", "--output", "stores/unread.zarr"]
     yield "rerun_series", [*rerun, "--series", "default", "--words", "--output-dir", "stores/series"]
     replay = ["vla-capture", "replay", "data", "--checkpoint", "untrained-tiny", "--threads", "1", "--every", "3"]
     replay += ["--camera", "base_0_rgb=front", "--camera", "left_wrist_0_rgb=none"]
-    yield "replay", [*replay, "--store", "stores/replay.zarr"]
+    yield "replay", [*replay, "--output", "stores/replay.zarr"]
     yield "status", ["vla-capture", "status", cubes]
     yield "status_json", ["vla-capture", "status", cubes, "--json"]
     yield "tasks", ["vla-capture", "tasks", "cubes"]
     yield "capture_verify", ["vla-capture", "verify", cubes]
     yield "capture_repair", ["vla-capture", "repair", cubes]
-    yield "doctor", ["vla-capture", "doctor", "--no-trial", "--store", cubes, "--threads", "1"]
+    yield "doctor", ["vla-capture", "doctor", "--no-trial", "--output", cubes, "--threads", "1"]
     for place in _stores(folder):
         kind = place.removeprefix("stores/").replace("/", "_").removesuffix(".zarr")
         for name, words in QUESTIONS.items():

@@ -100,9 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
     if len(stores) > 1:
         if without or arguments.push:
             raise BadArgument("--without and --push are for one store; make one of the several first, then copy that.")
-        from vla_attention.analyze.merge.command import merge
-
-        return merge(stores, target, copy=arguments.copy, packed=arguments.packed)
+        return _merge(stores, target, copy=arguments.copy, packed=arguments.packed)
     if arguments.copy:
         raise BadArgument("--copy is for several stores: the copy of one has files of its own anyway.")
     return _copy(stores[0], target, without, packed=arguments.packed, push=arguments.push)
@@ -131,6 +129,20 @@ def _copy(place: StorePlace, target: Path, without: Sequence[str], *, packed: bo
         from vla_attention.analyze.copy.pushing import push_store
 
         print(push_store(target, pushed))
+    return 0
+
+
+def _merge(places: Sequence[StorePlace], target: Path, *, copy: bool, packed: bool) -> int:
+    from vla_attention.analyze.copy.merging import merge_stores
+    from vla_attention.schemas.progress_bar import progress_bar
+    from vla_attention.schemas.stores.reader import open_store
+
+    stores = [open_store(path) for path in places]
+    with progress_bar(sum(len(store.episodes) for store in stores), "episodes") as advance:
+        merged = merge_stores(stores, target, advance, link=not copy, packed=packed)
+    parts = ", ".join(f"{len(store.episodes)} of {store.path}" for store in stores)
+    shared = f"; {format_bytes(merged.linked_bytes)} are shared with the given stores" if merged.linked_bytes else ""
+    print(f"{target}: {plural(merged.episodes, 'episode')} ({parts}), all whole{shared}.")
     return 0
 
 

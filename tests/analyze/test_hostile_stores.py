@@ -137,7 +137,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "effects": ("STORE", "OTHER", "--output", "OUT"),
     "deviation": ("STORE", "--output", "OUT"),
     "overlay": ("STORE", "OTHER", "--output", "OUT"),
-    "report": ("STORE", "--output", "OUT", "--episodes", "1", "--tasks", "0", "--layers", "0"),
+    "report": ("STORE", "--output", "OUT", "--episodes", "1", "--task", "0", "--layers", "0"),
     "view": ("STORE", "--site", "OUT"),
     "export": ("STORE", "--csv", "--output", "OUT"),
     "copy": ("STORE", "OUT/copy.zarr", "--without", "frames"),

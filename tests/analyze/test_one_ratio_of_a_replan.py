@@ -64,14 +64,14 @@ def test_overlay_prints_and_writes_it(ratios, tmp_path, capsys):
 
 def test_the_report_shows_it_below_its_slider(ratios, tmp_path):
     page = tmp_path / "report.html"
-    assert main(["report", str(CUBES), "--quick", "--episodes", "1", "--tasks", "0", "--output", str(page)]) == 0
+    assert main(["report", str(CUBES), "--quick", "--episodes", "1", "--task", "0", "--output", str(page)]) == 0
     shown = re.findall(r"replan (\d+)\b[^\"<]*?, ratio ([0-9.]+)", page.read_text(encoding="utf-8"))
     found = {int(replan): ratio for replan, ratio in shown}
     assert found == {replan: format_number(ratio) for replan, ratio in enumerate(ratios)}
 
 
 def test_plots_draw_it(ratios, tmp_path):
-    assert main([str(CUBES), "--tasks", "0", "--save-viz", "--output", str(tmp_path)]) == 0
+    assert main([str(CUBES), "--task", "0", "--save-viz", "--output", str(tmp_path)]) == 0
     found = 0
     for path in tmp_path.rglob("*.csv"):
         table = pl.read_csv(path)

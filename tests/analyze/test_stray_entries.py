@@ -56,14 +56,14 @@ def store(stores) -> Path:
 
 
 #: The stores of a command that takes others than a.zarr, or two.
-STORES = {"effects": ("a", "rerun"), "deviation": ("data",), "merge": ("one", "two"), "overlay": ("one", "two")}
+STORES = {"effects": ("a", "rerun"), "deviation": ("data",), "copy": ("one", "two"), "overlay": ("one", "two")}
 #: Commands that draw unless they are told not to.
 DRAWING = ("ratios", "words", "objects", "effects", "deviation", "overlay")
 #: `verify` and `repair` name strays in their own way.
 READING = [command for command in WORDS if command not in ("verify", "repair", "cache")]
 
 
-@pytest.mark.parametrize("command", slow_except(("groups", "export", "copy", "merge"), READING))
+@pytest.mark.parametrize("command", slow_except(("groups", "export", "copy", "copy"), READING))
 def test_a_command_names_them_and_goes_on(stores, tmp_path, monkeypatch, capsys, command):
     monkeypatch.setenv("VLA_CACHE", "off")
     first, second = (*STORES.get(command, ("a", "other")), "")[:2]

@@ -122,7 +122,7 @@ def test_json_stays_json(store: Path, capsys: pytest.CaptureFixture[str], comman
 
 
 def test_a_store_of_another_run_is_named_visibly(store: Path, capsys: pytest.CaptureFixture[str]):
-    assert run("pi", *TINY, "--task-suite", "cubes", "--store", store, "--resume") == 2
+    assert run("pi", *TINY, "--task-suite", "cubes", "--output", store, "--resume") == 2
     check_output(capsys)
     assert run("rerun", store, "--device", "cpu") == 2
     check_output(capsys)
@@ -132,20 +132,20 @@ def test_a_data_set_and_the_rerun_of_its_store(tmp_path: Path, capsys: pytest.Ca
     columns = {"observation.images.image": "image"}
     made = made_up_episodes((3, 3), tuple(columns), state=8, action=7, tasks=(HOSTILE,))
     refused = write_data_set(tmp_path / "refused", "v2.1", made, robot_type=HOSTILE)
-    assert run("replay", refused, *TINY, "--store", tmp_path / "other.zarr") == 2
+    assert run("replay", refused, *TINY, "--output", tmp_path / "other.zarr") == 2
     check_output(capsys)
     data = write_data_set(tmp_path / "data", "v2.1", made)
     cameras = ("--camera", "left_wrist_0_rgb=none")
     base = tmp_path / "base.zarr"
-    assert run("replay", data, *TINY, *cameras, "--store", base) == 0, check_output(capsys)
+    assert run("replay", data, *TINY, *cameras, "--output", base) == 0, check_output(capsys)
     check_output(capsys)
     for folder in sorted((base / "episodes").glob("task*")):
         change(folder / "zarr.json", lambda attributes: attributes["provenance"].update(torch=HOSTILE))
         reseal(folder)
-    assert run("rerun", base, "--device", "cpu", "--knockout", "role:image", "--store", tmp_path / "again.zarr") == 0
+    assert run("rerun", base, "--device", "cpu", "--knockout", "role:image", "--output", tmp_path / "again.zarr") == 0
     check_output(capsys)
     for wrong in (("--episodes", "99"), ("--camera", "x=y"), ("--state", "x")):
-        assert run("replay", data, *TINY, *wrong, "--store", tmp_path / "other.zarr") == 2
+        assert run("replay", data, *TINY, *wrong, "--output", tmp_path / "other.zarr") == 2
         check_output(capsys)
 
 
@@ -157,7 +157,7 @@ def test_a_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str], comman
     config.write_text(json.dumps(json.loads(config.read_text()) | {HOSTILE: HOSTILE}))
     words = ("pi",) if command == "doctor" else ()
     model = ("--checkpoint", checkpoint, "--tokenizer", EMBEDDED_TOKENIZER, "--device", "cpu")
-    model += ("--store", tmp_path / "a.zarr")
+    model += ("--output", tmp_path / "a.zarr")
     code = run(command, *words, *model, "--task-suite", "cubes")
     assert code == (1 if command == "doctor" else 2)
     assert r"\x1b[2J\u202e" in check_output(capsys)
@@ -178,7 +178,7 @@ def test_a_run_whose_instruction_is_hostile(tmp_path: Path, monkeypatch, capsys:
     hostile = lambda suite: tuple(replace(task, instruction=HOSTILE) for task in tasks(suite))  # noqa: E731
     monkeypatch.setattr(capture_run, "list_tasks", hostile)
     where = ("--task-suite", "robosuite", "--task-id", "0", "--num-episodes", "1", "--max-steps", "3")
-    assert run("pi", *TINY, *where, "--store", tmp_path / "a.zarr") in (0, 2)
+    assert run("pi", *TINY, *where, "--output", tmp_path / "a.zarr") in (0, 2)
     check_output(capsys)
 
 

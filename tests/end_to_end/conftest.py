@@ -37,6 +37,6 @@ def run_capture() -> Callable[..., None]:
 def captured_store(run_capture: Callable[..., None], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two built-in tasks with two episodes each; the second command resumes the store of the first."""
     store = tmp_path_factory.mktemp("captured") / "robosuite.zarr"
-    run_capture("--task-id", 0, "--num-episodes", 2, "--store", store)
-    run_capture("--task-id", 1, "--num-episodes", 2, "--store", store, "--resume")
+    run_capture("--task-id", 0, "--num-episodes", 2, "--output", store)
+    run_capture("--task-id", 1, "--num-episodes", 2, "--output", store, "--resume")
     return store

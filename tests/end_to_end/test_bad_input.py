@@ -38,7 +38,7 @@ def run(command, arguments, capsys) -> str:
         (["--layers", "1", "4", "1"], "name one of them twice"),
         (["--layers", "one"], "invalid int value"),
         (["--heads", "8"], "expected 0 to 7"),
-        (["--denoise-steps", "3"], "expected numbers 0 to 2, 'first', 'last' or 'all'"),
+        (["--denoise", "3"], "expected numbers 0 to 2, 'first', 'last' or 'all'"),
         (["--queries", "some"], "expected 'mean', 'steps' or 'all'"),
         (["--precision", "24"], "expected mantissa bits from 1 to 23, or 'exact'"),
         (["--replan-steps", "5"], "expected 1 to 4"),
@@ -61,25 +61,25 @@ def run(command, arguments, capsys) -> str:
 )
 def test_capture(arguments, expected, capsys, tmp_path):
     store = tmp_path / "a.zarr"
-    assert expected in run(capture, [*DUMMY, "--store", store, *arguments], capsys)
+    assert expected in run(capture, [*DUMMY, "--output", store, *arguments], capsys)
 
 
 def test_store_without_suffix_or_in_an_unwritable_place(tmp_path, capsys):
-    assert "ends with '.zarr'" in run(capture, [*DUMMY, "--store", tmp_path / "store"], capsys)
+    assert "ends with '.zarr'" in run(capture, [*DUMMY, "--output", tmp_path / "store"], capsys)
     (tmp_path / "file").write_text("")
-    said = run(capture, [*DUMMY, "--store", tmp_path / "file" / "a.zarr"], capsys)
+    said = run(capture, [*DUMMY, "--output", tmp_path / "file" / "a.zarr"], capsys)
     assert "give another --store" in said
 
 
 @pytest.mark.simulator
 def test_existing_store_needs_resume_or_overwrite(captured_store, capsys):
-    said = run(capture, [*DUMMY, "--task-id", "0", "--store", captured_store], capsys)
+    said = run(capture, [*DUMMY, "--task-id", "0", "--output", captured_store], capsys)
     assert "exists already and holds 4 episodes; add --resume" in said
 
 
 @pytest.mark.simulator
 def test_resume_with_other_settings_names_the_field(captured_store, capsys):
-    said = run(capture, [*DUMMY, "--max-steps", 12, "--seed", 8, "--store", captured_store, "--resume"], capsys)
+    said = run(capture, [*DUMMY, "--max-steps", 12, "--seed", 8, "--output", captured_store, "--resume"], capsys)
     assert "its protocol.seed is 7, this run's is 8" in said
 
 
@@ -101,7 +101,7 @@ def test_resume_with_other_settings_names_the_field(captured_store, capsys):
         (["--layers", "6"], "expected block indices 0 to 2"),
         (["--denoise", "1"], "was not recorded; recorded: 0, 2"),
         (["--heads", "9"], "Head 9 was not recorded"),
-        (["--tasks", "5"], "it has tasks 0, 1"),
+        (["--task", "5"], "it has tasks 0, 1"),
         (["--site", "cross"], "Unknown site 'cross'. Existing: joint."),
     ],
 )

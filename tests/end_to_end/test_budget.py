@@ -45,7 +45,7 @@ def bytes_of(folder: Path) -> int:
     ids=["pi05_cubes", "untrained-tiny", "cosmos-untrained-tiny"],
 )
 def test_a_few_replans_say_what_a_replan_takes(tmp_path, words, tried, tasks, precisions):
-    trials = trials_of([*words.split(), "--store", str(tmp_path / "none.zarr")], tried)
+    trials = trials_of([*words.split(), "--output", str(tmp_path / "none.zarr")], tried)
     for trial in trials:
         assert trial.policy_seconds > 0
         assert trial.start_seconds > 0
@@ -53,7 +53,7 @@ def test_a_few_replans_say_what_a_replan_takes(tmp_path, words, tried, tasks, pr
     for precision in precisions:
         store = tmp_path / f"{precision}.zarr"
         options = ["--task-id", *map(str, tasks), "--num-episodes", "1", "--precision", precision]
-        assert capture([*words.split(), *options, "--store", str(store)]) == 0
+        assert capture([*words.split(), *options, "--output", str(store)]) == 0
         recording = replace(trials[0].sample.attributes.recording, mantissa_bits=parse_precision(precision))
         size = mean_size([trial.sample.size(recording) for trial in trials])
         episodes = open_store(store).episodes
@@ -64,7 +64,7 @@ def test_a_few_replans_say_what_a_replan_takes(tmp_path, words, tried, tasks, pr
 
 def test_a_budget_is_kept_and_a_resumed_run_keeps_the_choice(tmp_path, capsys):
     store = tmp_path / "a.zarr"
-    arguments = ["pi", "--num-episodes", "1", "--store", str(store), "--max-steps", "100", "--budget", "600kB"]
+    arguments = ["pi", "--num-episodes", "1", "--output", str(store), "--max-steps", "100", "--budget", "600kB"]
     assert capture([*arguments, "--task-id", "3", "4"]) == 0
     said = capsys.readouterr().out
     assert "Budget 600 kB: recording " in said
@@ -84,7 +84,7 @@ def test_a_budget_is_kept_and_a_resumed_run_keeps_the_choice(tmp_path, capsys):
 
 def test_a_budget_that_nothing_fits_into_is_one_sentence(tmp_path, capsys):
     store = tmp_path / "a.zarr"
-    assert capture(["pi", "--num-episodes", "1", "--task-id", "3", "--store", str(store), "--budget", "10kB"]) == 2
+    assert capture(["pi", "--num-episodes", "1", "--task-id", "3", "--output", str(store), "--budget", "10kB"]) == 2
     said = capsys.readouterr().err
     assert said.startswith("vla-capture: Cannot keep within --budget 10 kB: the smallest recording (denoise steps 9 of")
     assert said.count("\n") == 1

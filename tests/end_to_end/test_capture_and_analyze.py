@@ -34,14 +34,14 @@ def test_capture_makes_a_complete_store_and_resume_adds_the_missing_episodes(cap
 
 def test_resuming_a_complete_store_changes_nothing(captured_store, run_capture, capsys):
     before = {path: path.read_bytes() for path in captured_store.rglob("*") if path.is_file()}
-    run_capture("--task-id", 0, "--num-episodes", 2, "--store", captured_store, "--resume")
+    run_capture("--task-id", 0, "--num-episodes", 2, "--output", captured_store, "--resume")
     assert "2 of 2 episodes are complete already; 0 to run" in capsys.readouterr().out
     assert {path: path.read_bytes() for path in captured_store.rglob("*") if path.is_file()} == before
 
 
 def test_two_runs_give_the_same_bytes_whatever_ran_before(captured_store, run_capture, tmp_path):
     again = tmp_path / "again.zarr"
-    run_capture("--task-id", 1, "--num-episodes", 2, "--store", again)
+    run_capture("--task-id", 1, "--num-episodes", 2, "--output", again)
     for name in ("task001_episode000", "task001_episode001"):
         first, second = captured_store / "episodes" / name, again / "episodes" / name
         files = sorted(path.relative_to(first) for path in first.rglob("*") if path.is_file())
@@ -54,7 +54,7 @@ def test_the_number_of_threads_is_printed_and_recorded(run_capture, tmp_path, mo
     before = torch.get_num_threads()
     monkeypatch.setattr(os, "environ", dict(os.environ))
     store = tmp_path / "a.zarr"
-    run_capture("--task-id", 0, "--num-episodes", 1, "--store", store, "--threads", 2)
+    run_capture("--task-id", 0, "--num-episodes", 1, "--output", store, "--threads", 2)
     assert torch.get_num_threads() == 2
     torch.set_num_threads(before)
     assert capsys.readouterr().out.startswith("Threads: 2 (--threads).\n")
@@ -154,7 +154,7 @@ def test_three_groupings_of_one_store_need_no_model(captured_store, tmp_path, mo
     tables = {}
     for grouping in ("default", "cameras", str(toml)):
         folder = tmp_path / Path(grouping).stem
-        arguments = ["--grouping", grouping, "--tasks", "1", "--output", str(folder), "--no-plots"]
+        arguments = ["--grouping", grouping, "--task", "1", "--output", str(folder), "--no-plots"]
         assert analyze([str(captured_store), *arguments]) == 0
         tables[folder.name] = written_steps(folder)
     sides = ["base_0_rgb_mass", "left_wrist_0_rgb_mass"]
@@ -221,11 +221,11 @@ def test_recording_does_not_change_what_the_robot_does(captured_store, run_captu
         0,
         "--num-episodes",
         1,
-        "--store",
+        "--output",
         little,
         "--layers",
         1,
-        "--denoise-steps",
+        "--denoise",
         "last",
         "--heads",
         3,
@@ -281,7 +281,7 @@ def test_real_libero_from_capture_to_word_and_object_groups(libero_assets, run_c
         1,
         "--libero-assets",
         libero_assets,
-        "--store",
+        "--output",
         store,
     )
     arguments = ["--group", "soup=object:alphabet_soup_1", "--group", "named=word:soup", "--ratio", "soup/named"]
@@ -308,7 +308,7 @@ def test_capture_is_interrupted_cleanly(monkeypatch, tmp_path, capsys):
             "0",
             "--num-envs",
             "1",
-            "--store",
+            "--output",
             str(tmp_path / "a.zarr"),
         ]
     )

@@ -45,7 +45,7 @@ def test_a_checkpoint_drives_the_simulator_and_its_store_is_analysed(name, small
         1,
         "--max-steps",
         7,
-        "--store",
+        "--output",
         store,
     ]
     assert capture(["pi", "--checkpoint", str(GOLDEN / name), *map(str, arguments)]) == 0
@@ -189,7 +189,7 @@ def test_spoiled_checkpoints(name, spoil, expected, small_tokenizer, tmp_path, c
     checkpoint = copied(name, tmp_path)
     spoil(checkpoint)
     store = tmp_path / "a.zarr"
-    said = refused(["--checkpoint", checkpoint, "--tokenizer", small_tokenizer, "--store", store], capsys)
+    said = refused(["--checkpoint", checkpoint, "--tokenizer", small_tokenizer, "--output", store], capsys)
     for words in expected:
         assert words in said
     assert not store.exists()
@@ -212,7 +212,7 @@ def test_spoiled_checkpoints(name, spoil, expected, small_tokenizer, tmp_path, c
 )
 def test_arguments_that_contradict_a_checkpoint(arguments, expected, small_tokenizer, tmp_path, capsys):
     said = refused(
-        ["--checkpoint", GOLDEN / JAX, "--tokenizer", small_tokenizer, "--store", tmp_path / "a.zarr", *arguments],
+        ["--checkpoint", GOLDEN / JAX, "--tokenizer", small_tokenizer, "--output", tmp_path / "a.zarr", *arguments],
         capsys,
     )
     assert expected in said
@@ -221,6 +221,6 @@ def test_arguments_that_contradict_a_checkpoint(arguments, expected, small_token
 def test_a_checkpoint_without_a_tokenizer(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("OPENPI_DATA_HOME", str(tmp_path))
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
-    said = refused(["--checkpoint", GOLDEN / JAX, "--store", tmp_path / "a.zarr"], capsys)
+    said = refused(["--checkpoint", GOLDEN / JAX, "--output", tmp_path / "a.zarr"], capsys)
     assert "give --tokenizer PATH" in said
     assert listing([GOLDEN / JAX / "tokenizer" / "tokenizer.model"]) in said

@@ -48,7 +48,7 @@ def cosmos_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "--max-steps",
         "20",
     ]
-    assert capture([*arguments, "--num-open-loop-steps", "8", "--store", str(store)]) == 0
+    assert capture([*arguments, "--num-open-loop-steps", "8", "--output", str(store)]) == 0
     return store
 
 
@@ -128,7 +128,7 @@ def test_the_published_frame_proxy_is_named_by_its_frames(tmp_path):
 
 def test_queries_can_be_pooled_by_action_step(tmp_path):
     store = tmp_path / "a.zarr"
-    assert capture([*ONE_LAYER, "--queries", "steps", "--store", str(store)]) == 0
+    assert capture([*ONE_LAYER, "--queries", "steps", "--output", str(store)]) == 0
     rows = zarr.open_group(store / "episodes/task000_episode000", mode="r")["self/rows"]
     assert rows.shape[4] == 16 * 7
     assert analyze(["verify", str(store)]) == 0
@@ -146,7 +146,7 @@ def test_queries_can_be_pooled_by_action_step(tmp_path):
     ],
 )
 def test_bad_input_is_one_sentence(arguments, expected, tmp_path, capsys):
-    given = ["cosmos", "--ckpt-path", "untrained-tiny", "--store", str(tmp_path / "a.zarr"), *arguments]
+    given = ["cosmos", "--ckpt-path", "untrained-tiny", "--output", str(tmp_path / "a.zarr"), *arguments]
     assert capture(given) == 2
     said = capsys.readouterr().err.strip()
     assert expected in said

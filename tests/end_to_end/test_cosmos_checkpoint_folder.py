@@ -160,7 +160,7 @@ def folder(tmp_path: Path) -> Path:
 def refused(folder: Path, capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     """The sentence that the command ends with, after checking the form of it."""
     store = folder.parent / "a.zarr"
-    given = ["cosmos", "--ckpt-path", folder, "--task-id", 0, "--device", "cpu", "--store", store, *arguments]
+    given = ["cosmos", "--ckpt-path", folder, "--task-id", 0, "--device", "cpu", "--output", store, *arguments]
     capsys.readouterr()
     assert capture([str(argument) for argument in given]) == 2
     said = capsys.readouterr().err.strip()
@@ -233,7 +233,7 @@ def test_frames_and_calls_that_do_not_exist_name_those_that_do(folder, capsys):
 def test_an_instruction_without_embedding_names_the_near_ones(folder, capsys):
     """The error comes at the first replan: the store exists then, without an episode."""
     store = folder.parent / "a.zarr"
-    assert capture(["cosmos", "--ckpt-path", str(folder), *SHORT, "--store", str(store)]) == 2
+    assert capture(["cosmos", "--ckpt-path", str(folder), *SHORT, "--output", str(store)]) == 2
     assert not list((store / "episodes").glob("task*"))
     said = capsys.readouterr().err.strip().splitlines()[-1]
     assert "There is no text embedding of 'stack the red cube on top of the green cube'" in said
@@ -245,7 +245,7 @@ def test_without_t5s_tokenizer_words_cannot_be_selected_and_the_text_as_a_whole_
     task = list_tasks(find_suite("robosuite"))[1]
     folder = write_dummy_folder(tmp_path / "checkpoint", DUMMY_CONFIG, [task.instruction], dtype=torch.float32)
     store = str(tmp_path / "a.zarr")
-    assert capture(["cosmos", "--ckpt-path", str(folder), *SHORT, "--store", store]) == 0
+    assert capture(["cosmos", "--ckpt-path", str(folder), *SHORT, "--output", store]) == 0
     assert "give --t5-tokenizer to select words" in capsys.readouterr().err
     asked = [store, "--site", "cross", "--no-plots", "--output", str(tmp_path / "out")]
     for words in (

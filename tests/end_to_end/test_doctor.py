@@ -22,7 +22,7 @@ def lines_of(said: str) -> dict[str, tuple[str, str]]:
 
 def test_the_run_of_the_policy_that_comes_along(tmp_path, capfd):
     store = tmp_path / "a.zarr"
-    options = ["--task-id", "0", "3", "--num-episodes", "4", "--max-steps", "50", "--store", str(store)]
+    options = ["--task-id", "0", "3", "--num-episodes", "4", "--max-steps", "50", "--output", str(store)]
     assert capture(["doctor", *options, "--num-envs", "1"]) == 0
     said = capfd.readouterr().out
     found = lines_of(said)
@@ -43,17 +43,17 @@ def test_the_run_of_the_policy_that_comes_along(tmp_path, capfd):
 def test_a_store_that_the_run_cannot_continue_is_missing(tmp_path, capfd):
     store = write_store(tmp_path / "a.zarr", tasks=(0,), episodes=1)
     options = ["--checkpoint", "untrained-tiny", "--task-id", "0", "--num-episodes", "1", "--max-steps", "4"]
-    assert capture(["doctor", *options, "--store", str(store), "--resume"]) == 1
+    assert capture(["doctor", *options, "--output", str(store), "--resume"]) == 1
     assert f"Cannot resume {store}: its " in lines_of(capfd.readouterr().out)["trial"][1]
     (tmp_path / "b.zarr").mkdir()
     for mode in ("--resume", "--overwrite"):
-        assert capture(["doctor", *options, "--no-trial", "--store", str(tmp_path / "b.zarr"), mode]) == 1
+        assert capture(["doctor", *options, "--no-trial", "--output", str(tmp_path / "b.zarr"), mode]) == 1
         assert lines_of(capfd.readouterr().out)["store"][0] == "MISSING"
 
 
 def test_the_run_that_was_made_is_no_fault(tmp_path, capfd):
     store = write_store(tmp_path / "a.zarr", tasks=(0,), episodes=1)
-    options = ["--task-id", "0", "--num-episodes", "1", "--max-steps", "4", "--store", str(store)]
+    options = ["--task-id", "0", "--num-episodes", "1", "--max-steps", "4", "--output", str(store)]
     assert capture(["doctor", *options]) == 0
     said = capfd.readouterr().out
     status, text = lines_of(said)["store"]
@@ -63,7 +63,7 @@ def test_the_run_that_was_made_is_no_fault(tmp_path, capfd):
 
 def test_missing_assets_are_said_before_anything_is_written(tmp_path, capfd, monkeypatch):
     monkeypatch.delenv(ASSETS_VARIABLE, raising=False)
-    run = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "libero_10", "--store", str(tmp_path / "a.zarr")]
+    run = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "libero_10", "--output", str(tmp_path / "a.zarr")]
     lacking = tmp_path / "assets"
     for _ in range(2):
         assert capture([*run, "--libero-assets", str(lacking)]) == 2
@@ -73,7 +73,7 @@ def test_missing_assets_are_said_before_anything_is_written(tmp_path, capfd, mon
 
 def test_what_a_run_needs_and_lacks_is_exit_code_1(tmp_path, capfd, monkeypatch):
     monkeypatch.delenv(ASSETS_VARIABLE, raising=False)
-    lacking = ["--libero-assets", str(tmp_path), "--store", str(tmp_path / "a.zarr")]
+    lacking = ["--libero-assets", str(tmp_path), "--output", str(tmp_path / "a.zarr")]
     assert capture(["doctor", "--no-trial", "--task-suite", "libero_10", *lacking]) == 1
     said = capfd.readouterr().out
     found = lines_of(said)
@@ -84,7 +84,7 @@ def test_what_a_run_needs_and_lacks_is_exit_code_1(tmp_path, capfd, monkeypatch)
         "pi05_cubes comes with the program. It is not loaded, nor are time and size measured (--no-trial).",
     )
     assert said.endswith("The run cannot be made as described: assets.\n")
-    nowhere = ["--checkpoint", str(tmp_path / "nowhere"), "--store", str(tmp_path / "a.zarr")]
+    nowhere = ["--checkpoint", str(tmp_path / "nowhere"), "--output", str(tmp_path / "a.zarr")]
     assert capture(["doctor", *nowhere]) == 1
     found = lines_of(capfd.readouterr().out)
     assert found["checkpoint"] == ("MISSING", f"There is no checkpoint folder at '{tmp_path / 'nowhere'}'.")
@@ -94,7 +94,7 @@ def test_what_a_run_needs_and_lacks_is_exit_code_1(tmp_path, capfd, monkeypatch)
 def test_a_disk_that_is_too_small_and_a_budget(tmp_path, capfd, monkeypatch):
     from vla_attention.capture.store import disk_estimate
 
-    run = ["doctor", "--num-episodes", "50", "--store", str(tmp_path / "a.zarr")]
+    run = ["doctor", "--num-episodes", "50", "--output", str(tmp_path / "a.zarr")]
     monkeypatch.setattr(disk_estimate, "free_bytes", lambda path: 10**7)
     assert capture(run) == 1
     status, text = lines_of(capfd.readouterr().out)["size"]
@@ -126,7 +126,7 @@ def test_the_number_of_episodes_can_be_given(tmp_path, capfd):
 @pytest.mark.slow
 def test_the_policy_that_comes_along_is_accepted(tmp_path, capfd):
     store = tmp_path / "kept.zarr"
-    assert capture(["doctor", "--accept", "pi05_cubes", "--store", str(store), "--layers", "3", "--no-frames"]) == 0
+    assert capture(["doctor", "--accept", "pi05_cubes", "--output", str(store), "--layers", "3", "--no-frames"]) == 0
     said = capfd.readouterr().out
     assert re.search(r"^Solved (9|10) of 10 episodes of cubes", said, re.MULTILINE)
     assert "Published: 99.1% of 850 episodes (98.2% to 99.6%), docs/cubes.md." in said

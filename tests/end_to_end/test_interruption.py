@@ -33,7 +33,7 @@ NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2")
 
 def test_sigterm_drops_the_episode_in_flight_and_resuming_completes_the_store(tmp_path):
     store = tmp_path / "a.zarr"
-    arguments = [*DUMMY, "--num-episodes", "3", "--max-steps", "32", "--store", str(store)]
+    arguments = [*DUMMY, "--num-episodes", "3", "--max-steps", "32", "--output", str(store)]
     log = tmp_path / "log"
 
     def in_a_later_episode() -> bool:
@@ -80,7 +80,7 @@ def test_sigterm_drops_the_episode_in_flight_and_resuming_completes_the_store(tm
 def test_kills_and_damage_end_in_a_whole_store_after_repair_and_resuming(tmp_path, capsys):
     """SIGKILL three times at moments that nobody chose, then lost files."""
     store, random = tmp_path / "a.zarr", Random(int.from_bytes(os.urandom(4)))
-    arguments = [*DUMMY, "--num-episodes", "4", "--max-steps", "8", "--store", str(store), "--resume"]
+    arguments = [*DUMMY, "--num-episodes", "4", "--max-steps", "8", "--output", str(store), "--resume"]
     command = [sys.executable, "-m", "vla_attention.capture", *arguments]
     environment = os.environ | {"MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
     for _ in range(3):
@@ -115,7 +115,7 @@ def test_kills_and_damage_end_in_a_whole_store_after_repair_and_resuming(tmp_pat
 def test_a_capture_waits_for_an_episode_that_another_process_has_claimed(tmp_path, monkeypatch, capsys):
     """After the capture the store is complete, so a dependent analysis is complete, too."""
     store = tmp_path / "a.zarr"
-    arguments = [*DUMMY, "--max-steps", "4", "--store", str(store)]
+    arguments = [*DUMMY, "--max-steps", "4", "--output", str(store)]
     assert capture([*arguments, "--num-episodes", "1"]) == 0
     other = Claims(store, NODE)
     assert other.acquire("task000_episode001") is None

@@ -23,7 +23,7 @@ SHORT = ("pi", "--checkpoint", "untrained-tiny", "--task-suite", "libero_goal", 
 @pytest.mark.libero
 def test_a_resumed_episode_is_the_one_of_a_run_in_order(tmp_path: Path, libero_assets: Path, capfd) -> None:
     def run(store: Path, *arguments: str) -> str:
-        given = [*SHORT, "--libero-assets", str(libero_assets), "--store", str(store), "--num-envs", "1", *arguments]
+        given = [*SHORT, "--libero-assets", str(libero_assets), "--output", str(store), "--num-envs", "1", *arguments]
         assert capture(given) == 0
         return capfd.readouterr().out
 

@@ -18,7 +18,7 @@ def test_png_pictures_of_a_run_give_its_rows_to_the_bit_and_a_video_is_analysed(
     episodes = episodes_of_store(captured_store, COLUMNS)[:2]  # the two of task 0: the noise depends on both numbers
     for name, encoding in (("png", None), ("video", Encoding())):
         data = write_data_set(tmp_path / name, "v3.0", episodes, video=encoding)
-        options = ["--checkpoint", "untrained-tiny", "--every", "1", "--store", str(tmp_path / f"{name}.zarr")]
+        options = ["--checkpoint", "untrained-tiny", "--every", "1", "--output", str(tmp_path / f"{name}.zarr")]
         assert capture(["replay", str(data), *options]) == 0
     for number in range(2):
         where = f"episodes/task000_episode{number:03d}"

@@ -27,16 +27,16 @@ def test_a_libero_store_is_made_again_and_without_an_object_and_a_word(
     options, camera = FAMILIES[family]
     base = tmp_path / "base.zarr"
     words = ["--task-suite", "libero_10", "--task-id", "0", "--num-episodes", "1"]
-    assert capture([family, *options, *words, "--libero-assets", str(libero_assets), "--store", str(base)]) == 0
+    assert capture([family, *options, *words, "--libero-assets", str(libero_assets), "--output", str(base)]) == 0
     again, changed = tmp_path / "again.zarr", tmp_path / "changed.zarr"
-    assert capture(["rerun", str(base), "--store", str(again)]) == 0
+    assert capture(["rerun", str(base), "--output", str(again)]) == 0
     assert "made again without any change: bit-equal" in capsys.readouterr().out
     [stored], [repeated] = open_store(base).episodes, open_store(again).episodes
     assert stored.attributes.arrays == repeated.attributes.arrays
 
     soup = "object:alphabet_soup_1"
     knockouts = ["--knockout", soup, "--knockout", "word:soup", "--image", f"{camera}=filled:tomato_sauce_1"]
-    assert capture(["rerun", str(base), "--store", str(changed), *knockouts, "--check", "1"]) == 0
+    assert capture(["rerun", str(base), "--output", str(changed), *knockouts, "--check", "1"]) == 0
     store = open_store(changed)
     assert verify_store(store) == []
     [episode] = store.episodes

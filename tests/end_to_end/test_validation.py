@@ -169,8 +169,8 @@ def test_the_reduced_run_has_every_table_and_unchanged_calls_are_the_stored_ones
 def test_effects_are_those_of_vla_analyze_on_the_stores_of_vla_capture_rerun(work, tmp_path):
     base = open_store(work / "words_0" / "base.zarr")
     store, noise = tmp_path / "without.zarr", tmp_path / "noise.zarr"
-    assert capture(["rerun", str(base.path), "--knockout", "role:instruction", "--store", str(store)]) == 0
-    assert capture(["rerun", str(base.path), "--noise-seed", "1000", "--store", str(noise)]) == 0
+    assert capture(["rerun", str(base.path), "--knockout", "role:instruction", "--output", str(store)]) == 0
+    assert capture(["rerun", str(base.path), "--noise-seed", "1000", "--output", str(noise)]) == 0
     study = study_effects(base.path, [store, noise], AnalysisSettings())
     table = study.episodes.filter(phase="all", kind="without")
     policy = load_policy(base.path)

@@ -52,7 +52,7 @@ def made(change: Callable[[Path], object], folder: Path) -> list[str]:
     shutil.copytree(dummy(), checkpoint)
     change(checkpoint)
     arguments = ["cosmos", "--ckpt-path", str(checkpoint), "--device", "cpu", "--task-suite", "cubes", "--task-id", "0"]
-    return [*arguments, "--num-episodes", "1", "--store", str(folder / "store.zarr")]
+    return [*arguments, "--num-episodes", "1", "--output", str(folder / "store.zarr")]
 
 
 def weights(change: Callable[[Path], object]) -> Make:

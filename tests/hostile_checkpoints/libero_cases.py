@@ -76,7 +76,7 @@ def made(change: Callable[[Path, Path, Path], object], folder: Path) -> list[str
         "--task-id",
         str(NUMBER),
     ]
-    more = ["--num-episodes", "1", "--libero-assets", str(assets), "--store", str(folder / "store.zarr")]
+    more = ["--num-episodes", "1", "--libero-assets", str(assets), "--output", str(folder / "store.zarr")]
     return [*arguments, *more]
 
 

@@ -35,7 +35,7 @@ NORMALIZER = "policy_preprocessor_step_3_normalizer_processor.safetensors"
 def arguments(checkpoint: Path, tokenizer: Path = EMBEDDED_TOKENIZER) -> list[str]:
     model = ["pi", "--checkpoint", str(checkpoint), "--tokenizer", str(tokenizer), "--device", "cpu"]
     store = checkpoint.parent / "store.zarr"
-    return [*model, "--task-suite", "cubes", "--task-id", "0", "--num-episodes", "1", "--store", str(store)]
+    return [*model, "--task-suite", "cubes", "--task-id", "0", "--num-episodes", "1", "--output", str(store)]
 
 
 def copied(of: str, change: Callable[[Path], object], folder: Path, *, case: bool = True) -> list[str]:

@@ -46,7 +46,7 @@ def hostile(change: Callable[[Path], object], *, version: str = "v2.1", video: b
 
 def command(folder: Path) -> list[str]:
     cameras = ["--camera", f"base_0_rgb={CAMERA}", "--camera", "left_wrist_0_rgb=none"]
-    store = ["--every", "1", "--store", str(folder / "store.zarr")]
+    store = ["--every", "1", "--output", str(folder / "store.zarr")]
     return ["replay", str(folder / "robot"), "--checkpoint", "untrained-tiny", *cameras, *store]
 
 

@@ -105,7 +105,7 @@ def capture(store: Path, tasks: Sequence[int]) -> int:
     capture_without_simulator(patch)
     patch.setattr(episode_loop, "_LOOK_EVERY_S", 0.3)
     chosen = ["--task-id", *map(str, tasks), "--num-episodes", str(EPISODES)]
-    return main([*_ARGUMENTS.split(), *chosen, "--store", str(store), "--resume"])
+    return main([*_ARGUMENTS.split(), *chosen, "--output", str(store), "--resume"])
 
 
 def run_round(folder: Path, undisturbed: Path, number: int, processes: int) -> Round:

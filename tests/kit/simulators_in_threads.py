@@ -69,7 +69,7 @@ def simulators_in_threads(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
 def record(store: Path, num_envs: int, *words: str) -> int:
     """Capture with the policy of test size; returns the exit code."""
-    return capture([*TINY, "--task-suite", "robosuite", "--store", str(store), "--num-envs", str(num_envs), *words])
+    return capture([*TINY, "--task-suite", "robosuite", "--output", str(store), "--num-envs", str(num_envs), *words])
 
 
 def assert_same_episodes(one: Path, other: Path) -> None:

@@ -57,7 +57,7 @@ def test_values(script):
 def test_paths_are_left_to_the_shell(script):
     assert completed(script, "vla-analyze", "runs/") == []
     assert completed(script, "vla-analyze", "words", "") == []
-    assert completed(script, "vla-capture", "pi", "--store", "") == []
+    assert completed(script, "vla-capture", "pi", "--output", "") == []
 
 
 def test_every_command_is_there():

@@ -40,7 +40,7 @@ def test_reruns_are_recorded_as_their_base_is(monkeypatch, tmp_path):
     reruns = [words for words in commands if words[0] == "rerun"]
     assert len(reruns) == 2
     for words in reruns:
-        assert not {"--layers", "--heads", "--denoise-steps", "--queries"} & set(words)
+        assert not {"--layers", "--heads", "--denoise", "--queries"} & set(words)
 
 
 def test_they_are_small():

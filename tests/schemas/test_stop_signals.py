@@ -197,7 +197,7 @@ def test_an_analysis_that_gets_sigterm_says_one_sentence(store, tmp_path):
     assert not [file for file in tmp_path.rglob("*") if file.name.endswith(".partial")]
 
 
-CAPTURE = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", "0", "--store", "STORE"]
+CAPTURE = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", "0", "--output", "STORE"]
 STOPPED = "complete episodes are kept, continue with --resume."
 
 

@@ -129,7 +129,7 @@ def run_watched(code: str, **environment: str) -> dict[str, dict[str, str]]:
 def test_capture_sets_them_before_torch_is_loaded(tmp_path):
     code = f"""
 from vla_attention.capture.__main__ import main
-main(["pi", "--threads", "3", "--store", {str(tmp_path / "a.zarr")!r}, "--device", "cpu", "--layers", "99"])
+main(["pi", "--threads", "3", "--output", {str(tmp_path / "a.zarr")!r}, "--device", "cpu", "--layers", "99"])
 import torch
 assert torch.get_num_threads() == 3, torch.get_num_threads()
 """

@@ -114,13 +114,13 @@ WORDS: dict[str, tuple[str, ...]] = {
     "effects": ("STORE", "OTHER", "--output", "OUT", "--no-plots"),
     "deviation": ("STORE", "--output", "OUT", "--no-plots"),
     "overlay": ("STORE", "--output", "OUT", "--episode", "0", "--task", "0"),
-    "report": ("STORE", "--output", "OUT", "--episodes", "1", "--tasks", "0", "--layers", "0"),
+    "report": ("STORE", "--output", "OUT", "--episodes", "1", "--task", "0", "--layers", "0"),
     "export": ("STORE", "--csv", "--output", "OUT"),
 }
 
 
 def test_every_command_that_reads_numbers_is_tried():
-    assert set(WORDS) == set(COMMANDS) - {"copy", "merge", "verify", "repair", "cache", "view"}
+    assert set(WORDS) == set(COMMANDS) - {"copy", "verify", "repair", "cache", "view"}
 
 
 def prepared(command: str, folder: Path) -> tuple[Path, Path]:

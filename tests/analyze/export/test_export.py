@@ -155,7 +155,7 @@ def test_a_selection_of_axes_is_labelled(store, tmp_path):
         "last",
         "--heads",
         1,
-        "--tasks",
+        "--task",
         2,
         "--output",
         tmp_path,

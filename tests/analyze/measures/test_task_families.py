@@ -82,7 +82,7 @@ def test_of_fewer_than_four_families_the_interval_is_about_these_tasks(store, tm
     assert few["num_families"] == 3
     assert few["intervals"] == "these-tasks"
     assert few["geometric_mean_low"] == these["geometric_mean_low"]
-    words = ["words", str(store), "--no-plots", "--output", str(tmp_path / "out"), "--tasks", "0", "1", "2", "3", "4"]
+    words = ["words", str(store), "--no-plots", "--output", str(tmp_path / "out"), "--task", "0", "1", "2", "3", "4"]
     assert main(words) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert (

@@ -32,7 +32,7 @@ def bytes_of(recording: Recording) -> DiskEstimate:
 
 
 def settings_of(*words: str) -> RunSettings:
-    return run_settings(build_parser().parse_args(["pi", *words, "--store", "a.zarr"]))
+    return run_settings(build_parser().parse_args(["pi", *words, "--output", "a.zarr"]))
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_what_was_chosen_and_given_up_is_said() -> None:
 
 def test_typed_options_stay_as_they_are() -> None:
     assert settings_of("--budget", "1GB").fixed == Fixed()
-    words = ("--precision", "exact", "--denoise-steps", "last", "--layers", "3", "--heads", "0", "1")
+    words = ("--precision", "exact", "--denoise", "last", "--layers", "3", "--heads", "0", "1")
     typed = settings_of("--budget", "1GB", *words)
     assert typed.fixed == Fixed(precision=True, denoise_steps=True, layers=True, heads=True)
     assert typed.budget == 10**9

@@ -43,7 +43,7 @@ def test_the_mean_is_that_of_the_tasks_stored_pictures(pi_store):
 
 def test_a_rerun_measures_what_the_policy_does_with_it(pi_store, tmp_path):
     target, policy = tmp_path / "effects.zarr", dummy_policy()
-    assert main(["rerun", str(pi_store), "--check", "0", "--store", str(target), "--effects", "cameras"]) == 0
+    assert main(["rerun", str(pi_store), "--check", "0", "--output", str(target), "--effects", "cameras"]) == 0
     for episode in open_store(target).episodes:
         effects, calls = episode.attributes.effects, read_calls(episode)
         names = [condition.name for condition in effects.conditions]
@@ -74,9 +74,9 @@ def test_without_a_store_of_pictures_they_are_grey_and_a_line_says_so(pi_store, 
         "1",
     ]
     words += ["--max-steps", "4", "--effects", "cameras"]
-    assert main([*words, "--store", str(tmp_path / "grey.zarr")]) == 0
+    assert main([*words, "--output", str(tmp_path / "grey.zarr")]) == 0
     assert "exchanged for grey ones; --effects-pictures STORE" in capsys.readouterr().out
-    assert main([*words, "--store", str(tmp_path / "mean.zarr"), "--effects-pictures", str(pi_store)]) == 0
+    assert main([*words, "--output", str(tmp_path / "mean.zarr"), "--effects-pictures", str(pi_store)]) == 0
     assert "grey" not in capsys.readouterr().out
     for name, kind in (("grey", "blank"), ("mean", "mean")):
         (episode,) = open_store(tmp_path / f"{name}.zarr").episodes

@@ -70,7 +70,7 @@ def test_the_robot_executes_what_it_would_without_them(pi_store, with_effects):
 )
 def test_a_rerun_of_one_condition_gives_the_same(with_effects, tmp_path, condition, words):
     target = tmp_path / "one.zarr"
-    assert main(["rerun", str(with_effects), "--store", str(target), "--check", "0", *words]) == 0
+    assert main(["rerun", str(with_effects), "--output", str(target), "--check", "0", *words]) == 0
     recorded = changes(open_store(with_effects), condition)
     rerun = open_store(target)
     assert set(recorded) == {episode.name for episode in rerun.episodes}
@@ -86,9 +86,9 @@ def test_effects_of_the_store_are_those_of_its_reruns(with_effects, tmp_path):
         for word in ("cube", "red"):
             target = folder / f"{word}_{queries}.zarr"
             options = ["--knockout", f'word:"{word}"', "--knockout-queries", queries, "--task-id", "0"]
-            assert main(["rerun", str(with_effects), "--store", str(target), "--check", "0", *options]) == 0
+            assert main(["rerun", str(with_effects), "--output", str(target), "--check", "0", *options]) == 0
     seed = str(open_store(with_effects).attributes.recording.effects.seed)
-    noise = ["rerun", str(with_effects), "--store", str(folder / "n.zarr"), "--check", "0", "--noise-seed", seed]
+    noise = ["rerun", str(with_effects), "--output", str(folder / "n.zarr"), "--check", "0", "--noise-seed", seed]
     assert main(noise) == 0
     settings = AnalysisSettings(tasks=(0,))
     recorded = study_effects(with_effects, [], settings, dimensions=range(7)).summary
@@ -153,7 +153,7 @@ def test_a_store_without_effects_says_how_to_get_them(pi_store, capsys):
 
 def test_a_rerun_adds_effects_to_stored_calls(pi_store, with_effects, tmp_path, capsys):
     target = tmp_path / "later.zarr"
-    assert main(["rerun", str(pi_store), "--check", "0", "--store", str(target), *EFFECTS]) == 0
+    assert main(["rerun", str(pi_store), "--check", "0", "--output", str(target), *EFFECTS]) == 0
     assert "0 episodes added" not in capsys.readouterr().out
     later, now = open_store(target), open_store(with_effects)
     assert verify_store(later) == []
@@ -168,8 +168,8 @@ def test_a_rerun_of_changed_attention_is_refused(pi_store, tmp_path, capsys):
     """The base's interventions are made again; an effect would be that of an item on top of them."""
     cut = tmp_path / "cut.zarr"
     words = ["rerun", str(pi_store), "--check", "0", "--num-episodes", "1"]
-    assert main([*words, "--store", str(cut), "--knockout", "role:image"]) == 0
-    assert main(["rerun", str(cut), "--check", "0", "--store", str(tmp_path / "a.zarr"), "--effects", "text"]) == 2
+    assert main([*words, "--output", str(cut), "--knockout", "role:image"]) == 0
+    assert main(["rerun", str(cut), "--check", "0", "--output", str(tmp_path / "a.zarr"), "--effects", "text"]) == 2
     assert "beside interventions on attention" in capsys.readouterr().err
     assert not (tmp_path / "a.zarr").exists()
 
@@ -178,7 +178,7 @@ def test_the_floor_is_another_noise_than_the_rerun_s(pi_store, tmp_path):
     base = open_store(pi_store).attributes.protocol.seed
     target = tmp_path / "a.zarr"
     words = ["rerun", str(pi_store), "--check", "0", "--num-episodes", "1", "--noise-seed", str(base + 1)]
-    assert main([*words, "--store", str(target), "--effects", "text"]) == 0
+    assert main([*words, "--output", str(target), "--effects", "text"]) == 0
     assert open_store(target).attributes.recording.effects.seed == base + 2
     assert all(np.abs(change).max() > 1e-3 for change in changes(open_store(target), "noise").values())
 
@@ -211,7 +211,7 @@ def test_one_reader_suffices(tmp_path):
 def test_resume_continues_and_another_choice_is_another_run(with_effects, tmp_path, capsys):
     path = capture(tmp_path / "pi.zarr", "pi", *EFFECTS)
     words = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", "0", "1"]
-    words += ["--num-episodes", "2", "--max-steps", "12", "--store", str(path), "--resume"]
+    words += ["--num-episodes", "2", "--max-steps", "12", "--output", str(path), "--resume"]
     assert main([*words, *EFFECTS]) == 0
     assert main([*words, "--effects", "text"]) == 2
     assert "recording.effects" in capsys.readouterr().err
@@ -227,7 +227,7 @@ def test_resume_continues_and_another_choice_is_another_run(with_effects, tmp_pa
 )
 def test_what_is_refused_before_the_first_episode(tmp_path, capsys, options, sentence):
     words = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", "0"]
-    assert main([*words, "--store", str(tmp_path / "a.zarr"), *options]) == 2
+    assert main([*words, "--output", str(tmp_path / "a.zarr"), *options]) == 2
     assert sentence in capsys.readouterr().err
     assert not (tmp_path / "a.zarr").exists()
 
@@ -263,7 +263,7 @@ def test_verify_finds_effects_that_do_not_fit(with_effects, tmp_path, edit, said
 def test_a_run_without_memory_for_one_changed_call_is_refused_before_it_starts(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("vla_attention.capture.policies.pi.policy.memory_left_on", lambda device: 1e5)
     target = tmp_path / "a.zarr"
-    words = ["pi", "--task-id", "0", "--num-episodes", "1", "--store", str(target), "--effects", "text"]
+    words = ["pi", "--task-id", "0", "--num-episodes", "1", "--output", str(target), "--effects", "text"]
     assert main(words) == 2
     assert (
         "Cannot measure effects: there is no memory for one changed call (each takes up to" in capsys.readouterr().err
@@ -274,6 +274,6 @@ def test_a_run_without_memory_for_one_changed_call_is_refused_before_it_starts(t
 def test_a_rerun_that_only_measured_effects_is_named_as_what_to_ask(pi_store, tmp_path, capsys):
     target = tmp_path / "pi_effects.zarr"
     words = ["--check", "0", "--task-id", "0", "--effects", "text", "--effects-every", "9"]
-    assert main(["rerun", str(pi_store), "--store", str(target), *words]) == 0
+    assert main(["rerun", str(pi_store), "--output", str(target), *words]) == 0
     assert analyze(["effects", str(pi_store), str(target), "--no-plots", "--output", str(tmp_path / "out")]) == 2
     assert f"vla-attention effects {target} shows them." in capsys.readouterr().err.replace("\n  ", " ")

@@ -38,7 +38,7 @@ def run(store: Path, *words: str, family: str = "pi") -> int:
         "--precision",
         "exact",
     ]
-    return main([*first, "--store", str(store), *words])
+    return main([*first, "--output", str(store), *words])
 
 
 def captured(store: Path, *words: str, family: str = "pi") -> Store:

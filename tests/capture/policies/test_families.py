@@ -91,7 +91,7 @@ def test_a_third_family_captures_and_is_analysed(tmp_path, capfd):
 def test_several_tasks_fill_one_store_and_their_status_is_theirs(tmp_path, capfd):
     """`--task-id 2 0` runs both, `status` expects both, and a task more joins with --resume."""
     store = tmp_path / "toy.zarr"
-    arguments = ["toy", "--num-episodes", "1", "--max-steps", "2", "--no-contributions", "--store", str(store)]
+    arguments = ["toy", "--num-episodes", "1", "--max-steps", "2", "--no-contributions", "--output", str(store)]
     assert main([*arguments, "--task-id", "2", "0"]) == 0
     assert sorted(path.name for path in (store / "episodes").glob("task*")) == [
         "task000_episode000",

@@ -167,7 +167,7 @@ def test_the_log_begins_with_the_job():
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["--task-suite", "all", "--store", "a.zarr"], "a store holds one suite"),
+        (["--task-suite", "all", "--output", "a.zarr"], "a store holds one suite"),
         (["--task-suite", "all", "--array-index", "40"], "--array=0-39"),
         (["--array-index", "1", "--task-id", "1"], "in an array the index is the task"),
         (["--task-id", "11"], "its tasks are 0 to 9"),

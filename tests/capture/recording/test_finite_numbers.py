@@ -86,7 +86,7 @@ def test_a_policy_that_overflows_is_reported_with_its_first_layer(
 ):
     capture_without_simulator(monkeypatch)
     store = tmp_path / "a.zarr"
-    arguments = [*DUMMY[family], "--store", str(store)]
+    arguments = [*DUMMY[family], "--output", str(store)]
     assert capture([*arguments, "--num-episodes", "1"]) == 0
     spoil({"pi": PiModel, "cosmos": Dit}[family], module, overflow(*calls))
     capsys.readouterr()
@@ -119,7 +119,7 @@ def test_a_checkpoint_with_nan_names_the_tensor_and_makes_no_store(tmp_path, mon
     save_file(tensors, checkpoint / "model.safetensors")
     store = tmp_path / "a.zarr"
     tokenizer = train_small_tokenizer(tmp_path / "small.model")
-    assert capture(["pi", "--checkpoint", str(checkpoint), "--tokenizer", str(tokenizer), "--store", str(store)]) == 2
+    assert capture(["pi", "--checkpoint", str(checkpoint), "--tokenizer", str(tokenizer), "--output", str(store)]) == 2
     said = capsys.readouterr().err
     assert (
         f"NaN or infinite weights in 2 tensors: action_out_proj.bias (1 of {len(tensors['action_out_proj.bias'])}"

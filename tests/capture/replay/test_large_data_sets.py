@@ -74,7 +74,7 @@ def check_replay(folder: Path, store: Path) -> None:
         "--camera",
         "left_wrist_0_rgb=none",
     )
-    assert capture(["replay", str(folder), *options, "--every", "100", "--store", str(store)]) == 0
+    assert capture(["replay", str(folder), *options, "--every", "100", "--output", str(store)]) == 0
     assert len(open_store(store).episodes) == 3
 
 

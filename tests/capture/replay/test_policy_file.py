@@ -58,7 +58,7 @@ def run(*arguments: object) -> int:
 
 def test_any_torch_policy_on_a_data_set(tmp_path, data, file, capsys):
     store = tmp_path / "replay.zarr"
-    assert run("replay", data, "--policy", file, "--store", store) == 0
+    assert run("replay", data, "--policy", file, "--output", store) == 0
     said = capsys.readouterr().out
     assert "Policy: small (torch modules of the caller: random weights)" in said
     assert "Columns: camera front = observation.images.front; state = observation.state; actions = action." in said
@@ -94,7 +94,7 @@ def test_recorded_actions_are_as_many_as_the_policy_s_where_the_layout_says_no_n
     store = tmp_path / "replay.zarr"
     file.write_text(FILE.replace("small_layout()", "dataclasses.replace(small_layout(), action_horizon=0)"))
     file.write_text("import dataclasses\n" + file.read_text())
-    assert run("replay", data, "--policy", file, "--store", store, "--episodes", 1) == 0
+    assert run("replay", data, "--policy", file, "--output", store, "--episodes", 1) == 0
     episode = zarr.open_group(store / "episodes" / "task001_episode001", mode="r")
     assert episode["dataset_actions"].shape[1] == HORIZON
     assert episode.attrs["dataset_action_count"] == [3, 2]
@@ -102,7 +102,7 @@ def test_recorded_actions_are_as_many_as_the_policy_s_where_the_layout_says_no_n
 
 def test_a_store_of_other_code_is_not_rerun_and_the_way_is_said(tmp_path, data, file, capsys):
     store = tmp_path / "replay.zarr"
-    assert run("replay", data, "--policy", file, "--store", store, "--episodes", 1) == 0
+    assert run("replay", data, "--policy", file, "--output", store, "--episodes", 1) == 0
     assert run("rerun", store, "--knockout", "camera:front") == 2
     said = capsys.readouterr().err
     assert "a policy of the caller's own code" in said
@@ -116,7 +116,7 @@ def _noise(seed: int) -> torch.Tensor:
 
 def test_a_file_s_replay_is_continued(tmp_path, data, file, capsys):
     store = tmp_path / "replay.zarr"
-    options = ("replay", data, "--policy", file, "--store", store, "--layers", 0, 2, "--queries", "all")
+    options = ("replay", data, "--policy", file, "--output", store, "--layers", 0, 2, "--queries", "all")
     assert run(*options, "--episodes", 2) == 0
     assert run(*options, "--resume") == 0
     assert "1 of 3 episodes are complete already; 2 to run." in capsys.readouterr().out
@@ -130,9 +130,9 @@ def test_a_file_s_replay_is_continued(tmp_path, data, file, capsys):
 def test_knockouts_are_paired_with_the_unchanged_replay(tmp_path, data, file, capsys):
     base, changed = tmp_path / "base.zarr", tmp_path / "without_front.zarr"
     replay = ("replay", data, "--policy", file)
-    assert run(*replay, "--store", base) == 0
+    assert run(*replay, "--output", base) == 0
     knockout = ("--knockout", "camera:front", "--rerun-of", base)
-    assert run(*replay, *knockout, "--store", changed) == 0
+    assert run(*replay, *knockout, "--output", changed) == 0
     said = capsys.readouterr().out
     assert "Interventions: " in said
     assert f"Next: vla-attention effects {base} {changed}" in said
@@ -150,7 +150,7 @@ def test_knockouts_are_paired_with_the_unchanged_replay(tmp_path, data, file, ca
     assert "without_front" in said
     # another noise seed is the scale of the effects
     noise = tmp_path / "noise.zarr"
-    assert run(*replay, "--noise-seed", 8, "--rerun-of", base, "--store", noise) == 0
+    assert run(*replay, "--noise-seed", 8, "--rerun-of", base, "--output", noise) == 0
     one, other = (zarr.open_group(store / "episodes" / "task000_episode000", mode="r") for store in (base, noise))
     assert other.attrs["noise_seed"][0] == noise_seed(8, 0, 0, 0)
     assert not np.array_equal(one["actions"][:], other["actions"][:])
@@ -162,9 +162,9 @@ def test_knockouts_are_paired_with_the_unchanged_replay(tmp_path, data, file, ca
         (("--every", 1), "other --every or --seed"),
         (("--state", "none"), "other data set, or columns of it"),
     ):
-        assert run(*replay, *knockout, *options, "--store", tmp_path / "no.zarr") == 2
+        assert run(*replay, *knockout, *options, "--output", tmp_path / "no.zarr") == 2
         assert message in capsys.readouterr().err
-    assert run(*replay, "--rerun-of", base, "--store", tmp_path / "no.zarr") == 2
+    assert run(*replay, "--rerun-of", base, "--output", tmp_path / "no.zarr") == 2
     assert "--rerun-of needs an intervention" in capsys.readouterr().err
 
 
@@ -190,7 +190,7 @@ def test_mistakes_end_with_one_sentence(tmp_path, data, capsys, content, options
     if content is not None:
         file.write_text(content)
     try:
-        code = run("replay", data, "--policy", file, "--store", tmp_path / "replay.zarr", *options)
+        code = run("replay", data, "--policy", file, "--output", tmp_path / "replay.zarr", *options)
     except SystemExit as end:  # argparse's own
         code = end.code
     assert code == 2

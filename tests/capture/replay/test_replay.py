@@ -46,7 +46,7 @@ def simulate(monkeypatch, store, *options):
     """A run of two episodes in a scene in which nothing moves; its noise changes from replan to replan."""
     capture_without_simulator(monkeypatch)
     where = ("--task-suite", "robosuite", "--task-id", 0, "--num-episodes", 2, "--max-steps", 15)
-    assert run("pi", *where, "--store", store, *options) == 0
+    assert run("pi", *where, "--output", store, *options) == 0
 
 
 def assert_same_calls(one: Path, other: Path, num_episodes: int = 2) -> None:
@@ -64,7 +64,7 @@ def test_pictures_of_a_run_give_the_rows_of_that_run(tmp_path, monkeypatch, vers
     simulate(monkeypatch, tmp_path / "run.zarr", *TINY)
     episodes = episodes_of_store(tmp_path / "run.zarr", LIBERO_COLUMNS, every=every)
     data = write_data_set(tmp_path / "data", version, episodes)
-    assert run("replay", data, *TINY, "--every", every, "--store", tmp_path / "replay.zarr") == 0
+    assert run("replay", data, *TINY, "--every", every, "--output", tmp_path / "replay.zarr") == 0
     assert_same_calls(tmp_path / "run.zarr", tmp_path / "replay.zarr")
     replayed = episode(tmp_path / "replay.zarr", 0, 1)
     assert replayed.attrs["env_step"] == [0, every, 2 * every, 3 * every]
@@ -78,7 +78,7 @@ def test_a_lerobot_policy_gives_the_rows_of_its_run(tmp_path, monkeypatch, token
     episodes = episodes_of_store(tmp_path / "run.zarr", LEROBOT_COLUMNS, own_pictures=True, state_dtype="float32")
     data = write_data_set(tmp_path / "data", "v3.0", episodes)
     # the evaluations of LeRobot have another seed
-    assert run("replay", data, *model, "--every", 1, "--seed", 1000, "--store", tmp_path / "replay.zarr") == 0
+    assert run("replay", data, *model, "--every", 1, "--seed", 1000, "--output", tmp_path / "replay.zarr") == 0
     assert_same_calls(tmp_path / "run.zarr", tmp_path / "replay.zarr")
     for camera in LEROBOT_COLUMNS:
         own = [episode(tmp_path / f"{name}.zarr", 0, 0)[f"camera_frames/{camera}"][:] for name in ("run", "replay")]
@@ -92,7 +92,7 @@ def test_a_video_gives_nearly_the_rows_of_the_run(tmp_path, monkeypatch, encodin
     simulate(monkeypatch, tmp_path / "run.zarr", *cubes)
     episodes = episodes_of_store(tmp_path / "run.zarr", LIBERO_COLUMNS)
     data = write_data_set(tmp_path / "data", "v3.0", episodes, video=encoding)
-    assert run("replay", data, *cubes, "--every", 1, "--store", tmp_path / "replay.zarr") == 0
+    assert run("replay", data, *cubes, "--every", 1, "--output", tmp_path / "replay.zarr") == 0
     for number in range(2):
         rows = [episode(tmp_path / f"{name}.zarr", 0, number)["joint/rows"][:] for name in ("run", "replay")]
         moved = np.abs(rows[0] - rows[1]).sum(axis=-1) / 2  # probability that lies on other keys
@@ -105,7 +105,7 @@ def test_the_store_says_what_was_replayed(tmp_path, capsys):
     data = write_data_set(tmp_path / "so101_pick", "v3.0", made, video=H264)
     cameras = ("--camera", "base_0_rgb=front", "--camera", "left_wrist_0_rgb=observation.images.wrist")
     store = tmp_path / "replay.zarr"
-    options = (*TINY, *cameras, "--every", 3, "--store", store)
+    options = (*TINY, *cameras, "--every", 3, "--output", store)
     assert run("replay", data, *options, "--episodes", "1-2") == 0
     said = capsys.readouterr().out
     assert (
@@ -151,7 +151,7 @@ def test_the_store_says_what_was_replayed(tmp_path, capsys):
     ]
     assert run("replay", data, *options) == 2
     assert "exists already" in capsys.readouterr().err
-    assert run("replay", data, *TINY, *cameras, "--every", 2, "--store", store, "--resume") == 2
+    assert run("replay", data, *TINY, *cameras, "--every", 2, "--output", store, "--resume") == 2
     assert "protocol.replan_steps is 3, this run's is 2" in capsys.readouterr().err
     assert analyze(["verify", str(store)]) == 0
     capsys.readouterr()
@@ -167,7 +167,7 @@ def test_another_instruction_and_known_outcomes(tmp_path):
     data = write_data_set(tmp_path / "data", "v2.1", made)
     store = tmp_path / "replay.zarr"
     words = ("--instruction", "close the box", "--action", "none")
-    assert run("replay", data, *TINY, *words, "--store", store) == 0
+    assert run("replay", data, *TINY, *words, "--output", store) == 0
     for number, solved in enumerate((False, True)):
         stored = episode(store, number, number)
         assert stored.attrs["success"] is solved
@@ -178,7 +178,7 @@ def test_another_instruction_and_known_outcomes(tmp_path):
 def test_a_call_that_turns_nan_costs_its_episode(tmp_path, monkeypatch, capsys):
     data = write_data_set(tmp_path / "data", "v2.1", made_up_episodes((4, 4, 4), tuple(LIBERO_COLUMNS.values())))
     store = tmp_path / "replay.zarr"
-    words = ("replay", data, *TINY, "--every", 2, "--store", store)
+    words = ("replay", data, *TINY, "--every", 2, "--output", store)
     assert run(*words, "--overwrite") == 0
     whole = sorted(path.name for path in (store / "episodes").glob("task*"))
     task, number = int(whole[1][4:7]), int(whole[1][15:])
@@ -207,7 +207,7 @@ def test_sigterm_ends_before_the_next_call(tmp_path, monkeypatch, capsys):
         return record_call(*given)
 
     monkeypatch.setattr(family_replay, "record_call", stopped)
-    words = ("replay", data, *TINY, "--every", 2, "--store", store)
+    words = ("replay", data, *TINY, "--every", 2, "--output", store)
     assert run(*words) == EXIT_TERMINATED
     assert len(calls) == 4
     assert len(list((store / "episodes").glob("task*"))) == 1
@@ -250,7 +250,7 @@ def test_a_lerobot_checkpoint_for_a_robot_of_its_own(tmp_path, tokenizer, capsys
     checkpoint = lerobot_checkpoint(tmp_path, {top: "observation.images.overhead", hand: hand, side: side}, 12, 11)
     made = made_up_episodes((6,), ("observation.images.overhead", hand), state=12, action=11)
     data = write_data_set(tmp_path / "bimanual", "v3.0", made, video=H264)
-    model = ("--checkpoint", checkpoint, "--tokenizer", tokenizer, "--store", tmp_path / "replay.zarr")
+    model = ("--checkpoint", checkpoint, "--tokenizer", tokenizer, "--output", tmp_path / "replay.zarr")
     assert run("replay", data, *model) == 2
     error = capsys.readouterr().err
     assert "The policy's camera 'side' has no pictures in the data set 'bimanual'" in error
@@ -273,7 +273,7 @@ def test_a_replay_can_be_rerun_with_interventions(tmp_path, capsys):
     made = made_up_episodes((8,), tuple(LIBERO_COLUMNS.values()), state=14, action=14)
     data = write_data_set(tmp_path / "data", "v3.0", made, video=H264)
     store = tmp_path / "replay.zarr"
-    assert run("replay", data, *TINY, "--store", store) == 0
+    assert run("replay", data, *TINY, "--output", store) == 0
     assert run("rerun", store, "--knockout", "camera:base_0_rgb") == 0
     said = capsys.readouterr().out
     assert "bit-equal" in said
@@ -302,14 +302,14 @@ def test_a_replay_can_be_rerun_with_interventions(tmp_path, capsys):
         (["--action", "actions"], "has no numbers 'actions'. Did you mean 'action'?"),
         (["--relative-actions", 9], "Cannot use --relative-actions 9"),
         (["--policy", "smolvla"], "Cannot use --policy smolvla; expected pi"),
-        (["--store", "here/name"], "expected a name that ends with '.zarr'"),
+        (["--output", "here/name"], "expected a name that ends with '.zarr'"),
     ],
 )
 def test_mistakes_end_with_one_sentence(tmp_path, capsys, monkeypatch, options, message):
     monkeypatch.chdir(tmp_path)
     made = made_up_episodes((3, 3, 3), tuple(LIBERO_COLUMNS.values()), state=8, action=7)
     data = write_data_set(tmp_path / "data", "v2.1", made)
-    assert run("replay", data, *TINY, "--store", "replay.zarr", *options) == 2
+    assert run("replay", data, *TINY, "--output", "replay.zarr", *options) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.startswith("vla-capture: ")
@@ -320,7 +320,7 @@ def test_mistakes_end_with_one_sentence(tmp_path, capsys, monkeypatch, options, 
 def test_a_checkpoint_of_another_robot_is_refused(tmp_path, capsys, tokenizer):
     made = made_up_episodes((3,), tuple(LIBERO_COLUMNS.values()), state=14, action=14)
     data = write_data_set(tmp_path / "data", "v2.1", made)
-    store = ("--tokenizer", tokenizer, "--store", tmp_path / "replay.zarr")
+    store = ("--tokenizer", tokenizer, "--output", tmp_path / "replay.zarr")
     assert run("replay", data, "--checkpoint", GOLDEN / "pi05_batch2/checkpoint_openpi_torch", *store) == 2
     assert (
         "states have 8 numbers, and those of the data set 'data' 14: observation.state (14)" in capsys.readouterr().err
@@ -342,7 +342,7 @@ def test_a_video_that_cannot_be_decoded_leaves_nothing(tmp_path, capsys):
         content = video.read_bytes()
         video.write_bytes(content[:40] + content[40:].replace(b"avc1", b"zzzz"))
     store = tmp_path / "replay.zarr"
-    assert run("replay", data, *TINY, "--store", store) == 2
+    assert run("replay", data, *TINY, "--output", store) == 2
     error = capsys.readouterr().err
     assert "cannot be decoded: the installed PyAV" in error
     assert "convert the video to H.264 or AV1" in error

@@ -17,7 +17,7 @@ def capture(path: Path, family: str, *arguments: str) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         capture_without_simulator(patch)
         steps = "12" if family == "pi" else "20"
-        assert main([family, *words, steps, "--store", str(path), *arguments]) == 0
+        assert main([family, *words, steps, "--output", str(path), *arguments]) == 0
     return path
 
 

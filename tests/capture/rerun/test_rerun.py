@@ -36,7 +36,7 @@ def refused(capsys: pytest.CaptureFixture[str], *words: object) -> str:
 def test_a_store_is_made_again_to_the_bit(family, request, tmp_path, capsys):
     """All arrays have the same values; the new store names its base, and a second run finds it complete."""
     base_path, again_path = request.getfixturevalue(f"{family}_store"), tmp_path / "again.zarr"
-    assert main(["rerun", str(base_path), "--store", str(again_path)]) == 0
+    assert main(["rerun", str(base_path), "--output", str(again_path)]) == 0
     assert (
         "made again without any change: bit-equal, actions and rows (stored with 10 bits)." in capsys.readouterr().out
     )
@@ -52,15 +52,15 @@ def test_a_store_is_made_again_to_the_bit(family, request, tmp_path, capsys):
         assert new.attributes.arrays == old.attributes.arrays  # shapes and digests of all values
         assert replace(new.attributes, provenance={}) == replace(old.attributes, provenance={})
     assert [episode.attributes.task_family for episode in again.episodes] == 2 * ["lift A"] + 2 * ["stack A on B"]
-    assert main(["rerun", str(base_path), "--store", str(again_path), "--resume", "--check", "0"]) == 0
+    assert main(["rerun", str(base_path), "--output", str(again_path), "--resume", "--check", "0"]) == 0
     assert "4 of 4 episodes are complete already; 0 to run." in capsys.readouterr().out
 
 
 def test_more_of_the_same_calls_can_be_recorded(pi_store, tmp_path):
     """Rows of all queries and denoise steps; their means are those of the store. A half-finished rerun goes on."""
     target = tmp_path / "more.zarr"
-    arguments = ["rerun", str(pi_store), "--store", str(target), "--check", "1", "--layers", "2", "--queries", "all"]
-    arguments += ["--denoise-steps", "all", "--no-contributions", "--precision", "exact", "--task-id", "1"]
+    arguments = ["rerun", str(pi_store), "--output", str(target), "--check", "1", "--layers", "2", "--queries", "all"]
+    arguments += ["--denoise", "all", "--no-contributions", "--precision", "exact", "--task-id", "1"]
     assert main([*arguments, "--num-episodes", "1"]) == 0
     assert main([*arguments, "--resume"]) == 0
     base, more = open_store(pi_store), open_store(target)
@@ -124,7 +124,7 @@ def test_wrong_stores_and_settings_are_one_sentence(pi_store, tmp_path, capsys):
     assert "There is no store at" in refused(
         capsys, "rerun", tmp_path / "nothing.zarr", "--checkpoint", "untrained-tiny"
     )
-    assert "into the store itself" in refused(capsys, "rerun", pi_store, "--store", pi_store, "--overwrite")
+    assert "into the store itself" in refused(capsys, "rerun", pi_store, "--output", pi_store, "--overwrite")
     assert "no episode of task 7; it has tasks 0, 1" in refused(capsys, "rerun", pi_store, "--task-id", "7")
     assert "--num-episodes 0" in refused(capsys, "rerun", pi_store, "--num-episodes", "0")
     assert "--check -1" in refused(capsys, "rerun", pi_store, "--check", "-1")
@@ -172,7 +172,7 @@ def test_a_damaged_episode_is_refused(pi_store, tmp_path, capsys):
     assert "frames" in said
     assert "task000_episode000" in said
     # It is no fault of the run: what is read again is the same.
-    words = ("rerun", str(damaged), "--task-id", "0", "--check", "0", "--store", str(tmp_path / "again.zarr"))
+    words = ("rerun", str(damaged), "--task-id", "0", "--check", "0", "--output", str(tmp_path / "again.zarr"))
     assert main([*words]) == 2
     ended = capsys.readouterr()
     assert "The episode begins again." not in ended.out
@@ -183,7 +183,7 @@ def test_a_damaged_episode_is_refused(pi_store, tmp_path, capsys):
 @pytest.mark.parametrize(("times", "missing"), [(1, []), (100, ["task000_episode001"])])
 def test_a_call_that_turns_nan_costs_its_episode(pi_store, tmp_path, capsys, monkeypatch, times, missing):
     left, target = spoil_actions(monkeypatch, 7, 0, 1, times=times), tmp_path / "again.zarr"
-    words = ["rerun", str(pi_store), "--store", str(target), "--check", "0"]
+    words = ["rerun", str(pi_store), "--output", str(target), "--check", "0"]
     assert main(words) == (2 if missing else 0)
     assert left[0] < times
     said = capsys.readouterr()
@@ -203,7 +203,7 @@ def test_a_call_that_turns_nan_costs_its_episode(pi_store, tmp_path, capsys, mon
 
 def test_a_new_store_in_which_every_episode_failed_is_removed(pi_store, tmp_path, capsys, monkeypatch):
     spoil_actions(monkeypatch, 7, 0, 0)
-    words = ["rerun", str(pi_store), "--task-id", "0", "--num-episodes", "1", "--store", str(tmp_path / "again.zarr")]
+    words = ["rerun", str(pi_store), "--task-id", "0", "--num-episodes", "1", "--output", str(tmp_path / "again.zarr")]
     assert main([*words, "--check", "0"]) == 2
     assert "1 of the episodes asked for is missing" in capsys.readouterr().err
     assert not (tmp_path / "again.zarr").exists()
@@ -211,7 +211,7 @@ def test_a_new_store_in_which_every_episode_failed_is_removed(pi_store, tmp_path
 
 def test_an_existing_store_is_not_overwritten_by_chance(pi_store, tmp_path, capsys):
     target = tmp_path / "again.zarr"
-    arguments = ("rerun", pi_store, "--store", target, "--check", "0", "--num-episodes", "1")
+    arguments = ("rerun", pi_store, "--output", target, "--check", "0", "--num-episodes", "1")
     assert main([str(word) for word in arguments]) == 0
     assert "add --resume to continue it" in refused(capsys, *arguments)
     assert "recording.layers" in refused(capsys, *arguments, "--resume", "--layers", "1")

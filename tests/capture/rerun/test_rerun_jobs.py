@@ -36,7 +36,7 @@ def status(store: Path, capsys: pytest.CaptureFixture[str]) -> dict:
 
 def test_a_rerun_waits_for_what_another_process_has_claimed(pi_store, tmp_path, monkeypatch, capsys):
     store = tmp_path / "again.zarr"
-    words = ["rerun", str(pi_store), "--store", str(store), "--check", "0"]
+    words = ["rerun", str(pi_store), "--output", str(store), "--check", "0"]
     assert main([*words, "--num-episodes", "1"]) == 0
     other = Claims(store, NODE)
     assert other.acquire(EPISODES[1]) is None
@@ -116,7 +116,7 @@ def test_two_processes_share_the_episodes_of_a_series(pi_store, tmp_path):
 
 def test_status_counts_what_a_rerun_was_asked_for(pi_store, tmp_path, capsys):
     store = tmp_path / "again.zarr"
-    words = ["rerun", str(pi_store), "--store", str(store), "--check", "0", "--task-id", "1"]
+    words = ["rerun", str(pi_store), "--output", str(store), "--check", "0", "--task-id", "1"]
     assert main(words) == 0
     found = status(store, capsys)
     assert found["complete"] is True
@@ -137,12 +137,12 @@ def test_sigterm_drops_the_episode_in_progress(pi_store, tmp_path, monkeypatch, 
             raise Terminated
 
     monkeypatch.setattr(Termination, "check", check)
-    assert main(["rerun", str(pi_store), "--store", str(store), "--check", "0"]) == EXIT_TERMINATED
+    assert main(["rerun", str(pi_store), "--output", str(store), "--check", "0"]) == EXIT_TERMINATED
     said = capsys.readouterr().out
     assert f"Stopped by SIGTERM: dropped {EPISODES[1]} at call" in said
     assert f"committed 1 episode ({EPISODES[0]}); 3 of this process's 4 are missing." in said
     assert names(store) == EPISODES[:1]
     assert [record.state for record in read_records(store)] == ["stopped"]
     monkeypatch.undo()
-    assert main(["rerun", str(pi_store), "--store", str(store), "--check", "0", "--resume"]) == 0
+    assert main(["rerun", str(pi_store), "--output", str(store), "--check", "0", "--resume"]) == 0
     assert names(store) == EPISODES

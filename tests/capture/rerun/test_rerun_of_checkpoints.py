@@ -35,7 +35,7 @@ def capture(monkeypatch, checkpoint, tokenizer, target):
         tokenizer,
         "--task-id",
         "0",
-        "--store",
+        "--output",
         str(target),
     ]
     assert main(["pi", *words, "--num-episodes", "1", "--max-steps", "7"]) == 0
@@ -48,7 +48,7 @@ def test_a_checkpoint_is_found_again_and_its_calls_are_bit_equal(checkpoint, tok
     assert verify_store(open_store(base)) == []
     capsys.readouterr()
     again = tmp_path / "again.zarr"
-    assert main(["rerun", str(base), "--tokenizer", tokenizer, "--store", str(again)]) == 0
+    assert main(["rerun", str(base), "--tokenizer", tokenizer, "--output", str(again)]) == 0
     assert "Check: 2 policy calls of task000_episode000, made again without any change: bit-eq" in said(capsys)
     old, new = (open_store(path).episodes[0].attributes.arrays for path in (base, again))
     assert old == new
@@ -63,7 +63,7 @@ def test_a_changed_picture_of_lerobot_is_of_whole_grey_levels_and_made_again(tok
     base = capture(monkeypatch, CHECKPOINTS[2], tokenizer, tmp_path / "base.zarr")
     target = tmp_path / "turned.zarr"
     words = ["--tokenizer", tokenizer, "--check", "0"]
-    assert main(["rerun", str(base), *words, "--store", str(target), "--image", "image=rotated"]) == 0
+    assert main(["rerun", str(base), *words, "--output", str(target), "--image", "image=rotated"]) == 0
     [old], [new] = open_store(base).episodes, open_store(target).episodes
     np.testing.assert_array_equal(new.read("frames/image"), old.read("frames/image")[:, ::-1, ::-1])
     assert "camera_frames/image" not in new.attributes.arrays

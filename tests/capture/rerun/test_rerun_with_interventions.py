@@ -22,7 +22,7 @@ ONE = ("--task-id", "0", "--num-episodes", "1")
 
 
 def rerun(base, target, *words: str) -> Store:
-    assert main(["rerun", str(base), "--store", str(target), "--check", "0", *ONE, *words]) == 0
+    assert main(["rerun", str(base), "--output", str(target), "--check", "0", *ONE, *words]) == 0
     store = open_store(target)
     assert verify_store(store) == []
     return store
@@ -32,7 +32,7 @@ def assert_applied_again(target, capsys) -> None:
     """An unchanged rerun of a store with interventions makes them again, to the bit."""
     capsys.readouterr()
     again = target.with_name("again.zarr")
-    assert main(["rerun", str(target), "--store", str(again)]) == 0
+    assert main(["rerun", str(target), "--output", str(again)]) == 0
     assert "made again without any change: bit-equal" in capsys.readouterr().out
     assert open_store(again).attributes.interventions == open_store(target).attributes.interventions
     for old, new in zip(open_store(target).episodes, open_store(again).episodes, strict=True):
@@ -91,7 +91,7 @@ def test_prompts_of_another_task_shuffled_and_with_synonyms(pi_store, tmp_path):
     (tmp_path / "words.json").write_text(json.dumps({"red": "crimson"}))
 
     def prompt_of(change: str) -> set[str]:
-        words = ["rerun", str(pi_store), "--store", str(tmp_path / "prompt.zarr"), "--overwrite", "--check", "0"]
+        words = ["rerun", str(pi_store), "--output", str(tmp_path / "prompt.zarr"), "--overwrite", "--check", "0"]
         assert main([*words, "--num-episodes", "1", "--layers", "0", "--prompt", change]) == 0
         first = open_store(tmp_path / "prompt.zarr").episodes[0]
         return {prompt.instruction_text for prompt in first.attributes.prompts}
@@ -120,7 +120,7 @@ def test_wrong_interventions_are_one_sentence_and_leave_no_store(pi_store, cosmo
     target = tmp_path / "wrong.zarr"
 
     def said(*words: str, base=pi_store) -> str:
-        sentence = refused(capsys, "rerun", base, "--store", target, "--check", "0", *words)
+        sentence = refused(capsys, "rerun", base, "--output", target, "--check", "0", *words)
         assert not target.exists()
         return sentence
 
@@ -153,7 +153,7 @@ def test_wrong_interventions_are_one_sentence_and_leave_no_store(pi_store, cosmo
     ],
 )
 def test_mistakes_of_the_changes_come_before_a_store_that_exists(pi_store, cosmos_store, capsys, words, message):
-    sentence = refused(capsys, "rerun", pi_store, "--store", cosmos_store, *words)
+    sentence = refused(capsys, "rerun", pi_store, "--output", cosmos_store, *words)
     assert message in sentence
 
 
@@ -163,7 +163,7 @@ def test_a_series_checks_its_places_before_the_policy_is_loaded(pi_store, tmp_pa
     assert "There is no layer 99" in refused(capsys, "rerun", pi_store, *words)
 
 
-@pytest.mark.parametrize("option", ["--knockout", "--store", "--prompt"])
+@pytest.mark.parametrize("option", ["--knockout", "--output", "--prompt"])
 def test_a_series_makes_its_own_interventions(pi_store, capsys, option):
     said = refused(capsys, "rerun", pi_store, "--series", "default", option, "empty")
     assert f"Cannot use {option} with --series" in said
@@ -258,7 +258,7 @@ def test_words_for_all_queries_cannot_be_limited_to_denoise_steps(pi_store, tmp_
 def test_the_prompt_of_a_task_that_is_not_run_again_is_known(pi_store, tmp_path):
     target = tmp_path / "other.zarr"
     words = ("--prompt", "task:1", "--task-id", "0", "--num-episodes", "1", "--check", "0")
-    assert main(["rerun", str(pi_store), *words, "--store", str(target)]) == 0
+    assert main(["rerun", str(pi_store), *words, "--output", str(target)]) == 0
     (episode,) = open_store(target).episodes
     base = {episode.attributes.task_id: episode.attributes.instruction for episode in open_store(pi_store).episodes}
     assert episode.attributes.task_id == 0
@@ -272,6 +272,6 @@ def test_a_packed_base_is_read(pi_store, tmp_path):
     copy_store(open_store(pi_store), packed, (), packed=True)
     before = sorted((path, path.stat().st_mtime_ns) for path in packed.rglob("*"))
     words = ("--noise-seed", "1", "--task-id", "0", "--check", "1")
-    assert main(["rerun", str(packed), *words, "--store", str(tmp_path / "noise.zarr")]) == 0
+    assert main(["rerun", str(packed), *words, "--output", str(tmp_path / "noise.zarr")]) == 0
     assert len(open_store(tmp_path / "noise.zarr").episodes) == 2
     assert sorted((path, path.stat().st_mtime_ns) for path in packed.rglob("*")) == before

@@ -380,7 +380,7 @@ def test_what_does_not_work_is_refused(scene, tmp_path, capsys, words, said):
 
 def test_a_policy_that_makes_single_calls_refuses_batches(scene, tmp_path, capsys):
     words = ["cosmos", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--policy-batch", "2"]
-    assert capture([*words, "--store", str(tmp_path / "a.zarr"), "--num-envs", "2"]) == 2
+    assert capture([*words, "--output", str(tmp_path / "a.zarr"), "--num-envs", "2"]) == 2
     assert "Cannot use --policy-batch 2: policies of the kind" in capsys.readouterr().err
 
 
@@ -403,7 +403,7 @@ def test_two_simulators_give_the_episodes_of_one_to_the_bit(suite, tmp_path, mon
     # One renders with the threads of this process, the other two with one each.
     words = ["--task-suite", suite, "--task-id", "0", "3", "--num-episodes", "2"]
     for name, num_envs in (("one", "1"), ("two", "2")):
-        arguments = [*TINY, *words, "--num-envs", num_envs, "--store", str(tmp_path / f"{name}.zarr")]
+        arguments = [*TINY, *words, "--num-envs", num_envs, "--output", str(tmp_path / f"{name}.zarr")]
         command = [sys.executable, "-m", "vla_attention.capture", *arguments, "--threads", "2"]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
@@ -416,7 +416,7 @@ def test_simulators_that_share_a_task_of_libero_give_the_published_episodes(libe
     words = [*TINY[:-1], "4", "--task-suite", "libero_goal", "--task-id", "0", "--num-episodes", "4"]
     words += ["--libero-assets", str(libero_assets)]
     for num_envs in ("1", "2"):
-        assert capture([*words, "--num-envs", num_envs, "--store", str(tmp_path / f"{num_envs}.zarr")]) == 0
+        assert capture([*words, "--num-envs", num_envs, "--output", str(tmp_path / f"{num_envs}.zarr")]) == 0
     assert_same_episodes(tmp_path / "1.zarr", tmp_path / "2.zarr")
 
 
@@ -427,7 +427,7 @@ class Run:
         self.store, self.log, self.temporary = folder / "a.zarr", folder / "log", folder / "temporary"
         self.temporary.mkdir()
         words = [*TINY[:-1], str(max_steps), "--task-suite", "robosuite", "--task-id", "0", "--num-envs", "2"]
-        words += ["--num-episodes", str(episodes), "--store", str(self.store)]
+        words += ["--num-episodes", str(episodes), "--output", str(self.store)]
         with self.log.open("w") as out:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "vla_attention.capture", *words],

@@ -18,7 +18,7 @@ from vla_attention.schemas.stores.store_format import Protocol
 
 
 def settings_of(*words: str) -> RunSettings:
-    return run_settings(build_parser().parse_args([*words, "--store", "a.zarr"]))
+    return run_settings(build_parser().parse_args([*words, "--output", "a.zarr"]))
 
 
 def protocol_of(own: EvaluationProtocol, *words: str, family: str = "pi") -> Protocol:

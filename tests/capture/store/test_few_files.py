@@ -60,12 +60,12 @@ def still_scene(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("still_scene")
 def test_pi_its_reruns_and_replays(tmp_path):
     store = tmp_path / "run.zarr"
-    run("pi", *WHERE, *TINY, "--queries", "all", "--denoise-steps", "all", "--contributions", "--store", store)
+    run("pi", *WHERE, *TINY, "--queries", "all", "--denoise", "all", "--contributions", "--output", store)
     assert check_few(store, 29) == 29
-    run("rerun", store, "--knockout", "camera:base_0_rgb", "--store", tmp_path / "without.zarr")
+    run("rerun", store, "--knockout", "camera:base_0_rgb", "--output", tmp_path / "without.zarr")
     check_few(tmp_path / "without.zarr")
     data = write_data_set(tmp_path / "data", "v3.0", episodes_of_store(store, CAMERAS))
-    run("replay", data, *TINY, "--contributions", "--store", tmp_path / "replay.zarr")
+    run("replay", data, *TINY, "--contributions", "--output", tmp_path / "replay.zarr")
     check_few(tmp_path / "replay.zarr")
 
 
@@ -74,7 +74,7 @@ def test_pi_its_reruns_and_replays(tmp_path):
 def test_policies_of_lerobot_which_keep_two_pictures_of_each_camera(tmp_path, case):
     tokenizer = train_small_tokenizer(tmp_path / "small.model")
     model = ("--checkpoint", GOLDEN / case / "checkpoint_lerobot", "--tokenizer", tokenizer, "--contributions")
-    run("pi", *WHERE, *model, "--store", tmp_path / "run.zarr")
+    run("pi", *WHERE, *model, "--output", tmp_path / "run.zarr")
     assert any(
         name.startswith("camera_frames/") for name in open_store(tmp_path / "run.zarr").episodes[0].attributes.arrays
     )
@@ -83,7 +83,7 @@ def test_policies_of_lerobot_which_keep_two_pictures_of_each_camera(tmp_path, ca
 
 @pytest.mark.usefixtures("still_scene")
 def test_cosmos_with_two_sites(tmp_path):
-    run("cosmos", *WHERE, "--ckpt-path", "untrained-tiny", "--contributions", "--store", tmp_path / "run.zarr")
+    run("cosmos", *WHERE, "--ckpt-path", "untrained-tiny", "--contributions", "--output", tmp_path / "run.zarr")
     assert [site.name for site in open_store(tmp_path / "run.zarr").attributes.sites] == ["self", "cross"]
     check_few(tmp_path / "run.zarr")
 

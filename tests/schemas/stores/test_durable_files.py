@@ -68,7 +68,7 @@ def test_copies_are_on_the_disk(store, tmp_path, monkeypatch, words):
 def test_merged_stores_are_on_the_disk(store, tmp_path, monkeypatch):
     more = write_store(tmp_path / "more.zarr", spec=StoreSpec(tasks=(1,), episodes=1, replans=2))
     disk = Disk(monkeypatch)
-    assert analyze(["merge", str(store), str(more), "-o", str(tmp_path / "all.zarr"), "--copy"]) == 0
+    assert analyze(["copy", str(store), str(more), "-o", str(tmp_path / "all.zarr"), "--copy"]) == 0
     assert (disk.renamed, disk.owed) == (["all.zarr"], set())
 
 

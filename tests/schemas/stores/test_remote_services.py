@@ -209,7 +209,7 @@ def test_a_zip_that_the_index_lacks_is_found_in_s3(bucket, stores, capsys):
 def test_a_merged_store_names_the_commit(hub, tmp_path):
     more = write_store(tmp_path / "more.zarr", spec=StoreSpec(tasks=(1,), episodes=1, replans=2))
     url = "hf://datasets/org/name/runs/a.zarr"
-    assert analyze(["merge", url, str(more), "-o", str(tmp_path / "all.zarr")]) == 0
+    assert analyze(["copy", url, str(more), "-o", str(tmp_path / "all.zarr")]) == 0
     assert open_store(tmp_path / "all.zarr").attributes.provenance["merged_from"] == (
         f"hf://datasets/org/name@{COMMIT}/runs/a.zarr (2 episodes), more.zarr (1 episode)"
     )

@@ -291,7 +291,7 @@ def test_resuming_records_what_is_missing_and_says_what_is_damaged(tmp_path, mon
         "--max-steps",
         "4",
     ]
-    given += ["--num-episodes", "3", "--store", str(store)]
+    given += ["--num-episodes", "3", "--output", str(store)]
     assert main(given) == 0
     reference = files(store)
     shutil.rmtree(store / "episodes/task000_episode000/joint/atoms")

@@ -13,7 +13,7 @@ import pytest
 import vla_attention as va
 from tests.kit.paths import GOLDEN
 from vla_attention.analyze.copy.copying import copy_store
-from vla_attention.analyze.merge.merging import merge_stores
+from vla_attention.analyze.copy.merging import merge_stores
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.json_files import schema_documents
 from vla_attention.schemas.stores.reader import open_store

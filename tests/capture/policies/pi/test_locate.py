@@ -156,14 +156,14 @@ def test_a_store_keeps_the_commit_and_a_rerun_asks_for_it(asked, tmp_path, monke
     store = tmp_path / "run.zarr"
     model = ["--checkpoint", "org/name", "--tokenizer", str(tokenizer), "--device", "cpu"]
     where = ["--task-suite", "robosuite", "--task-id", "0", "--num-episodes", "1", "--max-steps", "3"]
-    assert capture(["pi", *model, *where, "--store", str(store)]) == 0
+    assert capture(["pi", *model, *where, "--output", str(store)]) == 0
     root = json.loads((store / "zarr.json").read_text())["attributes"]
     assert root["policy"]["checkpoint"] == f"org/name@{COMMIT}"
     assert root["provenance"]["hub org/name"] == COMMIT
     episode = json.loads((store / "episodes" / "task000_episode000" / "zarr.json").read_text())["attributes"]
     assert episode["provenance"]["hub org/name"] == COMMIT
     again = tmp_path / "again.zarr"
-    assert capture(["rerun", str(store), "--tokenizer", str(tokenizer), "--device", "cpu", "--store", str(again)]) == 0
+    assert capture(["rerun", str(store), "--tokenizer", str(tokenizer), "--device", "cpu", "--output", str(again)]) == 0
     assert asked == [("org/name", None), ("org/name", COMMIT)]
 
 

@@ -12,7 +12,7 @@ import pytest
 from tests.kit.attacks import files_of
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.copy.copying import copy_store
-from vla_attention.analyze.merge.merging import merge_stores
+from vla_attention.analyze.copy.merging import merge_stores
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing import assert_whole
@@ -53,7 +53,7 @@ def inodes(store: Path) -> set[int]:
 
 
 def refused(capsys, *words: object) -> str:
-    assert analyze(["merge", *map(str, words)]) == 2
+    assert analyze(["copy", *map(str, words)]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     return said
@@ -62,7 +62,7 @@ def refused(capsys, *words: object) -> str:
 @pytest.mark.parametrize("copy", [False, True])
 def test_the_merged_store_is_the_one_that_one_capture_writes(original, parts, tmp_path, capsys, copy):
     before = [episode_bytes(part) for part in parts]
-    assert analyze(["merge", *map(str, parts), "-o", str(tmp_path / "c.zarr"), *(["--copy"] if copy else [])]) == 0
+    assert analyze(["copy", *map(str, parts), "-o", str(tmp_path / "c.zarr"), *(["--copy"] if copy else [])]) == 0
     said = capsys.readouterr().out
     assert f"c.zarr: 4 episodes (2 of {parts[0]}, 2 of {parts[1]}), all whole" in said
     assert ("are shared with the given stores" in said) is not copy
@@ -178,7 +178,7 @@ def test_foreign_files_stay_behind(original, parts, tmp_path):
 
 
 def test_a_packed_store_can_be_made(parts, original, tmp_path, capsys):
-    assert analyze(["merge", *map(str, parts), "-o", str(tmp_path / "all.zarr"), "--packed"]) == 0
+    assert analyze(["copy", *map(str, parts), "-o", str(tmp_path / "all.zarr"), "--packed"]) == 0
     said = capsys.readouterr().out
     assert ": 4 episodes (2 of " in said
     assert "shared" not in said
