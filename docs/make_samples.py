@@ -18,7 +18,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PROGRAMS = {"vla-analyze": "vla_attention.analyze", "vla-capture": "vla_attention.capture"}
+PROGRAMS = {
+    "vla-analyze": "vla_attention.analyze",
+    "vla-capture": "vla_attention.capture",
+    "vla-attention": "vla_attention",
+}
 _SAMPLE = re.compile(
     r"^<!-- sample: (?P<commands>[^\n]+?)(?: :: (?P<lines>[\d -]+))? -->\n\n?```(?P<language>\w*)\n(?P<text>.*?)^```",
     re.M | re.S,

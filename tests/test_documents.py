@@ -16,6 +16,7 @@ import yaml
 
 import vla_attention as va
 from scripts.site_hooks import OUTSIDE
+from vla_attention.__main__ import COMMANDS as PROGRAM_COMMANDS
 from vla_attention.analyze.commands import COMMANDS, DEFAULT_COMMAND
 from vla_attention.capture.commands.arguments import build_parser
 from vla_attention.capture.policies.families import policy_families
@@ -80,8 +81,8 @@ def test_the_guides_name_every_command_and_family():
     for command in COMMANDS:
         assert re.search(rf"^\| .*`{command}( A B)?`", commands, re.MULTILINE), command
     for family in policy_families():
-        assert f"`vla-capture {family.name}`" in commands, family.name
-        assert f"`vla-capture {family.name}`" in text_of(ROOT / "docs" / "policies.md"), family.name
+        assert f"`vla-attention capture {family.name}`" in commands, family.name
+        assert f"`vla-attention capture {family.name}`" in text_of(ROOT / "docs" / "policies.md"), family.name
 
 
 def command_lines(document: Path) -> Iterator[list[str]]:
@@ -92,7 +93,7 @@ def command_lines(document: Path) -> Iterator[list[str]]:
     for block in re.findall(r"^```(?:bash|sh)\n(.*?)^```", text_of(document), re.DOTALL | re.MULTILINE):
         for line in block.replace("\\\n", " ").splitlines():
             words = shlex.split(line, comments=True)
-            if words[:1] not in (["vla-analyze"], ["vla-capture"]) or words[1:2] == ["rerun"]:
+            if words[:1] not in (["vla-analyze"], ["vla-capture"], ["vla-attention"]) or "rerun" in words[1:3]:
                 continue
             if not any("$" in word or word == "..." for word in words):
                 yield words
@@ -101,6 +102,10 @@ def command_lines(document: Path) -> Iterator[list[str]]:
 @pytest.mark.parametrize("document", DOCUMENTS, ids=page_name)
 def test_the_parsers_take_every_command_line(document):
     for program, *given in command_lines(document):
+        if program == "vla-attention" and given[0] in PROGRAM_COMMANDS and given[0] not in ("analyze", "capture"):
+            continue  # example, completion
+        if program == "vla-attention" and given[0] in ("analyze", "capture"):
+            program, *given = f"vla-{given[0]}", *given[1:]
         if program == "vla-capture":
             parser = build_parser(given)
         else:
@@ -167,5 +172,6 @@ def test_every_sample_is_of_this_programs_commands():
     assert found
     for line in found:
         assert all(
-            command.split()[0] in ("vla-analyze", "vla-capture") for command in line.split(" :: ")[0].split(" && ")
+            command.split()[0] in ("vla-analyze", "vla-capture", "vla-attention")
+            for command in line.split(" :: ")[0].split(" && ")
         )

@@ -24,7 +24,7 @@ def chosen_tables(analysis: Analysis, names: Sequence[str]) -> dict[str, TableIn
         table: Tables | TableInParts | None = getattr(analysis, name)
         if table is None:
             raise BadArgument(
-                "These stores hold no contributions; record them with vla-capture "
+                "These stores hold no contributions; record them with vla-attention capture "
                 "--contributions, or choose other tables."
             )
         tables |= named_parts(name, table) if isinstance(table, Tables) else {name: table}

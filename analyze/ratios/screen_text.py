@@ -30,7 +30,7 @@ _MOST_GROUPS, _MOST_BLOCKS = 6, 2
 #: Notes leave room for so many tasks, and many groups for as many as these.
 _FEWEST_TASKS, _FEWEST_GROUPS = 3, 2
 _REST = f"in {WHOLE_TEXT}"
-_PROGRAM = "vla-analyze"
+_PROGRAM = "vla-attention"
 #: Groups whose fractions stand in rows where there is no ratio.
 _MOST_FRACTIONS = 3
 

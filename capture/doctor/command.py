@@ -212,7 +212,7 @@ def _try(settings: RunSettings, policy: Policy, device: str, termination: Termin
     if settings.budget is not None:
         text = " ".join([text, *choice.lines])
     if estimate.total_bytes > free:
-        to_do = f"{format_bytes(free)} are free: give --budget, fewer episodes, or another --store."
+        to_do = f"{format_bytes(free)} are free: give --budget, fewer episodes, or another --output."
         yield Finding("size", "missing", text, to_do)
     else:
         yield Finding("size", "ok", text)

@@ -107,7 +107,7 @@ def _target(arguments: argparse.Namespace, base: Store, interventions: Intervent
     else:
         target = local_path(base.path).with_name(f"{base.path.stem}_{file_part(interventions.name)}{STORE_SUFFIX}")
     if target.resolve() == base.path.resolve():
-        raise BadArgument(f"Cannot write the rerun of {base.path} into the store itself; give another --store.")
+        raise BadArgument(f"Cannot write the rerun of {base.path} into the store itself; give another --output.")
     return target
 
 

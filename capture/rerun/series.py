@@ -269,13 +269,13 @@ def _refuse_own_interventions(arguments: argparse.Namespace) -> None:
         ("--image", arguments.image),
         ("--allow-empty", arguments.allow_empty),
         ("--name", arguments.name),
-        ("--store", arguments.store),
+        ("--output NAME.zarr", arguments.store),
         ("--overwrite", arguments.overwrite),
         ("--effects", arguments.effects != NO_EFFECTS),
     ):
         if given:
             raise BadArgument(
-                f"Cannot use {option} with --series, which makes its own interventions and stores; run vla-capture "
+                f"Cannot use {option} with --series, which makes its own interventions and stores; run vla-attention capture "
                 "rerun once more for others."
             )
 

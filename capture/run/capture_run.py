@@ -22,8 +22,8 @@ from vla_attention.capture.jobs.worker_records import (
     read_records,
 )
 from vla_attention.capture.machine.provenance import POLICY_BATCH, describe_machine
+from vla_attention.capture.policies.families import family_of_kind
 from vla_attention.capture.policies.identity import announcement, downloads_of
-from vla_attention.capture.policies.pi.family import CUBES_POLICY
 from vla_attention.capture.policies.policy import BatchPolicy, Policy, is_compiled, stored_picture_sizes
 from vla_attention.capture.rollout.episode import EpisodeRun, check_protocol, max_replans
 from vla_attention.capture.rollout.episode_faults import EpisodesMissing, Faults, describe_missing
@@ -240,6 +240,18 @@ def _checkpoint_line(identity: PolicyIdentity) -> str:
     )
 
 
+def _other_suite_line(identity: PolicyIdentity, suite: str) -> str:
+    """A warning where a checkpoint whose suites are known runs in one of another kind; empty elsewhere."""
+    rates = family_of_kind(identity.family).published_rates
+    known = [rate.suite for rate in rates if rate.checkpoint == identity.checkpoint]
+    kinds = {name.partition("_")[0] for name in known}
+    if not known or suite.partition("_")[0] in kinds:
+        return ""
+    return (
+        f"WARNING: {identity.checkpoint} was trained on {listing(known)}; its numbers in {suite} say nothing about it."
+    )
+
+
 def _announce(
     policy: Policy,
     store: RunStore,
@@ -253,11 +265,8 @@ def _announce(
         say(line)
     if not identity.untrained:
         say(_checkpoint_line(identity))
-    if identity.checkpoint == CUBES_POLICY and not protocol.suite.startswith("cubes"):
-        say(
-            f"WARNING: {CUBES_POLICY} was trained on the suite cubes alone; in {protocol.suite} its numbers say "
-            "nothing about any policy."
-        )
+    if line := _other_suite_line(identity, protocol.suite):
+        say(line)
     say(
         f"Protocol: {protocol.name} (docs/protocol.md), seed {protocol.seed}, pictures of {protocol.image_size} "
         f"pixels, {protocol.wait_steps} waiting steps, at most {protocol.max_steps} steps after them."

@@ -32,12 +32,12 @@ def check_same_run(path: Path, existing: RootAttributes, wanted: RootAttributes)
     if existing.store_version != wanted.store_version:
         raise RunMismatch(
             f"Cannot resume {path}: it is of {existing.version_text}, and captures write {wanted.version_text}; give "
-            "another --store."
+            "another --output."
         )
     for where, old, new in run_differences(existing, wanted):
         raise RunMismatch(
             f"Cannot resume {path}: its {where} is {old!r}, this run's is {new!r}; "
-            "use the same settings, or another --store."
+            "use the same settings, or another --output."
         )
 
 
@@ -48,7 +48,7 @@ def read_existing_root(path: Path) -> RootAttributes:
     except FormatTooNew:
         raise
     except StoreError as error:
-        raise StoreError(f"{error} Give another --store.") from None
+        raise StoreError(f"{error} Give another --output.") from None
 
 
 def create_root(path: Path, attributes: RootAttributes, durable: bool) -> RootAttributes:

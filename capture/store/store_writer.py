@@ -127,7 +127,9 @@ def _saying_where(path: Path) -> Iterator[None]:
     except OSError as error:
         if isinstance(error, UserError):
             raise
-        raise BadArgument(f"Cannot write a store at {path}: {error.strerror or error}; give another --store.") from None
+        raise BadArgument(
+            f"Cannot write a store at {path}: {error.strerror or error}; give another --output."
+        ) from None
 
 
 def refuse_recorded(path: Path) -> None:
@@ -141,7 +143,7 @@ def refuse_recorded(path: Path) -> None:
     if count := len(episode_folders(path)):
         raise StoreExists(
             f"Store {path} exists already and holds {plural(count, 'episode')}; add --resume to continue it, "
-            "--overwrite to delete it and begin again, or give another --store."
+            "--overwrite to delete it and begin again, or give another --output."
         )
 
 
@@ -153,7 +155,7 @@ def _take_empty(path: Path, attributes: RootAttributes) -> None:
     if _is_being_recorded(path):
         raise StoreExists(
             f"Store {path} holds no episode yet, and another run is recording its first one; wait for it, add "
-            "--overwrite to delete the store and begin again, or give another --store."
+            "--overwrite to delete the store and begin again, or give another --output."
         )
     delete_store(path)
 

@@ -75,7 +75,7 @@ def test_a_command_names_them_and_goes_on(stores, tmp_path, monkeypatch, capsys,
     said = capsys.readouterr().err
     for path in {word for word in given if word in words.values()}:
         (line,) = [line for line in said.splitlines() if f"Ignored in {path}, " in line]
-        assert line.startswith(f"vla-attention analyze {command}: Ignored in ")
+        assert line.startswith(f"vla-analyze {command}: Ignored in ")
         assert NAMED in line
 
 

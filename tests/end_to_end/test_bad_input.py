@@ -9,6 +9,7 @@ import pytest
 
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
+from vla_attention.schemas.errors import Note
 from vla_attention.schemas.stores.store_format import STORE_VERSION
 
 DUMMY = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--replan-steps", "4"]
@@ -65,10 +66,12 @@ def test_capture(arguments, expected, capsys, tmp_path):
 
 
 def test_store_without_suffix_or_in_an_unwritable_place(tmp_path, capsys):
-    assert "ends with '.zarr'" in run(capture, [*DUMMY, "--output", tmp_path / "store"], capsys)
+    with pytest.warns(Note, match="--store is called --output now"):
+        assert capture([*DUMMY, "--store", str(tmp_path / "store")]) == 2
+    assert "ends with '.zarr'" in capsys.readouterr().err
     (tmp_path / "file").write_text("")
     said = run(capture, [*DUMMY, "--output", tmp_path / "file" / "a.zarr"], capsys)
-    assert "give another --store" in said
+    assert "give another --output" in said
 
 
 @pytest.mark.simulator

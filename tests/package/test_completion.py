@@ -32,9 +32,9 @@ def completed(script, *words: str) -> list[str]:
 def test_commands(script):
     assert completed(script, "vla-analyze", "") == list(COMMANDS)
     assert completed(script, "vla-analyze", "wor") == ["words"]
-    assert completed(script, "vla-attention", "comp") == ["completion"]
-    assert completed(script, "vla-attention", "analyze", "rep") == ["report", "repair"]
-    assert completed(script, "vla-capture", "re") == ["repair", "replay", "rerun"]
+    assert completed(script, "vla-attention", "comp") == ["completion", "compare"]
+    assert completed(script, "vla-attention", "analyze", "rep") == ["report"]
+    assert completed(script, "vla-capture", "re") == ["replay", "rerun"]
     assert completed(script, "/somewhere/bin/vla-attention", "completion", "") == ["bash", "zsh"]
 
 

@@ -130,7 +130,7 @@ def test_words_of_one_task_are_no_mistake_in_a_store_of_several(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--task", "5"], "There is no task 5 among the 4 selected episodes"),
+        (["--task", "5"], "has no episode of task 5; it has tasks"),
         (["--replan", "4"], "There is no replan 4 in task000_episode000; it has replans 0 to 3"),
         (["--group", "x=word:bowls"], "Did you mean 'bowl'?"),
         (["--group", "x=words:content & words:stop"], "has no key in any of the 4 selected episodes"),

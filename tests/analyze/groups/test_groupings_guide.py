@@ -93,7 +93,7 @@ def test_every_error_reads_as_described():
 def test_every_command_runs(tmp_path, monkeypatch, capsys):
     write_bowl_store(tmp_path / "runs" / "libero_10.zarr", tasks=(0,), episodes=1, layers=(0,), denoise_steps=(0,))
     monkeypatch.chdir(tmp_path)
-    commands = [line for block in blocks("bash") for line in block.splitlines() if line.startswith("vla-analyze")]
+    commands = [line for block in blocks("bash") for line in block.splitlines() if line.startswith("vla-attention")]
     assert len(commands) >= 5
     for command in commands:
         words = shlex.split(command)[1:]

@@ -385,7 +385,7 @@ def test_the_command_prints_writes_and_draws(follower_store, tmp_path, capsys):
 
 def test_a_mistake_ends_with_one_sentence(follower_store, tmp_path, capsys):
     for arguments, said in (
-        (["--task", "9"], "There is no task 9 among the 4 selected episodes"),
+        (["--task", "9"], "has no episode of task 9; it has tasks 0, 1"),
         (["--percentiles", "100"], "Percentile 100 was given"),
         (["--mask-coverage", "0"], "Mask coverage 0 was given"),
         (["--tolerance", "-1"], "Tolerance -1 was given"),

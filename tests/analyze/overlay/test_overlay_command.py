@@ -166,7 +166,7 @@ def test_turned_pictures_keep_the_selectors_coordinates(tmp_path: Path) -> None:
     [
         (["--camera", "base"], "Did you mean 'base_0_rgb'"),
         (["--replans", "9"], "replans 0 to 3"),
-        (["--task", "7"], "no task 7"),
+        (["--task", "7"], "no episode of task 7"),
         (["--group", "x=word:kettle"], "no instruction has the word 'kettle'"),
         (["--group", "x"], "NAME=SELECTOR"),
         (["--video", "gif", "--fps", "0"], "0.1 to 50"),

@@ -172,7 +172,6 @@ def test_the_command_prints_writes_and_draws(reader_store, tmp_path, capsys):
 
 def test_a_mistake_ends_with_one_sentence(reader_store, tmp_path, capsys):
     for arguments, said in (
-        (["--task", "0", "--task", "0"], "not both"),
         (["--task", "7"], "has no episode of task 7"),
         (["--site", "jont"], "Did you mean 'joint'?"),
     ):

@@ -172,7 +172,7 @@ def test_the_log_begins_with_the_job():
         (["--array-index", "1", "--task-id", "1"], "in an array the index is the task"),
         (["--task-id", "11"], "its tasks are 0 to 9"),
         (["--task-id", "3", "11"], "Task 11 does not exist"),
-        (["--layers", "3.5"], "invalid int value"),
+        (["--layers", "3.5"], "is neither a number nor a range"),
         (["--stage", "analyze"], "There is no store at"),
         (["--stage", "plot"], "invalid choice"),
     ],

@@ -160,7 +160,7 @@ def test_a_damaged_episode_is_refused(pi_store, tmp_path, capsys):
     said = refused(capsys, "rerun", damaged)
     assert "Cannot rerun" in said
     assert "task001_episode000" in said
-    assert "vla-capture repair" in said
+    assert "vla-attention capture verify --repair" in said
     # Bytes that were changed are found when they are read.
     frame = next((damaged / "episodes/task000_episode000/frames").rglob("c.*"))
     while frame.is_dir():

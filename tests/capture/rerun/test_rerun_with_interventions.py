@@ -163,7 +163,7 @@ def test_a_series_checks_its_places_before_the_policy_is_loaded(pi_store, tmp_pa
     assert "There is no layer 99" in refused(capsys, "rerun", pi_store, *words)
 
 
-@pytest.mark.parametrize("option", ["--knockout", "--output", "--prompt"])
+@pytest.mark.parametrize("option", ["--knockout", "--prompt"])
 def test_a_series_makes_its_own_interventions(pi_store, capsys, option):
     said = refused(capsys, "rerun", pi_store, "--series", "default", option, "empty")
     assert f"Cannot use {option} with --series" in said

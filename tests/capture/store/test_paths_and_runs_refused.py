@@ -203,7 +203,7 @@ def test_permission_denied_is_one_sentence(tmp_path, monkeypatch):
         raise PermissionError(errno.EACCES, "Permission denied")
 
     monkeypatch.setattr(Path, "mkdir", refuse)
-    with pytest.raises(BadArgument, match="Permission denied; give another --store"):
+    with pytest.raises(BadArgument, match="Permission denied; give another --output"):
         open_run(tmp_path / "a.zarr", root_attributes(SPEC), "new")
 
 

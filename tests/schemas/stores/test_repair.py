@@ -105,7 +105,7 @@ def test_a_damaged_episode_is_listed_moved_aside_and_missing(store, episode, ori
     assert f"damaged: Episode {DAMAGED} " in printed
     assert problem in printed
     assert "missing" not in printed
-    assert f"moved aside by: vla-capture repair {store}" in printed
+    assert f"moved aside by: vla-attention capture verify {store} --repair" in printed
 
     assert main(["repair", str(store), "--dry-run"]) == 1
     printed = capsys.readouterr().out
@@ -143,7 +143,7 @@ def test_damage_that_only_reading_shows_needs_verify(store, episode, capsys):
     file.write_bytes(content)
     assert main(["status", str(store), "--expected", "2", "--check"]) == 0
     assert main(["repair", str(store)]) == 0
-    assert "seals, presence and sizes; --verify reads every byte" in capsys.readouterr().out
+    assert "seals, presence and sizes; without --quick every byte is read" in capsys.readouterr().out
     assert main(["status", str(store), "--expected", "2", "--check", "--verify"]) == 1
     assert f"damaged: Array joint/rows of episode {DAMAGED} cannot be read" in capsys.readouterr().out
     assert main(["repair", str(store), "--verify"]) == 0
@@ -303,7 +303,10 @@ def test_resuming_records_what_is_missing_and_says_what_is_damaged(tmp_path, mon
         said = capsys.readouterr()
         assert f"{1 - added} of 3 episodes are complete already and 2 damaged; {added} to run." in said.out
         assert f"{plural(added, 'episode')} added" in said.out
-        assert "Not recorded again without vla-capture repair: Episode task000_episode001 cannot be read" in said.out
+        assert (
+            "Not recorded again without vla-attention capture verify --repair: Episode task000_episode001 cannot be read"
+            in said.out
+        )
         assert "2 of the episodes asked for are damaged: Episode task000_episode000 is damaged: it has lost" in said.err
         assert f"run vla-capture repair {store}, which" in said.err
         assert said.err.count("\n") == 1

@@ -130,7 +130,7 @@ def test_the_fields_of_version_1_are_frozen():
 def test_a_store_of_version_1_is_not_continued(tmp_path):
     shutil.copytree(GOLDEN / "stores" / "version1" / "joint.zarr", tmp_path / "a.zarr")
     wanted = replace(open_store(tmp_path / "a.zarr").attributes, store_version=STORE_VERSION)
-    with pytest.raises(RunMismatch, match=r"it is of version 1, and captures write version 2; give another --store"):
+    with pytest.raises(RunMismatch, match=r"it is of version 1, and captures write version 2; give another --output"):
         open_run(tmp_path / "a.zarr", wanted, "resume")
 
 
