@@ -220,7 +220,7 @@ def noise_sentence(study: EffectStudy) -> str:
         command = f"rerun {base.path} --noise-seed 1"
         if base.attributes.policy.checkpoint_format == CALLERS_MODULES:
             command = f"replay ... --noise-seed 1 --rerun-of {base.path}"
-        return f"{said}: make one with vla-capture {command}."
+        return f"{said}: make one with vla-attention capture {command}."
     texts = [f"{format_number(row['effect'])}{_interval(row, 'effect')}" for row in rows]
     return (
         f"Another noise seed on the same inputs changes the action by {', '.join(texts)} of its spread: a smaller "

@@ -47,9 +47,9 @@ def open_reruns(base: Store, given: Sequence[StorePlace]) -> BaseAndReruns:
         recorded = recorded_conditions(base)
         if not recorded:
             raise BadArgument(
-                f"{base.path} holds no effects, and no rerun of it was given; make a store with them with vla-attention capture "
-                f"rerun {base.path} --effects text,cameras, or give reruns, for instance the folder of vla-attention capture "
-                f"rerun {base.path} --series default."
+                f"{base.path} holds no effects, and no rerun of it was given; make a store with them with "
+                f"vla-attention capture rerun {base.path} --effects text,cameras, or give reruns, for instance the "
+                f"folder of vla-attention capture rerun {base.path} --series default."
             )
         return BaseAndReruns(base, recorded, (), ())
     reruns, rollouts, notes = [], [], []

@@ -80,7 +80,7 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
         help="make the policy calls of a store again, unchanged or with interventions",
         description="Give the policy of a store the same pictures, state, prompt and noise again, without a simulator. "
         "First the calls of one episode are made again unchanged, and their distance from the stored ones is printed. "
-        "With interventions, or with --store, the calls of all episodes go into a store like any other.",
+        "With interventions, or with --output, the calls of all episodes go into a store like any other.",
         epilog=f"examples:\n{RERUN_EXAMPLES}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -4,15 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from vla_attention.capture.policies.families import policy_families
 from vla_attention.schemas.errors import BadArgument
 
-#: Names of policies that are no command, and the command for them.
-_POLICIES = {
-    "pi0": "pi --checkpoint PATH",
-    "pi05": "pi --checkpoint PATH",
-    "pi0.5": "pi --checkpoint PATH",
-    "cosmos-policy": "cosmos --checkpoint PATH",
-}
 #: Policies that are called from their user's own code.
 _OWN_CODE = ("smolvla", "openvla", "openvla-oft", "act", "xvla", "x-vla", "gr00t", "groot", "diffusion", "tinyvla")
 
@@ -20,13 +14,13 @@ _OWN_CODE = ("smolvla", "openvla", "openvla-oft", "act", "xvla", "x-vla", "gr00t
 def refuse_other_tools_words(words: Sequence[str]) -> None:
     """Raise `BadArgument` for a policy's name in the place of a command, and for --episodes."""
     first = words[0].casefold() if words else ""
-    if first in _POLICIES:
-        raise BadArgument(
-            f"There is no command '{words[0]}': use vla-capture {_POLICIES[first]}, or pi alone for a small one."
-        )
+    for family in policy_families():
+        if first != family.name and first.replace(".", "") in family.kinds:
+            command = f"vla-attention capture {family.name} --checkpoint PATH"
+            raise BadArgument(f"There is no command '{words[0]}': use {command}.")
     if first in _OWN_CODE:
         raise BadArgument(
-            f"There is no command '{words[0]}': policies other than pi and Cosmos are recorded from your own code, "
+            f"There is no command '{words[0]}': a policy that no family knows is recorded from your own code, "
             "with va.record, or over a data set, with vla-attention capture replay DATASET --policy FILE.py "
             "(docs/your-policy.md)."
         )

@@ -154,7 +154,7 @@ def _find_place(settings: RunSettings) -> Finding:
         if settings.store.exists():
             read_existing_root(settings.store)
             held.append(len(episode_folders(settings.store)))
-        check_writable(settings.store.parent, "--store")
+        check_writable(settings.store.parent, "--output")
         return f"{format_bytes(free_bytes(settings.store))} free for {settings.store}."
 
     held: list[int] = []

@@ -118,7 +118,7 @@ def _jobs(arguments: argparse.Namespace) -> list[_Job]:
     if several and arguments.store is not None:
         raise BadArgument(
             f"Cannot put the suites of '{ALL_SUITES}' into one store, {arguments.store}: a store holds one suite; "
-            "leave --store out (each suite gets its own in --output-dir)."
+            "leave it out (each suite gets its own in --output-dir)."
         )
     task_ids: list[int] | None = arguments.task_id
     of_array: list[tuple[str, int]] = []
@@ -183,7 +183,7 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], threads: Threa
     from vla_attention.schemas.stores.store_place import check_writable
 
     for job in jobs:
-        check_writable(job.settings.store.parent, "--output-dir" if arguments.store is None else "--store")
+        check_writable(job.settings.store.parent, "--output")
 
     from vla_attention.capture.machine.device import load_torch
     from vla_attention.capture.rollout.episode_faults import EpisodesMissing
@@ -264,7 +264,7 @@ _OPTIONS = {
     "CONFIG_NAME": "--config-name",
     "TASK_SUITE": "--task-suite",
     "OUTPUT_DIR": "--output-dir",
-    "STORE": "--store",
+    "STORE": "--output",
     "STAGE": "--stage",
 }
 _WHOLE_NUMBERS = {

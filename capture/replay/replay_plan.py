@@ -127,7 +127,7 @@ def plan_replay(arguments: argparse.Namespace, termination: Termination) -> Repl
     # An existing store or an unwritable place is an error now, before the minutes for loading a model.
     if mode == "new":
         refuse_recorded(store)
-    check_writable(store.parent, "--store")
+    check_writable(store.parent, "--output")
     return ReplayPlan(
         data=data,
         wanted=wanted,

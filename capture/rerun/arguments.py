@@ -26,7 +26,7 @@ RERUN_EXAMPLES = """\
   vla-attention capture rerun runs/libero_10.zarr --keep role:instruction        with the words of the instruction alone
   vla-attention capture rerun runs/libero_10.zarr --prompt empty --image left_wrist_0_rgb=blank
   vla-attention capture rerun runs/libero_10.zarr --series default --words           every group and word, with controls
-  vla-attention capture rerun runs/libero_10.zarr --store more.zarr --layers 0 1 2 --queries all  more of the same calls
+  vla-attention capture rerun runs/libero_10.zarr --output more.zarr --layers 0 1 2 --queries all
 """
 
 

@@ -58,7 +58,7 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
     if target is not None:
         if mode == "new":
             refuse_recorded(target)
-        check_writable(target.parent, "--store")
+        check_writable(target.parent, "--output")
     for line in nothing_changes:
         say(line)
     if arguments.effects != NO_EFFECTS:

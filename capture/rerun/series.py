@@ -275,8 +275,8 @@ def _refuse_own_interventions(arguments: argparse.Namespace) -> None:
     ):
         if given:
             raise BadArgument(
-                f"Cannot use {option} with --series, which makes its own interventions and stores; run vla-attention capture "
-                "rerun once more for others."
+                f"Cannot use {option} with --series, which makes its own interventions and stores; run vla-attention "
+                "capture rerun once more for others."
             )
 
 

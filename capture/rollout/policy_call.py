@@ -153,5 +153,5 @@ def _not_finite(
     dtype = policy.identity().config.get("dtype")
     remedy = "use another checkpoint" if dtype == "float32" else "use --dtype float32, or another checkpoint"
     return NumbersNotFinite(
-        f"{sentence}, and the episodes before it are unharmed; {remedy}, and a new --store, if it comes again."
+        f"{sentence}, and the episodes before it are unharmed; {remedy}, and a new --output, if it comes again."
     )

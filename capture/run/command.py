@@ -29,7 +29,7 @@ def run_capture_of_family(arguments: argparse.Namespace, termination: Terminatio
     check_installed(settings.suite, settings.libero_assets)
     if settings.mode == "new":
         refuse_recorded(settings.store)
-    check_writable(settings.store.parent, "--store")
+    check_writable(settings.store.parent, "--output")
     if arguments.output_dir is not None:
         check_writable(arguments.output_dir, "--output-dir")
 

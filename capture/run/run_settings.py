@@ -129,7 +129,7 @@ def _protocol(arguments: argparse.Namespace) -> EvaluationProtocol | None:
 
 
 def store_path(arguments: argparse.Namespace) -> Path:
-    """Return the store's path: --store, else the name of family and suite, in --output-dir or `runs`."""
+    """Return the store's path: --output, else the name of family and suite, in its folder or `runs`."""
     if arguments.store is not None:
         return Path(arguments.store)
     family: PolicyFamily = arguments.family

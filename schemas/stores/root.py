@@ -106,8 +106,8 @@ def list_episodes(path: StorePlace) -> tuple[list[StorePlace], list[str]]:
             names = RemoteFolder(path.url).names(EPISODES_GROUP)
         except (OSError, NotImplementedError) as error:
             raise StoreError(
-                f"The episodes of {path} cannot be listed ({str(error).rstrip('.')}), and it has no index; vla-attention "
-                "copy --packed makes a store that is read without listing."
+                f"The episodes of {path} cannot be listed ({str(error).rstrip('.')}), and it has no index; "
+                "vla-attention copy --packed makes a store that is read without listing."
             ) from None
         is_episode_of = {name: is_episode_name(name) for name in names}
     elif (path / INDEX_FILE).is_file():

@@ -9,7 +9,6 @@ import pytest
 
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.schemas.errors import Note
 from vla_attention.schemas.stores.store_format import STORE_VERSION
 
 DUMMY = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--replan-steps", "4"]
@@ -37,7 +36,7 @@ def run(command, arguments, capsys) -> str:
         (["--task-suite", "libero_10", "--task-id", "10"], "its tasks are 0 to 9"),
         (["--layers", "6"], "expected block indices 0 to 2, or recorded-call numbers 3 to 5"),
         (["--layers", "1", "4", "1"], "name one of them twice"),
-        (["--layers", "one"], "invalid int value"),
+        (["--layers", "one"], "is neither a number nor a range"),
         (["--heads", "8"], "expected 0 to 7"),
         (["--denoise", "3"], "expected numbers 0 to 2, 'first', 'last' or 'all'"),
         (["--queries", "some"], "expected 'mean', 'steps' or 'all'"),
@@ -66,9 +65,10 @@ def test_capture(arguments, expected, capsys, tmp_path):
 
 
 def test_store_without_suffix_or_in_an_unwritable_place(tmp_path, capsys):
-    with pytest.warns(Note, match="--store is called --output now"):
-        assert capture([*DUMMY, "--store", str(tmp_path / "store")]) == 2
-    assert "ends with '.zarr'" in capsys.readouterr().err
+    assert capture([*DUMMY, "--store", str(tmp_path / "store")]) == 2
+    said = capsys.readouterr().err
+    assert "vla-capture: --store is called --output now.\n" in said
+    assert "ends with '.zarr'" in said
     (tmp_path / "file").write_text("")
     said = run(capture, [*DUMMY, "--output", tmp_path / "file" / "a.zarr"], capsys)
     assert "give another --output" in said

@@ -303,12 +303,10 @@ def test_resuming_records_what_is_missing_and_says_what_is_damaged(tmp_path, mon
         said = capsys.readouterr()
         assert f"{1 - added} of 3 episodes are complete already and 2 damaged; {added} to run." in said.out
         assert f"{plural(added, 'episode')} added" in said.out
-        assert (
-            "Not recorded again without vla-attention capture verify --repair: Episode task000_episode001 cannot be read"
-            in said.out
-        )
+        without = "Not recorded again without vla-attention capture verify --repair: "
+        assert f"{without}Episode task000_episode001 cannot be read" in said.out
         assert "2 of the episodes asked for are damaged: Episode task000_episode000 is damaged: it has lost" in said.err
-        assert f"run vla-capture repair {store}, which" in said.err
+        assert f"run vla-attention capture verify {store} --repair, which" in said.err
         assert said.err.count("\n") == 1
         assert (store / "episodes/task000_episode002").is_dir()
     assert not store_status(store).complete
