@@ -175,18 +175,24 @@ def select_again(question: Question, site: str) -> Selection:
 
 def choose_grouping(settings: AnalysisSettings, vocabulary: Vocabulary) -> Grouping:
     """The grouping that the settings name, with command-line groups added and the ratio replaced if asked."""
-    base = None
     ratio = None if settings.ratio is None else parse_ratio_argument(settings.ratio)
-    own = {parse_group_argument(text)[0] for text in settings.groups}
-    # A ratio that names a group of the default grouping beside one's own needs that grouping, too.
-    needs_default = ratio is not None and not {*ratio.numerator, *ratio.denominator} <= own | {"rest"}
-    if settings.grouping is not None or not settings.groups or needs_default:
+    own = [parse_group_argument(text) for text in settings.groups]
+    if settings.grouping is None and own and ratio is not None:
+        # A ratio may name groups of the default grouping beside one's own; these alone are taken from it.
+        default = find_grouping(DEFAULT_GROUPING, vocabulary).groups
+        wanted = dict.fromkeys((*ratio.numerator, *ratio.denominator))
+        known = {name for name, _ in own}
+        own += [(name, _union(default[name])) for name in wanted if name in default and name not in known]
+    base = None
+    if settings.grouping is not None or not settings.groups:
         base = find_grouping(settings.grouping or DEFAULT_GROUPING, vocabulary)
-    grouping = base
-    if settings.groups:
-        grouping = with_groups(base, [parse_group_argument(text) for text in settings.groups])
+    grouping = with_groups(base, own) if own else base
     assert grouping is not None
     return grouping if ratio is None else replace(grouping, ratio=ratio)
+
+
+def _union(selectors: Sequence[str]) -> str:
+    return " | ".join(f"({selector})" for selector in selectors)
 
 
 def _denoise_notes(root: RootAttributes, selection: Selection, grouping: Grouping) -> tuple[str, ...]:

@@ -30,7 +30,7 @@ EXAMPLES = """examples:
   NAME verify libero_10.zarr --quick              seals, metadata, presence and sizes of files: milliseconds an episode
   NAME verify *.zarr --json > report.json         for programs
   NAME verify libero_10.zarr --repair --dry-run   what would be moved aside
-  NAME verify libero_10.zarr --repair --quick     move aside what a quick look finds; --resume captures it again
+  NAME verify libero_10.zarr --repair --quick     move aside what a quick look finds
 """
 #: Reports of the episodes of a store, in their order, looked at quickly or not.
 Reports = Callable[["Store", bool], Iterable["EpisodeReport"]]

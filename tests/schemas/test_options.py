@@ -1,0 +1,100 @@
+"""Options of both command lines: former and published names, ranges, tasks by their words."""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+
+import pytest
+
+from vla_attention.schemas.errors import BadArgument, Note, UnknownName
+from vla_attention.schemas.former_commands import as_of_today
+from vla_attention.schemas.layers import select_layers
+from vla_attention.schemas.options import Numbers, add_capture_output, add_option, add_task, number_range, resolve_tasks
+
+INSTRUCTIONS = {0: "lift the red cube", 1: "lift the green cube", 4: "Lift the  red cube"}
+
+
+def parser() -> argparse.ArgumentParser:
+    made = argparse.ArgumentParser()
+    add_task(made, "task_id", "tasks", was=("--tasks",))
+    add_option(made, "--denoise", was=("--denoise-steps",), nargs="+")
+    made.add_argument("--layers", type=number_range, nargs="+", action=Numbers)
+    add_capture_output(made, "PATH", "the store")
+    return made
+
+
+def test_former_names_do_the_same_and_say_the_new_one():
+    with pytest.warns(Note, match=r"^--tasks is called --task now\.$"):
+        assert parser().parse_args(["--tasks", "3"]).task_id == [3]
+    with pytest.warns(Note, match=r"^--denoise-steps is called --denoise now\.$"):
+        assert parser().parse_args(["--denoise-steps", "first", "9"]).denoise == ["first", "9"]
+    with pytest.warns(Note, match=r"^--store is called --output now\.$"):
+        assert str(parser().parse_args(["--store", "a"]).store) == "a"
+
+
+def test_published_names_are_silent_and_no_help_shows_either():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", Note)
+        given = parser().parse_args(["--task-id", "5", "--output-dir", "results"])
+    assert (given.task_id, str(given.output_dir), given.store) == ([5], "results", None)
+    shown = parser().format_help()
+    assert "--task " in shown
+    for name in ("--task-id", "--tasks", "--denoise-steps", "--store", "--output-dir"):
+        assert name not in shown
+
+
+def test_nothing_given_is_nothing():
+    given = parser().parse_args([])
+    assert (given.task_id, given.denoise, given.layers, given.store, given.output_dir) == (None,) * 5
+
+
+def test_an_output_is_a_store_or_a_folder():
+    given = parser().parse_args(["--output", "runs/a.zarr", "--output", "results"])
+    assert (str(given.store), str(given.output_dir)) == ("runs/a.zarr", "results")
+
+
+def test_ranges_and_numbers_are_one_list():
+    assert parser().parse_args(["--layers", "0-2", "7", "9-9"]).layers == [0, 1, 2, 7, 9]
+    for wrong in ("2-1", "1-99999", "x", "1-", "1.5"):
+        with pytest.raises(argparse.ArgumentTypeError, match=f"^'{wrong}' is"):
+            number_range(wrong)
+
+
+def test_a_range_of_layers_stays_on_one_side_of_the_published_numbers():
+    assert select_layers(range(18), 18, "pi05").blocks == tuple(range(18))
+    assert select_layers(range(18, 36), 18, "pi05").blocks == tuple(range(18))
+    assert select_layers([0, 8, 17, 25, 26, 27], 18, "pi05").blocks == (0, 8, 17, 7, 8, 9)
+    with pytest.raises(BadArgument, match=r"A range stays on one side: 0-17, or 18-35\."):
+        select_layers(range(16, 20), 18, "pi05")
+    assert select_layers(range(16, 20), 28, "cosmos").blocks == (16, 17, 18, 19)
+
+
+def test_tasks_are_chosen_by_number_or_by_their_words():
+    given = parser().parse_args(["--task", "1-2", "LIFT the green cube", "0"]).task_id
+    assert given == [1, 2, "LIFT the green cube", 0]
+    assert resolve_tasks(given, INSTRUCTIONS, "the suite") == (1, 2, 0)
+    with pytest.warns(Note, match="Tasks 0, 4 of the suite have the instruction 'lift the red cube': all of them"):
+        assert resolve_tasks(["lift the red cube"], INSTRUCTIONS, "the suite") == (0, 4)
+    with pytest.raises(UnknownName, match="Did you mean 'lift the green cube'"):
+        resolve_tasks(["lift the gren cube"], INSTRUCTIONS, "the suite")
+
+
+@pytest.mark.parametrize(
+    ("given", "today"),
+    [
+        (["merge", "a", "b", "-o", "c"], ["copy", "a", "b", "-o", "c"]),
+        (["repair", "a"], ["verify", "--repair", "--quick", "a"]),
+        (["repair", "a", "--verify", "--dry-run"], ["verify", "--repair", "a", "--dry-run"]),
+    ],
+)
+def test_former_commands_are_parts_of_others(given, today):
+    with pytest.warns(Note, match="is called"):
+        assert as_of_today(given) == today
+
+
+def test_other_words_stay_as_they_are():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", Note)
+        assert as_of_today(["verify", "repair"]) == ["verify", "repair"]
+        assert as_of_today([]) == []
