@@ -11,7 +11,7 @@ from vla_attention.schemas.stores.verify_command import DESCRIPTION, EXAMPLES, a
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-attention verify STORE ...`."""
-    parser = command_parser("vla-attention verify", DESCRIPTION, EXAMPLES.replace("NAME", "vla-analyze"))
+    parser = command_parser("vla-attention verify", DESCRIPTION, EXAMPLES.replace("NAME", "vla-attention"))
     add_verify_arguments(parser)
     add_workers(parser)
     return parser

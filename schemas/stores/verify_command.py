@@ -27,7 +27,7 @@ DESCRIPTION = (
 )
 EXAMPLES = """examples:
   NAME verify libero_10.zarr                      every byte of every episode
-  NAME verify libero_10.zarr --quick              seals, metadata, presence and sizes of files: milliseconds an episode
+  NAME verify libero_10.zarr --quick              seals, metadata, presence and sizes: milliseconds an episode
   NAME verify *.zarr --json > report.json         for programs
   NAME verify libero_10.zarr --repair --dry-run   what would be moved aside
   NAME verify libero_10.zarr --repair --quick     move aside what a quick look finds
