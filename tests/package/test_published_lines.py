@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import subprocess
 import warnings
@@ -26,9 +27,12 @@ def parsed(words: list[str]):
         if family.published is not None and family.published.program == program:
             return build_evaluate_parser(family, family.published).parse_args(rest)
     assert program == "make"
-    printed = subprocess.run(
-        ["make", "--dry-run", *rest], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60
-    ).stdout.replace("\\\n", " ")
+    # A make that runs the tests hands its own variables, ARGS for instance, to what it starts.
+    outside = {"PATH": os.environ["PATH"]}
+    made = subprocess.run(
+        ["make", "--dry-run", *rest], cwd=ROOT, env=outside, capture_output=True, text=True, check=True, timeout=60
+    )
+    printed = made.stdout.replace("\\\n", " ")
     (line,) = [line for line in printed.splitlines() if "vla-capture" in line and "--task-suite" in line]
     words = shlex.split(line)
     return build_parser(words[1:]).parse_args(words[1:])

@@ -219,5 +219,5 @@ def test_an_exported_policy_runs_like_any_checkpoint(demonstrations, whole, tmp_
 
 @pytest.mark.parametrize("number", ["0", "24", "-1"])
 def test_a_number_of_tasks_that_does_not_exist_is_refused(tmp_path, capsys, number):
-    assert main(["train", str(tmp_path), str(tmp_path / "out"), "--task", number]) == 2
-    assert f"Cannot use --task {number}; expected 1 to 23." in capsys.readouterr().err
+    assert main(["train", str(tmp_path), str(tmp_path / "out"), "--tasks", number]) == 2
+    assert f"Cannot use --tasks {number}; expected 1 to 23." in capsys.readouterr().err
