@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 from vla_attention.schemas.errors import BadArgument, listing
 
@@ -39,7 +38,7 @@ def select_layers(numbers: Sequence[int] | None, num_layers: int, family: str) -
         if not 0 <= number <= last:
             also = f", or recorded-call numbers {num_layers} to {last}" if accepts_call_numbers else ""
             raise BadArgument(f"There is no layer {number}; expected block indices 0 to {num_layers - 1}{also}.")
-    if accepts_call_numbers and any(pair == (num_layers - 1, num_layers) for pair in pairwise(numbers)):
+    if accepts_call_numbers and _runs_across(numbers, num_layers):
         raise BadArgument(
             f"Layers {num_layers - 1} and {num_layers} do not follow each other: {num_layers - 1} is the last block, "
             f"and {num_layers} the published scripts' number of block 0. A range stays on one side: "
@@ -48,6 +47,12 @@ def select_layers(numbers: Sequence[int] | None, num_layers: int, family: str) -
     if len(set(numbers)) != len(numbers):
         raise BadArgument(f"Layers {listing(numbers, 40)} name one of them twice; give each number once.")
     return LayerSelection(block_of_labels(numbers, num_layers), tuple(numbers), _translation_note(numbers, num_layers))
+
+
+def _runs_across(numbers: Sequence[int], num_layers: int) -> bool:
+    """Whether three numbers in a row, as of a range, lie on both sides of the first call number."""
+    threes = zip(numbers, numbers[1:], numbers[2:], strict=False)
+    return any((a + 1, b + 1) == (b, c) and a < num_layers <= c for a, b, c in threes)
 
 
 def block_of_labels(numbers: Sequence[int], num_layers: int) -> tuple[int, ...]:

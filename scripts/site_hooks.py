@@ -151,7 +151,7 @@ def printed_help(program: str, command: str) -> str:
     else:
         run = ["-m", MODULES[program]]
     done = subprocess.run(
-        [sys.executable, *run, *command.split(), "--help"],
+        [sys.executable, *run, *command.split(), "--help-all"],
         cwd=ROOT,
         env={**os.environ, "COLUMNS": _COLUMNS, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"},
         capture_output=True,

@@ -48,7 +48,7 @@ def _lines(commands: Mapping[str, str]) -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code of the command, 2 for a command that does not exist."""
     given = sys.argv[1:] if argv is None else list(argv)
-    if not given or given[0] in ("-h", "--help", "help"):
+    if not given or given[0] in ("-h", "--help", "--help-all", "help"):
         print(usage(), end="")
         return 0
     if given[0] in ("-V", "--version"):

@@ -155,7 +155,7 @@ def test_mistakes_are_one_sentence(words: list[str], said: str, capfd):
 def test_help_has_the_options_of_the_policy_that_is_named(capfd):
     for words, option in (([], "--paligemma-variant"), (["cosmos"], "--t5-tokenizer")):
         with pytest.raises(SystemExit) as end:
-            capture(["doctor", *words, "--help"])
+            capture(["doctor", *words, "--help-all"])
         assert end.value.code == 0
         said = capfd.readouterr().out
         assert option in said

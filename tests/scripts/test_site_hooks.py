@@ -42,9 +42,9 @@ def test_other_links_and_code_stay():
 def test_every_command_has_its_help_text():
     text = help_texts()
     headings = re.findall(r"^#+ `(.*)`$", text, re.MULTILINE)
-    assert {f"vla-attention analyze {command}" for command in COMMANDS} <= set(headings)
+    assert {f"vla-analyze {command}" for command in COMMANDS} <= set(headings)
     assert {f"vla-capture {family.name}" for family in policy_families()} <= set(headings)
-    assert "vla-attention capture replay" in headings
+    assert "vla-capture replay" in headings
     assert len(headings) == text.count("usage: ") == len(set(headings))
     assert commands_of("vla-analyze") == list(COMMANDS)
 
