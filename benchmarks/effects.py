@@ -16,7 +16,7 @@ import gc
 import time
 
 import measurement
-from measurement import Table, fix_threads, measured, ratios, write_rows
+from measurement import Table, fix_threads, measured, peak_memory, ratios, write_rows
 
 #: Name of a row -> items, readers, denoise steps (None: all), and the conditions that are kept (None: all).
 KINDS: dict[str, tuple[tuple[str, ...], tuple[str, ...], int | None, int | None]] = {
@@ -143,7 +143,7 @@ def full_size_table(device: str, threads: int) -> Table:
     torch.set_num_threads(threads)
     policy = make_policy("full", device, "bfloat16")
     forget_peak(device)
-    model = peak_memory(device)
+    model = largest_memory(device)
     given, context = prepared_input(policy), CallContext(0, 0, 0)
     planned = planned_effects(EffectSettings(("text", "cameras")), policy, 7)
     run = EffectMeasurement(policy, planned, {}, print)
@@ -155,7 +155,7 @@ def full_size_table(device: str, threads: int) -> Table:
         forget_peak(device)
         began = time.perf_counter()
         result = call()
-        return result, time.perf_counter() - began, round((peak_memory(device) - model) / 1e9, 2)
+        return result, time.perf_counter() - began, round((largest_memory(device) - model) / 1e9, 2)
 
     _, plain, memory = timed(lambda: policy.act(given, 7))
     rows = [{"what": "the call alone", "conditions": 0, "seconds": plain, "calls": 1.0, "gb": memory, "floor": "-"}]
@@ -196,14 +196,11 @@ def forget_peak(device: str) -> None:
         file.write("5")
 
 
-def peak_memory(device: str) -> float:
+def largest_memory(device: str) -> float:
     """Return the largest memory since `forget_peak`, in bytes."""
     import torch
 
-    if device != "cpu":
-        return float(torch.cuda.max_memory_allocated())
-    with open("/proc/self/status") as file:
-        return 1024.0 * next(int(line.split()[1]) for line in file if line.startswith("VmHWM"))
+    return float(torch.cuda.max_memory_allocated()) if device != "cpu" else peak_memory()
 
 
 if __name__ == "__main__":

@@ -28,7 +28,8 @@ import torch
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
-from benchmarks.orbax_writer import write_orbax  # noqa: E402 - a script, and not part of the package
+from benchmarks.measurement import peak_memory  # noqa: E402 - a script, and not part of the package
+from benchmarks.orbax_writer import write_orbax  # noqa: E402
 
 GOLDEN = ROOT / "tests" / "golden" / "pi"
 MANIFESTS = {
@@ -128,7 +129,7 @@ def load_and_run(folder: Path, checkpoint_format: str, dtype: str) -> dict[str, 
     begun = time.perf_counter()
     options = loading.CheckpointOptions(checkpoint_format=checkpoint_format, dtype=getattr(torch, dtype))
     policy = loading.load_pi_policy(folder, EMBEDDED_TOKENIZER, options=options)
-    loaded, peak_loading = time.perf_counter() - begun, peak_memory()
+    loaded, peak_loading = time.perf_counter() - begun, peak_memory() / 1e9
     frame = np.random.default_rng(0).integers(0, 255, (256, 256, 3), dtype=np.uint8)
     observation = Observation(
         images={"agentview": frame, "robot0_eye_in_hand": frame},
@@ -150,14 +151,8 @@ def load_and_run(folder: Path, checkpoint_format: str, dtype: str) -> dict[str, 
         "replan_s": replan,
         "model_gb": weights / 1e9,
         "peak_load_gb": peak_loading,
-        "peak_gb": peak_memory(),
+        "peak_gb": peak_memory() / 1e9,
     }
-
-
-def peak_memory() -> float:
-    """Largest resident memory of this process so far, in GB (Linux: getrusage would count the parent's memory too)."""
-    [line] = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM:")]
-    return int(line.split()[1]) * 1024 / 1e9
 
 
 def main() -> None:

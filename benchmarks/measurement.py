@@ -208,6 +208,12 @@ def shown_command() -> str:
     return (f"OMP_NUM_THREADS={threads} " if threads else "") + shlex.join(["python", name, *sys.argv[1:]])
 
 
+def peak_memory() -> float:
+    """Return the largest resident memory of this process so far, in bytes; getrusage would count the parent's too."""
+    (line,) = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM:")]
+    return 1024.0 * int(line.split()[1])
+
+
 def write_rows(name: str, tables: Mapping[str, Table], *, command: str | None = None, folder: Path = ROWS) -> Path:
     """Write tables into NAME.json and return its path; other tables that the file holds stay as they are.
 

@@ -109,12 +109,7 @@ def _difference_section(comparison: Comparison, name: str, layer: str) -> Sectio
     paired = bool(rows["paired"].any())
     columns = [
         texts("quantity", lambda row: shortened(row["quantity"], 26), left=True),
-        _num_pairs(),
-        number(first[:14], "mean_first"),
-        number(name[:14], "mean_other"),
-        signed("difference", "difference"),
-        interval(""),
-        number("q", "q"),
+        *_of_both(first, name),
         *(signed_estimate("d_z", D_Z) if paired else signed_estimate("g", HEDGES_G)),
     ]
     named = findings(
@@ -133,6 +128,18 @@ def _difference_section(comparison: Comparison, name: str, layer: str) -> Sectio
     said = f"{_factor(comparison, name, rows)}{named}"
     pairing, table = _pairing(comparison, name, rows), Table(columns, rows.to_dicts())
     return Section([pairing, table, said, note], f"{name} AGAINST {first}")
+
+
+def _of_both(first: str, name: str) -> list[Column]:
+    """What is compared in two runs: how often, either mean, and the difference."""
+    return [
+        _num_pairs(),
+        number(first[:14], "mean_first"),
+        number(name[:14], "mean_other"),
+        signed("difference", "difference"),
+        interval(""),
+        number("q", "q"),
+    ]
 
 
 def _num_pairs() -> Column:
@@ -224,12 +231,7 @@ def _effects_section(comparison: Comparison, name: str) -> list[Section]:
     columns = [
         texts("item", lambda row: shortened(row["item"], 24), left=True),
         texts("read by", lambda row: {"total": "all", "direct": "action"}[row["reader"]], left=True),
-        _num_pairs(),
-        number(first[:14], "mean_first"),
-        number(name[:14], "mean_other"),
-        signed("difference", "difference"),
-        interval(""),
-        number("q", "q"),
+        *_of_both(first, name),
     ]
     labels = [row["item"] if row["reader"] == "total" else f"{row['item']} (action queries alone)" for row in rows]
     named = findings([row["q"] for row in rows], labels, "effect", "a difference", _num_sentences(comparison))

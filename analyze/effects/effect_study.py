@@ -127,12 +127,13 @@ class EffectStudy:
 
     def of(self, condition: Condition) -> dict[str, Any]:
         """The row of `summary` over all tasks and replans."""
-        return self.summary.row(
-            by_predicate=(pl.col("scope") == "all")
-            & (pl.col("phase") == ALL)
-            & (pl.col("condition") == condition.name),
-            named=True,
-        )
+        return self._over_all[condition.name]
+
+    @cached_property
+    def _over_all(self) -> dict[str, dict[str, Any]]:
+        """The rows of `summary` over all tasks and replans, by condition."""
+        rows = self.summary.filter(scope="all", phase=ALL).iter_rows(named=True)
+        return {row["condition"]: row for row in rows}
 
     def of_kind(self, *kinds: Kind) -> list[Condition]:
         """The conditions of some kinds."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -97,16 +97,12 @@ def effects_over_time(study: EffectStudy, num_bins: int) -> pl.DataFrame:
     places = {"position_low": edges[:-1], "position": (edges[:-1] + edges[1:]) / 2, "position_high": edges[1:]}
     columns = ["item", "reader", *places]
     parts = []
-    for base, condition, changes in _changes(study):
-        if condition.name in shown:
-            num_steps = episode_timing(base.item.store.attributes, base.item.episode, base.env_step)[1]
-            effect = on_episode_time(changes[:, :1], base.starts, num_steps, num_bins)[:, 0]
-            constant = _identity(base) | {"item": shown[condition.name], "reader": reader_of(condition)}
-            named = [
-                pl.lit(value, pl.Int64 if type(value) is int else pl.String).alias(name)
-                for name, value in constant.items()
-            ]
-            parts.append(pl.DataFrame(places | {"effect": effect}).with_columns(named))
+    for base, condition, changes in _changes(study, shown):
+        num_steps = episode_timing(base.item.store.attributes, base.item.episode, base.env_step)[1]
+        effect = on_episode_time(changes[:, :1], base.starts, num_steps, num_bins)[:, 0]
+        constant = _identity(base) | {"item": shown[condition.name], "reader": reader_of(condition)}
+        named = [pl.lit(value, _IDENTITY.get(name, pl.String)).alias(name) for name, value in constant.items()]
+        parts.append(pl.DataFrame(places | {"effect": effect}).with_columns(named))
     if not parts:
         return pl.DataFrame(schema=dict.fromkeys(columns, pl.Float64))
     order = {name: number for number, name in enumerate(dict.fromkeys(shown.values()))}
@@ -132,35 +128,42 @@ def shares_of_dimensions(study: EffectStudy, name: str) -> Array:
 
     name: of the condition. 0 for dimensions that are not compared, and everywhere where nothing changed.
     """
-    condition = next(one for one in study.conditions if one.name == name)
     used, squares = study.spread.used, np.zeros(len(study.spread.spread))
-    for item in study.question.selected:
-        effects = item.episode.attributes.effects
-        if effects is None or not condition.recorded:
-            continue
-        base = BaseEpisode.of(item)
-        change = actions_of(base, item.episode, condition) - base.actions
-        change = np.where(np.isfinite(change), change, 0.0) * counted(base.executed, change.shape[1])[..., None]
+    for base, _, actions in _recorded_actions(study, [name]):
+        change = np.where(np.isfinite(actions), actions - base.actions, 0.0)
+        change *= counted(base.executed, change.shape[1])[..., None]
         squares[used] += ((change[..., used] / study.spread.spread[used]) ** 2).sum(axis=(0, 1))
     total = squares.sum()
     return squares / total if total > 0 else squares
 
 
-def _changes(study: EffectStudy) -> Iterator[tuple[BaseEpisode, Condition, Array]]:
-    """(replan, change) of `CHANGES` for every selected episode and recorded condition; NaN where not measured."""
-    recorded = [condition for condition in study.conditions if condition.recorded]
+def _changes(
+    study: EffectStudy, names: Collection[str] | None = None
+) -> Iterator[tuple[BaseEpisode, Condition, Array]]:
+    """(replan, change) of `CHANGES` for every episode and condition of `_recorded_actions`; NaN where not measured."""
+    for base, condition, actions in _recorded_actions(study, names):
+        changes = changes_of(base, actions, study.spread)
+        changes[~np.isfinite(actions).all(axis=(1, 2))] = np.nan
+        yield base, condition, changes
+
+
+def _recorded_actions(
+    study: EffectStudy, names: Collection[str] | None
+) -> Iterator[tuple[BaseEpisode, Condition, Array]]:
+    """Actions (replan, step, dimension) of every selected episode under recorded conditions that it was measured under.
+
+    names: of the conditions; None for all. NaN at replans without a measurement.
+    """
+    recorded = [one for one in study.conditions if one.recorded and (names is None or one.name in names)]
     for item in study.question.selected:
-        if item.episode.attributes.effects is None:
+        if item.episode.attributes.effects is None or not recorded:
             continue
         base = BaseEpisode.of(item)
         entries = changes_recorded(base)
         for condition in recorded:
             actions = actions_of(base, item.episode, condition, entries)
-            measured = np.isfinite(actions).all(axis=(1, 2))
-            changes = changes_of(base, actions, study.spread)
-            changes[~measured] = np.nan
-            if measured.any():
-                yield base, condition, changes
+            if np.isfinite(actions).all(axis=(1, 2)).any():
+                yield base, condition, actions
 
 
 def _shown(study: EffectStudy) -> dict[str, str]:

@@ -13,7 +13,7 @@ import pytest
 
 import vla_attention as va
 from tests.analyze.view.test_page_effects import WAYS, planted
-from tests.kit.browser import Watched, chromium, needs_chromium, watched_page
+from tests.kit.browser import Watched, needs_chromium, watched_page
 from tests.kit.http_ranges import serve
 from tests.kit.viewer import served
 from vla_attention.analyze.__main__ import main
@@ -36,20 +36,6 @@ def server(store) -> Iterator[ViewerServer]:
     with served(store, summaries=True) as running:
         running.stores[0].summary.wait()
         yield running
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as running:
-        yield running
-
-
-@pytest.fixture
-def view(browser, server) -> Iterator[Watched]:
-    with watched_page(browser) as watched:
-        yield watched
-        assert watched.complaints == []
-        assert watched.requests_beside(server.link) == []
 
 
 def word(view: Watched, text: str) -> Any:

@@ -7,13 +7,12 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 import pytest
 
 import vla_attention as va
-from tests.kit.browser import Watched, chromium, needs_chromium, watched_page
+from tests.kit.browser import Watched, needs_chromium, watched_page
 from tests.kit.golden_stores import FOLDER
 from tests.kit.http_ranges import serve
 from tests.kit.viewer import served
@@ -54,20 +53,6 @@ def rerun(store) -> Path:
 def server(store, rerun) -> Iterator[ViewerServer]:
     with served(store, rerun, summaries=True) as running:
         yield running
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as running:
-        yield running
-
-
-@pytest.fixture
-def view(browser, server) -> Iterator[Watched]:
-    with watched_page(browser) as watched:
-        yield watched
-        assert watched.complaints == []
-        assert watched.requests_beside(server.link) == []
 
 
 def wait_for_ratios(view: Watched, episodes: int) -> None:

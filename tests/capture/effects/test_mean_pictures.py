@@ -72,8 +72,10 @@ def test_without_a_store_of_pictures_they_are_grey_and_a_line_says_so(pi_store, 
         "0",
         "--num-episodes",
         "1",
+        "--max-steps",
+        "4",
     ]
-    words += ["--max-steps", "4", "--effects", "cameras"]
+    words += ["--effects", "cameras"]
     assert main([*words, "--output", str(tmp_path / "grey.zarr")]) == 0
     assert "exchanged for grey ones; --effects-pictures STORE" in capsys.readouterr().out
     assert main([*words, "--output", str(tmp_path / "mean.zarr"), "--effects-pictures", str(pi_store)]) == 0
