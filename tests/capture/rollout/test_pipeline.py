@@ -491,7 +491,9 @@ def test_a_stopped_capture_leaves_no_half_episode_and_no_process(number, code, t
 
 @pytest.mark.simulator
 def test_a_killed_simulator_is_replaced(tmp_path):
-    run = Run(tmp_path, max_steps=16, episodes=8)  # whenever the kill comes, the simulator has an episode to begin
+    # Whenever the kill comes, the simulator has an episode to begin. Of short episodes, one might end before the other
+    # begins, every time.
+    run = Run(tmp_path, max_steps=60, episodes=8)
     run.wait_until(run.both_are_in_an_episode)
     victim = run.simulators()[0]
     folders = list(run.temporary.glob("vla-simulator-*"))
