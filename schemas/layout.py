@@ -29,7 +29,8 @@ ROLE_DTYPE = np.uint8
 RESERVED_NAMES = frozenset(
     {
         *("actions", "base_actions", "camera_frames", "dataset_action_count", "dataset_actions", "denoise_time"),
-        *("effects", "env_step", "frames", "noise_seed", "objects", "prompt_index", "seal", "state", "zarr.json"),
+        *("effects", "env_step", "frames", "noise_seed", "objects", "prompt_index", "seal", "state"),
+        *("steps", "zarr.json"),
     }
 )
 

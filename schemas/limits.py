@@ -69,6 +69,9 @@ PLACES = 10_000_000
 #: Conditions whose effects an episode has, and their entries: one for each replan and condition.
 CONDITIONS = 10_000
 EFFECT_ENTRIES = 1_000_000
+#: Bodies of a scene whose poses are stored, and tasks that share a scene. LIBERO's scenes have up to 20 and 10.
+BODIES = 10_000
+GOALS = 10_000
 #: Queries x keys of a growing span, for which version 1 counts each key in float64.
 GROWING_CELLS = 1_000_000
 #: Replans of an episode: fourteen hours at 20 calls a second.

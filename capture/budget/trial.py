@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.effects.measurement import EffectMeasurement
-from vla_attention.capture.environments.base import Environment, EnvironmentSettings, StepResult, Task
+from vla_attention.capture.environments.base import Environment, EnvironmentSettings, StepResult, Task, TellsMoments
 from vla_attention.capture.environments.suites import find_suite, make_environment
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.policies.policy import Policy
 from vla_attention.capture.rollout.episode import EpisodeRun, record_episode
 from vla_attention.capture.rollout.simulation import StopCheck
 from vla_attention.capture.store.disk_estimate import FEWEST_REPLANS, SampleOfReplans
-from vla_attention.capture.store.replan_records import EpisodeStart, ReplanRecord
+from vla_attention.capture.store.replan_records import EpisodeStart, RecordedSteps, ReplanRecord
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.stores.store_format import RootAttributes
 
@@ -92,7 +92,7 @@ def run_trial(
     if effects is not None:
         of_calls += median(effects.seconds) / effects.planned.every
     return Trial(
-        sample=SampleOfReplans(attributes, kept.start, kept.denoise_times, kept.records),
+        sample=SampleOfReplans(attributes, kept.start, kept.denoise_times, kept.records, kept.steps),
         policy_seconds=of_calls,
         step_seconds=max(0.0, float(np.median(of_replans)) - of_calls) / protocol.replan_steps,
         start_seconds=timed.calls[0].begun - begun,
@@ -127,6 +127,7 @@ class _KeptEpisode:
         self.records: list[ReplanRecord] = []
         self.times: list[float] = []
         self.start: EpisodeStart | None = None
+        self.steps: RecordedSteps | None = None
         self.denoise_times: NDArray[np.float64] = np.zeros(0)
 
     @contextmanager
@@ -140,7 +141,8 @@ class _KeptEpisode:
         self.records.append(record)
         self.times.append(time.perf_counter())
 
-    def commit(self, success: bool | None, num_steps: int) -> Path:
+    def commit(self, success: bool | None, num_steps: int, steps: RecordedSteps | None) -> Path:
+        self.steps = steps
         return self.path
 
 
@@ -172,6 +174,8 @@ class _NeverSolved:
 
     def __init__(self, environment: Environment) -> None:
         self._environment = environment
+        if isinstance(environment, TellsMoments):
+            self.bodies, self.goals, self.moment = environment.bodies, environment.goals, environment.moment
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._environment, name)

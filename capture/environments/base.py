@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from vla_attention.schemas.episode_steps import TaskGoal
     from vla_attention.schemas.groupings.vocabulary import SceneObject
 
 #: Name of the scene object that stands for the arm, its gripper and its mount.
@@ -101,6 +102,23 @@ class StepResult:
     observation: Observation | None
 
 
+@dataclass(frozen=True)
+class Moment:
+    """Where things are at the end of a step, what the gripper touches, and which goals hold.
+
+    poses: (body, 7) float32, position in metres and orientation as a quaternion (w, x, y, z), world frame: of the
+        gripper's site, then of the root bodies of objects.
+    gripper: (finger,) float32, positions of the finger joints in metres.
+    touched: (body,) bool. A touch that begins and ends within a step is not seen.
+    held: (goal,) bool.
+    """
+
+    poses: NDArray[np.float32]
+    gripper: NDArray[np.float32]
+    touched: NDArray[np.bool_]
+    held: NDArray[np.bool_]
+
+
 class Environment(Protocol):
     """One task in one simulator.
 
@@ -153,6 +171,21 @@ class SharesResets(Protocol):
 
     def learn_resets(self, seed: int, resets: Sequence[Any]) -> None:
         """Take over what another environment knows, if it knows more."""
+
+
+@runtime_checkable
+class TellsMoments(Protocol):
+    """An `Environment` that tells where things are after every step. Asking changes nothing: no picture, no state.
+
+    bodies: whose poses a `Moment` has: `HAND`, then objects that have a body. goals: of all tasks that share the scene,
+    the environment's own among them.
+    """
+
+    bodies: tuple[str, ...]
+    goals: tuple[TaskGoal, ...]
+
+    def moment(self) -> Moment:
+        """Return what holds after the last step, or after the reset."""
 
 
 def check_task_id(suite: Suite, task_id: int) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,9 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import ROBOT, EnvironmentSettings, Task
 from vla_attention.capture.environments.libero_installation import find_assets, load_libero, package_folder
-from vla_attention.capture.environments.simulator import SimulatedEnvironment
+from vla_attention.capture.environments.simulator import SimulatedEnvironment, goal_of
 from vla_attention.capture.foreign_files.checked_files import check_regular
+from vla_attention.schemas.episode_steps import TaskGoal
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 
@@ -101,7 +103,7 @@ class LiberoEnvironment(SimulatedEnvironment):
     So every episode is the published one, alone, in a job array, or after others (`Seeding` has the evaluations).
     """
 
-    def __init__(self, task: Task, settings: EnvironmentSettings) -> None:
+    def __init__(self, task: Task, settings: EnvironmentSettings, suite_tasks: Sequence[Task] = ()) -> None:
         self._assets = find_assets(settings.libero_assets)
         stored = package_folder() / "init_files" / task.suite / f"{task.name}.pruned_init"
         self._initial_states = load_initial_states(stored)
@@ -111,7 +113,7 @@ class LiberoEnvironment(SimulatedEnvironment):
                 f"instead of {task.num_initial_states}; run 'make setup'."
             )
         self._protocol = settings.protocol
-        super().__init__(task, settings)
+        super().__init__(task, settings, suite_tasks)
         #: The samplers that one reset appends; the environment's construction has appended the first ones.
         self._joint_samplers = tuple(self._simulator.object_property_initializers)
         #: By the run's seed, with what the resets of episodes 0, 1, ... begin, as far as known.
@@ -119,20 +121,9 @@ class LiberoEnvironment(SimulatedEnvironment):
 
     def _build(self, options: dict[str, Any]) -> Any:
         classes = load_libero(self._assets)
-        from libero.libero.envs.bddl_utils import get_problem_info
-
-        path = package_folder() / "bddl_files" / self.task.suite / f"{self.task.name}.bddl"
-        try:
-            check_task_file(path)
-            problem = get_problem_info(str(path))["problem_name"]
-            environment = classes[problem]
-        except UserError:
-            raise
-        except Exception as error:  # LIBERO's parser raises what its own code meets
-            raise UnusableTask(
-                f"The task file '{path}' cannot be read ({type(error).__name__}: {error}); install LIBERO again with "
-                "'make setup'."
-            ) from error
+        path = task_file(self.task)
+        with reading_task_file(path):
+            environment = classes[read_task_file(path)["problem_name"]]
         # The stored state sets the robot's joints, so they need no noise.
         try:
             return self._construct(environment, str(path), initialization_noise=None, **options)
@@ -202,6 +193,21 @@ class LiberoEnvironment(SimulatedEnvironment):
         self._simulator._post_process()
         self._simulator._update_observables(force=True)
 
+    def _scene_goals(self) -> Sequence[TaskGoal]:
+        self._conditions_of = goals_of_scene(self.task, self._suite_tasks)
+        return [goal_of(task, map(" ".join, conditions)) for task, conditions in self._conditions_of.items()]
+
+    def _held(self) -> Sequence[bool]:
+        simulator = self._simulator
+        things = [simulator.get_object(name).object_properties for name in simulator.visualization_sites_list]
+        # LIBERO's predicates of a stove write whether its burner is seen, which the next picture would show.
+        shown = [dict(properties["vis_site_names"]) for properties in things]
+        conditions = {one: None for of_task in self._conditions_of.values() for one in of_task}
+        holds = {one: bool(simulator._eval_predicate(list(one))) for one in conditions}
+        for properties, before in zip(things, shown, strict=True):
+            properties["vis_site_names"].update(before)
+        return [all(holds[one] for one in of_task) for of_task in self._conditions_of.values()]
+
     def _describe_objects(self) -> tuple[tuple[SceneObject, ...], Mapping[str, Sequence[str]]]:
         movable, fixed = self._simulator.objects_dict, self._simulator.fixtures_dict
         names = [*movable, *fixed]
@@ -212,6 +218,54 @@ class LiberoEnvironment(SimulatedEnvironment):
         ]
         roots = {name: [thing.root_body] for name, thing in (movable | fixed).items()}
         return self._with_robot_and_background(described), roots | {ROBOT: self._robot_bodies()}
+
+
+def task_file(task: Task) -> Path:
+    """Return the path of the file that says what is in a task's scene, and its goal."""
+    return package_folder() / "bddl_files" / task.suite / f"{task.name}.bddl"
+
+
+@contextmanager
+def reading_task_file(path: Path) -> Iterator[None]:
+    """Turn an error of LIBERO's parser, which raises what its own code meets, into `UnusableTask`."""
+    try:
+        yield
+    except UserError:
+        raise
+    except Exception as error:
+        raise UnusableTask(
+            f"The task file '{path}' cannot be read ({type(error).__name__}: {error}); install LIBERO again with "
+            "'make setup'."
+        ) from error
+
+
+def read_task_file(path: Path) -> dict[str, Any]:
+    """Return what LIBERO's parser reads of a task file; `UnusableTask` for one that it must not read."""
+    from libero.libero.envs.bddl_utils import robosuite_parse_problem
+
+    with reading_task_file(path):
+        check_task_file(path)
+        parsed: dict[str, Any] = robosuite_parse_problem(str(path))
+        return parsed
+
+
+#: What of a task's file is its scene. The sentence, the goal and the objects of interest are the task's own.
+_SCENE = ("problem_name", "fixtures", "objects", "regions", "scene_properties", "initial_state")
+
+
+def goals_of_scene(task: Task, tasks: Sequence[Task]) -> dict[Task, tuple[tuple[str, ...], ...]]:
+    """Return the tasks that share a task's scene, itself among them, with the conditions of their goals.
+
+    A condition is a predicate with its objects. The initial states of such tasks are drawn from one distribution; which
+    ones are stored with a task is the task's own. LIBERO must have been loaded.
+    """
+    parsed = {one: read_task_file(task_file(one)) for one in tasks}
+    scenes = {one: [parsed[one][part] for part in _SCENE] for one in tasks}
+    return {
+        one: tuple(tuple(condition) for condition in parsed[one]["goal_state"])
+        for one in tasks
+        if scenes[one] == scenes[task]
+    }
 
 
 #: Bytes of a task file; LIBERO's have up to 3,300.

@@ -14,7 +14,7 @@ import contextlib
 import functools
 import hashlib
 import random
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from vla_attention.capture.environments.base import (
     BACKGROUND,
     ROBOT,
     EnvironmentSettings,
+    Moment,
     Observation,
     StepResult,
     Task,
@@ -31,6 +32,7 @@ from vla_attention.capture.environments.base import (
 )
 from vla_attention.capture.environments.episode_protocol import ACTION_SIZE, CAMERAS, CONTROL_FREQUENCY_HZ
 from vla_attention.capture.environments.robosuite_installation import import_robosuite, readable_device_choice
+from vla_attention.schemas.episode_steps import HAND, TaskGoal
 from vla_attention.schemas.errors import BadArgument, unknown_name
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 
@@ -89,16 +91,24 @@ class CameraGate:
         return gated
 
 
+def goal_of(task: Task, conditions: Iterable[str]) -> TaskGoal:
+    """Return the goal of a task, before any step."""
+    return TaskGoal(task.task_id, task.name, task.instruction, tuple(conditions), None)
+
+
 class SimulatedEnvironment:
     """Base class of the environments; implements `Environment` except for the beginning of an episode.
 
     A subclass builds the simulator, chooses the random numbers of a reset, sets the initial state after it, and lists
     the scene objects.
+
+    suite_tasks: the suite's, of which some share the scene; the task alone if there are none.
     """
 
-    def __init__(self, task: Task, settings: EnvironmentSettings) -> None:
+    def __init__(self, task: Task, settings: EnvironmentSettings, suite_tasks: Sequence[Task] = ()) -> None:
         import_robosuite()
         self.task = task
+        self._suite_tasks = tuple(suite_tasks) or (task,)
         self._image_size = settings.protocol.image_size
         self._gate = CameraGate(self._image_size, before_drawing=self._keep_moment)
         self._digest: str | None = None
@@ -111,6 +121,11 @@ class SimulatedEnvironment:
         # reverse order, and `_build` made robosuite register EGL's end, so `close` runs before it.
         atexit.register(self.close)
         self.objects, self._roots = self._describe_objects()
+        self.bodies = (
+            HAND,
+            *(thing.name for thing in self.objects if thing.name in self._roots and thing.name != ROBOT),
+        )
+        self.goals = tuple(self._scene_goals())
 
     def _simulator_options(self) -> dict[str, Any]:
         """Options of the published LIBERO evaluations: a Panda arm, pose deltas of its gripper, two cameras."""
@@ -159,6 +174,14 @@ class SimulatedEnvironment:
         """Return the scene objects, and the root bodies of each by its name: it owns them and all bodies below them."""
         raise NotImplementedError
 
+    def _scene_goals(self) -> Sequence[TaskGoal]:
+        """Return the goals of all tasks of the suite that share the scene; this task's is among them."""
+        return [goal_of(self.task, ("solved",))]
+
+    def _held(self) -> Sequence[bool]:
+        """Return for each of `goals` whether it holds now. It must change nothing."""
+        return [bool(self._simulator._check_success())]
+
     def reset(self, initial_state_index: int, seed: int) -> None:
         """Begin an episode; see `Environment.reset`. The subclass determines the use of `seed`."""
         check_initial_state_index(self.task, initial_state_index)
@@ -178,6 +201,13 @@ class SimulatedEnvironment:
         roots = {model.body_name2id(body): index_of[name] for name, bodies in self._roots.items() for body in bodies}
         self._background = index_of[BACKGROUND]
         self._owners = owners_of_bodies(model.body_parentid, roots, self._background)
+        self._root_of = [model.body_name2id(self._roots[name][0]) for name in self.bodies[1:]]
+        # Of every geom the number of its body in `bodies`, -1 for none, and whether it is the gripper's.
+        place = {index_of[name]: number for number, name in enumerate(self.bodies) if name != HAND}
+        gripper = model.body_name2id(self._simulator.robots[0].gripper.root_body)
+        hands = owners_of_bodies(model.body_parentid, {gripper: 1}, 0)
+        self._body_of_geom = np.array([place.get(int(self._owners[body]), -1) for body in model.geom_bodyid])
+        self._is_gripper_geom = hands[model.geom_bodyid] == 1
 
     def missing_resets(self, initial_state_index: int, seed: int) -> int:
         """Return 0: no episode depends on another; see `Environment.missing_resets`."""
@@ -236,6 +266,36 @@ class SimulatedEnvironment:
                 gripper_qpos=np.array(values["robot0_gripper_qpos"], dtype=np.float64),
             ),
         )
+
+    def moment(self) -> Moment:
+        """Return where things are now; see `TellsMoments`."""
+        self._require_episode()
+        data, robot = self._simulator.sim.data, self._simulator.robots[0]
+        hand = np.concatenate([data.site_xpos[robot.eef_site_id], self._hand_orientation()])
+        roots = np.concatenate([data.body_xpos[self._root_of], data.body_xquat[self._root_of]], axis=1)
+        touched = np.zeros(len(self.bodies), dtype=bool)
+        touched[self._touched_now()] = True
+        return Moment(
+            poses=np.concatenate([hand[None], roots]).astype(np.float32),
+            gripper=np.array([data.qpos[joint] for joint in robot._ref_gripper_joint_pos_indexes], dtype=np.float32),
+            touched=touched,
+            held=np.array(self._held(), dtype=bool),
+        )
+
+    def _hand_orientation(self) -> NDArray[np.float64]:
+        """The hand's quaternion (w, x, y, z): that of the body which policies get as `eef_quat`, too."""
+        simulation, robot = self._simulator.sim, self._simulator.robots[0]
+        hand = simulation.model.body_name2id(robot.robot_model.eef_name)
+        return np.array(simulation.data.body_xquat[hand])
+
+    def _touched_now(self) -> NDArray[np.intp]:
+        """Numbers in `bodies` of what the gripper touches."""
+        data = self._simulator.sim.data._data
+        pairs = np.array(data.contact.geom[: data.ncon]).reshape(-1, 2)
+        both = np.concatenate([pairs, pairs[:, ::-1]])
+        of_gripper = both[self._is_gripper_geom[both[:, 0]], 1]
+        places = self._body_of_geom[of_gripper]
+        return np.unique(places[places >= 0])
 
     def _keep_moment(self) -> None:
         """Before the first picture of a step, copy the state that it shows; the step ends with another state."""

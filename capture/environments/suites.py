@@ -79,15 +79,16 @@ def make_environment(suite: Suite, task_id: int, settings: EnvironmentSettings) 
     check_task_id(suite, task_id)
     if settings.protocol.image_size < 1:
         raise BadArgument(f"The image size is {settings.protocol.image_size}; it must be at least 1 pixel.")
-    task = list_tasks(suite)[task_id]
+    tasks = list_tasks(suite)
+    task = tasks[task_id]
     if suite.kind == "libero":
         from vla_attention.capture.environments.libero import LiberoEnvironment
 
-        return LiberoEnvironment(task, settings)
+        return LiberoEnvironment(task, settings, tasks)
     if suite.kind == "cubes":
         from vla_attention.capture.environments.cubes.environment import CubesEnvironment
 
-        return CubesEnvironment(task, settings)
+        return CubesEnvironment(task, settings, tasks)
     from vla_attention.capture.environments.robosuite_tasks import RobosuiteEnvironment
 
     return RobosuiteEnvironment(task, settings)

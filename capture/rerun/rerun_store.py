@@ -81,8 +81,8 @@ class StoredCallsSource(EpisodeSource):
     def record(self, job: EpisodeJob, report: StepReport) -> EpisodeResult:
         """Rerun an episode and commit it.
 
-        Outcome, number of steps, environment steps and object coverage are those of the stored episode: nothing is
-        executed. With interventions the stored actions are kept beside the changed ones, to know the base by them.
+        Outcome, steps, environment steps and object coverage are those of the stored episode: nothing is executed. With
+        interventions the stored actions are kept beside the changed ones, to know the base by them.
         """
         with _reading_the_base():
             calls = read_calls(self.episodes[job.name])
@@ -121,7 +121,9 @@ class StoredCallsSource(EpisodeSource):
                     )
                 )
                 report(replan + 1, replan + 1)
-            folder = writer.commit(attributes.success, attributes.num_steps)
+            with _reading_the_base():
+                steps = calls.steps
+            folder = writer.commit(attributes.success, attributes.num_steps, steps)
         return EpisodeResult(
             job.task.task_id,
             job.episode_index,

@@ -13,6 +13,8 @@ from vla_attention.capture.interventions.changed_inputs import CallContext, chan
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.policies.policy import GivenInputs, Policy, PolicyInput
 from vla_attention.capture.rollout.policy_call import RecordedCall, record_call
+from vla_attention.capture.store.replan_records import RecordedSteps
+from vla_attention.schemas.episode_steps import EXECUTED, GRIPPER, POSES
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
@@ -82,6 +84,12 @@ class StoredCalls:
             return None
         actions, counts = self.dataset_actions
         return actions[replan, : int(counts[replan])]
+
+    @property
+    def steps(self) -> RecordedSteps | None:
+        """What the simulator told of every step; None where nobody told it. Read when asked for."""
+        steps, read = self.attributes.steps, self.episode.read
+        return None if steps is None else RecordedSteps(steps, read(POSES), read(GRIPPER), read(EXECUTED))
 
     def coverage_of(self, replan: int) -> dict[str, NDArray[np.float32]]:
         """Return how much of each patch each object covers, camera -> (patch, object)."""

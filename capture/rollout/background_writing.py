@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.store.episode_writer import EpisodeWriter, ReplanRefused
-from vla_attention.capture.store.replan_records import EpisodeStart, ReplanRecord
+from vla_attention.capture.store.replan_records import EpisodeStart, RecordedSteps, ReplanRecord
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.stores.store_format import CorruptEpisode, StoreExists
 
@@ -67,9 +67,9 @@ class EpisodeInBackground:
             arrays += [rows.rows, *([] if rows.contribution is None else [rows.contribution])]
         self.writing.put(lambda: self._append(record), sum(array.nbytes for array in arrays))
 
-    def commit(self, success: bool, num_steps: int) -> None:
+    def commit(self, success: bool, num_steps: int, steps: RecordedSteps | None) -> None:
         """Commit the episode after the replans given so far; `BackgroundWriting.take_commits` tells the outcome."""
-        self.writing.put(lambda: self._commit(success, num_steps), 0)
+        self.writing.put(lambda: self._commit(success, num_steps, steps), 0)
 
     def drop(self) -> None:
         """Forget the episode; nothing of it remains."""
@@ -88,13 +88,13 @@ class EpisodeInBackground:
         except ReplanRefused as error:
             self._end(error)
 
-    def _commit(self, success: bool, num_steps: int) -> None:
+    def _commit(self, success: bool, num_steps: int, steps: RecordedSteps | None) -> None:
         if self._dropped:
             return
         if self._writer is None:
             raise ValueError("an episode without replans cannot be committed")
         try:
-            folder = self._writer.commit(success, num_steps)
+            folder = self._writer.commit(success, num_steps, steps)
         except (StoreExists, CorruptEpisode) as error:
             self._end(error)
         else:

@@ -6,14 +6,14 @@ The simulator may be in this process (`record_episode`) or in another one (`pipe
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol as Interface
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.effects.measurement import EffectMeasurement, EpisodeEffectsMeasured
-from vla_attention.capture.environments.base import Environment, Task
+from vla_attention.capture.environments.base import Environment, Moment, Task
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.policies.policy import Policy, camera_grid
@@ -22,8 +22,9 @@ from vla_attention.capture.rollout.episode_loop import EpisodeResult, StepReport
 from vla_attention.capture.rollout.observation_checks import ObservationChecks
 from vla_attention.capture.rollout.policy_call import PreparedCall, RecordedCall, record_calls, replan_record
 from vla_attention.capture.rollout.simulation import Advanced, Begun, CameraPatches, Seen, Simulation, StopCheck
-from vla_attention.capture.store.replan_records import EpisodeStart, ReplanRecord
+from vla_attention.capture.store.replan_records import EpisodeStart, RecordedSteps, ReplanRecord
 from vla_attention.capture.store.store_writer import RunStore
+from vla_attention.schemas.episode_steps import EpisodeSteps
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.stores.store_format import Protocol, episode_name
@@ -108,10 +109,13 @@ class EpisodeRecording:
     run: EpisodeRun
     task: Task
     start: EpisodeStart
+    begun: Begun
     step: int = field(default=0, init=False)
     num_replans: int = field(default=0, init=False)
     success: bool = field(default=False, init=False)
     _effects: EpisodeEffectsMeasured | None = field(default=None, init=False)
+    _moments: list[Moment] = field(default_factory=list, init=False)
+    _executed: list[NDArray[np.float64]] = field(default_factory=list, init=False)
 
     def __post_init__(self) -> None:
         """Begin measuring effects, where the run does."""
@@ -177,12 +181,36 @@ class EpisodeRecording:
         """Return the actions (step, action dim) to execute after a call, and whether another call may follow."""
         protocol = self.run.store.attributes.protocol
         count = min(protocol.replan_steps, protocol.max_steps - self.step)
+        self._executed += list(call.actions[:count])
         return call.actions[:count], self.step + count < protocol.max_steps
 
     def advanced(self, result: Advanced) -> None:
-        """Note what the simulator gave for the last actions."""
+        """Note what the simulator gave for the waiting steps, or for the last actions."""
         self.step += result.steps
         self.success = result.success
+        self._moments += result.moments
+
+    @property
+    def steps(self) -> RecordedSteps | None:
+        """What the simulator told of every step; None where it told nothing."""
+        if self.begun.bodies is None:
+            return None
+        moments = self._moments
+        touched = np.stack([moment.touched for moment in moments])
+        held = np.stack([moment.held for moment in moments])
+        goals = [replace(goal, first_held=_first(when)) for goal, when in zip(self.begun.goals, held.T, strict=True)]
+        return RecordedSteps(
+            EpisodeSteps(self.begun.bodies, tuple(map(_first, touched.T)), tuple(goals)),
+            poses=np.stack([moment.poses for moment in moments]),
+            gripper=np.stack([moment.gripper for moment in moments]),
+            # Those after the one that solved the task were not executed.
+            actions=np.array(self._executed[: self.step], dtype=np.float32),
+        )
+
+
+def _first(moments: NDArray[np.bool_]) -> int | None:
+    """Return the first moment at which something holds, (moment,) bool; None where it never does."""
+    return int(np.argmax(moments)) if moments.any() else None
 
 
 def record_episode(
@@ -198,7 +226,8 @@ def record_episode(
     begun = simulation.begin(episode_index, episode_title(store, task, episode_index))
     start = simulated_start(run, task, episode_index, begun)
     with store.episode(start, recorded_times(run), max_replans(protocol)) as writer:
-        recording, result = EpisodeRecording(run, task, start), simulation.wait()
+        recording, result = EpisodeRecording(run, task, start, begun), simulation.wait()
+        recording.advanced(result)
         while not recording.ended:
             run.check()
             if result.seen is None:
@@ -212,5 +241,5 @@ def record_episode(
             recording.advanced(result)
             if report is not None:
                 report(recording.step, recording.num_replans)
-        folder = writer.commit(recording.success, recording.step)
+        folder = writer.commit(recording.success, recording.step, recording.steps)
     return EpisodeResult(task.task_id, episode_index, recording.success, recording.step, recording.num_replans, folder)

@@ -260,7 +260,7 @@ class PipelinedLoop(EpisodeLoop):
                 self._resets[simulator.job.task.task_id] = max(known, resets, key=len)
             case Begun():
                 start = simulated_start(self.run, simulator.job.task, simulator.job.episode_index, answer)
-                simulator.recording = EpisodeRecording(self.run, simulator.job.task, start)
+                simulator.recording = EpisodeRecording(self.run, simulator.job.task, start, answer)
                 protocol = self.run.store.attributes.protocol
                 simulator.writer = self._thread.episode(
                     self.run.store, start, recorded_times(self.run), max_replans(protocol)
@@ -287,7 +287,7 @@ class PipelinedLoop(EpisodeLoop):
         self._running.remove(simulator)
         self._idle.append((simulator.process, simulator.job.task.task_id))
         self._writing[writer] = (simulator.job, recording, simulator.progress)
-        writer.commit(recording.success, recording.step)
+        writer.commit(recording.success, recording.step, recording.steps)
 
     def _call_policy(self) -> None:
         """Make the next policy calls, and let their simulators go on before the calls are stored."""

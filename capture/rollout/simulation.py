@@ -8,15 +8,22 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.environments.base import Environment, Observation, camera_frame
+from vla_attention.capture.environments.base import (
+    Environment,
+    Moment,
+    Observation,
+    TellsMoments,
+    camera_frame,
+)
 from vla_attention.capture.environments.coverage import patch_coverage
 from vla_attention.capture.environments.episode_protocol import WAIT_ACTION
+from vla_attention.schemas.episode_steps import TaskGoal
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.stores.store_format import PolicyCameraView, Protocol
@@ -72,19 +79,28 @@ class Seen:
 
 @dataclass(frozen=True)
 class Begun:
-    """The beginning of an episode; `initial_state_digest` and `objects` as in `Environment`."""
+    """The beginning of an episode; `initial_state_digest` and `objects` as in `Environment`.
+
+    bodies, goals: as in `TellsMoments`; None where the environment tells none.
+    """
 
     initial_state_digest: str
     objects: tuple[SceneObject, ...]
+    bodies: tuple[str, ...] | None = None
+    goals: tuple[TaskGoal, ...] = ()
 
 
 @dataclass(frozen=True)
 class Advanced:
-    """What some steps gave: their number, whether the task is solved, and what the next policy call gets, if any."""
+    """What some steps gave: their number, whether the task is solved, and what the next policy call gets, if any.
+
+    moments: after each of the steps, or after the waiting steps; none where the environment tells none.
+    """
 
     steps: int
     success: bool
     seen: Seen | None
+    moments: tuple[Moment, ...] = ()
 
 
 @dataclass
@@ -108,8 +124,12 @@ class Simulation:
         """
         self._what, self._step, self._replan = what, 0, 0
         with naming_the_simulator(what):
-            self.environment.reset(episode_index, self.protocol.seed)
-            return Begun(self.environment.initial_state_digest, tuple(self.environment.objects))
+            environment = self.environment
+            environment.reset(episode_index, self.protocol.seed)
+            begun = Begun(environment.initial_state_digest, tuple(environment.objects))
+            if not isinstance(environment, TellsMoments):
+                return begun
+            return replace(begun, bodies=environment.bodies, goals=environment.goals)
 
     def wait(self) -> Advanced:
         """Make the waiting steps, in which objects come to rest; only the last one is observed."""
@@ -122,24 +142,29 @@ class Simulation:
             for i in range(self.protocol.wait_steps):
                 self.check()
                 observation = self.environment.step(action, observe=i == self.protocol.wait_steps - 1).observation
-            return Advanced(0, False, None if observation is None else self._seen(observation))
+            return Advanced(0, False, None if observation is None else self._seen(observation), self._moment())
 
     def advance(self, actions: NDArray[np.float64], observe: bool) -> Advanced:
         """Execute actions (step, 7) until the task is solved; with `observe` the last one is observed.
 
         Only the picture before the next replan is drawn, because the policy sees no other.
         """
-        observation = None
+        observation, moments = None, list[Moment]()
         with naming_the_simulator(self._what):
             for i, action in enumerate(actions):
                 self.check()
                 result = self.environment.step(action, observe=observe and i == len(actions) - 1)
                 self._step += 1
                 observation = result.observation
+                moments += self._moment()
                 if result.success:
-                    return Advanced(i + 1, True, None)
+                    return Advanced(i + 1, True, None, tuple(moments))
             self._replan += 1
-            return Advanced(len(actions), False, None if observation is None else self._seen(observation))
+            seen = None if observation is None else self._seen(observation)
+            return Advanced(len(actions), False, seen, tuple(moments))
+
+    def _moment(self) -> tuple[Moment, ...]:
+        return (self.environment.moment(),) if isinstance(self.environment, TellsMoments) else ()
 
     def _seen(self, observation: Observation) -> Seen:
         return Seen(observation, {camera.view.name: self._coverage(camera, observation) for camera in self.cameras})

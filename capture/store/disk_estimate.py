@@ -21,7 +21,7 @@ import zarr
 from numpy.typing import NDArray
 
 from vla_attention.capture.store.codecs import TARGET_CHUNK_BYTES
-from vla_attention.capture.store.replan_records import EpisodeStart, RecordedRows, ReplanRecord
+from vla_attention.capture.store.replan_records import EpisodeStart, RecordedRows, RecordedSteps, ReplanRecord
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.effects import EffectsRecorded
@@ -43,8 +43,8 @@ _BYTES_PER_PIECE = 150
 _COVERAGE_BYTES_PER_PATCH = 8
 #: What episodes of so many replans take, as shares of the bound: in `benchmarks/disk_estimate.py` 0.20 to 0.50.
 _USUAL = (0.2, 0.5)
-#: State, actions and numbers of a replan.
-_SMALL_PER_REPLAN = 8_000
+#: State, actions and numbers of a replan, and the poses of the steps until the next: 110 numbers a step in LIBERO.
+_SMALL_PER_REPLAN = 12_000
 #: Words of an instruction, exchanges of them, or objects of a scene, whose effects are measured; LIBERO has up to 20.
 _MOST_ITEMS = 25
 #: Numbers of an action: arms have 7, two arms 14.
@@ -199,6 +199,7 @@ class SampleOfReplans:
     start: EpisodeStart
     denoise_times: NDArray[np.float64]
     records: Sequence[ReplanRecord]
+    steps: RecordedSteps | None = None
 
     def size(self, recording: Recording) -> EpisodeSize:
         """Return what episodes take when they are recorded like this; writes the sample into a temporary folder."""
@@ -224,7 +225,22 @@ class SampleOfReplans:
         times = self.denoise_times[_places(full.denoise_steps, recording.denoise_steps)]
         attributes = replace(self.attributes, recording=recording)
         with tempfile.TemporaryDirectory(prefix="vla-size-") as folder:
-            return _write(Path(folder) / f"sample{STORE_SUFFIX}", attributes, self.start, times, records)
+            path = Path(folder) / f"sample{STORE_SUFFIX}"
+            return _write(path, attributes, self.start, times, records, self._steps_of(count))
+
+    def _steps_of(self, count: int) -> RecordedSteps | None:
+        """What was told of the steps of the first replans."""
+        if self.steps is None:
+            return None
+        steps = min(count * self.attributes.protocol.replan_steps, len(self.steps.actions))
+        said = self.steps.attributes
+        said = replace(
+            said,
+            first_touch=(None,) * len(said.bodies),
+            goals=tuple(replace(goal, first_held=None) for goal in said.goals),
+        )
+        moments = slice(steps + 1)
+        return RecordedSteps(said, self.steps.poses[moments], self.steps.gripper[moments], self.steps.actions[:steps])
 
 
 def smaller_record(
@@ -255,13 +271,14 @@ def _write(
     start: EpisodeStart,
     denoise_times: NDArray[np.float64],
     records: Sequence[ReplanRecord],
+    steps: RecordedSteps | None,
 ) -> dict[str, tuple[int, int]]:
     """Write one episode; return array -> (its bytes, its replans per chunk), with everything else under ''."""
     store = open_run(path, attributes, "new", durable=False)
     with store.episode(start, denoise_times, len(records)) as writer:
         for record in records:
             writer.append(record)
-        folder = writer.commit(success=None, num_steps=0)
+        folder = writer.commit(success=None, num_steps=0 if steps is None else len(steps.actions), steps=steps)
     sizes = {}
     for name, array in _arrays(zarr.open_group(folder, mode="r")):
         # Its metadata is not among its chunks, and counts with everything else.

@@ -12,7 +12,7 @@ import zarr
 from numpy.typing import NDArray
 
 from vla_attention.capture.store.codecs import write_whole
-from vla_attention.capture.store.replan_records import EpisodeStart, ReplanRecord
+from vla_attention.capture.store.replan_records import EpisodeStart, RecordedSteps, ReplanRecord
 from vla_attention.capture.store.site_writer import SiteWriter
 from vla_attention.capture.store.store_root import check_same_run, read_existing_root
 from vla_attention.schemas.effects import CHANGE, CUT, EpisodeEffects
@@ -194,10 +194,11 @@ class EpisodeWriter:
             if not np.isfinite(values).all():
                 yield f"{what} holds numbers that are NaN or infinite"
 
-    def commit(self, success: bool | None, num_steps: int) -> Path:
+    def commit(self, success: bool | None, num_steps: int, steps: RecordedSteps | None = None) -> Path:
         """Finish, verify and publish the episode; returns its folder in the store.
 
-        success: None where nobody knows it. num_steps: 0 where it is not known.
+        success: None where nobody knows it. num_steps: 0 where it is not known. steps: None where no simulator of ours
+        told them.
 
         Raises:
             StoreExists: another writer has published the same episode meanwhile.
@@ -209,13 +210,15 @@ class EpisodeWriter:
             for site in self.sites.values():
                 self.digests |= site.finish()
             self._write_side_arrays()
-            self.group.update_attributes(to_json(self._attributes(success, num_steps)))
+            for name, (values, axes) in ({} if steps is None else steps.arrays).items():
+                self.write(name, values, axes)
+            self.group.update_attributes(to_json(self._attributes(success, num_steps, steps)))
             run = read_run(self.store)[1]
             seal_episode(self.folder, self.name, run, self.run.store_version)
             self._read_back(run)
             return self._publish()
 
-    def _attributes(self, success: bool | None, num_steps: int) -> EpisodeAttributes:
+    def _attributes(self, success: bool | None, num_steps: int, steps: RecordedSteps | None) -> EpisodeAttributes:
         records = self.records
         constant = frozenset.intersection(*(record.constant_cameras for record in records))
         facts = {CONSTANT_CAMERAS: ", ".join(sorted(constant))} if constant else {}
@@ -233,6 +236,7 @@ class EpisodeWriter:
             dataset_action_count=tuple(len(r.dataset_actions) for r in records if r.dataset_actions is not None),
             denoise_time=tuple(float(time) for time in self.denoise_times),
             effects=self._effects(),
+            steps=None if steps is None else steps.attributes,
         )
 
     def _check_store(self) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.schemas.episode_steps import EXECUTED, GRIPPER, POSES, EpisodeSteps
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.layout import Prompt
@@ -85,6 +86,29 @@ class ReplanRecord:
     base_actions: NDArray[np.float64] | None = None
     constant_cameras: frozenset[str] = frozenset()
     effects: ReplanEffects | None = None
+
+
+@dataclass(frozen=True)
+class RecordedSteps:
+    """What a simulator told of every step of an episode.
+
+    attributes: what the store says of the arrays. poses: (moment, body, 7), gripper: (moment, finger), actions: (step,
+    action_dim), all float32.
+    """
+
+    attributes: EpisodeSteps
+    poses: NDArray[np.float32]
+    gripper: NDArray[np.float32]
+    actions: NDArray[np.float32]
+
+    @property
+    def arrays(self) -> dict[str, tuple[NDArray[np.float32], tuple[str, ...]]]:
+        """Path in the episode -> values and the names of their axes."""
+        return {
+            POSES: (self.poses, ("moment", "body", "pose")),
+            GRIPPER: (self.gripper, ("moment", "finger")),
+            EXECUTED: (self.actions, ("step", "action_dim")),
+        }
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.schemas.episode_steps import POSE, POSES
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.layout import INVALID_ROLES, ROLES_OF_KIND, Piece, Prompt, Role, SiteLayout, Span
 from vla_attention.schemas.precision import mass_error_bound
@@ -25,6 +26,8 @@ ROW_SUM_TOLERANCE = 1e-3
 _SUMMATION_TOLERANCE = 1e-5
 #: Largest distance of a patch's coverage from 1; float32 leaves 1e-6.
 _COVERAGE_TOLERANCE = 1e-3
+#: Largest distance of a quaternion's length from 1; float32 leaves 1e-7.
+_QUATERNION_TOLERANCE = 1e-3
 #: Asymmetry and negative eigenvalues that float32 products leave in a Gram matrix, as a share of its trace.
 _GRAM_TOLERANCE = 1e-4
 
@@ -351,6 +354,31 @@ def cut_problems(name: str, cut: NDArray[np.float32], first_entry: int = 0) -> I
         entry, key = np.argwhere(~inside)[0]
         given = cut[entry, key]
         yield f"{name} gives key {key} the weight {given:.4g} in entry {first_entry + int(entry)}; expected 0 to 1"
+
+
+def step_problems(name: str, values: NDArray[np.float32], first: int = 0) -> Iterator[str]:
+    """Poses (moment, body, 7), finger joints (moment, finger) or executed actions (step, action dim): numbers.
+
+    Of poses, quaternions have length 1.
+    """
+    if values.dtype != np.dtype(np.float32) or (name == POSES and values.shape[2:] != (POSE,)):
+        yield f"{name} has the shape {values.shape} and type {values.dtype}; expected float32, and {POSE} for a pose"
+        return
+    place = "step" if name.endswith("actions") else "moment"
+    bad = ~np.isfinite(values)
+    if bad.any():
+        number = first + int(np.argwhere(bad)[0][0])
+        yield f"{name} holds numbers that are NaN or infinite, the first at {place} {number}"
+        return
+    if name == POSES:
+        length = np.linalg.norm(values[..., 3:].astype(np.float64), axis=-1)
+        far = np.abs(length - 1) > _QUATERNION_TOLERANCE
+        if far.any():
+            moment, body = np.argwhere(far)[0]
+            yield (
+                f"{name} has a quaternion of length {length[moment, body]:.4g} instead of 1 for body {body} at moment "
+                f"{first + int(moment)}"
+            )
 
 
 def _grids(sites: Sequence[SiteLayout]) -> dict[str, Any]:

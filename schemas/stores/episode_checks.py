@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.schemas.effects import CHANGE, CUT
+from vla_attention.schemas.episode_steps import EXECUTED, GRIPPER, POSES
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import prompt_at
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
@@ -29,12 +30,13 @@ from vla_attention.schemas.stores.content_rules import (
     row_problems,
     row_sum_problems,
     sites_with_text,
+    step_problems,
     uniform_problems,
     unseen_problems,
 )
 from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.episode_files import files_of_no_array
-from vla_attention.schemas.stores.episode_shapes import effect_misfits, expected_shapes, shape_problems
+from vla_attention.schemas.stores.episode_shapes import effect_misfits, expected_shapes, shape_problems, step_misfits
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.root import group_attributes
 from vla_attention.schemas.stores.store_format import NUMBERS, CorruptEpisode, Problem, RootAttributes
@@ -63,7 +65,7 @@ def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[P
         yield from map(Problem, wrong)
         if not wrong and name not in numbers:
             yield from _guarded(_array_problems(root, episode, name, attributes.arrays[name].sha256))
-    yield from map(Problem, effect_misfits(root, attributes))
+    yield from map(Problem, [*effect_misfits(root, attributes), *step_misfits(attributes)])
     for check in (_axis_problems, _token_problems, _camera_problems, _counter_problems):
         yield from _guarded(check(root, episode))
 
@@ -113,6 +115,8 @@ def _array_problems(root: RootAttributes, episode: StoredEpisode, name: str, sha
             problems += effect_problems(name, values, first)
         elif kind == CUT:
             problems += cut_problems(name, values, first)
+        elif name in (POSES, GRIPPER, EXECUTED):
+            problems += step_problems(name, values, first)
         elif kind == "contribution":
             problems += gram_problems(name, values, recording, first)
     if digest.hexdigest() != sha256:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from vla_attention.schemas.effects import CHANGE, CUT
+from vla_attention.schemas.episode_steps import EXECUTED, GRIPPER, HAND, POSE, POSES
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.store_format import NUMBERS, EpisodeAttributes, RootAttributes
 
@@ -31,6 +32,10 @@ def expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dict
         horizon = root.policy.action_horizon if actions is None else actions.shape[1]
         shapes[CHANGE] = (entries, horizon, len(attributes.effects.units))
         shapes |= {f"{site.name}/{CUT}": (entries, site.num_keys) for site in root.sites}
+    if attributes.steps is not None:
+        moments = attributes.num_steps + 1
+        shapes[POSES] = (moments, len(attributes.steps.bodies), POSE)
+        shapes |= {GRIPPER: (moments,), EXECUTED: (attributes.num_steps,)}
     if "dataset_actions" in attributes.arrays:
         shapes["dataset_action_count"] = (replans,)
     for site in root.sites:
@@ -84,6 +89,29 @@ def effect_misfits(root: RootAttributes, attributes: EpisodeAttributes) -> Itera
             return
 
 
+def step_misfits(attributes: EpisodeAttributes) -> Iterator[str]:
+    """What of an episode's steps does not belong to its other attributes, as sentences without a full stop."""
+    steps = attributes.steps
+    if steps is None:
+        return
+    objects = {thing.name for thing in attributes.objects}
+    for name in steps.bodies:
+        if name != HAND and name not in objects:
+            yield f"it has poses of '{name}', which is none of its objects"
+    moments = [*steps.first_touch, *(goal.first_held for goal in steps.goals)]
+    latest = max((moment for moment in moments if moment is not None), default=0)
+    if latest > attributes.num_steps:
+        yield f"something of it happened first at moment {latest}; it has {attributes.num_steps} steps"
+    own = steps.goal_of(attributes.task_id)
+    if own is None:
+        yield f"its goals lack that of its own task {attributes.task_id}"
+    elif attributes.success and own.first_held is None:
+        yield "it is solved, and the goal of its task never held"
+    # A goal that holds before the first action, and no more after it, is not reached.
+    elif attributes.success is False and own.first_held:
+        yield f"it is not solved, and the goal of its task held at moment {own.first_held}"
+
+
 def misfits(root: RootAttributes, attributes: EpisodeAttributes) -> Iterator[str]:
     """What of an episode's attributes does not belong to its run, as sentences without a full stop. Reads no array."""
     replans = attributes.num_replans
@@ -101,5 +129,6 @@ def misfits(root: RootAttributes, attributes: EpisodeAttributes) -> Iterator[str
     for name, shape in listed.items():
         yield from shape_problems(name, shape, shapes.get(name, (replans,)))
     yield from effect_misfits(root, attributes)
+    yield from step_misfits(attributes)
     if not all(0 <= number < len(attributes.prompts) for number in attributes.prompt_index):
         yield "prompt_index names prompts that the attributes do not have"

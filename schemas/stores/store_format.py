@@ -21,6 +21,9 @@ NAME.zarr/                            attributes: `RootAttributes`
     objects/<camera>                  (replan, patch, object) float32
     effects/change                    (entry, horizon, action_dim) float32; only where effects were measured
     joint/cut                         (entry, key) float32, the weight of each key that an effect is without
+    steps/poses                       (moment, body, pose) float32; only where a simulator of ours ran the episode
+    steps/gripper                     (moment, finger) float32
+    steps/actions                     (step, action_dim) float32, those that were executed
     seal/                             attributes: `EpisodeSeal` (`seal_content.py`), which binds all of the above
 """
 
@@ -31,6 +34,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 from vla_attention.schemas.effects import EffectsRecorded, EpisodeEffects
+from vla_attention.schemas.episode_steps import EpisodeSteps
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import Interventions, RerunSource
@@ -386,7 +390,8 @@ class EpisodeAttributes:
     of them is made `safe_text.visible`.
 
     `task_family`: what tasks of one sentence template share; empty where nobody knows it, and in version 1. `effects`:
-    what the arrays of effects are of; None where none were measured.
+    what the arrays of effects are of; None where none were measured. `steps`: the same of the arrays of steps; None
+    where no simulator of ours ran the episode, and in version 1.
 
     `NUMBERS` are of each replan, and the noise level or flow time of each recorded denoise step; `env_step` counts the
     waiting steps too, `prompt_index` is the number of a prompt, `dataset_action_count` how many of `dataset_actions`
@@ -414,6 +419,7 @@ class EpisodeAttributes:
     denoise_time: tuple[float, ...] = ()
     task_family: str = ""
     effects: EpisodeEffects | None = None
+    steps: EpisodeSteps | None = None
 
     def __post_init__(self) -> None:
         """Check the task's name, the names of arrays, which are paths, and the lengths."""

@@ -18,9 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.store.episode_writer import EpisodeWriter
-from vla_attention.capture.store.replan_records import EpisodeStart, RecordedRows, ReplanEffects, ReplanRecord
+from vla_attention.capture.store.replan_records import (
+    EpisodeStart,
+    RecordedRows,
+    RecordedSteps,
+    ReplanEffects,
+    ReplanRecord,
+)
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run
 from vla_attention.schemas.effects import EffectsRecorded
+from vla_attention.schemas.episode_steps import HAND, EpisodeSteps, TaskGoal
 from vla_attention.schemas.groupings.key_counts import uniform_of_roles
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange, RerunSource
@@ -52,6 +59,8 @@ PlantCoverage = Callable[[int, int, EpisodeTokens], Mapping[str, NDArray[np.floa
 PlantActions = Callable[[int, int, int], NDArray[np.float64]]
 #: Task, episode, replan and the episode's tokens to the effects of the replan; see `small_effects`.
 PlantEffects = Callable[[int, int, int, EpisodeTokens], ReplanEffects]
+#: The spec, task, episode and number of steps to what a simulator told of the steps; see `small_steps`.
+PlantSteps = Callable[["StoreSpec", int, int, int], RecordedSteps]
 #: Task and episode to the outcome.
 PlantSuccess = Callable[[int, int], bool]
 
@@ -98,6 +107,7 @@ class StoreSpec:
     plant_actions: PlantActions | None = None
     plant_success: PlantSuccess | None = None
     plant_effects: PlantEffects | None = None
+    plant_steps: PlantSteps | None = None
 
     @property
     def layout(self) -> SiteLayout:
@@ -148,8 +158,18 @@ def write_episode(store: RunStore, spec: StoreSpec, task: int, episode: int) -> 
 
 def commit(writer: EpisodeWriter, spec: StoreSpec, task: int, episode: int) -> Path:
     """Commit with the outcome of the episode: unless planted, episodes of odd numbers are solved."""
-    success = spec.plant_success(task, episode) if spec.plant_success else episode % 2 == 1
-    return writer.commit(success=success, num_steps=5 * spec.num_replans - episode % 2)
+    steps = None if spec.plant_steps is None else spec.plant_steps(spec, task, episode, num_steps(spec, episode))
+    return writer.commit(solved(spec, task, episode), num_steps(spec, episode), steps)
+
+
+def solved(spec: StoreSpec, task: int, episode: int) -> bool:
+    """Whether an episode is solved."""
+    return spec.plant_success(task, episode) if spec.plant_success else episode % 2 == 1
+
+
+def num_steps(spec: StoreSpec, episode: int) -> int:
+    """Environment steps of an episode."""
+    return 5 * spec.num_replans - episode % 2
 
 
 def reseal(folder: Path) -> None:
@@ -306,6 +326,35 @@ def small_effects(task: int, episode: int, replan: int, tokens: EpisodeTokens) -
     return ReplanEffects(SMALL_CONDITIONS, (2.0,) * 7, measured, change.astype(np.float32), {"joint": cut})
 
 
+def small_steps(spec: StoreSpec, task: int, episode: int, steps: int) -> RecordedSteps:
+    """`PlantSteps` of random poses: the hand touches the first object, and the goals of all tasks are in the scene.
+
+    An episode reaches its own goal at its end if it is solved, and no other.
+    """
+    generator = np.random.default_rng([spec.seed, task, episode, steps])
+    start, _ = episode_records(spec, task, episode)
+    objects = [thing.name for thing in start.objects if thing.kind == "object"]
+    bodies = (HAND, *objects)
+    poses = generator.normal(size=(steps + 1, len(bodies), 7))
+    poses[..., 3:] /= np.linalg.norm(poses[..., 3:], axis=-1, keepdims=True)
+    goals = tuple(
+        TaskGoal(
+            other,
+            f"task_{other}",
+            INSTRUCTIONS[other % len(INSTRUCTIONS)],
+            (f"on thing_{other} table",),
+            steps if other == task and solved(spec, task, episode) else None,
+        )
+        for other in spec.tasks
+    )
+    return RecordedSteps(
+        EpisodeSteps(bodies, (None, steps // 2, *(None for _ in objects[1:])), goals),
+        poses.astype(np.float32),
+        generator.uniform(0, 0.04, (steps + 1, 2)).astype(np.float32),
+        generator.normal(size=(steps, 7)).astype(np.float32),
+    )
+
+
 def every_key_seen(tokens: EpisodeTokens, _cells: tuple[int, int, int, int]) -> NDArray[np.float64]:
     """`PlantUniform` of queries that see all keys, masked ones too, as Cosmos's null keys are seen."""
     return np.full((1,) * 5 + (tokens.layout.num_keys,), 1.0 / tokens.layout.num_keys)
@@ -344,6 +393,9 @@ def expected_arrays(spec: StoreSpec, task: int, episode: int) -> dict[str, NDArr
     if effects:
         arrays["effects/change"] = np.concatenate([of.change for of in effects])
         arrays["joint/cut"] = np.concatenate([of.cut["joint"] for of in effects])
+    if spec.plant_steps is not None:
+        steps = spec.plant_steps(spec, task, episode, num_steps(spec, episode))
+        arrays |= {name: values for name, (values, _) in steps.arrays.items()}
     for camera in records[0].frames:
         arrays[f"frames/{camera}"] = np.stack([record.frames[camera] for record in records])
     for camera in records[0].coverage:

@@ -13,7 +13,8 @@ from vla_attention.capture.environments.base import ROBOT, EnvironmentSettings, 
 from vla_attention.capture.environments.cubes.scene import EVALUATION, MARK_VERBS, draw_scene, paste_mark, scene_seed
 from vla_attention.capture.environments.cubes.tasks import COLOURS, CUBE_TASKS, MARK_ONLY, MARKED, CubeTask
 from vla_attention.capture.environments.episode_protocol import CAMERAS
-from vla_attention.capture.environments.simulator import SimulatedEnvironment
+from vla_attention.capture.environments.simulator import SimulatedEnvironment, goal_of
+from vla_attention.schemas.episode_steps import TaskGoal
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 
@@ -33,11 +34,17 @@ class CubesEnvironment(SimulatedEnvironment):
     purpose: what the scene's seeds begin with; demonstrations have scenes of their own (`scene.TRAINING`).
     """
 
-    def __init__(self, task: Task, settings: EnvironmentSettings, purpose: str = EVALUATION) -> None:
+    def __init__(
+        self,
+        task: Task,
+        settings: EnvironmentSettings,
+        suite_tasks: Sequence[Task] = (),
+        purpose: str = EVALUATION,
+    ) -> None:
         self._cube_task: CubeTask = CUBE_TASKS[task.task_id]
         self._purpose = purpose
         self._has_mark = task.suite in (MARKED, MARK_ONLY)
-        super().__init__(task, settings)
+        super().__init__(task, settings, suite_tasks)
 
     def _build(self, options: dict[str, Any]) -> Any:
         from vla_attention.capture.environments.cubes.table import CubeTable
@@ -63,6 +70,18 @@ class CubesEnvironment(SimulatedEnvironment):
         if self._has_mark:
             cubes.append(SceneObject(MARK, "object", of_interest=True))  # no body: it exists in pictures only
         return self._with_robot_and_background(cubes), roots | {ROBOT: self._robot_bodies()}
+
+    def _scene_goals(self) -> Sequence[TaskGoal]:
+        sharing = [
+            (task, CUBE_TASKS[task.task_id])
+            for task in self._suite_tasks
+            if CUBE_TASKS[task.task_id].num_cubes == self._cube_task.num_cubes
+        ]
+        self._sharing = [cube_task for _, cube_task in sharing]
+        return [goal_of(task, (cube_task.name,)) for task, cube_task in sharing]
+
+    def _held(self) -> Sequence[bool]:
+        return [self._simulator.solves(task) for task in self._sharing]
 
     def step(self, action: NDArray[np.floating], observe: bool) -> StepResult:
         """Advance by one control step; see `Environment.step`."""

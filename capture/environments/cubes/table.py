@@ -32,7 +32,7 @@ class CubeTable(SingleArmEnv):  # type: ignore[misc]  # robosuite has no types
     def __init__(self, task: CubeTask, **options: Any) -> None:
         self.task = task
         self.scene: Scene | None = None
-        self.first_touched: int | None = None
+        self._touched_first: list[int] = []
         self.target = 0
         self.destination: int | None = None
         super().__init__(mount_types="default", initialization_noise="default", hard_reset=False, **options)
@@ -87,18 +87,22 @@ class CubeTable(SingleArmEnv):  # type: ignore[misc]  # robosuite has no types
     def begin_task(self) -> None:
         """Begin the task: which cube it means depends on the places at the beginning of the episode."""
         places, task = self._beginning, self.task
-        self.first_touched = None
+        self._touched_first = []
         self.target = find_target(task.target, places)
         self.destination = None if task.destination is None else find_target(task.destination, places)
 
     def _post_action(self, action: NDArray[np.float64]) -> Any:
         result = super()._post_action(action)
-        if self.first_touched is None:
-            touched = self.touched_cubes()
-            if touched:
-                # Of two that are touched in the same control step, the wrong one counts.
-                self.first_touched = next((cube for cube in touched if cube != self.target), self.target)
+        self._touched_first = self._touched_first or self.touched_cubes()
         return result
+
+    @property
+    def first_touched(self) -> int | None:
+        """The cube that the gripper touched first; of two that were touched in one control step, the wrong one."""
+        return self._first_but(self.target)
+
+    def _first_but(self, target: int) -> int | None:
+        return min(self._touched_first, key=lambda cube: cube == target, default=None)
 
     def touched_cubes(self) -> list[int]:
         """Return the cubes that the gripper touches now."""
@@ -129,18 +133,24 @@ class CubeTable(SingleArmEnv):  # type: ignore[misc]  # robosuite has no types
 
     def _check_success(self) -> bool:
         """Return whether the task is solved now."""
-        position = self.cube_positions()[self.target]
-        moved = position - self._beginning[self.target]
-        verb = self.task.verb
+        return self.solves(self.task)
+
+    def solves(self, task: CubeTask) -> bool:
+        """Return whether a task with these cubes is solved now, as if it had been asked for from the beginning."""
+        target = find_target(task.target, self._beginning)
+        position = self.cube_positions()[target]
+        moved = position - self._beginning[target]
+        verb = task.verb
         if verb == "touch":
-            return self.first_touched == self.target
+            return self._first_but(target) == target
         if verb == "lift":
             return bool(moved[2] >= LIFTED)
         if verb == "push_left":
             return bool(moved[1] >= PUSHED)
         if verb == "push_right":
             return bool(moved[1] <= -PUSHED)
-        assert self.destination is not None
-        released = self.target not in self.touched_cubes()
-        above = position[2] - self.cube_positions()[self.destination][2] > HALF_SIZE
-        return bool(released and above and self.cubes_touch(self.target, self.destination))
+        assert task.destination is not None
+        destination = find_target(task.destination, self._beginning)
+        released = target not in self.touched_cubes()
+        above = position[2] - self.cube_positions()[destination][2] > HALF_SIZE
+        return bool(released and above and self.cubes_touch(target, destination))
