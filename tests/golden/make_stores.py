@@ -20,6 +20,7 @@ from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import STORE_VERSION
+from vla_attention.testing.stores import small_steps, write_store
 
 _WHERE = ("--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", "0", "1", "--num-episodes", "1")
 
@@ -41,6 +42,9 @@ def make_stores(folder: Path) -> None:
     _run("rerun", str(folder / "joint.zarr"), *effects, *little, "--output", str(folder / "effects.zarr"))
     (masks,) = (case for case in TABLE["stored"] if case["name"] == "masks differ along every axis")
     write_case(folder / "masks.zarr", masks, masks["weights"])
+    write_store(
+        folder / "steps.zarr", tasks=(0,), replans=2, layers=(0,), heads=(0,), frames=False, plant_steps=small_steps
+    )
     for name in STORES[STORE_VERSION]:
         write_tables(folder / f"{name}.zarr", folder / name)
 

@@ -28,11 +28,18 @@ from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.seal import SEAL_FILE
 from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
-from vla_attention.testing.stores import StoreSpec, small_effects, write_store
+from vla_attention.testing.stores import StoreSpec, small_effects, small_steps, write_store
 
 #: Small enough that every analysis takes some hundredths of a second.
 SPEC = StoreSpec(
-    tasks=(0, 1), episodes=2, replans=2, layers=(0, 2), heads=(0, 1), contributions=True, plant_effects=small_effects
+    tasks=(0, 1),
+    episodes=2,
+    replans=2,
+    layers=(0, 2),
+    heads=(0, 1),
+    contributions=True,
+    plant_effects=small_effects,
+    plant_steps=small_steps,
 )
 _EPISODE = re.compile(r"episodes/(?:task\d+_\d+/)?(?P<episode>task\d+_episode\d+)(?:\.zip|/(?P<inner>.*))")
 
@@ -69,6 +76,7 @@ KINDS: tuple[FileKind, ...] = (
     FileKind("contributions", _IN_EPISODE + r"[^/]+/contribution/.*", ("contributions",)),
     FileKind("state and actions", _IN_EPISODE + r"(state|actions|dataset_actions)/.*", ("time", "rest")),
     FileKind("effects", _IN_EPISODE + r"(effects|[^/]+/cut)/.*", ("rest",)),
+    FileKind("steps", _IN_EPISODE + r"steps/.*", ("rest",)),
     FileKind("pictures", _IN_EPISODE + r"(camera_)?frames/.*", ("rest",)),
     FileKind("coverage by objects", _IN_EPISODE + r"objects/.*", ("objects",)),
 )
@@ -86,7 +94,7 @@ def _rest(run: OpenStores, site: str) -> dict[str, Any]:
         for episode in store.episodes
         for name in episode.attributes.arrays
         if name in ("state", "actions", "dataset_actions", CHANGE)
-        or name.startswith(("frames/", "camera_frames/"))
+        or name.startswith(("frames/", "camera_frames/", "steps/"))
         or name.endswith(f"/{CUT}")
     }
 

@@ -44,7 +44,7 @@ from vla_attention.schemas.stores.seal import SEAL_FILE, read_seal
 from vla_attention.schemas.stores.seal_content import FileRecord
 from vla_attention.schemas.stores.shards import SealedShard, ShardedLayers, index_size
 from vla_attention.schemas.stores.zip_members import ZipMembers
-from vla_attention.testing.stores import StoreSpec, small_effects, write_store
+from vla_attention.testing.stores import StoreSpec, small_effects, small_steps, write_store
 from vla_attention.testing.tokens import small_tokens
 
 SPEC = StoreSpec(
@@ -56,6 +56,7 @@ SPEC = StoreSpec(
     coverage=False,
     frames=False,
     plant_effects=small_effects,
+    plant_steps=small_steps,
 )
 _ROWS = "joint/rows"
 _TABLE = "data/chunk-000/episode_000000.parquet"

@@ -18,8 +18,9 @@ FOLDER = GOLDEN / "stores" / "version1"
 #: rerun: the policy calls of `joint` without one of its cameras.
 NAMES = ("joint", "cosmos", "library", "packed", "rerun")
 #: By version. masks: queries, layers, heads, denoise steps and replans see different keys, which version 1 cannot say.
-#: effects: the policy calls of `joint` again, with the effects of words and objects for all four readers.
-STORES = {1: NAMES, 2: (*NAMES, "masks", "effects")}
+#: effects: the policy calls of `joint` again, with the effects of words and objects for all four readers. steps: made
+#: up, with positions, touches and goals.
+STORES = {1: NAMES, 2: (*NAMES, "masks", "effects", "steps")}
 GOLDEN_STORES = [(version, name) for version, names in STORES.items() for name in names]
 
 

@@ -17,10 +17,17 @@ from vla_attention.schemas.stores.durable_files import lock_for_writing
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode, RunMismatch, StoreError
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import StoreSpec, reseal, small_effects, write_store
+from vla_attention.testing.stores import StoreSpec, reseal, small_effects, small_steps, write_store
 
 SPEC = StoreSpec(
-    tasks=(0,), episodes=2, replans=2, layers=(0,), heads=(0,), contributions=True, plant_effects=small_effects
+    tasks=(0,),
+    episodes=2,
+    replans=2,
+    layers=(0,),
+    heads=(0,),
+    contributions=True,
+    plant_effects=small_effects,
+    plant_steps=small_steps,
 )
 
 

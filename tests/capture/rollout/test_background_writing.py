@@ -39,7 +39,7 @@ class MadeUpStore:
             self.may_append.wait()
             self.log.append(f"{name}: {record.number}")
 
-        def commit(success: bool, num_steps: int) -> Path:
+        def commit(success: bool, num_steps: int, steps: None) -> Path:
             if self.refuses is not None:
                 raise self.refuses
             self.log.append(f"{name}: commit {success} {num_steps}")
@@ -86,7 +86,7 @@ def test_replans_and_commits_are_written_in_order() -> None:
         one.append(record(0, 1))
         other.append(record(0, 1))
         one.append(record(1, 1))
-        one.commit(True, 7)
+        one.commit(True, 7, None)
         (committed,) = writing.commits_after_notice()
         assert committed.episode is one
         assert committed.folder == Path("one-that-is-not-there")
@@ -110,7 +110,7 @@ def test_what_waits_is_bounded() -> None:
         store.may_append.set()
         episode.append(record(2))
         episode.append(record(3, 1000))  # waits until nothing else does, and is not refused
-        episode.commit(False, 0)
+        episode.commit(False, 0, None)
         assert len(writing.commits_after_notice()) == 1
     assert store.log[1:4] == ["one: 0", "one: 2", "one: 3"]
 
@@ -126,7 +126,7 @@ def test_a_dropped_episode_is_closed_and_may_begin_again() -> None:
         first.drop()
         again = begin(writing, store, "again")
         again.append(record(0, 1))
-        again.commit(True, 1)
+        again.commit(True, 1, None)
         store.may_append.set()
         assert [committed.episode for committed in writing.commits_after_notice()] == [again]
     assert store.log[:3] == ["one: open", "one: 0", "one: close"]  # not its second replan
@@ -138,7 +138,7 @@ def test_an_episode_of_another_process_is_no_failure() -> None:
     with Writing() as writing:
         episode = begin(writing, store, "one")
         episode.append(record(0))
-        episode.commit(True, 1)
+        episode.commit(True, 1, None)
         (committed,) = writing.commits_after_notice()
         assert committed.folder is store.refuses
         begin(writing, store, "next").append(record(0))
@@ -152,7 +152,7 @@ def test_a_failure_is_raised_where_the_work_comes_from() -> None:
         episode, other = begin(writing, store, "one"), begin(writing, store, "other")
         other.append(record(0, 1))
         episode.append(record(0, 1))
-        episode.commit(True, 1)
+        episode.commit(True, 1, None)
         with pytest.raises(OSError, match="the disk is full"):
             writing.commits_after_notice()
         with pytest.raises(OSError, match="the disk is full"):

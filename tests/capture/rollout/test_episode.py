@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 import torch
 
-from vla_attention.capture.environments.base import Observation, StepResult, Task
+from vla_attention.capture.environments.base import Moment, Observation, StepResult, Task
 from vla_attention.capture.environments.episode_protocol import WAIT_ACTION, WAIT_STEPS
 from vla_attention.capture.policies.policy import PolicyInput
 from vla_attention.capture.rollout.episode import EpisodeRun, check_protocol, max_replans, record_episode
-from vla_attention.capture.store.replan_records import ReplanRecord
+from vla_attention.capture.store.replan_records import RecordedSteps, ReplanRecord
+from vla_attention.schemas.episode_steps import TaskGoal
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.layout import PatchGrid, Prompt, Role, SiteLayout, Span
@@ -130,8 +131,8 @@ class FakeStore:
     def append(self, record: ReplanRecord) -> None:
         self.records.append(record)
 
-    def commit(self, success: bool, num_steps: int) -> Path:
-        self.ending = (success, num_steps)
+    def commit(self, success: bool, num_steps: int, steps: RecordedSteps | None) -> Path:
+        self.ending, self.steps = (success, num_steps), steps
         return Path("task003_episode002")
 
 
@@ -162,6 +163,42 @@ def test_a_solved_task_ends_the_episode() -> None:
     result = record_episode(EpisodeRun(FakePolicy(), store, {}), environment, TASK, 0)
     assert (result.success, result.num_steps, result.num_replans) == (True, 2, 1)
     assert store.ending == (True, 2)
+
+
+class WatchedEnvironment(FakeEnvironment):
+    """Tells moments: the hand is as high as the number of steps; the cube is touched from the second on."""
+
+    bodies = ("hand", "cube")
+    goals = (TaskGoal(3, "lift", "lift the cube", ("up",), None), TaskGoal(4, "touch", "touch it", ("touch",), None))
+
+    def moment(self) -> Moment:
+        number = len(self.actions)
+        poses = np.zeros((2, 7), np.float32)
+        poses[:, 3], poses[0, 2] = 1, number
+        touched = number >= WAIT_STEPS + 2
+        return Moment(
+            poses, np.zeros(2, np.float32), np.array([False, touched]), np.array([number == self.solved_after, touched])
+        )
+
+
+def test_what_is_told_of_every_step_is_stored() -> None:
+    environment, store = WatchedEnvironment(solved_after=WAIT_STEPS + 4), FakeStore()
+    record_episode(EpisodeRun(FakePolicy(), store, {}), environment, TASK, 0)
+    steps = store.steps
+    assert steps is not None
+    assert steps.poses[:, 0, 2].tolist() == [WAIT_STEPS + i for i in range(5)]
+    # Three actions of the first chunk, and the one of the second that solved the task.
+    assert steps.actions[:, 0].tolist() == [0, 1, 2, 10]
+    assert (steps.poses.dtype, steps.actions.dtype, steps.gripper.shape) == (np.float32, np.float32, (5, 2))
+    assert steps.attributes.bodies == ("hand", "cube")
+    assert steps.attributes.first_touch == (None, 2)
+    assert [goal.first_held for goal in steps.attributes.goals] == [4, 2]
+
+
+def test_an_environment_that_tells_nothing_leaves_no_steps() -> None:
+    store = FakeStore()
+    record_episode(EpisodeRun(FakePolicy(), store, {}), FakeEnvironment(), TASK, 0)
+    assert store.steps is None
 
 
 def test_a_replan_is_stored_with_its_rows_and_coverage() -> None:

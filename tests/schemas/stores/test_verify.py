@@ -19,9 +19,9 @@ from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 from vla_attention.schemas.stores.verify import Fault, episode_report, verify_store
-from vla_attention.testing.stores import StoreSpec, reseal, write_store
+from vla_attention.testing.stores import StoreSpec, reseal, small_steps, write_store
 
-SPEC = StoreSpec(tasks=(0, 1), episodes=1, replans=3, heads=(0,))
+SPEC = StoreSpec(tasks=(0, 1), episodes=1, replans=3, heads=(0,), plant_steps=small_steps)
 EPISODE = "task000_episode000"
 ARRAYS = (
     "joint/rows",
@@ -32,6 +32,9 @@ ARRAYS = (
     "objects/left_wrist_0_rgb",
     "state",
     "actions",
+    "steps/poses",
+    "steps/gripper",
+    "steps/actions",
 )
 #: Those that the fast part of the suite damages.
 FEW_ARRAYS = ("joint/rows", "joint/key_role", "frames/base_0_rgb", "state")
@@ -40,6 +43,7 @@ METADATA = (
     "zarr.json",
     "joint/zarr.json",
     "frames/zarr.json",
+    "steps/zarr.json",
     "seal/zarr.json",
     *(f"{name}/zarr.json" for name in ARRAYS),
 )

@@ -109,7 +109,7 @@ def reached(schema: dict[str, Any]) -> dict[str, Any]:
 ADDED_VALUES = {"root_attributes": (("ImageChange", "kind", "mean"),)}
 ADDED = {
     "root_attributes": (("Recording", "effects"),),
-    "episode_attributes": (("EpisodeAttributes", "task_family"), ("EpisodeAttributes", "effects")),
+    "episode_attributes": tuple(("EpisodeAttributes", name) for name in ("task_family", "effects", "steps")),
     "episode_seal": (("FileRecord", "digests"),),
 }
 

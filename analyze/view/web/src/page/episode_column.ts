@@ -1,5 +1,6 @@
 /** Pictures, words and numbers of one episode at one replan: the page's own, and that of an episode beside it. */
 import { visible } from "../store/errors";
+import { happenings } from "../store/steps_document";
 import { element } from "./dom";
 import { EffectTable } from "./effect_table";
 import { Headline } from "./headline";
@@ -64,6 +65,7 @@ export function episodeColumn(host: HTMLElement, explain: () => void, level: "h1
         episode.name,
         document.task_name,
         outcomeWord(document.success),
+        ...happenings(document.steps, document.task_id).map(visible),
         `replan ${replan} (last: ${episode.numReplans - 1})${step === undefined ? "" : `, step ${step}`}`,
         averagedOver(shown),
         store.root.policy.untrained ? "untrained weights" : "",

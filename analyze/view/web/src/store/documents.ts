@@ -4,6 +4,7 @@
  * Fields have the names that they have in the files. Characters are counted as code points, as Python does.
  */
 import { type EffectsDocument, parseEffects } from "./effects_document";
+import { type StepsDocument, parseSteps } from "./steps_document";
 import { StoreError } from "./errors";
 import { type Fields, flag, list, name, object, oneOf, text, whole, wholes } from "./json_fields";
 import * as limits from "./limits";
@@ -136,6 +137,8 @@ export interface EpisodeDocument {
   denoise_time: number[];
   /** What was measured beside the calls; null: nothing. */
   effects: EffectsDocument | null;
+  /** Where things were at every step, and whose goal was reached; null where no simulator told it. */
+  steps: StepsDocument | null;
 }
 
 /** The axes of one site of an episode: the recorded numbers of its layers, denoise steps and heads. */
@@ -306,6 +309,7 @@ export function parseEpisode(document: unknown, name_: string): EpisodeDocument 
       };
     });
   }
+  const numSteps = whole(fields.num_steps, "num_steps", 2 ** 40);
   const numbers = (of: string, most: number): number[] => {
     const found = wholes(fields[of] ?? [], of, limits.REPLANS, most);
     if (found.length && found.length !== replans) {
@@ -319,7 +323,7 @@ export function parseEpisode(document: unknown, name_: string): EpisodeDocument 
     instruction: text(fields.instruction, "instruction"),
     episode_index: whole(fields.episode_index, "episode_index", 1e12),
     success: fields.success == null ? null : flag(fields.success, "success"),
-    num_steps: whole(fields.num_steps, "num_steps", 2 ** 40),
+    num_steps: numSteps,
     num_replans: replans,
     prompts,
     segments,
@@ -336,6 +340,7 @@ export function parseEpisode(document: unknown, name_: string): EpisodeDocument 
     prompt_index: prompts.length ? numbers("prompt_index", prompts.length - 1) : [],
     denoise_time: list(fields.denoise_time ?? [], "denoise_time", limits.AXIS).map(Number),
     effects: parseEffects(fields.effects, replans),
+    steps: parseSteps(fields.steps, numSteps),
   };
 }
 

@@ -18,6 +18,8 @@ export const EPISODE_FILES = 10_000;
 export const ARRAY_AXES = 8;
 export const CONDITIONS = 10_000;
 export const EFFECT_ENTRIES = 1_000_000;
+export const BODIES = 10_000;
+export const GOALS = 10_000;
 
 /** Bytes of one array that the page holds at once: a browser has less memory than the commands. */
 export const ARRAY_IN_PAGE_BYTES = 256_000_000;

@@ -1,0 +1,121 @@
+"""What a store says of an episode's steps: names once, moments that exist, goals that belong to the episode."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.kit.examples import examples
+from vla_attention.schemas.episode_steps import HAND, POSES, EpisodeSteps, TaskGoal
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.jsonable import from_json, to_json
+from vla_attention.schemas.stores.content_rules import step_problems
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.verify import verify_store
+from vla_attention.testing.stores import StoreSpec, expected_arrays, reseal, small_steps, write_store
+
+GOAL = TaskGoal(0, "lift", "lift the bowl", ("up bowl",), None)
+STEPS = EpisodeSteps((HAND, "bowl", "plate"), (None, 4, None), (GOAL,))
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"bodies": (HAND, "bowl", "bowl")}, "The bodies of an episode are hand, bowl, bowl"),
+        ({"bodies": ("bowl", HAND, "plate")}, "expected 'hand', then others"),
+        ({"first_touch": (None, 4)}, "There are 2 first touches of 3 bodies"),
+        ({"first_touch": (0, 4, None)}, "none of the hand"),
+        ({"first_touch": (None, -1, None)}, "The first touch of 'bowl' is -1"),
+        ({"goals": (GOAL, GOAL)}, "There are goals of the tasks 0, 0"),
+    ],
+)
+def test_steps_that_cannot_be_are_refused(changes, sentence):
+    with pytest.raises(BadArgument, match=sentence):
+        replace(STEPS, **changes)
+
+
+@given(st.lists(st.none() | st.integers(0, 30), max_size=6))
+@settings(max_examples=examples(100))
+def test_what_was_touched_is_in_the_order_of_the_touches(moments):
+    names = tuple(f"thing_{i}" for i in range(len(moments)))
+    steps = EpisodeSteps((HAND, *names), (None, *moments), ())
+    known = [(moment, i) for i, moment in enumerate(moments) if moment is not None]
+    assert steps.touched == tuple(names[i] for _, i in sorted(known))
+    assert from_json(EpisodeSteps, json.loads(json.dumps(to_json(steps)))) == steps
+
+
+def test_a_goal_is_part_of_one_with_more_conditions():
+    both = replace(GOAL, conditions=("up bowl", "open drawer"))
+    assert GOAL.is_part_of(both)
+    assert GOAL.is_part_of(replace(GOAL, task_id=5))
+    assert not both.is_part_of(GOAL)
+
+
+def test_poses_are_finite_and_turns_have_length_one():
+    poses = np.zeros((3, 2, 7), np.float32)
+    poses[..., 3] = 1
+    assert list(step_problems(POSES, poses)) == []
+    poses[2, 1, 3] = 0.9
+    assert list(step_problems(POSES, poses, 10)) == [
+        "steps/poses has a quaternion of length 0.9 instead of 1 for body 1 at moment 12"
+    ]
+    poses[1, 0, 0] = np.nan
+    assert list(step_problems(POSES, poses)) == [
+        "steps/poses holds numbers that are NaN or infinite, the first at moment 1"
+    ]
+    assert "expected float32, and 7 for a pose" in next(step_problems(POSES, poses[..., :6]))
+
+
+@pytest.fixture
+def path(tmp_path) -> Path:
+    return write_store(tmp_path / "a.zarr", tasks=(0, 1), episodes=2, plant_steps=small_steps)
+
+
+def test_a_store_gives_them_back(path):
+    spec = StoreSpec(tasks=(0, 1), episodes=2, plant_steps=small_steps)
+    assert verify_store(open_store(path)) == []
+    for episode in open_store(path).episodes:
+        attributes = episode.attributes
+        steps = attributes.steps
+        assert steps is not None
+        own = steps.goal_of(attributes.task_id)
+        assert own is not None
+        assert own.first_held == (attributes.num_steps if attributes.success else None)
+        assert steps.goal_of(7) is None
+        expected = expected_arrays(spec, attributes.task_id, attributes.episode_index)
+        for name in ("steps/poses", "steps/gripper", "steps/actions"):
+            np.testing.assert_array_equal(episode.read(name), expected[name])
+        assert episode.array("steps/poses").metadata.dimension_names == ("moment", "body", "pose")
+
+
+def _solved(attributes: dict[str, Any]) -> None:
+    attributes["success"] = not attributes["success"]
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (lambda a: a.update(steps=None), "steps/poses has the shape (16, 3, 7); expected (3,)"),
+        (lambda a: a["steps"]["bodies"].__setitem__(1, "moon"), "it has poses of 'moon', which is none of its objects"),
+        (lambda a: a["steps"]["first_touch"].__setitem__(1, 99), "happened first at moment 99; it has 15 steps"),
+        (lambda a: a["steps"]["goals"].pop(0), "its goals lack that of its own task 0"),
+        (_solved, "it is solved, and the goal of its task never held"),
+        (lambda a: a["steps"]["goals"][0].update(first_held=3), "it is not solved, and the goal of its task held at"),
+        (lambda a: a.update(num_steps=14), "steps/actions has the shape (15, 7); expected (14,)"),
+        (lambda a: a["arrays"].pop("steps/gripper"), "steps/gripper is not in the episode"),
+    ],
+)
+def test_steps_that_contradict_the_rest_are_a_fault(path, change, problem):
+    folder = path / "episodes/task000_episode000"
+    document = json.loads((folder / "zarr.json").read_text())
+    change(document["attributes"])
+    (folder / "zarr.json").write_text(json.dumps(document))
+    reseal(folder)
+    assert problem in " ".join(fault.problem for fault in verify_store(open_store(path)))
