@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from tests.kit.policy_inputs import make_observation
-from vla_attention.capture.environments.base import StepResult
+from vla_attention.capture.environments.base import Moment, StepResult
+from vla_attention.capture.environments.episode_protocol import WAIT_STEPS
+from vla_attention.schemas.episode_steps import HAND, POSE, TaskGoal
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 
 
@@ -34,9 +36,36 @@ class StillScene:
         pass
 
 
+class ToldScene(StillScene):
+    """A `StillScene` that tells moments, as simulators do: the hand rises, and touches the cube at the third step."""
+
+    bodies = (HAND, "cube")
+
+    def __init__(self, task_id: int) -> None:
+        self.goals = tuple(
+            TaskGoal(task, f"lift_{task}", f"lift cube {task}", (f"up cube_{task}",), None)
+            for task in (task_id, task_id + 1)
+        )
+
+    def reset(self, initial_state_index: int, seed: int) -> None:
+        super().reset(initial_state_index, seed)
+        self.steps = 0
+
+    def step(self, action: np.ndarray, observe: bool) -> StepResult:
+        self.steps += 1
+        return super().step(action, observe)
+
+    def moment(self) -> Moment:
+        poses = np.zeros((2, POSE), np.float32)
+        poses[:, 3], poses[0, 2] = 1, self.steps / 100
+        touches = self.steps >= WAIT_STEPS + 3
+        return Moment(poses, np.full(2, 0.04, np.float32), np.array([False, touches]), np.array([False, touches]))
+
+
 def capture_without_simulator(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let captures of this test run in a `StillScene`."""
+    """Let captures of this test run in a `ToldScene`."""
     monkeypatch.setattr(
-        "vla_attention.capture.rollout.simulator_source.make_environment", lambda suite, task_id, settings: StillScene()
+        "vla_attention.capture.rollout.simulator_source.make_environment",
+        lambda suite, task_id, settings: ToldScene(task_id),
     )
     monkeypatch.setattr("vla_attention.capture.run.capture_run.default_num_envs", lambda: 1)

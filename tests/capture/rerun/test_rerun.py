@@ -51,6 +51,9 @@ def test_a_store_is_made_again_to_the_bit(family, request, tmp_path, capsys):
     for old, new in zip(base.episodes, again.episodes, strict=True):
         assert new.attributes.arrays == old.attributes.arrays  # shapes and digests of all values
         assert replace(new.attributes, provenance={}) == replace(old.attributes, provenance={})
+        assert new.attributes.steps is not None
+        assert new.attributes.steps.touched == ("cube",)
+        np.testing.assert_array_equal(new.read("steps/actions")[:4], old.read("actions")[0, :4].astype(np.float32))
     assert [episode.attributes.task_family for episode in again.episodes] == 2 * ["lift A"] + 2 * ["stack A on B"]
     assert main(["rerun", str(base_path), "--output", str(again_path), "--resume", "--check", "0"]) == 0
     assert "4 of 4 episodes are complete already; 0 to run." in capsys.readouterr().out

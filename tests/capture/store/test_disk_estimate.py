@@ -25,7 +25,14 @@ from vla_attention.capture.store.disk_estimate import (
 )
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import PatchGrid, SiteLayout, Span
-from vla_attention.testing.stores import StoreSpec, denoise_times, episode_records, root_attributes, write_store
+from vla_attention.testing.stores import (
+    StoreSpec,
+    denoise_times,
+    episode_records,
+    root_attributes,
+    small_steps,
+    write_store,
+)
 from vla_attention.testing.tokens import OBJECTS, small_prompt
 
 
@@ -157,12 +164,14 @@ SPEC = StoreSpec(
     heads=(0, 1, 2, 3),
     denoise_steps=(0, 4, 9),
     contributions=True,
+    plant_steps=small_steps,
 )
 
 
 def sample_of(spec: StoreSpec, replans: int) -> SampleOfReplans:
     start, records = episode_records(spec, 0, 0)
-    return SampleOfReplans(root_attributes(spec), start, denoise_times(spec), records[:replans])
+    steps = small_steps(spec, 0, 0, 5 * replans)
+    return SampleOfReplans(root_attributes(spec), start, denoise_times(spec), records[:replans], steps)
 
 
 def bytes_written(spec: StoreSpec, folder: Path) -> int:
