@@ -4,10 +4,11 @@ Usage: python scripts/make_example_stores.py [--folder vla_attention/example_sto
 
 `cubes.zarr`              the shipped policy pi05_cubes, "touch the red (green, blue) cube", two episodes each
 `cubes_one_colour.zarr`   the same tasks, initial states and noise with a copy of that policy to which the three colour
-                          words are the same: their embeddings are replaced by their mean. Without pictures
+                          words are the same: their embeddings are replaced by their mean
 `cubes_reruns/`           the first episode of each task of cubes.zarr again: with other noise, without the pictures' or
                           the instruction's keys, with these alone, without as many random keys, and without any
                           query that reads the instruction. Actions and attention of the same layers, without pictures
+                          and steps
 
 Takes about two minutes on two cores. The same machine, libraries and number of threads give the same stores, but for
 the times and versions in their provenance. `tests/package/test_example_stores.py` reads what is there.
@@ -30,7 +31,7 @@ POLICY = ROOT / "capture/policies/pi/pi05_cubes"
 #: "touch the red cube", "touch the green cube", "touch the blue cube".
 TASKS = ("0", "1", "2")
 #: Enough for every episode of the shipped policy; the other one would search until the end.
-MOST_STEPS = "40"
+MOST_STEPS = "25"
 EMBEDDINGS = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
 COLOURS = ("red", "green", "blue")
 #: The two groups whose reruns are made.
@@ -62,11 +63,11 @@ def make(folder: Path) -> None:
     store, other, reruns = Path("cubes.zarr"), Path("cubes_one_colour.zarr"), Path("cubes_reruns")
     rollouts = ("--task-suite", "cubes", "--task-id", *TASKS, "--num-episodes", "2", "--max-steps", MOST_STEPS)
     must(capture, "pi", *rollouts, "--output", store)
-    must(capture, "pi", "--checkpoint", one_colour(Path("one_colour")), *rollouts, "--no-frames", "--output", other)
+    must(capture, "pi", "--checkpoint", one_colour(Path("one_colour")), *rollouts, "--output", other)
     grouping = Path("see-read.toml")
     grouping.write_text(GROUPING)
     # The layers, heads and denoise steps of the base: the viewer compares what both recorded.
-    recorded = ("--no-frames", "--no-contributions")
+    recorded = ("--no-frames", "--no-contributions", "--precision", "7")
     must(capture, "rerun", store, "--series", grouping, "--num-episodes", "1", *recorded, "--output-dir", reruns)
     unread = ("--knockout", "role:instruction", "--knockout-queries", "all", "--name", "unread_linguistic")
     must(
@@ -81,9 +82,9 @@ def make(folder: Path) -> None:
         reruns / "unread_linguistic.zarr",
     )
     pack(store, folder / store.name)
-    pack(other, folder / other.name, "--without", "objects", "contributions")
+    pack(other, folder / other.name, "--without", "contributions")
     for condition in sorted(reruns.glob("*.zarr")):
-        pack(condition, folder / reruns.name / condition.name, "--without", "objects")
+        pack(condition, folder / reruns.name / condition.name, "--without", "objects", "steps")
 
 
 def one_colour(folder: Path) -> Path:

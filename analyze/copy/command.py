@@ -28,9 +28,9 @@ _EXAMPLES = """examples:
   vla-attention copy node1/libero_10.zarr node2/libero_10.zarr --output libero_10.zarr     one store of several
 
 frames: the cameras' pictures (overlays and reruns need them). objects: what each patch shows (object: groups need it).
-contributions: norms of what keys add. effects: changes of the action without an item. Rows, and everything else that
-groupings of keys, words, cameras and roles need, are always copied. The copy passes verify, and its provenance names
-the omitted parts.
+contributions: norms of what keys add. effects: changes of the action without an item. steps: positions and goals.
+Rows, and everything else that groupings of keys, words, cameras and roles need, are always copied. The copy passes
+verify, and its provenance names the omitted parts.
 
 Several stores have to be of one run configuration: what differs is named. No two of them may hold the same episode. The
 one store shares the files of the given ones (hard links), so that it takes no space; a damage of one is then a damage
@@ -61,7 +61,7 @@ def build_parser() -> argparse.ArgumentParser:
         nargs="+",
         default=[],
         metavar="PART",
-        help="frames, objects, contributions, effects (default: copy all)",
+        help="frames, objects, contributions, effects, steps (default: copy all)",
     )
     parser.add_argument(
         "--packed",

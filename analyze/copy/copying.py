@@ -47,13 +47,14 @@ class Part:
     pattern: str
 
 
-EFFECTS = "effects"
+EFFECTS, STEPS = "effects", "steps"
 #: The parts that may be omitted. Rows, atoms, roles and the small arrays are always copied.
 PARTS: dict[str, Part] = {
     "frames": Part("the cameras' pictures; overlays and reruns need them", r"^(camera_)?frames/"),
     "objects": Part("what each patch shows; object: groups need it", r"^objects/"),
     "contributions": Part("value-weighted contributions; their norms need them", r"/contribution(/|$)"),
     EFFECTS: Part("changes of the action without an item; effects needs them", r"^effects/|/cut(/|$)"),
+    STEPS: Part("positions, touches and goals; what was done and why it failed need them", r"^steps/"),
 }
 REST = "rest"
 #: What a copy's provenance calls the address on the hub that it was copied from, with its commit.
@@ -282,8 +283,9 @@ def _without_arrays(document: bytes, without: tuple[str, ...]) -> bytes:
     changed = json.loads(document)
     arrays = changed["attributes"]["arrays"]
     changed["attributes"]["arrays"] = {name: arrays[name] for name in arrays if _part_of(name) not in without}
-    if EFFECTS in without and "effects" in changed["attributes"]:
-        changed["attributes"]["effects"] = None
+    for part in (EFFECTS, STEPS):
+        if part in without and part in changed["attributes"]:
+            changed["attributes"][part] = None
     return json.dumps(changed, indent=2).encode()
 
 

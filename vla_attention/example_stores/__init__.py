@@ -11,7 +11,7 @@ from pathlib import Path
 FOLDER = Path(__file__).parent
 #: "touch the red (green, blue) cube", two episodes each, with pictures.
 CUBES = FOLDER / "cubes.zarr"
-#: The same initial states and noise, by a copy of the policy to which the three colour words are the same. No pictures.
+#: The same initial states and noise, by a copy of the policy to which the three colour words are the same.
 ONE_COLOUR = FOLDER / "cubes_one_colour.zarr"
 #: The first episode of each task of `CUBES` again: with other noise, without the keys of the pictures or the
 #: instruction, and with these alone.

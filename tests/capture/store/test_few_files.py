@@ -24,7 +24,7 @@ from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.site_stores import write_site_store
 from vla_attention.testing.stores import write_store
 
-MOST_FILES = 45
+MOST_FILES = 49
 WHERE = ("--task-suite", "robosuite", "--task-id", "0", "--num-episodes", "1", "--max-steps", "30")
 TINY = ("--checkpoint", "untrained-tiny")
 CAMERAS = {"base_0_rgb": "image", "left_wrist_0_rgb": "wrist_image"}
@@ -61,7 +61,7 @@ def still_scene(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_pi_its_reruns_and_replays(tmp_path):
     store = tmp_path / "run.zarr"
     run("pi", *WHERE, *TINY, "--queries", "all", "--denoise", "all", "--contributions", "--output", store)
-    assert check_few(store, 29) == 29
+    assert check_few(store, 36) == 36
     run("rerun", store, "--knockout", "camera:base_0_rgb", "--output", tmp_path / "without.zarr")
     check_few(tmp_path / "without.zarr")
     data = write_data_set(tmp_path / "data", "v3.0", episodes_of_store(store, CAMERAS))
