@@ -84,6 +84,7 @@ async function answerOf({ base, root, packed, episode, query, summary }) {
     words: shown.words.map((word) => ({ text: word.text, keys: word.keys, ...reading.measuresOfKeys(word.keys, shown) })),
     readers: shown.words.length ? reading.headsThatRead(heads, shown.words[0].keys, 3) : [],
     effects: ofEffects(shown),
+    happened: reading.happenings(opened.document.steps, opened.document.task_id),
     events: await reading.eventsOf(store.root, opened),
   };
 }

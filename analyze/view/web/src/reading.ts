@@ -6,6 +6,7 @@ export { headsThatRead, objectsAt } from "./page/inspector";
 export { colourTable } from "./page/colour_maps";
 export { overlayPixels, patchAt, placeOfPatch, scaleFor, shownValues, viewOf } from "./page/overlay";
 export { decidingWord, itemsOfWords, wordEffect } from "./page/effect_words";
+export { happenings } from "./store/steps_document";
 export { effectsOf } from "./page/effects_shown";
 export { closingReplan, eventsOf } from "./page/events";
 export { found } from "./page/episode_list";
