@@ -87,7 +87,7 @@ test-remote: .venv-remote/installed
 notebooks: .venv-notebooks/installed
 	.venv-notebooks/bin/python scripts/run_notebooks.py $(ARGS)
 
-# What it finds is kept in results/reliability/fuzz; mended findings belong into tests/fuzz/corpus.
+# What it finds is kept in results/reliability/fuzz; mended findings belong into tests/thorough/fuzz/corpus.
 SECONDS ?= 3600
 fuzz: .venv-fuzz/installed
 	nice .venv-fuzz/bin/python benchmarks/reliability.py fuzz --seconds $(SECONDS)

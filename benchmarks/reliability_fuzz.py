@@ -5,7 +5,7 @@ Usage: .venv-fuzz/bin/python benchmarks/reliability_fuzz.py TARGET --seconds 300
 
 What is found is kept once for each place in the code, in FOLDER/findings/TARGET, and the run goes on. An input that
 hangs or takes all memory ends it, and is kept in the same place. FOLDER/corpus/TARGET grows from run to run.
-Findings that were mended belong into `tests/fuzz/corpus`, whose files are tests.
+Findings that were mended belong into `tests/thorough/fuzz/corpus`, whose files are tests.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def main() -> None:
     findings = arguments.folder / "findings" / arguments.target
     for folder in (corpus, findings):
         folder.mkdir(parents=True, exist_ok=True)
-    kept = ROOT / "tests" / "fuzz" / "corpus" / arguments.target
+    kept = ROOT / "tests" / "thorough" / "fuzz" / "corpus" / arguments.target
     for content in (*fuzz_targets.seeds(arguments.target), *(path.read_bytes() for path in sorted(kept.glob("*")))):
         (corpus / hashlib.sha1(content, usedforsecurity=False).hexdigest()).write_bytes(content)
     words = arguments.folder / f"{arguments.target}.words"

@@ -32,6 +32,9 @@ for _name, _count in PROFILES.items():
 settings.load_profile("fast")
 
 
+#: Attacks, fuzz and campaigns.
+THOROUGH = Path(__file__).with_name("thorough")
+
 #: Where temporary folders go if it has this much room: files in memory take a third of the time of those on a disk.
 _MEMORY, _ROOM = Path("/dev/shm"), 4 << 30
 if _MEMORY.is_dir() and os.access(_MEMORY, os.W_OK) and shutil.disk_usage(_MEMORY).free >= _ROOM:
@@ -39,22 +42,34 @@ if _MEMORY.is_dir() and os.access(_MEMORY, os.W_OK) and shutil.disk_usage(_MEMOR
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--slow", action="store_true", help="run tests with the mark slow too; draw PDF files")
-    parser.addoption("--thorough", action="store_true", help="run tests with the marks slow and thorough too")
+    parser.addoption("--thorough", action="store_true", help="run what make test-thorough runs too")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    # `-m slow`, alone or in an expression, asks for these tests as well.
+    # `-m thorough`, alone or in an expression, asks for these tests as well.
     config.option.thorough = config.option.thorough or "thorough" in config.option.markexpr
-    config.option.slow = config.option.slow or config.option.thorough or "slow" in config.option.markexpr
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave the folder out: importing its hundreds of cases takes seconds. Named on the command line, it is wanted."""
+    named = any(collection_path.resolve() in (path, *path.parents) for path in map(_named, config.args))
+    return None if config.option.thorough or named or collection_path != THOROUGH else True
+
+
+def _named(argument: str) -> Path:
+    return Path(argument.split("::")[0]).resolve()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    unasked = [mark for mark in ("slow", "thorough") if not config.getoption(mark)]
-    left_out = [item for item in items if any(map(item.get_closest_marker, unasked))]
+    for item in items:
+        if item.path.is_relative_to(THOROUGH):
+            item.add_marker(pytest.mark.thorough)
+    if config.option.thorough:
+        return
+    left_out = [item for item in items if item.get_closest_marker("thorough")]
     if left_out:
         config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if not any(map(item.get_closest_marker, unasked))]
+        items[:] = [item for item in items if item not in set(left_out)]
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -1,7 +1,6 @@
-"""The fast tests draw pictures where they have the mark `drawn` or `pdf`; in others a file has one white pixel.
+"""Tests draw where they have the mark `drawn`, PNG files of low resolution; elsewhere a file has one white pixel.
 
-Pictures that are drawn are PNG files of low resolution. With `--slow` all tests and fixtures draw, and tests with the
-mark `pdf` as the product does.
+With `--thorough` all tests and fixtures draw, and those with the mark as the product does, PDF files too.
 """
 
 from __future__ import annotations
@@ -45,10 +44,10 @@ def draw_quickly(figure: Figure, file: Any, **options: Any) -> None:
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
     """Around a test and the fixtures that it sets up; those of other folders draw as they like."""
-    slow, pdf = item.config.option.slow, item.get_closest_marker("pdf")
-    draws = slow or pdf or item.get_closest_marker("drawn")
+    thorough, drawn = item.config.option.thorough, item.get_closest_marker("drawn")
     with pytest.MonkeyPatch.context() as patch:
-        if item.path.is_relative_to(HERE) and not (slow and pdf):
+        if item.path.is_relative_to(HERE) and not (thorough and drawn):
+            draws = thorough or drawn
             patch.setattr(Figure, "savefig", draw_quickly if draws else leave_blank)
             patch.setattr(plot_style, "find_places", plot_style.find_places if draws else lambda _figure: None)
         return (yield)

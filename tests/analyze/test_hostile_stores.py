@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import vla_attention as va
-from tests.kit.slow import slow_except
+from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.commands import COMMANDS
 from vla_attention.analyze.parse.command import main as parse
@@ -152,7 +152,7 @@ def test_every_command_is_tried():
 
 @pytest.mark.drawn
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("command", slow_except(("ratios", "report", "copy", "verify"), WORDS))
+@pytest.mark.parametrize("command", thorough_except(("ratios", "report", "copy", "verify"), WORDS))
 def test_hostile_texts_are_printed_visibly_and_nothing_is_written_elsewhere(
     store, tmp_path, monkeypatch, capsys, command
 ):
@@ -289,7 +289,7 @@ class HostileSites(SiteStoreSpec):
 
 @pytest.mark.drawn
 @pytest.mark.parametrize(
-    "command", slow_except(("ratios",), sorted(set(WORDS) - {"effects", "objects", "compare", "merge"}))
+    "command", thorough_except(("ratios",), sorted(set(WORDS) - {"effects", "objects", "compare", "merge"}))
 )
 def test_hostile_names_of_sites_are_printed_visibly_and_nothing_is_written_elsewhere(tmp_path, capsys, command):
     store = write_site_store(tmp_path / "a.zarr", HostileSites(kind="split", dataset_actions=0.5, outcome="some"))

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.null_stores import NAMES, printed
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.thorough
 
 
 KINDS = ["words", "objects", "time", "drift", "compare"]

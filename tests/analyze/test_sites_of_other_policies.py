@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 
 from tests.kit.questions import question_about
-from tests.kit.slow import slow_except
+from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.measures.contributions import contribution_table
 from vla_attention.analyze.measures.sinks import SinkRule, search_sinks
@@ -155,7 +155,7 @@ SAYS = {
 FAST = [(command, "growing") for command in SAYS if command != "report"] + [("", name) for name in (*KINDS, "bare")]
 
 
-@pytest.mark.parametrize(("command", "name"), slow_except(FAST, product(SAYS, (*KINDS, "bare")), several=True))
+@pytest.mark.parametrize(("command", "name"), thorough_except(FAST, product(SAYS, (*KINDS, "bare")), several=True))
 def test_commands(stores, tmp_path, capsys, command, name):
     given = [str(stores[name]), "--list"] if command == "--list" else [*command.split(), str(stores[name])]
     if command not in ("--list", "verify"):

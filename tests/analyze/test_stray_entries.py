@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.analyze.test_hostile_stores import WORDS
-from tests.kit.slow import slow_except
+from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.errors import Note
@@ -63,7 +63,7 @@ DRAWING = ("ratios", "words", "objects", "effects", "deviation", "overlay")
 READING = [command for command in WORDS if command not in ("verify", "repair", "cache")]
 
 
-@pytest.mark.parametrize("command", slow_except(("groups", "export", "copy", "copy"), READING))
+@pytest.mark.parametrize("command", thorough_except(("groups", "export", "copy", "copy"), READING))
 def test_a_command_names_them_and_goes_on(stores, tmp_path, monkeypatch, capsys, command):
     monkeypatch.setenv("VLA_CACHE", "off")
     first, second = (*STORES.get(command, ("a", "other")), "")[:2]

@@ -14,7 +14,7 @@ from tests.kit.policy_inputs import KeepAll, make_observation
 from vla_attention.capture.policies.pi.embedded import dummy_policy
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_without_a_gpu_it_says_so_and_ends_with_2():
     torch = pytest.importorskip("torch")
     if torch.cuda.is_available():

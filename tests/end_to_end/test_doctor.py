@@ -123,7 +123,7 @@ def test_the_number_of_episodes_can_be_given(tmp_path, capfd):
     assert "Solved 0 of 20 episodes of cubes" in capfd.readouterr().out
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_policy_that_comes_along_is_accepted(tmp_path, capfd):
     store = tmp_path / "kept.zarr"
     assert capture(["doctor", "--accept", "pi05_cubes", "--output", str(store), "--layers", "3", "--no-frames"]) == 0

@@ -93,7 +93,7 @@ def stores(tmp_path_factory) -> tuple[Path, dict[str, dict[str, bytes]]]:
     return store, {name: files(out) for name, out in outs.items()}
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("limit", LIMITS)
 def test_a_full_disk_is_one_sentence_and_leaves_no_part_of_a_file(stores, tmp_path, limit):
     store, whole = stores

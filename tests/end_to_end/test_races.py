@@ -17,7 +17,7 @@ import pytest
 from tests.kit.races import EPISODES, TASKS, overlapping_lists
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_eight_processes_of_which_one_is_killed_fill_a_store_as_one_does(tmp_path):
     command = [sys.executable, "-m", "tests.kit.races", str(tmp_path), "--rounds", "1"]
     ended = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -65,7 +65,7 @@ def test_your_checkpoint_and_then_your_question(tmp_path, monkeypatch, capsys):
     assert "bit-equal" in printed
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_your_robots_data(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     cameras = ("observation.images.front", "observation.images.wrist")
@@ -75,7 +75,7 @@ def test_your_robots_data(tmp_path, monkeypatch, capsys):
     assert "standard deviations of the data set's actions" in " ".join(capsys.readouterr().out.split())
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_commands_in_the_text_of_notebooks(tmp_path, monkeypatch, capsys, notebook):
     """`make notebooks` runs the cells of code; these commands stand in cells of text."""

@@ -153,7 +153,7 @@ def work(tmp_path_factory):
 
 
 @pytest.mark.simulator
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_reduced_run_has_every_table_and_unchanged_calls_are_the_stored_ones(work):
     results = json.loads((work / "results.json").read_text())
     names = {"policies", "words/redundant", "other", "mixing", "readers", "success"}
@@ -165,7 +165,7 @@ def test_the_reduced_run_has_every_table_and_unchanged_calls_are_the_stored_ones
 
 
 @pytest.mark.simulator
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_effects_are_those_of_vla_analyze_on_the_stores_of_vla_capture_rerun(work, tmp_path):
     base = open_store(work / "words_0" / "base.zarr")
     store, noise = tmp_path / "without.zarr", tmp_path / "noise.zarr"

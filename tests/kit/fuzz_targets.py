@@ -1,7 +1,7 @@
 """What is done with bytes from anywhere, a function for each parser: it returns, or raises a `UserError`.
 
 Any other exception is a finding. `benchmarks/reliability_fuzz.py` gives them bytes that atheris makes up, the tests in
-`tests/fuzz` the files of its corpus and documents that hypothesis changes. They need neither torch nor a simulator.
+tests/thorough the files of its corpus and documents that hypothesis changes. They need neither torch nor a simulator.
 Bytes that a checksum or a digest would refuse at once get the right one, so that what is behind it is reached.
 """
 

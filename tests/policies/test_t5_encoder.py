@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.hostile_checkpoints.hostile_files import TRACE, executing_pickle
+from tests.thorough.hostile_checkpoints.hostile_files import TRACE, executing_pickle
 from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint
 from vla_attention.capture.policies.cosmos.text import T5Encoder
 from vla_attention.schemas.errors import BadArgument

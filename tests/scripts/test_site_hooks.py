@@ -38,7 +38,7 @@ def test_other_links_and_code_stay():
     assert translate_links(text, "store.md", {}) == text
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_every_command_has_its_help_text():
     text = help_texts()
     headings = re.findall(r"^#+ `(.*)`$", text, re.MULTILINE)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 import vla_attention as va
 from tests.kit.attacks import attacks, encode_again, files_of, first, two
-from tests.kit.slow import slow_except
+from tests.kit.thorough import thorough_except
 from vla_attention.analyze.cache import fingerprints, remembered
 from vla_attention.analyze.cache.housekeeping import kept_files
 from vla_attention.analyze.measures import steps
@@ -208,18 +208,9 @@ FAST = (
     "an episode copied under another name",
     "the root of another run",
 )
-SLOW = (
-    "joint/atoms exchanged",
-    "joint/row_sum encoded again",
-    "joint/key_role of another store",
-    "joint/uniform encoded again",
-    "chunks of rows: layers exchanged",
-    "episodes exchanged",
-    "an episode of another run",
-)
 
 
-@pytest.mark.parametrize("name", slow_except(FAST, attacks(list(ARRAYS)), slow=SLOW))
+@pytest.mark.parametrize("name", thorough_except(FAST, attacks(list(ARRAYS))))
 def test_no_attack_is_answered_from_the_cache(cache, stores, uncached, name):
     """A question about a damaged store ends as without the cache: refused, or with the right numbers."""
     for path in stores:

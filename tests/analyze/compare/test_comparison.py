@@ -317,7 +317,7 @@ def test_a_path_that_holds_an_equals_sign_is_a_path(stores, tmp_path):
         parse_runs([str(path)])
 
 
-@pytest.mark.pdf
+@pytest.mark.drawn
 def test_the_command_writes_tables_and_pictures(stores, tmp_path, capsys):
     out = tmp_path / "out"
     assert (

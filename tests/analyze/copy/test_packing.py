@@ -16,7 +16,7 @@ import tensorstore
 import zarr
 
 from tests.kit.crashes import before_call, die, run_child
-from tests.kit.slow import slow_except
+from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.commands import COMMANDS
 from vla_attention.analyze.copy import packing
@@ -153,7 +153,7 @@ def numbers_of(folder: Path, stores: dict[str, str]) -> dict[str, object]:
     return found
 
 
-@pytest.mark.parametrize("command", slow_except(("ratios", "objects", "export"), WORDS))
+@pytest.mark.parametrize("command", thorough_except(("ratios", "objects", "export"), WORDS))
 def test_every_command_gives_the_same_tables_as_from_the_folder(command, tmp_path, monkeypatch, capsys):
     folders = prepared(command, tmp_path)
     packed = tuple(pack(path, tmp_path / "packed" / path.name) for path in folders)

@@ -50,7 +50,7 @@ def named(table: pl.DataFrame, floor: str) -> list[str]:
     return summary.filter(pl.col(floor) > 0, pl.col(f"{floor}_q") <= 0.025)["condition"].to_list()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_nothing_is_named_where_nothing_exceeds_the_floors():
     tables = [drawn_table(seed) for seed in range(DRAWS)]
     both = [bool(named(table, "minus_noise")) + bool(named(table, "minus_random")) > 0 for table in tables]

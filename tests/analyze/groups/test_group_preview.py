@@ -59,7 +59,7 @@ def test_words_come_with_their_pieces(store):
     assert set(words.filter(pl.col("group") == "rest")["word"]) == {"the", "on"}
 
 
-@pytest.mark.pdf
+@pytest.mark.drawn
 def test_overlaps_and_keys_without_a_group_are_printed(store, tmp_path, capsys):
     (tmp_path / "g.toml").write_text(
         'overlap = true\n[groups]\nlooks = "role:image"\nbowl = "object:akita_black_bowl_1"\nnoun = "word:bowl"\n'

@@ -17,7 +17,7 @@ from tests.kit.made_up_steps import (
     measured_of,
     replans_of,
 )
-from tests.kit.slow import slow_except
+from tests.kit.thorough import thorough_except
 from vla_attention.analyze.heads.head_measures import episode_heads, heads_tables
 from vla_attention.analyze.heads.head_study import denoise_tables
 from vla_attention.analyze.heads.layer_time import layer_time_table
@@ -55,8 +55,8 @@ CASES = {
 FAST = ("one of everything", "some infinite", "many groups")
 
 
-@pytest.mark.pdf
-@pytest.mark.parametrize("case", slow_except(FAST, CASES, slow=("all infinite", "no ratio", "many of everything")))
+@pytest.mark.drawn
+@pytest.mark.parametrize("case", thorough_except(FAST, CASES))
 def test_every_picture_of_every_case_is_drawn_without_a_warning(case, tmp_path):
     wanted, grouping = CASES[case]
     steps = make_steps(**({"grouping": grouping} | wanted))

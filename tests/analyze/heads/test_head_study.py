@@ -304,7 +304,7 @@ def test_the_summary_without_sinks_names_the_keys_and_takes_a_folder_of_its_own(
 # --- the command ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.pdf
+@pytest.mark.drawn
 def test_the_command_writes_tables_and_pictures_and_names_the_nearest_key(tmp_path, capsys):
     from vla_attention.analyze.__main__ import main
 
@@ -338,7 +338,7 @@ def test_the_command_writes_tables_and_pictures_and_names_the_nearest_key(tmp_pa
     [
         ["--layers", "2", "--heads", "1", "--denoise", "9"],
         ["--group", "base=camera:base_0_rgb", "--no-rows"],
-        pytest.param(["--grouping", "objects"], marks=pytest.mark.slow),
+        pytest.param(["--grouping", "objects"], marks=pytest.mark.thorough),
         ["--group", "seen=role:image", "--group", "blind=span:right_wrist_0_rgb", "--ratio", "seen/blind"],
         ["--group", "seen=role:image", "--group", "blind=span:right_wrist_0_rgb", "--ratio", "blind/blind"],
     ],

@@ -355,7 +355,7 @@ def test_sites_are_chosen_by_what_they_hold():
         site_of_words(root, "self")
 
 
-@pytest.mark.pdf
+@pytest.mark.drawn
 def test_the_command_prints_writes_and_draws(follower_store, tmp_path, capsys):
     arguments = [
         "objects",

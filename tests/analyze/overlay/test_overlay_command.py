@@ -86,7 +86,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return kit.write_store(path, episodes=2, replans=4, plant_rows=follow)
 
 
-@pytest.mark.pdf
+@pytest.mark.drawn
 def test_the_csv_has_the_raw_rows_numbers(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = [
         "overlay",

@@ -110,8 +110,8 @@ def test_several_suites_are_summarised_one_by_one_and_combined(tmp_path, capsys)
     assert summary.read_text() in out
 
 
-@pytest.mark.slow
-@pytest.mark.pdf
+@pytest.mark.thorough
+@pytest.mark.drawn
 def test_every_picture_has_its_vector_version_and_its_numbers(tmp_path, capsys):
     path = write_published(tmp_path, "libero_10", pi_episodes(dark=0.1))
     folder = tmp_path / "pictures"

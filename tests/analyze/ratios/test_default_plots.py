@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups, replans_of
-from tests.kit.slow import slow_except
+from tests.kit.thorough import thorough_except
 from vla_attention.analyze.measures.aggregate import episode_tables, task_tables
 from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.ratios.plot_attention_fractions import plot_attention_fractions
@@ -53,11 +53,10 @@ CASES = {
 }
 #: Cases that the fast part of the suite draws.
 FAST = ("one of everything", "some infinite", "many groups")
-SLOW = ("all infinite", "a layer infinite", "custom", "ninety tasks")
 
 
-@pytest.mark.pdf
-@pytest.mark.parametrize("case", slow_except(FAST, CASES, slow=SLOW))
+@pytest.mark.drawn
+@pytest.mark.parametrize("case", thorough_except(FAST, CASES))
 def test_every_picture_of_every_case_is_drawn_without_a_warning(case, tmp_path):
     steps, grouping = CASES[case]()
     replans = replans_of(steps, grouping)
@@ -93,7 +92,7 @@ def test_data_beside_the_picture_are_those_of_the_picture(tmp_path):
     assert data["ratio"].to_list() == pytest.approx(replans["ratio"].to_list())
 
 
-@pytest.mark.pdf
+@pytest.mark.drawn
 def test_same_data_give_the_same_file(tmp_path):
     grouping = default_grouping()
     tasks = task_tables(episode_tables(replans_of(make_steps(), grouping), grouping), grouping, Sampling())
@@ -104,7 +103,7 @@ def test_same_data_give_the_same_file(tmp_path):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_all_evolutions_keep_suites_apart(tmp_path):
     grouping = default_grouping()
     small = {"num_tasks": 1, "num_episodes": 1, "layers": (3, 4), "num_replans": 2}

@@ -14,7 +14,7 @@ import vla_attention.testing.stores as kit
 from tests.kit.browser import CHROMIUM, needs_chromium
 from vla_attention.analyze.__main__ import main
 
-pytestmark = [pytest.mark.slow, needs_chromium]
+pytestmark = [pytest.mark.thorough, needs_chromium]
 
 #: Runs before the page's own script, and after it everything that a user would do; the findings go into the page.
 _LISTEN = """<script>

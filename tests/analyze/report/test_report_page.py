@@ -120,8 +120,8 @@ def test_what_a_store_says_is_text_and_never_markup(html: str) -> None:
     assert html.count("<script>") == 1
 
 
-@pytest.mark.slow
-@pytest.mark.pdf
+@pytest.mark.thorough
+@pytest.mark.drawn
 def test_the_page_is_small_and_the_same_twice(analysis: Analysis) -> None:
     page = report_html(analysis, ReportSettings())
     assert len(page.encode()) < 3_000_000
@@ -164,7 +164,7 @@ def test_episodes_have_a_slider_over_their_replans(analysis: Analysis, html: str
         assert base64.b64decode(content)[8:12] == b"WEBP"
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_slider_over_some_of_the_replans_says_so(analysis: Analysis) -> None:
     page = Page(report_html(analysis, ReportSettings(episodes=1, replans=2, rows=False)))
     assert "2 of 3 replans, from the first to the last." in page.text
@@ -234,7 +234,7 @@ def no_words(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -
     return rows / rows.sum(axis=-1, keepdims=True)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_store_of_infinite_ratios_still_gives_a_page_that_says_so(tmp_path: Path) -> None:
     store = kit.write_store(tmp_path / "a.zarr", plant_rows=no_words, frames=False, coverage=False)
     assert main(["report", str(store), "--output", str(tmp_path / "a.html")]) == 0
@@ -245,7 +245,7 @@ def test_a_store_of_infinite_ratios_still_gives_a_page_that_says_so(tmp_path: Pa
     assert "attention alone, on grey" in page.text
 
 
-@pytest.mark.pdf
+@pytest.mark.drawn
 def test_a_single_episode_of_a_single_layer_and_a_grouping_without_ratio(tmp_path: Path) -> None:
     store = kit.write_store(tmp_path / "a.zarr", tasks=(0,), episodes=1, replans=1, layers=(1,), heads=(0,))
     path = tmp_path / "deep" / "b.html"

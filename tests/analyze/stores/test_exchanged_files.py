@@ -12,7 +12,7 @@ import pytest
 
 import vla_attention as va
 from tests.kit.attacks import SECOND, arrays_of, attacks, edit_root, encode_again, exchange, first, root_leaves, two
-from tests.kit.slow import slow_except
+from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.api import OpenStores
 from vla_attention.analyze.copy.copying import copy_store
@@ -103,22 +103,9 @@ FAST = (
     "chunks of rows: other bits of the same crc32c",
     "an episode copied under another name",
 )
-SLOW = (
-    "joint/key_role of another store",
-    "joint/uniform of another store",
-    "joint/contribution encoded again",
-    "objects/base_0_rgb encoded again",
-    "frames/base_0_rgb exchanged",
-    "joint/row_sum exchanged with joint/atoms",
-    "chunks of rows: denoise steps exchanged",
-    "attributes exchanged",
-    "seals and attributes exchanged",
-    "an episode of another run",
-    "the root of another run",
-)
 
 
-@pytest.mark.parametrize("name", slow_except(FAST, attacks(list(ARRAYS)), slow=SLOW))
+@pytest.mark.parametrize("name", thorough_except(FAST, attacks(list(ARRAYS))))
 def test_no_question_is_answered_with_bytes_of_something_else(stores, answers, tmp_path, name):
     before = all_bytes(stores[0])
     attacks(list(ARRAYS))[name](*stores)

@@ -285,7 +285,7 @@ def test_one_class_alone_is_said_and_not_computed(tmp_path):
     assert "0 solved and 4 failed; at least 2 of either" in text_of(time_sections(question, found, TimeSettings()))
 
 
-@pytest.mark.pdf
+@pytest.mark.drawn
 def test_the_command_writes_tables_and_pictures(store, tmp_path, capsys):
     assert main(["time", str(store), "--output", str(tmp_path / "out"), "--bins", "4", "--window", "2", "--pdf"]) == 0
     assert "SUCCESS AGAINST FAILURE" in capsys.readouterr().out

@@ -20,7 +20,7 @@ from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.view.server import ViewerServer
 from vla_attention.testing.stores import StoreSpec, write_store
 
-pytestmark = [pytest.mark.slow, needs_chromium]
+pytestmark = [pytest.mark.thorough, needs_chromium]
 SIZES = WAYS["through the pictures"] | {"the": (0.01, 0.01, 0, 0)}
 SPEC = StoreSpec(tasks=(0,), episodes=1, plant_effects=partial(planted, SIZES))
 SHADED = '.main .words[data-shade="effect"]'

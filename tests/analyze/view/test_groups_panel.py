@@ -24,7 +24,7 @@ from tests.kit.browser import needs_chromium, shown_page, wait_until_ready
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.testing import StoreSpec, write_site_store, write_store
 
-pytestmark = [pytest.mark.slow, needs_chromium]
+pytestmark = [pytest.mark.thorough, needs_chromium]
 CLOSE = 1e-6
 
 

@@ -9,8 +9,8 @@ import shutil
 from pathlib import Path
 
 from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answers
-from tests.hostile.make import CASES, make_case, originals
 from tests.kit.http_ranges import serve
+from tests.thorough.hostile.make import CASES, make_case, originals
 
 #: One case in so many is tried; HOSTILE_EVERY=1 tries all, which takes a minute.
 EVERY = int(os.environ.get("HOSTILE_EVERY", "8"))

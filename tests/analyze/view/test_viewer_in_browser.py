@@ -23,7 +23,7 @@ from vla_attention.schemas.interventions import Interventions, PromptChange
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import StoreSpec, rerun_source, write_store
 
-pytestmark = [pytest.mark.slow, needs_chromium]
+pytestmark = [pytest.mark.thorough, needs_chromium]
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=3, layers=(0, 1, 2, 3, 4, 5), num_layers=6)
 MAIN = ".main"

@@ -150,7 +150,7 @@ def test_words_of_several_tasks_are_averaged_over_the_episodes_that_have_them(tm
     assert row["lift_low"] <= row["lift"] <= row["lift_high"]
 
 
-@pytest.mark.pdf
+@pytest.mark.drawn
 def test_the_command_prints_writes_and_draws(reader_store, tmp_path, capsys):
     assert main(["words", str(reader_store), "--output", str(tmp_path), "--per-head", "--pdf"]) == 0
     printed = capsys.readouterr().out

@@ -14,7 +14,7 @@ pytest.importorskip("libero")
 pytest.importorskip("robosuite")
 
 from tests.kit.published_loops import PublishedEpisode, cosmos_loop, lerobot_loop, openpi_loop
-from tests.kit.slow import slow_except
+from tests.kit.thorough import thorough_except
 from vla_attention.capture.environments.base import EnvironmentSettings
 from vla_attention.capture.environments.episode_protocol import (
     CAMERAS,
@@ -69,10 +69,9 @@ def check(ours: PublishedEpisode, published: PublishedEpisode) -> None:
 
 #: One task of each suite that is not above; that of libero_object has no furniture.
 OTHERS = ("libero_spatial", 7), ("libero_object", 0), ("libero_90", 20)
-SLOW = DRAWER, OTHERS[1]
 
 
-@pytest.mark.parametrize("place", slow_except([FURNITURE], [FURNITURE, DRAWER, STOVE, *OTHERS], slow=SLOW))
+@pytest.mark.parametrize("place", thorough_except([FURNITURE], [FURNITURE, DRAWER, STOVE, *OTHERS]))
 def test_every_episode_is_that_of_openpi_in_any_order(place: Place, libero_assets: Path) -> None:
     published = openpi_loop(libero_assets, list_tasks(find_suite(place[0]))[place[1]], episodes=4)
     assert np.array_equal(published[0].body_pos, published[1].body_pos) == (place[0] == "libero_object")
@@ -85,7 +84,7 @@ def test_every_episode_is_that_of_openpi_in_any_order(place: Place, libero_asset
                 check(play(environment, episode, 7, further_steps=3), published[episode])
 
 
-@pytest.mark.parametrize("place", slow_except([DRAWER], [FURNITURE, DRAWER], slow=()))
+@pytest.mark.parametrize("place", thorough_except([DRAWER], [FURNITURE, DRAWER]))
 def test_every_episode_is_that_of_lerobot_in_any_order(place: Place, libero_assets: Path) -> None:
     """The drawer draws further numbers at every reset, and LeRobot resets once before the first episode."""
     published = lerobot_loop(libero_assets, list_tasks(find_suite(place[0]))[place[1]], episodes=3)
@@ -98,7 +97,7 @@ def test_every_episode_is_that_of_lerobot_in_any_order(place: Place, libero_asse
                 assert environment.segmentation(camera).shape == (360, 360)
 
 
-@pytest.mark.parametrize("place", slow_except([DRAWER], [FURNITURE, DRAWER], slow=()))
+@pytest.mark.parametrize("place", thorough_except([DRAWER], [FURNITURE, DRAWER]))
 def test_every_episode_is_that_of_cosmos_whatever_the_seed_of_its_noise(place: Place, libero_assets: Path) -> None:
     published = cosmos_loop(libero_assets, list_tasks(find_suite(place[0]))[place[1]], episodes=3)
     with environment_of(place, COSMOS, libero_assets) as environment:

@@ -101,7 +101,7 @@ def test_instructions_come_from_names(name: str, instruction: str) -> None:
 
 
 @pytest.mark.libero
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_nothing_is_asked_printed_or_left_at_home(tmp_path: Path, libero_assets: Path) -> None:
     """A fresh process loads the real package; standard input is closed. Compares all names with the package's own."""
     code = (

@@ -11,7 +11,7 @@ pytest.importorskip("robosuite")
 
 import mujoco
 
-from tests.kit.slow import slow_except
+from tests.kit.thorough import thorough_except
 from vla_attention.capture.environments import simulator
 from vla_attention.capture.environments.base import EnvironmentSettings
 from vla_attention.capture.environments.episode_protocol import CAMERAS
@@ -90,7 +90,7 @@ def test_pictures_in_a_kept_context_are_those_of_a_new_one() -> None:
 @pytest.mark.libero
 @pytest.mark.parametrize(
     ("suite", "task"),
-    slow_except([("libero_goal", 0)], [("libero_goal", 0), ("libero_90", 20)], slow=(), several=True),
+    thorough_except([("libero_goal", 0)], [("libero_goal", 0), ("libero_90", 20)], several=True),
 )
 def test_pictures_of_libero_in_a_kept_context_are_those_of_a_new_one(libero_assets, suite, task) -> None:
     hold_that_the_context_is_kept(suite, task, EnvironmentSettings(libero_assets=libero_assets))

@@ -1,4 +1,4 @@
-"""MP4 files as encoders write them, and lists that cannot be; `tests/hostile_data_sets` has more."""
+"""MP4 files as encoders write them, and lists that cannot be; `tests/thorough/hostile_data_sets` has more."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a Parquet file says of itself, against what polars reads; `tests/hostile_data_sets` has files that lie."""
+"""What a Parquet file says of itself, against what polars reads; tests/thorough has files that lie."""
 
 from __future__ import annotations
 

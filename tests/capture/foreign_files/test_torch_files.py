@@ -1,4 +1,4 @@
-"""What torch.save writes is read, in both of its formats; tests/hostile_checkpoints has what is refused."""
+"""What torch.save writes is read, in both of its formats; tests/thorough/hostile_checkpoints has what is refused."""
 
 from __future__ import annotations
 

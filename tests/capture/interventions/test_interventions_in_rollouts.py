@@ -156,7 +156,7 @@ def test_empty_groups_are_allowed_on_request(base, tmp_path, capsys):
     np.testing.assert_array_equal(same.episodes[0].read("actions"), base.episodes[0].read("actions"))
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_compiled_denoise_steps_refuse_interventions_and_batches_before_a_store_is_made(tmp_path, monkeypatch, capsys):
     from vla_attention.capture.policies.pi import loading
     from vla_attention.capture.policies.pi.compiled import compile_steps

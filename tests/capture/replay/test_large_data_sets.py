@@ -22,7 +22,7 @@ from tests.kit.lerobot_data_sets import (
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.stores.reader import open_store
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.thorough
 
 SIZE = (480, 640)
 CAMERA = "observation.images.front"

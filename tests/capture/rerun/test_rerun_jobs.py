@@ -81,7 +81,7 @@ sys.exit(main(sys.argv[2:]))
 """
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_two_processes_share_the_episodes_of_a_series(pi_store, tmp_path):
     """Every episode of every store is recorded once, by one of them, and both end when all is there."""
     folder = tmp_path / "series"

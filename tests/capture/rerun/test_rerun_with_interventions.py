@@ -102,7 +102,7 @@ def test_prompts_of_another_task_shuffled_and_with_synonyms(pi_store, tmp_path):
     assert sorted(order.split()) == ["cube", "lift", "red", "the"]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_cosmos_without_words_and_with_the_wrist_alone(cosmos_store, tmp_path, capsys):
     target = tmp_path / "without.zarr"
     store = rerun(cosmos_store, target, "--knockout", "word:cube", "--keep", "frame:wrist")
@@ -169,7 +169,7 @@ def test_a_series_makes_its_own_interventions(pi_store, capsys, option):
     assert f"Cannot use {option} with --series" in said
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_a_series_has_every_group_and_word_with_its_controls(pi_store, tmp_path, capsys):
     """One store for each condition; groups without keys are named; a second run finds all of them whole."""
     folder = tmp_path / "series"

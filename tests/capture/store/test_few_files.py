@@ -14,9 +14,9 @@ import pytest
 from tests.kit.attacks import files_of
 from tests.kit.lerobot_data_sets import episodes_of_store, write_data_set
 from tests.kit.pi_golden import GOLDEN
-from tests.kit.slow import slow_except
 from tests.kit.small_tokenizer import train_small_tokenizer
 from tests.kit.still_scene import capture_without_simulator
+from tests.kit.thorough import thorough_except
 from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.store import codecs as store_codecs
@@ -88,7 +88,7 @@ def test_cosmos_with_two_sites(tmp_path):
     check_few(tmp_path / "run.zarr")
 
 
-@pytest.mark.parametrize("kind", slow_except(["growing"], ["alternating", "split", "growing"]))
+@pytest.mark.parametrize("kind", thorough_except(["growing"], ["alternating", "split", "growing"]))
 def test_sites_of_other_policies_with_what_a_data_set_has(tmp_path, monkeypatch, kind):
     monkeypatch.setattr(store_codecs, "TARGET_CHUNK_BYTES", 1)
     store = write_site_store(tmp_path / "a.zarr", kind=kind, protocol="dataset", dataset_actions=0.5, replans=20)

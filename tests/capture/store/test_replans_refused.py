@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.kit.slow import slow_except
+from tests.kit.thorough import thorough_except
 from vla_attention.capture.store.episode_writer import EpisodeWriter, ReplanRefused
 from vla_attention.capture.store.replan_records import RecordedRows, ReplanRecord
 from vla_attention.capture.store.store_writer import open_run
@@ -249,7 +249,9 @@ def test_a_camera_that_the_layout_lacks_is_refused(tmp_path):
         writer.append(change(records[0]))
 
 
-@pytest.mark.parametrize("name", slow_except(("infinite row", "wrong row sum", "coverage of another camera"), STORABLE))
+@pytest.mark.parametrize(
+    "name", thorough_except(("infinite row", "wrong row sum", "coverage of another camera"), STORABLE)
+)
 @pytest.mark.filterwarnings("ignore:invalid value encountered in matmul")
 def test_verify_reports_what_the_writer_refuses(tmp_path, monkeypatch, name):
     """Written by a writer without rules: checksums, digests and seal are in order."""

@@ -25,7 +25,7 @@ from zarr.storage import LocalStore
 from tests.kit.crashes import PROCESSES, before_call, die, run_child
 from tests.kit.durable_stores import SPEC, leftovers, names, store_bytes, write_store
 from tests.kit.examples import examples
-from tests.kit.slow import slow_except
+from tests.kit.thorough import thorough_except
 from vla_attention.capture.store.episode_writer import StoreWriteFailed
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument, UserError
@@ -63,7 +63,7 @@ def count_calls(kind: str, path: Path) -> int:
     [
         ("set", 6),
         ("rename", 3),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in (("fsync", 4), ("renamed", 3))),
+        *(pytest.param(*case, marks=pytest.mark.thorough) for case in (("fsync", 4), ("renamed", 3))),
     ],
 )
 def test_a_killed_process_leaves_whole_episodes_and_is_resumed(tmp_path, uninterrupted, kind, moments):
@@ -103,7 +103,7 @@ def test_an_exception_in_the_block_leaves_no_trace(tmp_path, uninterrupted):
 
 
 @pytest.mark.parametrize("kind", ["set", "fsync", "rename"])
-@pytest.mark.parametrize("code", slow_except([errno.ENOSPC], [errno.ENOSPC, errno.EIO]))
+@pytest.mark.parametrize("code", thorough_except([errno.ENOSPC], [errno.ENOSPC, errno.EIO]))
 def test_a_full_or_failing_disk_is_an_error_and_harms_nothing(tmp_path, uninterrupted, kind, code):
     path = write_store(tmp_path / "a.zarr", spec=SPEC)
     store = open_run(path, root_attributes(SPEC), "resume")

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from tests.kit.attacks import files_of
 from tests.kit.examples import examples
-from tests.kit.slow import slow_except
+from tests.kit.thorough import thorough_except
 from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.capture.store.codecs import replans_per_block, write_whole
@@ -127,7 +127,7 @@ def test_random_layouts_are_read_back(tmp_path_factory, tokens, bits):
     check_equals_spec(write_store(tmp_path_factory.mktemp("stores") / "a.zarr", spec=spec), spec)
 
 
-@pytest.mark.parametrize("replans", slow_except((7, 8, 17), (7, 8, 9, 15, 16, 17, 24, 30)))
+@pytest.mark.parametrize("replans", thorough_except((7, 8, 17), (7, 8, 9, 15, 16, 17, 24, 30)))
 def test_episodes_around_the_size_of_a_block(tmp_path, monkeypatch, replans):
     monkeypatch.setattr(store_codecs, "TARGET_CHUNK_BYTES", 1)
     spec = StoreSpec(replans=replans, tasks=(0,), episodes=1, heads=(0,), layers=(0, 1))

@@ -9,7 +9,6 @@ from torch import nn
 from torch.nn.attention.flex_attention import create_block_mask, flex_attention
 
 import vla_attention as va
-from tests.kit.slow import slow_except
 from tests.kit.small_torch_policy import HEADS, WIDTH, SmallPolicy, given, small_layout
 from tests.kit.small_torch_variants import (
     OneModulePolicy,
@@ -20,6 +19,7 @@ from tests.kit.small_torch_variants import (
     token_layout,
     turns_layout,
 )
+from tests.kit.thorough import thorough_except
 from tests.kit.uniform_attention import check_uniform, lifts_of_groups, zero_queries
 from vla_attention.capture.torch_policies.policy_layout import CallRule, PolicyLayout, RecordedSite
 from vla_attention.capture.torch_policies.record import record
@@ -156,7 +156,7 @@ FAST = [
 ]
 
 
-@pytest.mark.parametrize(("attend", "change", "queries"), slow_except(FAST, WAYS, slow=(), several=True))
+@pytest.mark.parametrize(("attend", "change", "queries"), thorough_except(FAST, WAYS, several=True))
 def test_every_query_s_own_keys_are_the_baseline(tmp_path, attend, change, queries):
     policy = MaskedPolicy(attend, change)
     assert zero_queries(policy) == LAYERS

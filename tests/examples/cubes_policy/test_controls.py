@@ -11,7 +11,7 @@ from examples.cubes_policy import controls, demonstrate
 from examples.cubes_policy.__main__ import main
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_every_control_and_seed_is_trained_once_and_read_by_the_validation(folder, tmp_path, monkeypatch, capsys):
     asked: list[argparse.Namespace] = []
     monkeypatch.setattr(demonstrate, "run", lambda arguments: asked.append(arguments) or 0)

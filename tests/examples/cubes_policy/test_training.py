@@ -21,8 +21,8 @@ from examples.cubes_policy.training import (
 )
 from examples.cubes_policy.training_pass import _RmsNorm, encode, velocities
 from tests.examples.cubes_policy.test_dataset import make_batches
-from tests.hostile_checkpoints.hostile_files import TRACE, executing_pickle, pipe, torch_zip
 from tests.kit.made_up_demonstrations import INSTRUCTIONS, write_demonstrations
+from tests.thorough.hostile_checkpoints.hostile_files import TRACE, executing_pickle, pipe, torch_zip
 from vla_attention.capture.policies.pi.flow_time import denoise_times
 from vla_attention.capture.policies.pi.gemma import RMSNorm
 from vla_attention.capture.policies.pi.loading import build_pi_policy
@@ -109,7 +109,7 @@ def test_every_part_of_the_model_gets_a_gradient(model, demonstrations, tokenize
     model.zero_grad()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_loss_falls(demonstrations, tmp_path):
     settings = TrainingSettings(steps=40, batch_size=8, log_every=10, evaluate_every=40)
     train(demonstrations, INSTRUCTIONS, tmp_path, settings, say=quiet)
@@ -135,7 +135,7 @@ def test_a_training_that_was_stopped_goes_on_the_same(demonstrations, whole, tmp
     assert last_of_one["held_out_total"] == last_of_other["held_out_total"]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_number_of_steps_may_change_on_the_way(demonstrations, tmp_path):
     train(demonstrations, INSTRUCTIONS, tmp_path, SETTINGS, stop_at=3, say=quiet)
     shorter = TrainingSettings(steps=5, batch_size=4, log_every=2, evaluate_every=4)
@@ -144,7 +144,7 @@ def test_the_number_of_steps_may_change_on_the_way(demonstrations, tmp_path):
     assert json.loads((tmp_path / "settings.json").read_text())["schedule"] == [[0, 8], [3, 5]]
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_demonstrations_may_be_added_on_the_way(demonstrations, tmp_path):
     few = write_demonstrations(tmp_path / "few", scenes=6, seed=1)
     train(read_demonstrations(few), INSTRUCTIONS, tmp_path / "t", SETTINGS, stop_at=3, say=quiet)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from tests.kit.examples import examples
-from tests.kit.slow import slow_except
+from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.analyze.copy.packing import write_zip
@@ -114,7 +114,7 @@ def test_a_whole_store_is_read(path, recorded):
     assert wrong_or_refused(path, recorded) == []
 
 
-@pytest.mark.parametrize("bits", slow_except((0x01,), (0x01, 0x80, 0xFF)))
+@pytest.mark.parametrize("bits", thorough_except((0x01,), (0x01, 0x80, 0xFF)))
 def test_a_byte_that_was_flipped_anywhere_gives_no_other_number(path, recorded, bits):
     zip_file = path / FIRST
     whole = zip_file.read_bytes()
@@ -415,7 +415,7 @@ def test_a_copy_refuses_damage_and_packs_none_of_it(path, tmp_path, capsys):
     assert verify_store(open_store(tmp_path / "c.zarr")) == []
 
 
-@pytest.mark.parametrize("bits", slow_except((0x01,), (0x01, 0x80, 0xFF)))
+@pytest.mark.parametrize("bits", thorough_except((0x01,), (0x01, 0x80, 0xFF)))
 def test_every_byte_of_a_zip_is_compared_by_verify(path, bits):
     """Names and dates before each file, by which nothing is read, too."""
     zip_file = path / FIRST

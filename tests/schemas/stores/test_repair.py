@@ -16,8 +16,8 @@ import pytest
 
 from tests.kit.attacks import files_of
 from tests.kit.crashes import before_call, die, run_child
-from tests.kit.slow import slow_except
 from tests.kit.still_scene import capture_without_simulator
+from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main
 from vla_attention.capture.jobs.status import store_status
@@ -93,7 +93,7 @@ def names(store: Path) -> list[str]:
     return [found.name for found in open_store(store).episodes]
 
 
-@pytest.mark.parametrize("kind", slow_except(("emptied", "lacks atoms", "cut off"), DAMAGE))
+@pytest.mark.parametrize("kind", thorough_except(("emptied", "lacks atoms", "cut off"), DAMAGE))
 def test_a_damaged_episode_is_listed_moved_aside_and_missing(store, episode, original, capsys, kind):
     damage, problem = DAMAGE[kind]
     damage(episode)
@@ -244,7 +244,7 @@ def repair_and_die(store: Path, kind: str, number: int) -> None:
         repair_store(store)
 
 
-@pytest.mark.parametrize("number", slow_except((1,), range(3)))  # renames: the claim, the episode, the claim's end
+@pytest.mark.parametrize("number", thorough_except((1,), range(3)))  # renames: the claim, the episode, the claim's end
 @pytest.mark.parametrize("kind", ["rename", "renamed"])
 def test_a_killed_repair_harms_nothing(store, episode, original, kind, number):
     empty(episode)

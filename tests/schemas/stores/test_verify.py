@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.kit.attacks import files_of, with_checksum
 from tests.kit.examples import examples
-from tests.kit.slow import slow_except
+from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
@@ -98,7 +98,7 @@ def test_a_whole_store_has_no_faults(original):
     assert counted == [1, 1]
 
 
-@pytest.mark.parametrize("array", slow_except(FEW_ARRAYS, ARRAYS))
+@pytest.mark.parametrize("array", thorough_except(FEW_ARRAYS, ARRAYS))
 def test_a_flipped_byte_in_a_chunk(path, array):
     file = chunk_file(path, array)
     content = file.read_bytes()
@@ -109,7 +109,7 @@ def test_a_flipped_byte_in_a_chunk(path, array):
         check_unreadable(path, array)
 
 
-@pytest.mark.parametrize("array", slow_except(FEW_ARRAYS, ARRAYS))
+@pytest.mark.parametrize("array", thorough_except(FEW_ARRAYS, ARRAYS))
 def test_a_truncated_chunk(path, array):
     file = chunk_file(path, array)
     content = file.read_bytes()
@@ -119,14 +119,14 @@ def test_a_truncated_chunk(path, array):
         check_unreadable(path, array)
 
 
-@pytest.mark.parametrize("array", slow_except(FEW_ARRAYS, ARRAYS))
+@pytest.mark.parametrize("array", thorough_except(FEW_ARRAYS, ARRAYS))
 def test_a_deleted_chunk(path, array):
     chunk_file(path, array).unlink()
     assert f"{array} of episode {EPISODE} cannot be read: it has lost its {array}/c.0" in only_fault_of(path)
     check_unreadable(path, array)
 
 
-@pytest.mark.parametrize("array", slow_except(FEW_ARRAYS, ARRAYS))
+@pytest.mark.parametrize("array", thorough_except(FEW_ARRAYS, ARRAYS))
 def test_a_deleted_array(path, array):
     shutil.rmtree(path / "episodes" / EPISODE / array)
     assert array in only_fault_of(path)
@@ -172,7 +172,7 @@ def test_an_episode_of_another_run(path, tmp_path):
     assert "a run of another configuration" in only_fault_of(path)
 
 
-@pytest.mark.parametrize("file", slow_except(FEW_METADATA, METADATA))
+@pytest.mark.parametrize("file", thorough_except(FEW_METADATA, METADATA))
 def test_every_changed_byte_of_metadata_is_noticed(path, file):
     target = path / "episodes" / EPISODE / file
     content = target.read_bytes()
@@ -193,7 +193,7 @@ def same_json(one: bytes, other: bytes) -> bool:
         return False
 
 
-@pytest.mark.parametrize("file", slow_except(FEW_METADATA, METADATA))
+@pytest.mark.parametrize("file", thorough_except(FEW_METADATA, METADATA))
 def test_deleted_metadata(path, file):
     (path / "episodes" / EPISODE / file).unlink()
     assert Path(file).parent.name in only_fault_of(path)

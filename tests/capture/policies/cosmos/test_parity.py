@@ -25,7 +25,7 @@ def test_the_cases_in_the_repository_are_met(name):
     assert report.passed, describe(report)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", LARGE_CASES)
 def test_the_cases_beside_the_checkout_are_met(name):
     if not (LARGE_GOLDEN / name).is_dir():

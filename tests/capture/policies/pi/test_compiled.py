@@ -127,7 +127,7 @@ def test_a_cosmos_policy_refuses_to_be_compiled():
         COSMOS_FAMILY.build(parser.parse_args(["--compile"]), "cpu")
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_code_of_the_real_compiler_gives_the_same(policy):
     made = dummy_policy()
     compile_steps(made.model)

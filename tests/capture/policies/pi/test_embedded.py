@@ -68,7 +68,7 @@ def test_rows_are_neither_uniform_nor_on_one_key(embedded, observation):
         assert (share > 0.003).all()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_rows_depend_on_picture_words_noise_and_time(embedded, observation):
     rows, _ = record(embedded, observation)
     assert distance(rows, record(embedded, make_observation(9))[0]) > 0.1
@@ -77,7 +77,7 @@ def test_rows_depend_on_picture_words_noise_and_time(embedded, observation):
     assert distance(rows[:, 0], rows[:, 1]) > 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_actions_stay_near_the_built_in_ranges(embedded, observation):
     stats = builtin_stats().actions
     chunks = np.stack([embedded.act(embedded.prepare(observation, INSTRUCTION), seed) for seed in range(3)])

@@ -12,7 +12,7 @@ from benchmarks.orbax_writer import write_leaves
 from tests.kit.jax_leaves import to_jax_leaves
 from tests.kit.jax_state import from_jax_flat
 from tests.kit.pi_golden import GOLDEN, LARGE_GOLDEN, load_case
-from tests.kit.slow import slow_except
+from tests.kit.thorough import thorough_except
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint, UnsupportedCheckpoint
 from vla_attention.capture.policies.pi.config import GemmaConfig
 from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, random_weights
@@ -71,7 +71,7 @@ OTHER_SIZES = {
 
 @pytest.mark.parametrize("sizes", OTHER_SIZES)
 @pytest.mark.parametrize("options", [{"dtype": "bfloat16"}, {"value_suffix": False, "chunk_per_layer": True}, {}])
-@pytest.mark.parametrize("pi05", slow_except((True,), (True, False)))
+@pytest.mark.parametrize("pi05", thorough_except((True,), (True, False)))
 def test_other_sizes_and_ways_of_storing(tmp_path, sizes, options, pi05):
     parts = {
         name: GemmaConfig(width=width, depth=3, mlp_dim=40, **{"head_dim": 8, **OTHER_SIZES[sizes]})

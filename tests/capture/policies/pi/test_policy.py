@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 
 from tests.kit.pi_golden import GOLDEN
 from tests.kit.policy_inputs import assert_same_input, make_observation
-from tests.kit.slow import slow_except
+from tests.kit.thorough import thorough_except
 from vla_attention.capture.environments.base import Observation
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound
 from vla_attention.capture.policies.identity import PolicySource
@@ -61,7 +61,7 @@ def dummy_pi0():
     )
 
 
-@pytest.fixture(params=slow_except(["dummy", "dummy_pi0"], ["dummy", "dummy_pi0", "embedded"]))
+@pytest.fixture(params=thorough_except(["dummy", "dummy_pi0"], ["dummy", "dummy_pi0", "embedded"]))
 def policy(request):
     return request.getfixturevalue(request.param)
 

@@ -1,6 +1,6 @@
 """Run every hostile case as `vla-capture` in a process of its own, with a limit of memory; prints a line of JSON each.
 
-    python -m tests.hostile_checkpoints.run_cases FOLDER [NAME ...]
+    python -m tests.thorough.hostile_checkpoints.run_cases FOLDER [NAME ...]
 
 Libraries are imported once, and each case is a fork; see `tests.kit.hostile_runs`.
 """
@@ -11,11 +11,11 @@ import json
 import sys
 from pathlib import Path
 
-from tests.hostile_checkpoints.cosmos_cases import COSMOS, dummy
-from tests.hostile_checkpoints.hostile_files import TRACE, Case
-from tests.hostile_checkpoints.libero_cases import LIBERO, PARITY
-from tests.hostile_checkpoints.pi_cases import PI
 from tests.kit import hostile_runs
+from tests.thorough.hostile_checkpoints.cosmos_cases import COSMOS, dummy
+from tests.thorough.hostile_checkpoints.hostile_files import TRACE, Case
+from tests.thorough.hostile_checkpoints.libero_cases import LIBERO, PARITY
+from tests.thorough.hostile_checkpoints.pi_cases import PI
 
 CASES: dict[str, Case] = {
     f"{family}: {name}": case

@@ -1,4 +1,4 @@
 """Stores, results files and groupings that attack memory, time, paths, links and text, with what must be said of each.
 
-`python -m tests.hostile.make FOLDER` writes all of them.
+`python -m tests.thorough.hostile.make FOLDER` writes all of them.
 """

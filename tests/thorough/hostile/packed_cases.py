@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.hostile.changes import Case
+from tests.thorough.hostile.changes import Case
 from vla_attention.schemas.stores.digest import seal_digest
 
 INDEX = r"its index\.json is damaged .*"

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import load_file, save_file
 
-from tests.hostile_checkpoints.hostile_files import (
+from tests.kit.paths import GOLDEN
+from tests.thorough.hostile_checkpoints.hostile_files import (
     HUGE_NUMBER,
     Case,
     Make,
@@ -24,7 +25,6 @@ from tests.hostile_checkpoints.hostile_files import (
     sparse,
     tensor,
 )
-from tests.kit.paths import GOLDEN
 from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 
 VISION = "paligemma_with_expert.paligemma.model.vision_tower.vision_model."

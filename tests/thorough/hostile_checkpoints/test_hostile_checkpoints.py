@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from tests.hostile_checkpoints.cosmos_cases import EXECUTES
-from tests.hostile_checkpoints.hostile_files import TRACE, executing_pickle
-from tests.hostile_checkpoints.run_cases import CASES
-from tests.kit.slow import asked_for, slow_except
+from tests.kit.thorough import asked_for, thorough_except
+from tests.thorough.hostile_checkpoints.cosmos_cases import EXECUTES
+from tests.thorough.hostile_checkpoints.hostile_files import TRACE, executing_pickle
+from tests.thorough.hostile_checkpoints.run_cases import CASES
 
 #: Resident memory that a refusal may take beyond start-up.
 MOST_BYTES = 500_000_000
@@ -41,7 +41,7 @@ def results(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     """The cases that this session asks for, run in one process that forks."""
     names = asked_for(request, "name", CASES)
     folder = tmp_path_factory.mktemp("hostile")
-    command = [sys.executable, "-m", "tests.hostile_checkpoints.run_cases", str(folder), *names]
+    command = [sys.executable, "-m", "tests.thorough.hostile_checkpoints.run_cases", str(folder), *names]
     ran = subprocess.run(command, capture_output=True, text=True, check=False)
     shutil.rmtree(folder, ignore_errors=True)
     found = [json.loads(line) for line in ran.stdout.splitlines() if line.startswith("{")]
@@ -53,7 +53,7 @@ def test_there_are_enough_of_them():
     assert len(CASES) >= 40
 
 
-@pytest.mark.parametrize("name", slow_except(FAST, CASES))
+@pytest.mark.parametrize("name", thorough_except(FAST, CASES))
 def test_a_hostile_checkpoint_is_refused_with_a_sentence(results, name):
     result = results[name]
     said = result["output"].strip()

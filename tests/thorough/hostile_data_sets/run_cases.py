@@ -1,6 +1,6 @@
 """Run every hostile data set through `vla-capture replay` in a process of its own; prints a line of JSON each.
 
-python -m tests.hostile_data_sets.run_cases FOLDER [NAME ...]
+python -m tests.thorough.hostile_data_sets.run_cases FOLDER [NAME ...]
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ import shutil
 import sys
 from pathlib import Path
 
-from tests.hostile_data_sets.made import Case, good
-from tests.hostile_data_sets.meta_cases import META
-from tests.hostile_data_sets.picture_cases import PICTURES
-from tests.hostile_data_sets.table_cases import TABLES
-from tests.hostile_data_sets.video_cases import VIDEOS
 from tests.kit import hostile_runs
 from tests.kit.hostile_runs import Make
+from tests.thorough.hostile_data_sets.made import Case, good
+from tests.thorough.hostile_data_sets.meta_cases import META
+from tests.thorough.hostile_data_sets.picture_cases import PICTURES
+from tests.thorough.hostile_data_sets.table_cases import TABLES
+from tests.thorough.hostile_data_sets.video_cases import VIDEOS
 
 CASES: dict[str, Case] = {
     f"{kind}: {name}": case

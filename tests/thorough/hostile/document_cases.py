@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.hostile.changes import Case
+from tests.thorough.hostile.changes import Case
 
 RESULTS = ("--results", "FILE", "--output", "OUT")
 GROUPING = ("STORE", "--grouping", "FILE", "--output", "OUT", "--no-cache")

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.hostile.changes import VERIFY, Case, edit, edit_array, edit_episode, episode_of, seal_again
 from tests.kit.attacks import files_of
+from tests.thorough.hostile.changes import VERIFY, Case, edit, edit_array, edit_episode, episode_of, seal_again
 from vla_attention.schemas.stores.digest import seal_digest
 
 DAMAGED = "Episode task000_episode000 cannot be read: its attributes are damaged .*"

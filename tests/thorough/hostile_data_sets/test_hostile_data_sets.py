@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from tests.hostile_data_sets.run_cases import CASES, GOOD
-from tests.kit.slow import asked_for, slow_except
+from tests.kit.thorough import asked_for, thorough_except
+from tests.thorough.hostile_data_sets.run_cases import CASES, GOOD
 
 #: Resident memory and processor time that a refusal may take beyond start-up.
 MOST_BYTES, MOST_SECONDS = 500_000_000, 2.0
@@ -35,7 +35,7 @@ def results(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     """The cases that this session asks for, run in one process that forks."""
     names = [*GOOD, *asked_for(request, "name", CASES)]
     folder = tmp_path_factory.mktemp("hostile")
-    command = [sys.executable, "-m", "tests.hostile_data_sets.run_cases", str(folder), *names]
+    command = [sys.executable, "-m", "tests.thorough.hostile_data_sets.run_cases", str(folder), *names]
     ran = subprocess.run(command, capture_output=True, text=True, check=False)
     shutil.rmtree(folder, ignore_errors=True)
     found = [json.loads(line) for line in ran.stdout.splitlines() if line.startswith("{")]
@@ -48,7 +48,7 @@ def test_the_data_sets_themselves_are_replayed(results, name):
     assert (results[name]["code"], results[name]["episodes"]) == (0, 1), results[name]
 
 
-@pytest.mark.parametrize("name", slow_except(FAST, CASES))
+@pytest.mark.parametrize("name", thorough_except(FAST, CASES))
 def test_a_hostile_data_set_is_refused_with_a_sentence(results, name):
     result = results[name]
     said = result["output"].strip()

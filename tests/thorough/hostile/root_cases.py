@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.hostile.changes import Case, edit_root
+from tests.thorough.hostile.changes import Case, edit_root
 
 #: What a root says first of every problem.
 REFUSED = r"The store .*a\.zarr cannot be read: "

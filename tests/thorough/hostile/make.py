@@ -1,4 +1,4 @@
-"""Writes the hostile stores, results files and groupings: `python -m tests.hostile.make FOLDER`."""
+"""Writes the hostile stores, results files and groupings: `python -m tests.thorough.hostile.make FOLDER`."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from tests.hostile.array_cases import ARRAY_CASES
-from tests.hostile.changes import Case
-from tests.hostile.document_cases import GROUPING_CASES, RESULTS_CASES
-from tests.hostile.episode_cases import EPISODE_CASES
-from tests.hostile.job_cases import JOB_CASES
-from tests.hostile.packed_cases import PACKED_CASES
-from tests.hostile.root_cases import ROOT_CASES
+from tests.thorough.hostile.array_cases import ARRAY_CASES
+from tests.thorough.hostile.changes import Case
+from tests.thorough.hostile.document_cases import GROUPING_CASES, RESULTS_CASES
+from tests.thorough.hostile.episode_cases import EPISODE_CASES
+from tests.thorough.hostile.job_cases import JOB_CASES
+from tests.thorough.hostile.packed_cases import PACKED_CASES
+from tests.thorough.hostile.root_cases import ROOT_CASES
 from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import write_store

@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from tests.hostile_checkpoints.hostile_files import (
+from tests.kit.hostile_runs import PACKAGES, Make
+from tests.kit.paths import GOLDEN
+from tests.thorough.hostile_checkpoints.hostile_files import (
     TRACE,
     Case,
     executing_pickle,
@@ -22,8 +24,6 @@ from tests.hostile_checkpoints.hostile_files import (
     sparse,
     torch_zip,
 )
-from tests.kit.hostile_runs import PACKAGES, Make
-from tests.kit.paths import GOLDEN
 from vla_attention.capture.environments.libero_installation import ASSET_SUBFOLDERS
 
 #: The first task of the suite.

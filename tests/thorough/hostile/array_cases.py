@@ -12,7 +12,8 @@ import zarr
 from numcodecs import blosc
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from tests.hostile.changes import (
+from tests.kit.attacks import files_of, with_checksum
+from tests.thorough.hostile.changes import (
     VERIFY,
     Case,
     change_index,
@@ -23,7 +24,6 @@ from tests.hostile.changes import (
     rows_file,
     seal_again,
 )
-from tests.kit.attacks import files_of, with_checksum
 from vla_attention.schemas.stores.digest import bytes_digest
 from vla_attention.testing.stores import reseal
 

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.hostile.changes import Case, edit, episode_of
 from tests.kit.attacks import FIRST
+from tests.thorough.hostile.changes import Case, edit, episode_of
 
 STATUS, REPAIR = ("status", "STORE"), ("repair", "STORE")
 WORKER = {"tag": "x", "host": "node7", "process": 1, "process_start": "1", "process_space": "1"}

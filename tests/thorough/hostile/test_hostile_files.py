@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from tests.hostile.make import CASES, PROGRAMS, make_case, originals
-from tests.kit.slow import asked_for, slow_except
+from tests.kit.thorough import asked_for, thorough_except
+from tests.thorough.hostile.make import CASES, PROGRAMS, make_case, originals
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 #: Bytes that a command may have resident beyond those of a command that works.
 MOST_BYTES = 500_000_000
 
@@ -23,7 +23,7 @@ MOST_BYTES = 500_000_000
 def run_in_child(commands: list[tuple[str, list[str]]]) -> list[dict[str, Any]]:
     """What each command printed and took, in one process with limits."""
     done = subprocess.run(
-        [sys.executable, "-m", "tests.hostile.child"],
+        [sys.executable, "-m", "tests.thorough.hostile.child"],
         input=json.dumps(commands),
         capture_output=True,
         text=True,
@@ -77,7 +77,7 @@ def ended(request, tmp_path_factory) -> dict[str, list[dict[str, Any]]]:
     return {kind: [next(rest) for _ in cases] for kind, cases in run.items()}
 
 
-@pytest.mark.parametrize("kind", slow_except(("roots", "jobs", "groupings"), CASES))
+@pytest.mark.parametrize("kind", thorough_except(("roots", "jobs", "groupings"), CASES))
 def test_hostile_files_end_with_their_sentence(ended, kind):
     pairs = list(zip(CASES[kind], ended[kind], strict=True))
     if os.environ.get("HOSTILE_FIGURES"):

@@ -15,7 +15,8 @@ from tempfile import mkdtemp
 
 import torch
 
-from tests.hostile_checkpoints.hostile_files import (
+from tests.kit.cosmos_checkpoint import WEIGHTS_NAME, write_dummy_folder
+from tests.thorough.hostile_checkpoints.hostile_files import (
     TRACE,
     Case,
     Execute,
@@ -34,7 +35,6 @@ from tests.hostile_checkpoints.hostile_files import (
     text,
     torch_zip,
 )
-from tests.kit.cosmos_checkpoint import WEIGHTS_NAME, write_dummy_folder
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG
 from vla_attention.capture.policies.cosmos.locate import EMBEDDINGS_NAME, STATISTICS_NAME, VAE_NAME
 

@@ -13,8 +13,6 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from tests.hostile_checkpoints.hostile_files import sparse
-from tests.hostile_data_sets.made import FRAMES, TABLE, Case, hostile
 from tests.kit.hostile_runs import Make
 from tests.kit.parquet_writer import (
     BYTE_ARRAY,
@@ -39,6 +37,8 @@ from tests.kit.parquet_writer import (
     write_parquet,
     zeros,
 )
+from tests.thorough.hostile_checkpoints.hostile_files import sparse
+from tests.thorough.hostile_data_sets.made import FRAMES, TABLE, Case, hostile
 
 PATH = TABLE["v2.1"]
 
