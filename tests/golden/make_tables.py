@@ -1,0 +1,54 @@
+"""Make the golden tables that are missing: python -m tests.golden.make_tables [--column CASE/TABLE:NAME ...]
+
+Tables that are there stay as they are. With --column the named columns are replaced, and no others: a change that means
+to alter numbers names them. The stores in tests/golden/tables/stores were captured once, with one thread:
+
+    vla-attention capture pi --task-suite cubes --task-id 0 1 5 6 10 13 --num-episodes 1 --max-steps 25 --no-frames
+        --no-contributions --precision 7 --effects text,cameras --effects-readers all action pictures text
+    vla-attention capture pi --checkpoint untrained-tiny --task-suite libero_spatial --task-id 0 1 3 --num-episodes 1
+        --max-steps 15 --precision 7 --num-envs 1                        (with LIBERO's reduced assets)
+    vla-attention capture cosmos --checkpoint untrained-tiny --task-suite robosuite --task-id 0 1 --num-episodes 2
+        --max-steps 32 --precision 7 --num-envs 1 --no-frames
+    vla-attention capture replay DATA --checkpoint untrained-tiny --every 3 --camera base_0_rgb=front
+        --camera left_wrist_0_rgb=none --no-frames --precision 7   (DATA: `made_up_episodes` of the tests' kit)
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import polars as pl
+
+from tests.kit.golden_tables import CASES, FOLDER, link_stores, published_arguments, tables_of
+
+
+def write(case: str, tables: dict[str, pl.DataFrame], columns: list[str]) -> None:
+    """Write the tables that are missing, and the named columns."""
+    for name, table in tables.items():
+        file = FOLDER / case / f"{name}.parquet"
+        named = [column.split(":")[1] for column in columns if column.split(":")[0] == f"{case}/{name}"]
+        if file.exists():
+            if not named:
+                continue
+            table = pl.read_parquet(file).with_columns(table[column] for column in named)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        table.write_parquet(file, compression="zstd", compression_level=22, statistics=False)
+        print(file.relative_to(FOLDER), table.shape)
+
+
+def main() -> None:
+    """Ask every question."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--column", nargs="+", default=[], metavar="CASE/TABLE:NAME")
+    columns = parser.parse_args().column
+    with tempfile.TemporaryDirectory() as temporary:
+        link_stores(Path(temporary))
+        for case in CASES:
+            write(case, tables_of(case, Path(temporary)), columns)
+    write("published", {"arguments": published_arguments()}, columns)
+
+
+if __name__ == "__main__":
+    main()

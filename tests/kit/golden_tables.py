@@ -1,0 +1,230 @@
+"""The golden tables: what every question gives on fixed stores, and what the published lines pass on.
+
+`tests/golden/tables/CASE/TABLE.parquet` holds a table of a command's results; `python -m tests.golden.make_tables` made
+them. A command of another form gives them in another way: then `tables_of` below reads the new results, and the kept
+tables stay as they are.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+import shlex
+import shutil
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+from tests.kit.paths import GOLDEN, ROOT
+from vla_attention.__main__ import main as vla_attention
+from vla_attention.analyze.parse.command import main as parse_attention_ratio_results
+from vla_attention.analyze.show import plot_style
+from vla_attention.capture.commands.arguments import build_evaluate_parser, build_parser
+from vla_attention.capture.policies.families import policy_families
+from vla_attention.capture.published.evaluate import arguments_from_environment
+
+FOLDER = GOLDEN / "tables"
+#: Name below which a question sees a store -> where it lies. effects: pi05_cubes with recorded effects of words and
+#: cameras, for all four readers. libero, cosmos, replay: policies of test size.
+STORES = {
+    "cubes": ROOT / "vla_attention/example_stores/cubes.zarr",
+    "one_colour": ROOT / "vla_attention/example_stores/cubes_one_colour.zarr",
+    **{name: FOLDER / "stores" / f"{name}.zarr" for name in ("effects", "libero", "cosmos", "replay")},
+}
+RERUNS = ROOT / "vla_attention/example_stores/cubes_reruns"
+
+_EXPORT = ("--parquet", *(word for name in ("steps", "replans", "episodes", "tasks") for word in ("--table", name)))
+_STEPS = ("--group", "thing=word:cube", "--group", "seen=role:image", "--ratio", "seen/thing")
+#: Case -> the words after `vla-attention`.
+CASES: dict[str, tuple[str, ...]] = {
+    "cubes_analyze": ("analyze", "cubes.zarr"),
+    "cubes_cameras": ("analyze", "cubes.zarr", "--grouping", "cameras", "--layers", "0", "2"),
+    "cubes_own_groups": ("analyze", "cubes.zarr", *_STEPS),
+    "cubes_words": ("words", "cubes.zarr"),
+    "cubes_objects": ("objects", "cubes.zarr"),
+    "cubes_heads": ("heads", "cubes.zarr"),
+    "cubes_time": ("time", "cubes.zarr"),
+    "cubes_groups": ("groups", "cubes.zarr"),
+    "cubes_export": ("export", "cubes.zarr", *_EXPORT, "--table", "contributions"),
+    "cubes_per_head": ("export", "cubes.zarr", "--parquet", "--table", "steps", "--per-head", "--tasks", "0"),
+    "pair_compare": ("compare", "cubes.zarr", "one_colour.zarr"),
+    "reruns_effects": ("effects", "cubes.zarr", "RERUNS"),
+    "noise_compare": ("compare", "cubes.zarr", "RERUN"),
+    "effects_effects": ("effects", "effects.zarr"),
+    "effects_export": ("export", "effects.zarr", "--parquet", "--table", "effects"),
+    "effects_analyze": ("analyze", "effects.zarr"),
+    "effects_words": ("words", "effects.zarr"),
+    "libero_analyze": ("analyze", "libero.zarr"),
+    "libero_reference": ("analyze", "libero.zarr", "--grouping", "reference"),
+    "libero_words": ("words", "libero.zarr"),
+    "libero_objects": ("objects", "libero.zarr"),
+    "libero_heads": ("heads", "libero.zarr"),
+    "libero_time": ("time", "libero.zarr"),
+    "libero_groups": ("groups", "libero.zarr"),
+    "cosmos_analyze": ("analyze", "cosmos.zarr"),
+    "cosmos_cross": ("analyze", "cosmos.zarr", "--site", "cross"),
+    "cosmos_heads": ("heads", "cosmos.zarr"),
+    "cosmos_groups": ("groups", "cosmos.zarr"),
+    "replay_deviation": ("deviation", "replay.zarr"),
+    "published_results": ("parse", "cubes.zarr"),
+    "published_comparison": ("parse", "cubes.zarr", "libero.zarr"),
+}
+#: Variables of the batch scripts, which one at a time and together say everything that can be said.
+VARIABLES: dict[str, dict[str, dict[str, str]]] = {
+    "evaluate-attention-ratio": {
+        "none": {},
+        "all": {
+            "CHECKPOINT": "PATH", "CONFIG_NAME": "pi05_libero", "TASK_SUITE": "libero_goal", "TASK_ID": "0 3",
+            "NUM_EPISODES": "10", "PROTOCOL": "openpi", "SEED": "3", "REPLAN_STEPS": "4", "LAYERS": "17 25 26 27",
+            "SAVE_VIZ": "1", "OUTPUT_DIR": "results/mine", "STORE": "mine.zarr", "STAGE": "capture", "DEVICE": "cpu",
+            "MAX_REQUEUES": "2", "ARGS": "--max-steps 100 --precision exact",
+        },
+        "another name of the checkpoint": {"CKPT_PATH": "PATH", "TASK_SUITE": "all", "SAVE_VIZ": "0"},
+        "a task of an array": {"SLURM_JOB_ID": "7", "SLURM_ARRAY_TASK_ID": "4", "CHECKPOINT": "PATH"},
+        "the analysis of an array": {"SLURM_JOB_ID": "7", "STAGE": "analyze"},
+    },
+    "evaluate-attention-ratio-cosmos": {
+        "none": {},
+        "all": {
+            "CKPT_PATH": "PATH", "CONFIG_NAME": "NAME", "QUERY_FRAME": "curr_last", "VISUAL_FRAME": "frame1",
+            "TEXT_FRAME": "frame0", "LAYERS": "25 26 27", "SEED": "1", "TASK_ID": "2",
+        },
+    },
+}  # fmt: skip
+
+
+def link_stores(folder: Path) -> None:
+    """Give the stores the short names that the questions use: results name a store as it was typed."""
+    for name, place in STORES.items():
+        (folder / f"{name}.zarr").symlink_to(place, target_is_directory=True)
+    for rerun in sorted(RERUNS.glob("*.zarr")):
+        (folder / f"rerun_{rerun.stem}.zarr").symlink_to(rerun, target_is_directory=True)
+
+
+def tables_of(case: str, folder: Path) -> dict[str, pl.DataFrame]:
+    """Ask the question of a case in a folder with the stores, and read all tables of its results.
+
+    Plotted data (CSV) and results files (JSON: a row for each value) are tables too.
+    """
+    reruns = sorted(path.name for path in folder.glob("rerun_*.zarr"))
+    words = [word for given in CASES[case] for word in {"RERUNS": reruns, "RERUN": reruns[:1]}.get(given, [given])]
+    if words[0] != "parse":
+        return _asked(vla_attention, [*words, "--output", "results"], folder)
+    files = []
+    for store in words[1:]:
+        _asked(vla_attention, ["analyze", store, "--output", "results"], folder)
+        (written,) = folder.glob("results/attention_ratio_results_*.json")
+        files.append(str(written.rename(folder / written.name)))
+    plots = "--plot-all" if len(files) == 1 else "--plot-comparison"
+    return _asked(parse_attention_ratio_results, ["--results", *files, plots, "--output-dir", "results"], folder)
+
+
+def _asked(program: Callable[[list[str]], int], words: list[str], folder: Path) -> dict[str, pl.DataFrame]:
+    shutil.rmtree(folder / "results", ignore_errors=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(Figure, "savefig", _leave_blank)
+        patch.setattr(plot_style, "find_places", lambda _figure: None)
+        assert program(words) == 0
+    return dict(_read(folder / "results"))
+
+
+def _leave_blank(_figure: Figure, file: Any, **options: Any) -> None:
+    blank = io.BytesIO()
+    Image.new("RGB", (1, 1)).save(blank, format="PNG")
+    Path(file).write_bytes(blank.getvalue())
+
+
+def _read(folder: Path) -> Iterator[tuple[str, pl.DataFrame]]:
+    for file in sorted(folder.rglob("*")):
+        if file.suffix == ".parquet":
+            yield file.stem, pl.read_parquet(file)
+        elif file.suffix == ".csv" and not file.with_suffix(".parquet").exists():
+            yield f"{file.stem}_plotted", pl.read_csv(file, infer_schema_length=None)
+        elif file.suffix == ".json":
+            values = dict(_values(json.loads(file.read_text(encoding="utf-8"))))
+            kept = [(name, value) for name, value in values.items() if not name.startswith(("provenance", "software"))]
+            yield f"{file.stem}_values", pl.DataFrame(kept, schema={"name": str, "value": str}, orient="row")
+
+
+def _values(document: object, name: str = "") -> Iterator[tuple[str, str]]:
+    if isinstance(document, dict | list):
+        members = document.items() if isinstance(document, dict) else enumerate(document)
+        for key, member in members:
+            yield from _values(member, f"{name}.{key}" if name else str(key))
+    else:
+        yield name, json.dumps(document)
+
+
+def published_arguments() -> pl.DataFrame:
+    """A row for each option that a published line, or the variables of a batch script, set: given, option, value."""
+    rows = []
+    for line in (GOLDEN / "published_lines.txt").read_text(encoding="utf-8").splitlines():
+        program, *words = shlex.split(line)
+        if program.startswith("evaluate"):
+            rows += [(line, *value) for value in _parsed(program, words)]
+        elif program == "make":
+            rows += [(line, *value) for value in _made(words)]
+    for program, settings in VARIABLES.items():
+        for name, variables in settings.items():
+            words = arguments_from_environment(variables, _family(program))
+            rows += [(f"{program} with variables: {name}", *value) for value in _parsed(program, words)]
+    return pl.DataFrame(rows, schema={"given": str, "option": str, "value": str}, orient="row")
+
+
+def _family(program: str) -> Any:
+    (family,) = (one for one in policy_families() if one.published and one.published.program == program)
+    return family
+
+
+def _parsed(program: str, words: list[str]) -> Iterator[tuple[str, str]]:
+    family = _family(program)
+    yield from _options(build_evaluate_parser(family, family.published).parse_args(words))
+
+
+def _made(words: list[str]) -> Iterator[tuple[str, str]]:
+    # A make that runs the tests hands its own variables, ARGS for instance, to what it starts.
+    done = subprocess.run(
+        ["make", "--dry-run", *words], cwd=ROOT, env={"PATH": os.environ["PATH"]}, capture_output=True, check=True
+    )
+    lines = done.stdout.decode().replace("\\\n", " ").splitlines()
+    (line,) = [line for line in lines if "vla-capture" in line and "--task-suite" in line]
+    _, *given = shlex.split(line)
+    yield from _options(build_parser(given).parse_args(given))
+
+
+def _options(arguments: Any) -> Iterator[tuple[str, str]]:
+    for name, value in sorted(vars(arguments).items()):
+        if not callable(value) and name != "family" and value not in (None, False, []):
+            yield name, str(value)
+
+
+def differences(found: pl.DataFrame, kept: pl.DataFrame, relative: float = 1e-6) -> list[str]:
+    """Where a table differs from the kept one; its further columns are left out. Floats to a millionth."""
+    lacking = [name for name in kept.columns if name not in found.columns]
+    if lacking or found.height != kept.height:
+        return [f"{found.height} rows for {kept.height}; without the columns {lacking}"]
+    return [
+        f"row {row}, {name}: {one!r}; kept is {other!r}"
+        for name in kept.columns
+        for row, (one, other) in enumerate(zip(found[name].to_list(), kept[name].to_list(), strict=True))
+        if not _same(one, other, relative)
+    ]
+
+
+def _same(one: object, other: object, relative: float) -> bool:
+    if isinstance(one, list) and isinstance(other, list):
+        return len(one) == len(other) and all(map(_same, one, other, [relative] * len(one)))
+    try:
+        first, second = (float(value) for value in (one, other))  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        return one == other
+    return (math.isnan(first) and math.isnan(second)) or math.isclose(first, second, rel_tol=relative, abs_tol=1e-9)
