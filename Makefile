@@ -2,8 +2,9 @@
 #
 #   make capture     run a policy in simulation and record its attention (installs torch and the simulators)
 #   make analyze     masses, ratios, tables and pictures from a store (installs the laptop's small set only)
-#   make test        formatting, types, all tests, and the package as others install it
-#   make test-thorough   more cases of attacks and damages, and ten times as many random examples (an hour or more)
+#   make test        the gate: formatting, types, tests, and the package as others install it; minutes by part
+#   make test-thorough   attacks, damages, fuzz, kills, memory, many examples, site and notebooks too (an hour or more)
+#   make faults      twenty faults planted one at a time: the tests of their area have to catch each
 #   make test-policies   policies of transformers 5 and LeRobot, in environments of their own (.venv-transformers, .venv-lerobot)
 #   make test-remote stores in S3, on moto's server on this machine, in an environment of its own (.venv-remote)
 #   make viewer      the page of `vla-attention view` from its sources in analyze/view/web (needs node and npm)
@@ -43,7 +44,7 @@ WORKERS ?= 2
 # An empty PYTHONDONTWRITEBYTECODE: where it is set, both processes compile all tests anew at every run.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: capture analyze test test-policies test-remote test-slurm notebooks fuzz test-thorough check unit package audit setup setup-analyze schemas docs pictures screenshots viewer clean
+.PHONY: capture analyze test test-policies test-remote test-slurm notebooks fuzz faults test-thorough check unit package audit setup setup-analyze schemas docs pictures screenshots viewer clean
 
 capture: .venv/capture-installed
 	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --output $(STORE) \
@@ -52,9 +53,9 @@ capture: .venv/capture-installed
 analyze: .venv/analyze-installed
 	$(BIN)/vla-attention analyze $(STORE) --grouping $(GROUPING) --output $(OUTPUT) $(if $(LAYERS),--layers $(LAYERS)) $(ARGS)
 
-test: check
-	$(MAKE) unit ARGS="--slow $(ARGS)"
-	$(MAKE) package
+# All that CI does; prints what each part took.
+test:
+	@.ci/run
 
 check: .venv/capture-installed
 	$(BIN)/ruff check $(SOURCES)
@@ -64,10 +65,14 @@ check: .venv/capture-installed
 unit: .venv/capture-installed
 	$(PYTEST) $(ARGS)
 
-# Every case of the tests that try many of a kind, and ten times as many random examples; for changes of formulas, file
-# formats and readers.
+# For changes of formulas, file formats and readers, and before a release. With ten times as many random examples.
 test-thorough: .venv/capture-installed
-	$(PYTEST) --thorough --hypothesis-profile thorough -m "thorough or not simulator" $(ARGS)
+	$(PYTEST) --thorough --hypothesis-profile thorough $(ARGS)
+	$(MAKE) docs notebooks
+
+# In copies of the checkout, two at a time; half an hour. ARGS=NAME plants one.
+faults: .venv/capture-installed
+	$(BIN)/python scripts/planted_faults.py $(ARGS)
 
 # Source distribution, wheel, and their use from environments outside the checkout.
 package: .venv/capture-installed
