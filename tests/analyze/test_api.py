@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import doctest
-from dataclasses import fields
 from pathlib import Path
 from types import ModuleType
 
@@ -18,7 +17,7 @@ import vla_attention.analyze.api
 import vla_attention.analyze.measures.question_settings
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.api import OpenStores
-from vla_attention.analyze.measures.question_settings import AnalysisSettings, SettingKeywords, settings_from_keywords
+from vla_attention.analyze.measures.question_settings import AnalysisSettings, settings_from_keywords
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions, KeyKnockout
 from vla_attention.schemas.precision import mass_error_bound
@@ -73,12 +72,6 @@ def test_examples(test, store, other, rerun, replayed, tmp_path):
     assert result.attempted > 0
 
 
-def test_every_method_has_an_example():
-    named = {test.name.rpartition(".")[2] for module in MODULES for test in examples(module)}
-    methods = {name for name in dir(OpenStores) if not name.startswith("_")} - {"attributes", "analysis"}
-    assert methods <= named
-
-
 @pytest.mark.parametrize("level", ["tasks", "episodes", "steps"])
 def test_ratios_are_those_of_the_command(run, store, tmp_path, level):
     assert (
@@ -116,24 +109,6 @@ def test_masses_in_long_form_are_sums_over_the_raw_rows(run, store):
     np.testing.assert_allclose(total["fraction"].to_numpy(), 1, rtol=1e-9)
 
 
-def test_the_last_four_analyses_are_kept(store, monkeypatch):
-    run = va.open(store)
-    asked = []
-    real = vla_attention.analyze.api.analyse
-    monkeypatch.setattr(
-        vla_attention.analyze.api, "analyse", lambda question: (asked.append(question), real(question))[1]
-    )
-    run.ratios("tasks")
-    run.ratios("episodes")
-    run.summary()
-    assert len(asked) == 1
-    for layer in (0, 2):
-        for head in (0, 1):
-            run.ratios(layers=layer, heads=head)
-    run.ratios("steps")
-    assert len(asked) == 6
-
-
 @pytest.mark.parametrize(
     ("given", "expected"),
     [
@@ -153,10 +128,6 @@ def test_the_last_four_analyses_are_kept(store, monkeypatch):
 def test_keywords_become_settings(given, expected):
     assert settings_from_keywords(**given) == expected
     assert hash(settings_from_keywords(**given)) == hash(expected)
-
-
-def test_keywords_have_the_names_of_the_settings():
-    assert set(SettingKeywords.__annotations__) == {field.name for field in fields(AnalysisSettings)}
 
 
 @pytest.mark.parametrize(
@@ -189,13 +160,6 @@ def test_stores_are_opened_by_path_text_or_several(store, other, tmp_path):
         va.open([store, other])
 
 
-def test_repr_names_stores_policy_and_axes(run, store):
-    text = repr(run)
-    assert text.splitlines()[0] == "OpenStores of 1 store: 4 episodes of 2 tasks (2 solved), 12 replans, suite made_up"
-    for part in (str(store), "UNTRAINED", "layers   0, 2", "joint (39 keys)", ".ratios()"):
-        assert part in text
-
-
 def test_an_empty_store_can_be_opened_and_says_that_it_is_empty(tmp_path):
     run = va.open(write_store(tmp_path / "a.zarr", tasks=()))
     assert run.episodes.height == 0
@@ -204,61 +168,10 @@ def test_an_empty_store_can_be_opened_and_says_that_it_is_empty(tmp_path):
         run.ratios()
 
 
-def test_the_guide_names_every_column(run, other, rerun, replayed, tmp_path):
-    guide = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
-    levels = ("steps", "replans", "episodes", "tasks")
-    tables = [ask(level) for level in levels for ask in (run.ratios, run.masses)]
-    names = ("heads", "heads_groups", "dispersion", "depth", "denoise", "denoise_groups")
-    tables += [*(run.heads(name) for name in names), run.row_metrics(), run.row_metrics("groups")]
-    run_with_norms = va.open(write_store(tmp_path / "a.zarr", contributions=True))
-    tables += [run_with_norms.contributions(), run.sinks(), run.sinks("heads")]
-    tables += [run.objects(name) for name in ("objects", "summary", "times", "pointing", "iou")]
-    tables += [run.words(name) for name in ("summary", "episodes")]
-    tables += [run.time(name) for name in ("course", "closing", "change", "outcomes", "autocorrelation")]
-    tables += [run.compare(other, name) for name in ("differences", "estimates", "pairs", "unpaired")]
-    tables += [run.groups(name) for name in ("groups", "words", "overlaps")]
-    tables += [run.effects(rerun, name) for name in ("episodes", "summary", "rollouts", "rollout_episodes")]
-    tables += [va.open(replayed).deviation(name) for name in ("summary", "dimensions", "attention", "replans")]
-    norms = run.analysis().group_contributions
-    assert norms is not None
-    tables += [norms.cells, norms.groups, run.overlay()]
-    ends = ("_low", "_high", "_episodes")
-    missing = {
-        name for table in tables for name in table.columns if f"`{name}`" not in guide and not name.endswith(ends)
-    }
-    assert missing == set()
-
-
-def test_the_guide_names_every_table_file(store, other, rerun, tmp_path, monkeypatch):
-    guide = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
-    monkeypatch.chdir(tmp_path)
-    for command in ("ratios", "heads", "words", "objects", "time"):
-        assert main([command, str(store), "--no-plots"]) == 0
-    assert main(["groups", str(store), "--no-plots"]) == 0
-    assert main(["compare", f"a={store}", f"b={other}", "--no-plots"]) == 0
-    assert main(["effects", str(store), str(rerun), "--no-plots"]) == 0
-    names = {path.stem for path in tmp_path.rglob("*.parquet")}
-    assert len(names) > 20
-    levels = {name.removesuffix("_groups") for name in names} & {"steps", "replans", "episodes", "tasks"}
-    own = {name for name in names if name.removesuffix("_groups") not in levels}
-    missing = {name for name in own if f"`{name}`" not in guide and f"`{name}.parquet`" not in guide}
-    assert missing == set()
-
-
 def test_a_group_inside_of_a_store_leads_to_the_store(store, capsys):
     for inside in (store / "episodes", store / "episodes" / "task000_episode000"):
         assert main(["verify", str(inside)]) == 2
         assert f"is a group inside of a store; give the folder above, {store}." in capsys.readouterr().err
-
-
-def test_what_was_a_seed_of_intervals_can_be_left_out(store, capsys):
-    assert main([str(store), "--seed", "3"]) == 2
-    assert capsys.readouterr().err == "vla-analyze: Intervals have no random draws any more: leave --seed out.\n"
-
-
-def test_the_description_is_a_page_wide(run):
-    lines = [line for line in run.describe().splitlines() if not line.startswith("Store ")]
-    assert max(map(len, lines)) <= 100
 
 
 def test_the_guides_examples(tmp_path, monkeypatch):

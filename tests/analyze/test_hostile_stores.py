@@ -13,19 +13,14 @@ from typing import Any
 
 import pytest
 
-import vla_attention as va
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.analyze.commands import COMMANDS
 from vla_attention.analyze.parse.command import main as parse
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.example_stores.command import main as example
-from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions, PromptChange
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import SiteLayout, Span
 from vla_attention.schemas.stores.digest import bytes_digest, seal_digest
-from vla_attention.schemas.stores.store_place import check_writable
 from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
 from vla_attention.testing.stores import StoreSpec, rerun_source, reseal, reseal_root, write_store
 
@@ -146,10 +141,6 @@ WORDS: dict[str, tuple[str, ...]] = {
 }
 
 
-def test_every_command_is_tried():
-    assert set(WORDS) == set(COMMANDS)
-
-
 @pytest.mark.drawn
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("command", thorough_except(("ratios", "report", "copy", "verify"), WORDS))
@@ -227,15 +218,6 @@ def test_no_command_writes_into_a_store(original, store, tmp_path, capsys, comma
     assert all_paths(store) == before
 
 
-@pytest.mark.parametrize("words", [("ratios", "--no-cache"), ("groups",), ("report", "--quick", "--no-cache")])
-def test_nothing_is_written_into_a_store_that_is_the_working_directory(store, monkeypatch, capsys, words):
-    monkeypatch.chdir(store / "episodes")
-    before = all_paths(store)
-    assert analyze([words[0], str(store), *words[1:]]) == 2
-    assert f"it is inside of the store {store}" in check_output(capsys)
-    assert all_paths(store) == before
-
-
 @pytest.mark.parametrize("given", [None, "cache"])
 def test_the_cache_is_in_no_store(store, tmp_path, monkeypatch, capsys, given):
     monkeypatch.chdir(store)
@@ -252,28 +234,6 @@ def test_the_cache_is_in_no_store(store, tmp_path, monkeypatch, capsys, given):
     assert analyze([*words, "--no-cache"]) == 0
 
 
-def test_python_and_other_programs_write_into_no_store(store, tmp_path, monkeypatch, capsys):
-    before = all_paths(store)
-    run = va.open(store)
-    for write in (
-        lambda: run.report(store / "page.html", episodes=0),
-        lambda: run.overlay(folder=store / "out"),
-        lambda: check_writable(store / "results", "--output-dir"),
-    ):
-        with pytest.raises(BadArgument, match="is inside of the store"):
-            write()
-    (tmp_path / "results").mkdir()
-    assert analyze([str(store), "--no-plots", "--no-cache", "--output", str(tmp_path / "results")]) == 0
-    check_output(capsys)
-    for option in ("--output", "--output-dir"):
-        with pytest.raises(SystemExit, match="2"):
-            parse(["--results", str(tmp_path / "results"), option, str(store / "x")])
-        assert "is inside of the store" in check_output(capsys)
-    assert example([str(store / "examples")]) == 2
-    assert "is inside of the store" in check_output(capsys)
-    assert all_paths(store) == before
-
-
 @dataclass(frozen=True)
 class HostileSites(SiteStoreSpec):
     """Sites, spans and cameras whose names are markup and a formula."""
@@ -287,6 +247,7 @@ class HostileSites(SiteStoreSpec):
         return tuple(replace(site, name=name, spans=tuple(map(named, site.spans))) for name, site in made)
 
 
+@pytest.mark.thorough
 @pytest.mark.drawn
 @pytest.mark.parametrize(
     "command", thorough_except(("ratios",), sorted(set(WORDS) - {"effects", "objects", "compare", "merge"}))

@@ -24,6 +24,8 @@ from vla_attention.analyze.words.word_study import study_words
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.testing.stores import StoreSpec, write_store
 
+pytestmark = pytest.mark.thorough
+
 #: Large enough that an array or a table with a number for each replan and layer is seen.
 SPEC = StoreSpec(
     replans=64,

@@ -12,8 +12,6 @@ import polars as pl
 import pytest
 
 import vla_attention as va
-from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answers
-from tests.kit.http_ranges import serve
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.show.numbers import format_number
 from vla_attention.example_stores import CUBES
@@ -60,32 +58,3 @@ def test_overlay_prints_and_writes_it(ratios, tmp_path, capsys):
     # Of one layer there is nothing to say.
     assert main([*words, "--layers", "2", "--no-plots"]) == 0
     assert "geometric mean of the layers" not in capsys.readouterr().out
-
-
-def test_the_report_shows_it_below_its_slider(ratios, tmp_path):
-    page = tmp_path / "report.html"
-    assert main(["report", str(CUBES), "--quick", "--episodes", "1", "--task", "0", "--output", str(page)]) == 0
-    shown = re.findall(r"replan (\d+)\b[^\"<]*?, ratio ([0-9.]+)", page.read_text(encoding="utf-8"))
-    found = {int(replan): ratio for replan, ratio in shown}
-    assert found == {replan: format_number(ratio) for replan, ratio in enumerate(ratios)}
-
-
-def test_plots_draw_it(ratios, tmp_path):
-    assert main([str(CUBES), "--task", "0", "--save-viz", "--output", str(tmp_path)]) == 0
-    found = 0
-    for path in tmp_path.rglob("*.csv"):
-        table = pl.read_csv(path)
-        if not {"ratio", "replan", "layer"} <= set(table.columns):
-            continue
-        rows = table.filter(pl.col("layer").cast(pl.String) == "layers_avg", **EPISODE).sort("replan")
-        found += not rows.is_empty()
-        assert rows.is_empty() or rows["ratio"].to_list() == pytest.approx(ratios, rel=1e-6), path
-    assert found >= 2  # the distribution over replans, and the evolution in time
-
-
-@needs_node
-def test_the_page_of_the_viewer_shows_it(ratios, tmp_path):
-    with serve(CUBES.parent) as served:
-        (answer,) = page_answers(tmp_path, [PageQuestion(f"{served.url}/", f"{CUBES.name}/", packed=True)])
-    shown = [float(replan["ratio"][0]) for replan in answer["replans"]]
-    assert shown == pytest.approx(ratios, rel=2e-6)

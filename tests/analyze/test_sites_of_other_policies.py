@@ -13,15 +13,14 @@ from tests.kit.questions import question_about
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.measures.contributions import contribution_table
-from vla_attention.analyze.measures.sinks import SinkRule, search_sinks
 from vla_attention.analyze.measures.steps import measure_episodes, step_tables
 from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions, KeyKnockout
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.root import group_attributes
-from vla_attention.testing import assert_whole, rerun_source
-from vla_attention.testing.site_stores import SiteStoreSpec, key_exists, site_root, write_site_store
+from vla_attention.testing import assert_whole
+from vla_attention.testing.site_stores import write_site_store
 
 KINDS = ("alternating", "split", "growing")
 
@@ -75,13 +74,6 @@ def test_absent_keys_are_never_called_padding(stores, capsys):
     assert "Padding" not in (stores["growing"].parent / "report" / "report.html").read_text()
 
 
-def test_no_key_is_a_sink_of_uniform_attention(tmp_path):
-    path = write_site_store(tmp_path / "a.zarr", kind="growing", spread=0, replans=1)
-    search = search_sinks(question_about(path), SinkRule(factor=1.01))
-    assert search.sinks.is_empty()
-    np.testing.assert_allclose(search.keys["times_uniform"].to_numpy(), 1.0, rtol=2e-3)
-
-
 def test_layers_that_a_site_lacks(stores):
     with pytest.raises(BadArgument, match=r"Layers 0 were not recorded at site 'cross'; recorded blocks: 1, 3; other"):
         question_about(stores["alternating"], site="cross", layers=(0, 1))
@@ -125,20 +117,6 @@ def test_contributions_of_sites_in_different_blocks(stores):
     assert contribution_table(question.selected, question.selection, layers=(0, 2)) is None
 
 
-def test_unknown_outcomes_are_in_no_share_of_solved_episodes(stores, capsys):
-    overall = analyse(question_about(stores["alternating"])).overall
-    known = [
-        episode.attributes.success
-        for episode in open_store(stores["alternating"]).episodes
-        if episode.attributes.success is not None
-    ]
-    assert 0 < len(known) < 6
-    # The mean over tasks of each task's known episodes.
-    assert overall["success_rate"] == pytest.approx(0.5)
-    assert "with a known outcome solved" in " ".join(analyse(question_about(stores["alternating"])).answer)
-    assert "outcomes not known" in " ".join(analyse(question_about(stores["bare"])).answer)
-
-
 #: What each command says of any of the stores.
 SAYS = {
     "": "",
@@ -179,63 +157,9 @@ def test_effects_of_recorded_rollouts(stores, tmp_path, capsys):
     assert pairs["success"].null_count() == 2
 
 
-@pytest.mark.parametrize("state", [True, False])
-def test_effects_of_replays_name_no_gripper(tmp_path, capsys, state):
-    base = write_site_store(tmp_path / "base.zarr", protocol="dataset", dataset_actions=0.5, state=state)
-    knockout = Interventions("without_visual", keys=(KeyKnockout("role:image"),))
-    rerun = write_site_store(
-        tmp_path / "rerun.zarr",
-        protocol="dataset",
-        dataset_actions=0.5,
-        state=state,
-        interventions=knockout,
-        rerun_of=rerun_source(base),
-    )
-    assert analyze(["effects", str(base), str(rerun), "--out", str(tmp_path), "--no-plots"]) == 0
-    episodes = pl.read_parquet(tmp_path / "effects.parquet")
-    assert (episodes["effect"] == 0).all()
-    assert episodes["angle"].is_null().all()
-    assert episodes["gripper_flips"].is_null().all()
-
-
-def test_masses_as_netcdf_where_outcomes_are_not_known(stores, tmp_path, capsys):
-    xarray = pytest.importorskip("xarray")
-    assert analyze(["export", str(stores["alternating"]), "--netcdf", "--output", str(tmp_path)]) == 0
-    (file,) = tmp_path.glob("*.nc")
-    with xarray.open_dataset(file) as dataset:
-        assert np.isnan(dataset["success"].to_numpy()).sum() == 2 * 4
-
-
-def test_objects_need_coverage(stores, tmp_path, capsys):
-    assert analyze(["objects", str(stores["alternating"]), "--out", str(tmp_path)]) == 2
-    said = capsys.readouterr().err
-    assert "no selected episode has object coverage" in said
-    assert "va.record from the masks or coverage that replan() is given, and replays of data sets have none" in said
-
-
-def test_success_is_not_compared_where_it_is_not_known(stores, tmp_path, capsys):
-    assert analyze(["time", str(stores["bare"]), "--out", str(tmp_path), "--no-plots"]) == 0
-    text = " ".join((tmp_path / "summary.txt").read_text().split())
-    assert "Not compared: the outcomes of the episodes are not known." in text
-
-
-def test_no_results_file_without_outcomes(stores, tmp_path, capsys):
-    assert analyze([str(stores["growing"]), "--out", str(tmp_path), "--no-plots"]) == 0
-    assert not list(tmp_path.glob("attention_ratio_results_*.json"))
-    assert "No results file in the published format" in (tmp_path / "summary.txt").read_text()
-
-
 def test_runs_are_compared_episode_by_episode_where_the_first_state_is_not_known(stores, tmp_path, capsys):
     other = write_site_store(tmp_path / "other.zarr", kind="growing", outcome="some", spread=0.5)
     assert analyze(["compare", str(stores["growing"]), str(other), "--out", str(tmp_path), "--no-plots"]) == 0
     pairs = pl.read_parquet(tmp_path / "pairs.parquet")
     assert (pairs["episode_first"] == pairs["episode_other"]).all()
     assert pairs["episode_first"].n_unique() == 3
-
-
-def test_the_kit_gives_no_mass_to_keys_that_do_not_exist():
-    spec = SiteStoreSpec(kind="growing")
-    (site,) = site_root(spec).sites
-    assert site.growing_span is not None
-    exists = key_exists(site, np.full(site.num_keys, 8, dtype=np.uint8), 7)
-    assert exists[:, site.growing_span.start :].sum(axis=1).tolist() == [0, 1, 2, 3, 4, 5, 6]

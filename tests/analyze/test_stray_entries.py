@@ -10,7 +10,6 @@ import pytest
 from tests.analyze.test_hostile_stores import WORDS
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.errors import Note
 from vla_attention.schemas.interventions import Interventions, NoiseChange
 from vla_attention.schemas.stores.reader import open_store
@@ -77,13 +76,6 @@ def test_a_command_names_them_and_goes_on(stores, tmp_path, monkeypatch, capsys,
         (line,) = [line for line in said.splitlines() if f"Ignored in {path}, " in line]
         assert line.startswith(f"vla-analyze {command}: Ignored in ")
         assert NAMED in line
-
-
-def test_capture_status_names_them(store, capsys):
-    assert capture(["status", str(store)]) == 0
-    said = capsys.readouterr()
-    assert said.err.count(NAMED) == 1
-    assert "4 episodes of 2 tasks" in said.out
 
 
 def test_the_library_warns(store):

@@ -6,17 +6,16 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
-from numpy.typing import NDArray
 
 import vla_attention as va
-from tests.kit.attacks import attacks, encode_again, files_of, first, two
+from tests.kit.attacks import attacks, files_of, first, two
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.cache import fingerprints, remembered
 from vla_attention.analyze.cache.housekeeping import kept_files
@@ -26,9 +25,8 @@ from vla_attention.analyze.measures.question_settings import settings_from_keywo
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.measures.steps import measure_episodes
 from vla_attention.capture.store import codecs as store_codecs
-from vla_attention.schemas.groupings.resolve import EmptyGroup
-from vla_attention.schemas.stores.reader import StoredEpisode, open_store
-from vla_attention.schemas.stores.store_format import STORE_VERSION, CorruptEpisode
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import CorruptEpisode
 from vla_attention.testing.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=9, contributions=True, prompts="same")
@@ -126,15 +124,6 @@ def test_a_second_analysis_measures_nothing_and_gives_the_same_bits(cache, origi
     assert len(measured) == 4
 
 
-def test_what_does_not_change_masses_needs_no_new_ones(cache, originals, measured):
-    tables(originals[0], groups={"a": "role:image", "b": "word:bowl"}, ratio="a/b")
-    measured.clear()
-    tables(originals[0], groups={"a": "role:image", "b": "word:bowl"}, ratio="b/a")
-    tables(originals[0], groups={"a": "role:image", "b": "word:bowl"}, ratio="b/a", intervals="these-tasks")
-    tables(originals[0], groups={"a": "role:image", "b": "word:bowl"}, tasks=0)
-    assert measured == []
-
-
 def test_one_more_episode_costs_one_episode(cache, stores, measured, uncached, tmp_path):
     aside = two(stores[0])[1].rename(tmp_path / "aside")
     tables(stores[0], **WORDS)
@@ -166,39 +155,6 @@ def test_masses_without_some_keys_are_kept_apart(cache, originals, measured):
     assert len(measured) == 12
     assert not any(np.array_equal(found[()][0], found[other][0]) for other in ((0, 1), (0, 2)))
     assert not np.array_equal(found[0, 1][0], found[0, 2][0])
-
-
-ROWS: dict[str, Callable[[Path], list[pl.DataFrame]]] = {
-    "words": lambda path: [va.open(path).words(), va.open(path).words("episodes", per_head=True)],
-    "heads": lambda path: [va.open(path).heads(), va.open(path).row_metrics()],
-    "sinks": lambda path: [va.open(path).sinks()],
-    "sinks of words": lambda path: [va.open(path).row_metrics(groups={"bowl": "word:bowl", "rest": "*"})],
-}
-
-
-@pytest.mark.parametrize("name", ROWS)
-def test_rows_are_read_once(cache, stores, monkeypatch, name):
-    """The other questions that read rows: the same bits, without a row, and not of a damaged store."""
-    with monkeypatch.context() as patch:
-        patch.setenv("VLA_CACHE", "off")
-        expected = ROWS[name](stores[0])
-    for question in ROWS.values():
-        assert question is not ROWS[name] or same(question(stores[0]), expected)
-    read: list[str] = []
-    read_layers = StoredEpisode.read_layers
-
-    def watched(self: StoredEpisode, array: str, places: Iterable[tuple[int, int]]) -> Iterator[NDArray[np.float32]]:
-        if array.endswith("/rows"):
-            read.append(array)
-        return read_layers(self, array, places)
-
-    monkeypatch.setattr(StoredEpisode, "read_layers", watched)
-    assert same(ROWS[name](stores[0]), expected)
-    assert read == []
-    encode_again(first(stores[0]), "joint/rows")
-    with pytest.raises(CorruptEpisode, match="task000_episode000"):
-        ROWS[name](stores[0])
-    assert read
 
 
 FAST = (
@@ -249,17 +205,6 @@ def test_a_byte_that_changes_in_place_is_noticed_whatever_the_dates_say(cache, s
         tables(stores[0], **question)
 
 
-def test_a_store_that_stays_open_is_not_answered_from_the_cache_when_files_change(cache, stores):
-    run = va.open(stores[0])
-    expected = run.ratios("steps", **SPANS)
-    again = va.open(stores[0])
-    file = files_of(first(stores[0]), "joint/atoms")[0]
-    file.write_bytes(file.read_bytes()[:-1] + b"x")
-    with pytest.raises(CorruptEpisode):
-        again.ratios("steps", **SPANS)
-    assert run.ratios("steps", **SPANS).equals(expected)  # its own answer, made before
-
-
 def test_an_episode_that_was_captured_again_has_its_new_numbers(cache, stores, measured, uncached, tmp_path):
     tables(stores[0], **SPANS)
     episode = first(stores[0])
@@ -271,49 +216,6 @@ def test_an_episode_that_was_captured_again_has_its_new_numbers(cache, stores, m
     assert measured == [episode.name]
     assert same(found, uncached(stores[0], **SPANS))
     assert found[1].filter(task_id=0, episode_index=0)["success"].to_list()[0] is True
-
-
-def test_files_that_changed_a_moment_ago_are_not_kept(cache, stores, measured, monkeypatch):
-    """Within a tick of the file system's clock, a second change would not be seen."""
-    monkeypatch.setattr(fingerprints, "SETTLED_SECONDS", 1e9)
-    tables(stores[0], **SPANS)
-    tables(stores[0], **SPANS)
-    assert len(measured) == 8
-    assert kept_files(cache) == []
-
-
-def test_a_moved_store_is_known_and_a_copied_one_is_measured(cache, stores, measured, tmp_path):
-    tables(stores[0], **SPANS)
-    measured.clear()
-    moved = stores[0].rename(tmp_path / "moved.zarr")
-    tables(moved, **SPANS)
-    assert measured == []
-    shutil.copytree(moved, tmp_path / "copied.zarr")
-    tables(tmp_path / "copied.zarr", **SPANS)  # copying may damage files
-    assert len(measured) == 4
-
-
-def test_the_state_of_a_zip_is_that_of_the_file(tmp_path, monkeypatch):
-    monkeypatch.setattr(fingerprints, "SETTLED_SECONDS", 0.0)
-    path = tmp_path / "task000_episode000.zip"
-    path.write_bytes(b"some bytes")
-    episode = StoredEpisode(path, path.stem, "", STORE_VERSION)
-    state = fingerprints.file_state(episode)
-    assert state == fingerprints.file_state(episode) is not None
-    before = path.stat()
-    while path.stat().st_ctime_ns == before.st_ctime_ns:  # the clock of file systems may tick every 4 ms only
-        path.write_bytes(b"same bytes")
-        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
-    assert fingerprints.file_state(episode) not in (state, None)
-    monkeypatch.setattr(fingerprints, "SETTLED_SECONDS", 3600.0)
-    assert fingerprints.file_state(episode) is None
-
-
-def test_an_empty_group_is_refused_from_the_cache_too(cache, stores):
-    groups = {"rest": "*", "proprio": "role:proprio & role:image"}
-    for _ in range(2):
-        with pytest.raises(EmptyGroup, match="proprio"):
-            tables(stores[0], groups=groups)
 
 
 def test_a_cache_that_cannot_be_written_changes_nothing(stores, tmp_path, monkeypatch, uncached):
@@ -349,6 +251,7 @@ run.ratios("steps", grouping="cameras").write_parquet(sys.argv[2])
 """
 
 
+@pytest.mark.thorough
 def test_processes_that_fill_one_cache_at_the_same_time_agree(cache, stores, measured, tmp_path):
     outputs = [tmp_path / f"{i}.parquet" for i in range(3)]
     running = [

@@ -11,7 +11,6 @@ from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.compare import runs as runs_module
 from vla_attention.analyze.compare.comparison import compare
 from vla_attention.analyze.compare.runs import (
-    FIELDS,
     MixedPolicies,
     RunsDiffer,
     check_comparable,
@@ -21,8 +20,6 @@ from vla_attention.analyze.compare.runs import (
 from vla_attention.analyze.compare.text import comparison_sections
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.show.answer import text_of
-from vla_attention.schemas.errors import BadArgument, UnknownName
-from vla_attention.schemas.interventions import Interventions, KeyKnockout, PromptChange
 from vla_attention.schemas.layout import Role
 from vla_attention.testing.stores import StoreSpec, rerun_source, write_store
 
@@ -107,16 +104,6 @@ def test_paired_differences_are_those_of_the_planted_pairs(stores):
     assert found.unpaired.is_empty()
 
 
-def test_pairing_is_far_sharper_than_comparing_means(stores):
-    widths = []
-    for other, allowed in (("higher", ()), ("goal", ("suite",))):
-        found = compare(opened(stores, "base", other, allowed=allowed), allowed)
-        row = one(found.differences, scope="all", layer="layers_avg", quantity="log2_ratio")
-        widths.append(row["high"] - row["low"])
-    # The same planted difference; scenes differ fifteen times as much as runs of one scene do.
-    assert widths[1] > 8 * widths[0]
-
-
 def test_with_another_seed_allowed_the_initial_state_alone_makes_a_pair(stores):
     found = compare(opened(stores, "base", "reseeded", allowed=("seed",)), ("seed",))
     row = one(found.differences, scope="all", layer="layers_avg", quantity="log2_ratio")
@@ -139,19 +126,6 @@ def test_episodes_without_a_partner_are_counted_and_named(stores):
     assert "task000_episode000" in text
     assert "task001_episode004" in text
     assert max(map(len, text.splitlines())) <= 101
-
-
-def test_three_runs_are_each_compared_with_the_first(stores):
-    runs = opened(stores, "base", "higher", "lower")
-    found = compare(runs)
-    assert found.differences["run"].unique(maintain_order=True).to_list() == ["higher", "lower"]
-    lower = one(found.differences, run="lower", scope="all", layer="layers_avg", quantity="log2_ratio")
-    assert lower["high"] < 0 < -lower["low"]
-    # Each run's own estimate is the plain geometric mean over its episodes.
-    row = one(found.estimates, run="lower", layer="layers_avg", quantity="ratio")
-    logs = [log_ratio(2, task, episode) for task in (1, 2, 5) for episode in range(5)]
-    assert row["value"] == pytest.approx(np.exp(np.mean(logs)), rel=1e-4)
-    assert row["num_episodes"] == 15
 
 
 def test_nothing_that_pairs_is_compared_unpaired_and_said(stores):
@@ -239,28 +213,6 @@ def test_every_field_that_must_agree_is_named_and_can_be_allowed(changed, field)
     assert field in notes[0]
 
 
-def test_weights_and_their_names_may_differ(changed):
-    policy = {"name": "b", "checkpoint": "gs://b", "checkpoint_format": "x", "digest": "1" * 64, "untrained": False}
-    assert check_comparable(changed(lambda root: replace(root, policy=replace(root.policy, **policy))), ()) == []
-
-
-def test_other_software_is_noted_and_not_refused(changed):
-    found = compare(changed(lambda root: replace(root, provenance={"numpy": "0.1"})))
-    assert [note for note in found.notes if "numpy" in note and "0.1" in note]
-
-
-def test_mixed_policies_without_a_common_site_cannot_be_allowed(changed):
-    def as_cosmos(root):
-        sites = (replace(root.sites[0], name="self"), replace(root.sites[0], name="cross"))
-        return replace(root, policy=replace(root.policy, family="cosmos"), sites=sites)
-
-    for allowed in ((), ("family",)):
-        with pytest.raises(
-            MixedPolicies, match=r"made-up and cosmos, which have no site in common \(joint; self, cross\)"
-        ):
-            changed(as_cosmos, allowed)
-
-
 def test_layers_that_only_one_run_recorded_are_refused_until_chosen(stores):
     with pytest.raises(RunsDiffer, match=r"layers: 0, 1 and 1.*--layers"):
         compare(opened(stores, "base", "one_layer"))
@@ -292,31 +244,6 @@ def test_mistakes_are_one_sentence(stores, words, said, capsys):
     assert len(error.strip().splitlines()) == 1
 
 
-def test_an_unknown_field_names_all_fields(stores):
-    with pytest.raises(UnknownName) as caught:
-        opened(stores, "base", "higher", allowed=("colour",))
-    assert all(field in str(caught.value) for field in FIELDS)
-
-
-def test_stores_of_one_file_name_are_named_with_their_folders(tmp_path):
-    paths = [tmp_path / folder / "libero_10.zarr" for folder in ("base", "tuned")] + [
-        tmp_path / "tuned" / "libero_goal.zarr"
-    ]
-    assert [run.name for run in parse_runs([str(path) for path in paths])] == [
-        "base/libero_10",
-        "tuned/libero_10",
-        "libero_goal",
-    ]
-
-
-def test_a_path_that_holds_an_equals_sign_is_a_path(stores, tmp_path):
-    path = tmp_path / "seed=8.zarr"
-    path.mkdir()
-    assert [run.name for run in parse_runs([str(stores["base"]), str(path)])] == ["base", "seed=8"]
-    with pytest.raises(BadArgument):
-        parse_runs([str(path)])
-
-
 @pytest.mark.drawn
 def test_the_command_writes_tables_and_pictures(stores, tmp_path, capsys):
     out = tmp_path / "out"
@@ -341,13 +268,6 @@ def test_the_command_writes_tables_and_pictures(stores, tmp_path, capsys):
     for stem in ("forest", "paired_differences_new", "paired_differences_lower"):
         for kind in ("png", "pdf", "csv"):
             assert (out / f"{stem}.{kind}").stat().st_size > 0
-
-
-def test_without_a_ratio_fractions_are_compared(stores, tmp_path):
-    words = ["--group", "base=camera:base_0_rgb", "--group", "rest=*", "--output", str(tmp_path)]
-    assert main(["compare", str(stores["base"]), str(stores["higher"]), *words]) == 0
-    table = pl.read_parquet(tmp_path / "comparison.parquet")
-    assert table["quantity"].unique(maintain_order=True).to_list() == ["base_fraction", "rest_fraction", "success"]
 
 
 def test_a_rerun_pairs_at_every_replan(stores, tmp_path):
@@ -377,21 +297,6 @@ def test_a_rerun_pairs_at_every_replan(stores, tmp_path):
     assert found.reruns == ("rerun",)
 
 
-def test_a_rerun_without_any_ratio_has_its_fractions_compared(stores, tmp_path):
-    def plant(task, episode, tokens, rows):
-        rows = planting(0)(task, episode, tokens, rows) * (tokens.key_role != Role.IMAGE)[:, None, None, None, None]
-        return rows / rows.sum(axis=-1, keepdims=True)
-
-    knockout = Interventions("without_visual", keys=(KeyKnockout("role:image"),))
-    spec = replace(PLAIN, plant_rows=plant, rerun_of=rerun_source(stores["base"]), interventions=knockout)
-    known = {**stores, "rerun": write_store(tmp_path / "rerun.zarr", spec=spec)}
-    found = compare(opened(known, "base", "rerun"))
-    row = one(found.differences, scope="all", layer="layers_avg", quantity="visual_fraction")
-    assert (row["mean_other"], row["num_pairs"]) == (0.0, 16)
-    text = " ".join(text_of(comparison_sections(found)).split())
-    assert "every replan is a pair. It changed: the keys of 'role:image' knocked out for the action queries." in text
-
-
 def test_a_rerun_with_other_replans_is_refused(stores, tmp_path):
     spec = replace(PLAIN, plant_rows=planting(1), rerun_of=rerun_source(stores["base"]), replans=1, tasks=(0,))
     known = {**stores, "rerun": write_store(tmp_path / "rerun.zarr", spec=spec)}
@@ -399,13 +304,6 @@ def test_a_rerun_with_other_replans_is_refused(stores, tmp_path):
         RunsDiffer, match=r"task000_episode000, .* of the rerun rerun has other replans than in its base"
     ):
         compare(opened(known, "base", "rerun", allowed=("max_steps",)), ("max_steps",))
-
-
-def test_other_interventions_are_noted(stores, tmp_path):
-    spec = replace(PLAIN, plant_rows=planting(1), interventions=Interventions("empty", prompt=PromptChange("empty")))
-    known = {**stores, "empty": write_store(tmp_path / "empty.zarr", spec=spec)}
-    found = compare(opened(known, "base", "empty"))
-    assert "base and empty differ in their interventions (none; the instruction empty)." in found.notes
 
 
 def test_differences_over_tasks_are_by_families(tmp_path):

@@ -60,22 +60,10 @@ def test_the_differences_are_those_of_the_two_commands(stores):
         assert row["paired"]
 
 
+@pytest.mark.thorough
 def test_the_planted_word_is_named_and_nothing_else(stores):
     comparison = compared(stores, "base", "other")
     shown = comparison.effects.filter(scope="all").sort("q", nulls_last=True)
     assert (shown["item"][0], shown["reader"][0]) == (f"'{FIRST}'", "total")
     text = text_of(comparison_sections(comparison))
     assert f"'{FIRST}'" in text.split("EFFECTS  without it")[1].splitlines()[2]
-
-
-def test_where_a_run_recorded_none_a_note_says_so(stores):
-    comparison = compared(stores, "base", "plain")
-    assert comparison.effects.is_empty()
-    assert "effects are not compared: plain recorded none." in comparison.notes
-    assert "EFFECTS" not in text_of(comparison_sections(comparison))
-
-
-def test_runs_of_other_seeds_are_compared_by_their_means(stores):
-    comparison = compared(stores, "base", "elsewhere", allowed=("seed",))
-    (row,) = comparison.effects.filter(scope="all", item=f"'{FIRST}'", reader="total").to_dicts()
-    assert row["difference"] > 0.3 * row["mean_first"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from pathlib import Path
 
@@ -11,9 +10,7 @@ import numpy as np
 import pytest
 
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.analyze.copy.copying import PARTS, check_parts, copy_store, part_sizes
-from vla_attention.schemas.errors import BadArgument, UnknownName
-from vla_attention.schemas.stores.durable_files import lock_for_writing
+from vla_attention.analyze.copy.copying import PARTS, copy_store, part_sizes
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode, RunMismatch, StoreError
 from vla_attention.schemas.stores.verify import verify_store
@@ -73,27 +70,6 @@ def test_a_copy_verifies_and_holds_the_same_numbers(original, tmp_path, without)
         assert all_bytes(tmp_path / "b.zarr") == before
 
 
-def test_the_copy_lists_the_parts_it_lacks(original, tmp_path):
-    copy_store(open_store(original), tmp_path / "b.zarr", ("frames",))
-    root = open_store(tmp_path / "b.zarr").attributes
-    assert root.provenance["copied_without"] == "frames"
-    assert root.recording.frames is False
-    assert root.recording.contributions is True
-    copy_store(open_store(tmp_path / "b.zarr"), tmp_path / "c.zarr", ("contributions",))
-    last = open_store(tmp_path / "c.zarr").attributes
-    assert last.provenance["copied_without"] == "frames, contributions"
-    assert last.provenance["copied_from"] == root.provenance["copied_from"]
-    assert verify_store(open_store(tmp_path / "c.zarr")) == []
-
-
-def test_part_sizes_add_up_to_the_episodes(original):
-    episodes = sum(file.stat().st_size for file in (original / "episodes").rglob("*") if file.is_file())
-    outside = (original / "episodes/zarr.json").stat().st_size
-    sizes = part_sizes(open_store(original))
-    assert sum(sizes.values()) == episodes - outside
-    assert all(sizes[name] > 0 for name in PARTS)
-
-
 def test_a_copy_is_brought_up_to_date(tmp_path):
     path = write_store(tmp_path / "a.zarr", spec=SPEC, episodes=1)
     first = copy_store(open_store(path), tmp_path / "b.zarr", ("frames",))
@@ -122,14 +98,6 @@ def test_an_episode_that_was_recorded_again_is_not_taken_for_the_copied_one(tmp_
     assert "task000_episode001 in it is not what" in said
     assert said.count("\n") == 1
     assert all_bytes(target) == before
-
-
-def test_a_copy_with_a_damaged_seal_is_not_continued(original, tmp_path, capsys):
-    assert analyze(["copy", str(original), str(tmp_path / "b.zarr")]) == 0
-    seal = tmp_path / "b.zarr/episodes/task000_episode000/seal/zarr.json"
-    seal.write_bytes(seal.read_bytes().replace(b'"', b" ", 1))
-    assert analyze(["copy", str(original), str(tmp_path / "b.zarr")]) == 2
-    assert f"Cannot continue the copy {tmp_path}/b.zarr: Episode task000_episode000" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("file", ["zarr.json", "joint/rows/zarr.json", "seal/zarr.json"])
@@ -206,12 +174,6 @@ def test_command_line(original, tmp_path, capsys):
     assert not (tmp_path / "x.zarr").exists()
 
 
-def test_parts_are_checked():
-    assert check_parts(["objects", "frames", "objects"]) == ("frames", "objects")
-    with pytest.raises(UnknownName):
-        check_parts(["rows"])
-
-
 def smuggled(episode: Path) -> None:
     (episode / "payload.sh").write_text("rm -rf ~")
     reseal(episode)
@@ -278,36 +240,3 @@ def test_a_copy_has_nothing_but_what_the_format_names(original, tmp_path, packed
     assert set(copied) == set(expected)
     assert not any(b"rm -rf" in content or content == b"mine" for content in copied.values())
     assert verify_store(open_store(tmp_path / "b.zarr")) == []
-
-
-@pytest.mark.parametrize("change", [Path.unlink, lambda file: file.write_text("{")])
-def test_a_lost_group_of_episodes_is_written_anew(original, tmp_path, change):
-    path = tmp_path / "a.zarr"
-    shutil.copytree(original, path)
-    change(path / "episodes/zarr.json")
-    copy_store(open_store(path), tmp_path / "b.zarr", ())
-    assert verify_store(open_store(tmp_path / "b.zarr")) == []
-    assert json.loads((tmp_path / "b.zarr/episodes/zarr.json").read_text())["node_type"] == "group"
-
-
-@pytest.mark.parametrize("packing", [True, False])
-def test_a_store_that_is_being_packed_is_no_target(original, tmp_path, packing):
-    """Neither before its index is there; and nobody packs where folders are being written."""
-    target = tmp_path / "b.zarr"
-    store = open_store(original)
-    copy_store(store, target, ())
-    for folder in (target / "episodes").glob("task*"):
-        shutil.rmtree(folder)
-    lock = lock_for_writing(target, packing=packing)
-    try:
-        with pytest.raises(BadArgument, match=f"another copy is {'packing' if packing else 'writing'} into it"):
-            copy_store(store, target, (), packed=not packing)
-        if not packing:
-            assert copy_store(store, target, ()).added == 2
-        assert not list(tmp_path.glob("*.partial"))
-    finally:
-        os.close(lock)
-    if packing:
-        assert copy_store(store, target, (), packed=True).added == 2
-        with pytest.raises(StoreError, match="is packed"):
-            copy_store(store, target, ())

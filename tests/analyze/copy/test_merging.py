@@ -79,12 +79,6 @@ def test_the_merged_store_is_the_one_that_one_capture_writes(original, parts, tm
     assert_whole(tmp_path / "c.zarr")
 
 
-def test_packed_stores_are_merged_too(original, parts, tmp_path):
-    copy_store(open_store(parts[0]), tmp_path / "packed.zarr", (), packed=True)
-    merge_stores([open_store(tmp_path / "packed.zarr"), open_store(parts[1])], tmp_path / "c.zarr")
-    assert episode_bytes(tmp_path / "c.zarr") == episode_bytes(original)
-
-
 def test_files_are_copied_where_there_are_no_hard_links(original, parts, tmp_path, monkeypatch):
     def no_links(*_: object, **__: object) -> None:
         raise OSError(errno.EXDEV, "Invalid cross-device link")
@@ -113,15 +107,6 @@ def test_equal_episodes_are_refused_by_name(original, parts, tmp_path, capsys):
     said = refused(capsys, parts[0], parts[1], original, "-o", tmp_path / "c.zarr")
     assert f"{parts[0]} and {original} hold the same episodes: task000_episode000, task000_episode001." in said
     assert "hold the same episodes" in refused(capsys, parts[0], parts[0], "-o", tmp_path / "c.zarr")
-
-
-def test_places_that_cannot_be_merged_into(parts, tmp_path, capsys):
-    assert "a name that ends with '.zarr'" in refused(capsys, *parts, "-o", tmp_path / "c")
-    assert "it exists already" in refused(capsys, *parts, "-o", parts[0])
-    (tmp_path / "link.zarr").symlink_to(tmp_path / "nowhere")
-    assert "it exists already" in refused(capsys, *parts, "-o", tmp_path / "link.zarr")
-    (tmp_path / "file").write_text("")
-    assert "Cannot merge into" in refused(capsys, *parts, "-o", tmp_path / "file/c.zarr")
 
 
 def flipped(episode: Path) -> None:
@@ -166,25 +151,3 @@ def test_damage_is_named_and_nothing_is_left(parts, tmp_path, capsys, damage, pr
     assert problem in said
     assert "task001_episode000" in said
     assert sorted(path.name for path in tmp_path.iterdir()) == before
-
-
-def test_foreign_files_stay_behind(original, parts, tmp_path):
-    (parts[0] / "episodes/task000_episode000/.DS_Store").write_text("")
-    (parts[0] / "notes.txt").write_text("")
-    merge_stores([open_store(part) for part in parts], tmp_path / "c.zarr")
-    assert episode_bytes(tmp_path / "c.zarr") == episode_bytes(original)
-    assert sorted(path.name for path in (tmp_path / "c.zarr").iterdir()) == ["episodes", "zarr.json"]
-
-
-def test_a_packed_store_can_be_made(parts, original, tmp_path, capsys):
-    assert analyze(["copy", *map(str, parts), "-o", str(tmp_path / "all.zarr"), "--packed"]) == 0
-    said = capsys.readouterr().out
-    assert ": 4 episodes (2 of " in said
-    assert "shared" not in said
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zarr", "all.zarr", "b.zarr"]
-    merged = open_store(tmp_path / "all.zarr")
-    assert_whole(tmp_path / "all.zarr")
-    assert len(list((tmp_path / "all.zarr").glob("episodes/*/*.zip"))) == 4
-    assert merged.attributes.provenance["merged_from"] == "a.zarr (2 episodes), b.zarr (2 episodes)"
-    copy_store(merged, tmp_path / "folders.zarr", ())
-    assert episode_bytes(tmp_path / "folders.zarr") == episode_bytes(original)

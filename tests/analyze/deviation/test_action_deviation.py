@@ -2,9 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import stats
 
-from vla_attention.analyze.deviation.deviation_study import rank_correlation, root_mean_square, scaled_deviation
+from vla_attention.analyze.deviation.deviation_study import root_mean_square, scaled_deviation
 
 
 def test_steps_that_only_one_side_has_are_not_compared():
@@ -17,18 +16,3 @@ def test_steps_that_only_one_side_has_are_not_compared():
     assert np.isnan(found[..., 1]).all()
     assert root_mean_square(found, axis=(1, 2)) == pytest.approx([np.sqrt(5 / 3), 4.0])
     assert np.isnan(root_mean_square(found[1, 1:], axis=-1)).all()
-
-
-def test_rank_correlation_is_scipys():
-    generator = np.random.default_rng(0)
-    for _ in range(20):
-        x, y = generator.integers(0, 5, (2, 12)).astype(float)
-        x[generator.integers(12)] = np.nan
-        there = np.isfinite(x)
-        expected = stats.spearmanr(x[there], y[there]).statistic
-        assert rank_correlation(x, y) == pytest.approx(expected, abs=1e-12)
-
-
-def test_rank_correlation_that_is_not_defined():
-    assert np.isnan(rank_correlation(np.arange(3.0), np.arange(3.0)))
-    assert np.isnan(rank_correlation(np.ones(5), np.arange(5.0)))

@@ -12,7 +12,6 @@ import zarr
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.deviation.deviation_study import study_deviation
-from vla_attention.schemas.errors import BadArgument
 from vla_attention.testing.site_stores import write_site_store
 
 
@@ -34,12 +33,6 @@ def raw(store: Path) -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
 def spread_of(episodes: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray:
     steps = [chunk[:n] for _, data, counts in episodes.values() for chunk, n in zip(data, counts, strict=True)]
     return np.concatenate(steps).std(axis=0)
-
-
-def test_the_writer_counts_the_steps_that_the_data_set_has(store):
-    for _, data, counts in raw(store).values():
-        assert counts.tolist() == [5] * 5 + [2]
-        assert (data[-1, 2:] == 0).all()
 
 
 def test_replans_dimensions_and_phases_are_those_of_the_raw_arrays(store):
@@ -75,27 +68,7 @@ def test_a_policy_of_the_mean_action_is_one_spread_away(tmp_path):
     assert study.overall["chunk"] == pytest.approx(1 / np.sqrt(2), rel=0.1)
 
 
-def test_correlations_are_taken_within_episodes(store):
-    study = study_deviation(question_about(store))
-    pairs = set(study.correlations.select("quantity", "measure").iter_rows())
-    assert {("ratio", "first"), ("visual", "chunk")} <= pairs
-    assert (study.correlations["correlation_episodes"] == 6).all()
-    assert study.correlations["correlation"].abs().max() < 0.9
-
-
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
-        ({"dataset_actions": None}, "holds no actions of a data set to compare the policy's with"),
-        ({"actions": False}, "holds no actions of the policy, only those of the data set"),
-    ],
-)
-def test_stores_without_one_of_the_two(tmp_path, changes, says):
-    path = write_site_store(tmp_path / "a.zarr", **{"dataset_actions": 0.5} | changes)
-    with pytest.raises(BadArgument, match=says):
-        study_deviation(question_about(path))
-
-
+@pytest.mark.thorough
 @pytest.mark.drawn
 def test_the_command_and_the_section_of_the_report(store, tmp_path, capsys):
     assert analyze(["deviation", str(store), "--out", str(tmp_path)]) == 0

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from vla_attention.analyze.effects.conditions import Condition, GroupOfKeys, Kind, Place, group_of, kind_of
+from vla_attention.analyze.effects.conditions import Condition, Kind, kind_of
 from vla_attention.schemas.interventions import (
     AttentionScale,
-    AttentionUniform,
     ImageChange,
     Interventions,
     KeyKnockout,
@@ -39,23 +38,6 @@ def condition(name: str, *keys: KeyKnockout, **more) -> Condition:
 )
 def test_kinds(interventions, kind):
     assert kind_of(interventions) == kind
-
-
-def test_groups_hold_selectors_and_places():
-    both = Interventions(keys=(KeyKnockout("word:red", layers=(1, 2)), KeyKnockout("word:cube", layers=(1, 2))))
-    assert group_of(both) == GroupOfKeys(("word:red", "word:cube"), Place((1, 2)))
-    apart = Interventions(keys=(KeyKnockout("word:red", layers=(1,)), KeyKnockout("word:cube", layers=(2,))))
-    assert group_of(apart) is None
-    assert group_of(Interventions(attention=(AttentionUniform("role:image", heads=(0,)),))).place.heads == (0,)
-    assert group_of(Interventions(prompt=PromptChange("empty"))) is None
-
-
-def test_a_control_is_alike_in_all_but_the_seed():
-    without = condition("without_visual", KeyKnockout("role:image", layers=(1,)))
-    assert condition("r", KeyKnockout("role:image", layers=(1,), random_seed=4)).is_control_of(without)
-    assert not condition("r", KeyKnockout("role:image", random_seed=4)).is_control_of(without)
-    assert not condition("r", KeyKnockout("role:image", layers=(1,), keep=True, random_seed=4)).is_control_of(without)
-    assert not without.is_control_of(without)
 
 
 def test_the_reverse_keeps_what_the_other_knocked_out():

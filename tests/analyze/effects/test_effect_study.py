@@ -23,10 +23,8 @@ from tests.kit.reruns import (
     write_series,
 )
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.effects.action_changes import action_spread
 from vla_attention.analyze.effects.effect_study import study_effects
-from vla_attention.analyze.effects.group_rows import group_rows
-from vla_attention.analyze.effects.paired_replans import BaseEpisode, changes_of
+from vla_attention.analyze.effects.paired_replans import BaseEpisode
 from vla_attention.analyze.effects.text import effects_sections
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.show.answer import text_of
@@ -143,46 +141,6 @@ def test_attention_is_read_where_it_was_changed(folder, tmp_path):
     found = study.episodes.filter(task_id=0, episode_index=0, phase="all")
     assert found["mass"].item() == pytest.approx(np.mean(mass), rel=1e-4)
     assert found["norm"].item() is None  # a word is a part of a segment
-
-
-def test_a_selector_that_the_base_does_not_know_has_no_attention(folder, tmp_path):
-    planted = PlantedRerun(knockout("without_cup", "word:cup"), 0.3)
-    write_rerun(tmp_path / "cup.zarr", folder / "base.zarr", planted)
-    study = study_effects(folder / "base.zarr", [tmp_path / "cup.zarr"], AnalysisSettings())
-    assert study.episodes["mass"].null_count() == study.episodes.height
-    assert "no attention beside 'word:cup'" in text_of(effects_sections(study))
-
-
-def test_groups_stand_with_what_keeps_them(study):
-    rows = group_rows(study)
-    assert [row.name for row in rows] == ["visual", "linguistic", "state"]
-    assert [row.only["condition"] if row.only else None for row in rows] == ["only_visual", "only_linguistic", None]
-
-
-def test_the_text_answers_and_names_its_floors(study):
-    text = " ".join(text_of(effects_sections(study)).split())
-    assert "Without visual the action changes by 1.2" in text
-    assert "with linguistic alone by 1.0" in text
-    assert "Attention in the same replans: the ratio visual / linguistic is" in text
-    assert "Of 6 conditions, 5 show an effect beyond the noise" in text
-    assert max(map(len, text_of(effects_sections(study)).splitlines())) <= 100
-
-
-def test_without_a_noise_rerun_the_text_says_what_is_missing(folder):
-    study = study_effects(folder / "base.zarr", [folder / "series" / "without_visual.zarr"], AnalysisSettings())
-    text = " ".join(text_of(effects_sections(study)).split())
-    assert "nobody knows how much of an effect another noise would give" in text
-    assert "--noise-seed 1" in text
-    assert row_of(study, "without_visual")["over_noise"] is None
-
-
-def test_an_effect_within_the_noise_is_called_so(folder, tmp_path):
-    """The grouping's own state group, planted as large as the noise."""
-    settings = AnalysisSettings(groups=("state=role:state", "rest=*"), ratio="state/rest")
-    series = [folder / "series" / f"{name}.zarr" for name in ("noise", "without_state")]
-    text = " ".join(text_of(effects_sections(study_effects(folder / "base.zarr", series, settings))).split())
-    assert "Without state the action changes by 0.091" in text
-    assert "not shown to exceed the noise" in text
 
 
 def test_nothing_changed_is_an_effect_of_zero(folder, tmp_path):
@@ -314,18 +272,6 @@ def test_replans_without_the_word_are_in_no_effect(folder, tmp_path):
         assert study.notes == ()
 
 
-def test_a_rerun_without_any_key_of_its_group_is_left_out_by_name(folder, tmp_path):
-    """'bowl' is in the instruction of task 0, and the rerun holds task 1 only, as --allow-empty allows it."""
-    planted = PlantedRerun(knockout("without_bowl", "word:bowl"), 0.3)
-    write_rerun(tmp_path / "bowl.zarr", folder / "base.zarr", planted, tasks=(1,))
-    given = [tmp_path, folder / "series" / "noise.zarr"]
-    study = study_effects(folder / "base.zarr", given, AnalysisSettings())
-    assert [condition.name for condition in study.conditions] == ["noise"]
-    assert "note: without_bowl is left out" in text_of(effects_sections(study))
-    with pytest.raises(BadArgument, match=r"No rerun of .*base.zarr can be compared: without_bowl is left out"):
-        study_effects(folder / "base.zarr", [tmp_path], AnalysisSettings())
-
-
 def test_dimensions_that_are_mostly_noise_are_named(folder, tmp_path):
     def plant(task, episode, replans):
         actions = changed_actions(PLANTED["noise"])(task, episode, replans)
@@ -347,42 +293,6 @@ def test_dimensions_that_are_mostly_noise_are_named(folder, tmp_path):
     all_of_them = study_effects(folder / "base.zarr", [noisy], AnalysisSettings(), dimensions=tuple(range(7)))
     assert all_of_them.spread.left_out == ()
     assert row_of(all_of_them, "noise")["effect"] > 0.4
-
-
-def test_a_control_of_less_than_half_a_key_is_none(folder, tmp_path):
-    """An object that covers 0.3 of a patch: its knockout is a knockout, and random keys are counted in whole ones."""
-    selector = "object:robot & patch:base_0_rgb[0:1,0:1]"
-    for name, options in (("without_robot", {}), ("random_robot", {"random_seed": 0})):
-        write_rerun(
-            tmp_path / f"{name}.zarr", folder / "base.zarr", PlantedRerun(knockout(name, selector, **options), 0.3)
-        )
-    found = study_effects(folder / "base.zarr", [tmp_path], AnalysisSettings()).episodes.filter(phase="all")
-    keys = {row["episode_index"]: row for row in found.filter(condition="without_robot", task_id=0).to_dicts()}
-    assert all(row["keys"] > 0 and row["num_replans"] == REPLANS for row in keys.values())
-    controls = found.filter(condition="random_robot")
-    assert controls["num_replans"].sum() < found.filter(condition="without_robot")["num_replans"].sum()
-
-
-def test_what_is_seen_and_read_is_told_without_a_ratio_too(folder):
-    """As for Cosmos, where each site has one of the modalities."""
-    series = [folder / "series" / f"{name}.zarr" for name in ("noise", "without_visual")]
-    study = study_effects(folder / "base.zarr", series, AnalysisSettings(groups=("image=role:image",)))
-    assert study.analysis.grouping.ratio is None
-    assert "Without visual the action changes by 1.2" in " ".join(text_of(effects_sections(study)).split())
-
-
-def test_a_rerun_of_a_part_is_not_said_to_be_of_all(study):
-    part = replace(study, episodes=study.episodes.filter(pl.col("task_id") == 0))
-    assert (study.measured, part.measured) == ((6, 3), (2, 1))
-    text = " ".join(text_of(effects_sections(part)).split())
-    assert "Attention in all 6 episodes of the base, of which effects were measured in 2: the ratio" in text
-    assert "in the same replans" not in text
-
-
-def test_the_header_says_in_how_many_episodes_effects_were_measured(study):
-    assert "Effects were measured in 6 episodes of 3 tasks." in text_of(effects_sections(study)).splitlines()
-    part = replace(study, episodes=study.episodes.filter(pl.col("task_id") == 0))
-    assert "Effects were measured in 2 episodes of 1 task." in text_of(effects_sections(part)).splitlines()
 
 
 def test_a_word_that_no_selected_task_has_leaves_its_rerun_out(folder, tmp_path):
@@ -448,26 +358,24 @@ def test_only_executed_steps_count_where_the_base_stores_how_many(folder):
     assert executed(name="recorded", replan_steps=0) == [5] * REPLANS
 
 
-@pytest.mark.parametrize("name", ["dataset", "recorded"])
-def test_which_numbers_are_the_gripper_s_is_known_of_own_runs_only(folder, name):
-    [item, *_] = study_effects(
-        folder / "base.zarr", [folder / "series" / "noise.zarr"], AnalysisSettings()
-    ).question.selected
-    attributes = replace(item.store.attributes, protocol=replace(item.store.attributes.protocol, name=name))
-    other = BaseEpisode.of(replace(item, store=replace(item.store, attributes=attributes)))
-    own = BaseEpisode.of(item)
-    spread = action_spread([own.actions])
-    known = changes_of(own, own.actions + 1, spread)
-    unknown = changes_of(other, own.actions + 1, spread)
-    np.testing.assert_array_equal(unknown[:, :2], known[:, :2])
-    assert np.isfinite(known).all()
-    assert np.isnan(unknown[:, 2:]).all()
+def test_an_effect_within_the_noise_is_called_so(folder, tmp_path):
+    """The grouping's own state group, planted as large as the noise."""
+    settings = AnalysisSettings(groups=("state=role:state", "rest=*"), ratio="state/rest")
+    series = [folder / "series" / f"{name}.zarr" for name in ("noise", "without_state")]
+    text = " ".join(text_of(effects_sections(study_effects(folder / "base.zarr", series, settings))).split())
+    assert "Without state the action changes by 0.091" in text
+    assert "not shown to exceed the noise" in text
 
 
-def test_it_is_said_where_the_number_of_executed_steps_is_not_known(study):
-    base = study.given.base
-    protocol = replace(base.attributes.protocol, name="recorded", replan_steps=0)
-    other = replace(base, attributes=replace(base.attributes, protocol=protocol))
-    text = " ".join(text_of(effects_sections(replace(study, given=replace(study.given, base=other)))).split())
-    assert "root mean square change of the chunk's actions" in text
-    assert "root mean square change of the executed actions" in " ".join(text_of(effects_sections(study)).split())
+def test_a_control_of_less_than_half_a_key_is_none(folder, tmp_path):
+    """An object that covers 0.3 of a patch: its knockout is a knockout, and random keys are counted in whole ones."""
+    selector = "object:robot & patch:base_0_rgb[0:1,0:1]"
+    for name, options in (("without_robot", {}), ("random_robot", {"random_seed": 0})):
+        write_rerun(
+            tmp_path / f"{name}.zarr", folder / "base.zarr", PlantedRerun(knockout(name, selector, **options), 0.3)
+        )
+    found = study_effects(folder / "base.zarr", [tmp_path], AnalysisSettings()).episodes.filter(phase="all")
+    keys = {row["episode_index"]: row for row in found.filter(condition="without_robot", task_id=0).to_dicts()}
+    assert all(row["keys"] > 0 and row["num_replans"] == REPLANS for row in keys.values())
+    controls = found.filter(condition="random_robot")
+    assert controls["num_replans"].sum() < found.filter(condition="without_robot")["num_replans"].sum()

@@ -8,12 +8,11 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tests.kit.planted_effects import FIRST, ITEMS, RANDOM, READERS, WORDS, conditions, planted_effects
-from vla_attention.analyze.effects.answer import item_lines, mostly_one_dimension
+from tests.kit.planted_effects import FIRST, ITEMS, RANDOM, READERS, WORDS, planted_effects
+from vla_attention.analyze.effects.answer import mostly_one_dimension
 from vla_attention.analyze.effects.effect_study import study_effects
 from vla_attention.analyze.effects.item_rows import item_rows, ratio_of_effects, ratios_by_family
 from vla_attention.analyze.effects.over_time import shares_of_dimensions
-from vla_attention.analyze.effects.text import item_table
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.show.findings import findings
 from vla_attention.testing.stores import StoreSpec, write_store
@@ -72,62 +71,6 @@ def test_each_word_has_the_random_keys_of_the_nearest_number_of_its_reader(study
     assert rows.filter(pl.col("group") == "visual")["random"].to_list() == [None] * len(READERS)
 
 
-def test_the_first_lines_say_which_word_decides_and_by_which_way(study):
-    said = " ".join(item_lines(study, item_rows(study)))
-    first, second = WORDS[0], WORDS[1]
-    assert f"'{first}' has the largest effect of {len(WORDS)} words: without it the action changes by" in said
-    assert f"'{first}', '{second}' reach the action through the pictures, which have read them" in said
-    assert "Without all pictures the action changes 2 times as much as without all text" in said
-
-
-def test_the_unchanged_call_is_told_of_when_it_is_not_the_same(store, tmp_path):
-    def drifting(task, episode, replan, tokens):
-        given = planted_effects()(task, episode, replan, tokens)
-        change = given.change.copy()
-        change[0] = 0.1
-        return replace(given, change=change)
-
-    path = write_store(tmp_path / "b.zarr", tasks=(0,), episodes=2, replans=3, plant_effects=drifting)
-    told = study_effects(path, [], AnalysisSettings())
-    assert any(note.startswith("unchanged changes nothing") for note in told.notes)
-    assert not any("unchanged" in note for note in study_effects(store, [], AnalysisSettings()).notes)
-    assert "unchanged" not in {condition.name for condition in told.conditions}
-
-
-def test_a_group_that_was_not_measured_has_the_sums_of_its_words(store):
-    first, second = INSTRUCTIONS[0].split()[0], INSTRUCTIONS[0].split()[2]
-    groups = (f"two=word:{first} | word:{second}", f"one=word:{INSTRUCTIONS[0].split()[-1]}", "rest=*")
-    study = study_effects(store, [], AnalysisSettings(groups=groups, ratio="two/one"))
-    spread = study.spread.spread
-    assert set(study.sums["group"]) == {"two"}
-    total = study.sums.filter(reader="total")
-    assert set(total["num_items"]) == {2.0}
-    names = list(conditions())
-    for row in total.to_dicts():
-        episode = (row["task_id"], row["episode_index"])
-        numbers = [names.index(f"without_word_{word}_queries_all") for word in (first, second)]
-        drawn = [
-            [
-                ITEMS[f"word_{word}"][1]["total"]
-                * np.random.default_rng([*episode, replan, number]).choice([-1.0, 1.0], (5, 7))
-                for word, number in zip((first, second), numbers, strict=True)
-            ]
-            for replan in range(4)
-        ]
-        sizes = 3.0 * np.array(drawn) / spread
-        together = np.sqrt((sizes.sum(axis=1) ** 2).mean(axis=(1, 2))).mean()
-        apart = np.sqrt((sizes**2).mean(axis=(2, 3))).sum(axis=1).mean()
-        # The last chunk of an episode of an odd number is executed but for its last step.
-        assert row["size_of_sum"] == pytest.approx(together, rel=0.05)
-        assert row["sum_of_sizes"] == pytest.approx(apart, rel=1e-6)
-    assert total.height == 4
-
-
-def test_no_group_of_half_words_has_sums(store):
-    groups = (f"part=word:{FIRST} | role:template", "v=role:image", "rest=*")
-    assert study_effects(store, [], AnalysisSettings(groups=groups, ratio="v/part")).sums.is_empty()
-
-
 def test_each_family_has_its_ratio_of_effects(tmp_path):
     factors = {0: 1.0, 1: 3.0, 2: 0.5}
 
@@ -146,10 +89,6 @@ def test_each_family_has_its_ratio_of_effects(tmp_path):
     cells = study.analysis.episodes.cells.filter(layer="layers_avg")
     of_two = [cells.filter(task_id=task)["log_ratio_mean"].mean() for task in (1, 2)]
     assert rows["two"]["attention"] == pytest.approx(np.exp(np.mean(of_two)), rel=1e-9)
-
-
-def test_one_family_is_no_table(study):
-    assert ratios_by_family(study) == []
 
 
 def in_one_dimension(task, episode, replan, tokens):
@@ -176,11 +115,6 @@ def test_an_effect_in_one_dimension_is_said_with_what_the_movement_does(tmp_path
         shares_of_dimensions(study, other.strongest["condition"]), squares / squares.sum(), rtol=1e-6
     )
     assert mostly_one_dimension(study, other) == ""
-
-
-def test_words_stand_before_parts_and_pictures(study):
-    kinds = [row.kind == "word" for row in item_table(study).rows]
-    assert kinds == sorted(kinds, reverse=True)
 
 
 def test_items_that_cannot_be_tested_are_counted():

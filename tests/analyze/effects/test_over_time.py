@@ -8,12 +8,9 @@ import pytest
 import zarr
 
 from tests.kit.planted_effects import FIRST, planted_effects
-from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.effects.effect_study import study_effects
-from vla_attention.analyze.effects.over_time import NOISE, early_and_late, effects_by_replan, effects_over_time
-from vla_attention.analyze.effects.plot_effects_over_time import plot_effects_over_time
+from vla_attention.analyze.effects.over_time import effects_by_replan, effects_over_time
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
-from vla_attention.analyze.show.numbers import format_number
 from vla_attention.testing.stores import StoreSpec, write_store
 
 REPLANS = 4
@@ -72,43 +69,3 @@ def test_the_course_is_the_mean_of_each_part_of_the_time(study):
         assert value == pytest.approx(of_replan, rel=0.1)
     assert course["effect"].is_sorted(descending=True)
     assert course["effect"][0] == pytest.approx(by_replan.filter(replan=0)["effect"].mean(), rel=1e-9)
-
-
-def test_noise_pictures_text_and_words_stand_beside_each_other(study):
-    course = effects_over_time(study, 5)
-    assert course["item"].unique(maintain_order=True).to_list()[:3] == ["visual", "linguistic", f"'{FIRST}'"]
-    noise = course.filter(item=NOISE)["effect"]
-    assert noise.max() == pytest.approx(noise.min(), rel=1e-6)
-
-
-def test_the_sentence_has_the_first_and_the_last_third(study):
-    rows = study.summary.filter(scope="all", condition=f"without_word_{FIRST}_queries_all")
-    first, last = (rows.filter(phase=f"{name} third")["effect"].item() for name in ("first", "last"))
-    assert f"'{FIRST}' {format_number(first)} and {format_number(last)}" in early_and_late(study)
-    assert first > 1.5 * last
-
-
-def test_time_shows_effects_beside_attention_and_writes_them(store, tmp_path, capsys):
-    assert main(["time", str(store), "--bins", "4", "--output", str(tmp_path), "--intervals", "these-tasks"]) == 0
-    printed = capsys.readouterr().out
-    assert printed.index("OVER THE EPISODE'S TIME, 0 to 1") < printed.index("EFFECTS OVER THE EPISODE'S TIME")
-    written = pl.read_parquet(tmp_path / "effects_over_time.parquet")
-    study = study_effects(store, [], AnalysisSettings(intervals="these-tasks"))
-    assert written["effect"].to_list() == effects_over_time(study, 4)["effect"].to_list()
-
-
-def test_a_store_without_effects_has_no_such_section(tmp_path, capsys):
-    plain = write_store(tmp_path / "plain.zarr", tasks=(0,), episodes=1)
-    assert main(["time", str(plain), "--output", str(tmp_path / "out"), "--no-plots"]) == 0
-    assert "EFFECTS" not in capsys.readouterr().out
-    assert not (tmp_path / "out/effects_over_time.parquet").exists()
-
-
-@pytest.mark.drawn
-def test_the_picture_holds_every_item(study, tmp_path):
-    from vla_attention.analyze.effects.over_time import EffectsOverTime
-
-    course = effects_over_time(study, 4)
-    files = plot_effects_over_time(EffectsOverTime(study, course), tmp_path)
-    assert {file.suffix for file in files} >= {".png", ".csv"}
-    assert pl.read_csv(tmp_path / "effects_over_time.csv").height == course.height

@@ -11,13 +11,9 @@ import numpy as np
 import pytest
 
 from tests.kit.reruns import BASE, PLANTED, base_actions, changed_actions, knockout, write_with
-from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.effects.effect_study import study_effects
-from vla_attention.analyze.effects.text import effects_sections
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
-from vla_attention.analyze.show.answer import text_of
 from vla_attention.schemas.interventions import ImageChange, Interventions, NoiseChange, PromptChange
-from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import StoreError
 from vla_attention.testing.stores import rerun_source, write_store
 
@@ -98,24 +94,6 @@ def test_one_other_input_of_one_replan_is_named(base, tmp_path, name):
     )
 
 
-def test_it_is_one_sentence_of_the_command(base, tmp_path, capsys):
-    path = write_with(tmp_path / "rerun.zarr", spec_of(base, CUT), at(another_state))
-    assert main(["effects", str(base), str(path), "--output", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr().err
-    assert "another state of the robot" in said
-    assert said.count("\n") == 1
-
-
-def test_the_first_replan_is_named_and_what_differs_there(base, tmp_path):
-    def everywhere(task, episode, replan, record):
-        record = another_seed(record) if replan >= 2 else record
-        return another_prompt(record) if replan >= 4 else record
-
-    said = refused(base, write_with(tmp_path / "rerun.zarr", spec_of(base, CUT), everywhere))
-    assert said.startswith("Replan 2 of task000_episode000")
-    assert "was given another noise seed than" in said
-
-
 @pytest.mark.parametrize(
     ("interventions", "free", "held"),
     [
@@ -194,23 +172,3 @@ def test_an_unchanged_rerun_with_other_actions_is_named(base, tmp_path):
         assert len(study.notes) == notes
     assert "moved changes nothing, and its actions are not those of the base" in study.notes[0]
     assert "(replan 3 of task001_episode000)" in study.notes[0]
-
-
-def test_what_only_one_of_both_stores_holds_is_said(base, tmp_path):
-    path = write_store(tmp_path / "rerun.zarr", spec=replace(spec_of(base, CUT), frames=False))
-    study = study_effects(base, [path], AnalysisSettings())
-    assert study.notes == (
-        "without_state was not compared with the base in the pictures of camera 'base_0_rgb', pictures of camera "
-        "'left_wrist_0_rgb', which one of the two stores lacks.",
-    )
-    assert "was not compared" in text_of(effects_sections(study))
-
-
-def test_equal_pictures_are_compared_without_being_read(base, tmp_path, monkeypatch):
-    path = write_store(tmp_path / "rerun.zarr", spec=spec_of(base, CUT))
-    reader = type(open_store(base).episodes[0])
-    read, names = reader.read, []
-    monkeypatch.setattr(reader, "read", lambda self, name, *index: (names.append(name), read(self, name, *index))[1])
-    study_effects(base, [path], AnalysisSettings())
-    assert names
-    assert not [name for name in names if name.startswith("frames/")]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from pathlib import Path
 
@@ -18,9 +17,8 @@ from polars.testing import assert_frame_equal
 from tests.kit.examples import examples
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.export.labelled_arrays import masses_array, rows_array, rows_size, write_netcdf
+from vla_attention.analyze.export.labelled_arrays import masses_array, rows_array, write_netcdf
 from vla_attention.analyze.ratios.analysis import analyse
-from vla_attention.schemas.errors import BadArgument, MissingDependency
 from vla_attention.schemas.groupings.resolve import resolve
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.precision import mass_error_bound
@@ -73,18 +71,6 @@ def test_tables_are_those_of_the_analysis(store, tmp_path, capsys):
         text = pl.read_csv(tmp_path / f"{name}.csv", schema=table.schema)
         assert_frame_equal(text, table)
     assert "12 files in" in capsys.readouterr().out
-
-
-def test_a_table_of_ones_own_choice(store, tmp_path):
-    exported(store, "--parquet", "--table", "replans", "--table", "contributions", "--layers", 2, "--output", tmp_path)
-    assert sorted(file.name for file in tmp_path.iterdir()) == [
-        "contributions.parquet",
-        "replans.parquet",
-        "replans_groups.parquet",
-    ]
-    assert pl.read_parquet(tmp_path / "replans.parquet")["block"].drop_nulls().unique().to_list() == [2]
-    exported(store, "--parquet", "--table", "steps", "--per-head", "--output", tmp_path)
-    assert pl.read_parquet(tmp_path / "steps.parquet")["head"].unique().sort().to_list() == [0, 1]
 
 
 def test_infinite_ratios_survive_in_csv(store, tmp_path):
@@ -144,30 +130,6 @@ def test_netcdf_with_rows_holds_the_rows_to_the_bit_and_what_every_key_is(ragged
         assert "task_id" in data["rows"].coords
 
 
-def test_a_selection_of_axes_is_labelled(store, tmp_path):
-    exported(
-        store,
-        "--netcdf",
-        "--rows",
-        "--layers",
-        2,
-        "--denoise",
-        "last",
-        "--heads",
-        1,
-        "--task",
-        2,
-        "--output",
-        tmp_path,
-    )
-    with xr.open_dataset(tmp_path / "attention.nc") as data:
-        assert (data["layer"].values.tolist(), data["denoise"].values.tolist()) == ([2], [9])
-        assert (data["head"].values.tolist(), sorted(set(data["task_id"].values.tolist()))) == ([1], [2])
-        assert data["denoise_time"].values.tolist() == pytest.approx([0.1])
-        whole = raw_rows(store)[6:, 1:2, 1:2, 1:2]
-        np.testing.assert_array_equal(data["rows"].values, whole)
-
-
 def test_arrays_in_memory_are_those_of_the_file(store, tmp_path):
     question = question_about(store, grouping="cameras")
     exported(store, "--netcdf", "--rows", "--grouping", "cameras", "--output", tmp_path)
@@ -186,24 +148,6 @@ def test_the_means_over_heads_are_those_of_the_steps_table(store):
     np.testing.assert_allclose(mean.sel(group="visual").values.ravel(), mass, rtol=1e-5)
 
 
-def test_rows_that_are_too_large_for_memory_are_refused_with_their_size(store):
-    question = question_about(store)
-    assert rows_size(question).num_bytes == 12 * 2 * 2 * 2 * 39 * 4
-    with pytest.raises(BadArgument, match=r"12 samples x 2 layers.*more than the 1 kB.*--netcdf --rows"):
-        rows_array(question, most_bytes=1000)
-
-
-@pytest.mark.parametrize("missing", ["xarray", "h5netcdf"])
-def test_a_missing_package_is_named_with_its_extra(store, tmp_path, monkeypatch, capsys, missing):
-    monkeypatch.setitem(sys.modules, missing, None)
-    assert exported(store, "--netcdf", "--output", tmp_path / "out") == 2
-    assert f"need {missing}, which is not installed; pip install 'vla-attention[xarray]'" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-    if missing == "xarray":
-        with pytest.raises(MissingDependency):
-            masses_array(question_about(store))
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -220,19 +164,7 @@ def test_mistakes_end_with_one_sentence(store, capsys, words, message):
     assert len(err.splitlines()) == 1
 
 
-def test_contributions_that_were_not_recorded_are_no_table(ragged, tmp_path, capsys):
-    assert exported(*ragged, "--csv", "--table", "contributions", "--output", tmp_path) == 2
-    assert "hold no contributions" in capsys.readouterr().err
-
-
-def test_the_error_of_a_folder_that_cannot_be_written_names_it(store, tmp_path, capsys):
-    file = tmp_path / "file"
-    file.write_text("")
-    for kind in ("--csv", "--parquet", "--netcdf"):
-        assert exported(store, kind, "--output", file) == 2
-        assert "give another --output" in capsys.readouterr().err
-
-
+@pytest.mark.thorough
 @settings(
     max_examples=examples(5),
     phases=[Phase.explicit, Phase.generate],
@@ -274,8 +206,3 @@ def test_recorded_effects_are_a_table_and_arrays(tmp_path, capsys):
     named = [str(name) for name in dataset["effect_condition"].values if name != "unchanged"]
     assert table.height == len(named)
     assert sorted(table["condition"]) == sorted(named)
-
-
-def test_effects_that_were_not_recorded_are_no_table(ragged, tmp_path, capsys):
-    assert exported(*ragged, "--csv", "--table", "effects", "--output", tmp_path / "out") == 2
-    assert "These stores hold no effects; record them with vla-capture --effects" in capsys.readouterr().err

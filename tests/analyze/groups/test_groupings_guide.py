@@ -12,10 +12,8 @@ import pytest
 
 from tests.kit.bowl_scene import bowl_tokens, write_bowl_store
 from vla_attention.analyze.__main__ import main
-from vla_attention.schemas.groupings.builtin_groupings import BUILTIN_GROUPINGS
 from vla_attention.schemas.groupings.grouping import Grouping, read_grouping_file
 from vla_attention.schemas.groupings.resolve import check_names, resolve
-from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS, SelectorError
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vocabulary
 from vla_attention.schemas.layout import Role, SiteLayout, Span
 
@@ -64,29 +62,6 @@ def test_every_selector_takes_keys(selector):
 def test_every_latent_frame_takes_its_key(selector):
     resolved = resolve(Grouping("g", {"g": (selector,)}), latent_tokens())
     assert np.flatnonzero(resolved.weights[0, :, 0]).tolist() == [3]
-
-
-def test_all_kinds_of_selectors_and_all_builtin_groupings_are_described():
-    described = {selector.partition(":")[0] for selector in first_column("selector | takes")}
-    described |= {selector.partition(":")[0] for selector in first_column("selector, Cosmos | takes")}
-    assert described == {*SELECTOR_KINDS, "*"}
-    assert set(first_column("name | groups")) == set(BUILTIN_GROUPINGS)
-
-
-def check_and_resolve(selector: str, tokens: EpisodeTokens) -> None:
-    grouping = Grouping("g", {"g": (selector,)})
-    check_names(grouping, collect_vocabulary([tokens]), tokens.layout)
-    resolve(grouping, tokens)
-
-
-def test_every_error_reads_as_described():
-    tokens = bowl_tokens()
-    rows = re.findall(r"^\| `(.*?)` \| (.*?) \|$", GUIDE.split("| given | message |")[1], re.MULTILINE)
-    assert len(rows) >= 6
-    for selector, message in rows:
-        with pytest.raises(SelectorError) as caught:
-            check_and_resolve(selector, tokens)
-        assert message in str(caught.value)
 
 
 @pytest.mark.drawn

@@ -18,7 +18,6 @@ from tests.kit.raw_rows import FEW, leaky, raw_episodes, weights_of
 from vla_attention.analyze.heads.head_measures import ranked_heads
 from vla_attention.analyze.heads.head_study import HeadStudy, study_heads
 from vla_attention.analyze.heads.row_metrics import RowOptions
-from vla_attention.analyze.measures.frames import Tables
 from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.testing.stores import StoreSpec, every_key_seen, write_store
@@ -131,6 +130,7 @@ def test_numbers_of_heads_equal_loops_over_raw_rows(data):
             assert row["fraction_std"] == pytest.approx(np.mean(np.std(of_heads, axis=0)), abs=1e-5)
 
 
+@pytest.mark.thorough
 @FEW
 @given(data=st.data())
 def test_layers_of_a_study_equal_those_of_the_whole_analysis(data):
@@ -206,55 +206,6 @@ def test_heads_without_a_finite_ratio_are_ranked_at_the_ends_and_heads_without_m
     assert reads["ratio_of_means"] == 0.0
     assert nothing["ratio_of_means"] is None
     assert sees["num_nonfinite"] == reads["num_nonfinite"] == 2 * 2 * 3
-
-
-def test_all_ratios_infinite_are_reported(tmp_path):
-    grouping = Grouping(
-        "blind",
-        {"seen": ("role:image",), "masked": ("role:masked_image",), "rest": ("*",)},
-        Ratio(("seen",), ("masked",)),
-    )
-    study = study_of(tmp_path, grouping)
-    assert study.heads.cells["log2_ratio"].is_null().all()
-    assert study.heads.cells["ratio_of_means"].is_infinite().all()
-    assert study.heads.cells["num_nonfinite"].to_list() == [2 * 2 * 3] * 4
-    assert ranked_heads(study.heads, grouping).height == 4
-    assert study.dispersion["log2_ratio_std"].is_null().all()
-    assert study.dispersion["fraction_std"].is_not_null().all()
-    assert study.denoise.cells["ratio_mean"].is_null().all()
-    assert study.denoise.cells["num_nonfinite"].to_list() == [2 * 2 * 3] * 2
-
-
-def test_one_episode_and_one_head_have_numbers_but_no_intervals_and_no_spread(tmp_path):
-    study = study_of(tmp_path, tasks=(0,), episodes=1, replans=1, layers=(2,), heads=(1,), denoise_steps=(9,))
-    (row,) = study.heads.cells.iter_rows(named=True)
-    assert row["log2_ratio"] is not None
-    assert row["log2_ratio_low"] is None
-    (spread,) = study.dispersion.iter_rows(named=True)
-    assert spread["fraction_std"] is None
-    assert set(study.depth["centre"]) == {2.0}
-    assert study.denoise.cells.height == 1
-
-
-def test_without_a_ratio_heads_are_ranked_by_the_first_group_that_has_mass(tmp_path):
-    grouping = Grouping("bare", {"blind": ("role:masked_image",), "words": ("span:prompt",), "rest": ("*",)})
-    plant = planted({(1, 0): (slice(BOS, BOS + 14), 20.0)})
-    study = study_of(tmp_path, grouping, plant_rows=plant)
-    ranked = ranked_heads(study.heads, grouping)
-    assert ranked.select("block", "head").row(0) == (2, 0)
-    assert ranked.height == 4
-    of_group = study.heads.by_group("block", "head")
-    shares = [of_group[block, head, "words"]["fraction"] for block, head in ranked.select("block", "head").rows()]
-    assert shares == sorted(shares, reverse=True)
-    assert "log2_ratio" not in study.heads.cells.columns
-    assert "log2_ratio_std" not in study.dispersion.columns
-
-
-def test_without_a_ratio_heads_without_a_fraction_are_last():
-    cells = pl.DataFrame({"layer": [0, 0, 0], "block": [0, 0, 0], "head": [0, 1, 2]})
-    groups = cells.with_columns(pl.lit("words").alias("group"), pl.Series("fraction", [None, 0.25, 0.5]))
-    ranked = ranked_heads(Tables(cells, groups), Grouping("bare", {"words": ("*",)}))
-    assert ranked["head"].to_list() == [2, 1, 0]
 
 
 def test_intervals_of_heads_hold_what_was_planted_and_not_the_uniform_value(tmp_path):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 
-import numpy as np
 import polars as pl
 import pytest
 
@@ -27,9 +26,6 @@ from vla_attention.analyze.heads.plot_layer_time import plot_layer_time
 from vla_attention.analyze.measures.aggregate import episode_tables, task_tables
 from vla_attention.analyze.measures.frames import concat_tables
 from vla_attention.analyze.ratios.plot_layer_profile import plot_layer_profile
-from vla_attention.analyze.show.plot_colours import diverging_colors
-from vla_attention.analyze.show.plot_heat_map import draw_log2_map
-from vla_attention.analyze.show.plot_style import new_figure
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 
 CASES = {
@@ -78,37 +74,3 @@ def test_every_picture_of_every_case_is_drawn_without_a_warning(case, tmp_path):
         assert path.stat().st_size > 0
         if path.suffix == ".csv":
             assert pl.read_csv(path).height > 0
-
-
-def test_layers_over_time_are_means_over_episodes_of_what_each_part_of_the_time_holds():
-    grouping = default_grouping()
-    steps = make_steps(layers=(3, 4), num_replans=6, num_tasks=2, num_episodes=2)
-    # Every replan lasts five steps, so that three parts of the time hold two replans each.
-    replans = replans_of(steps.with_columns(num_steps=pl.lit(30)), grouping)
-    table = layer_time_table(replans, grouping, Sampling(), num_bins=3)
-    assert table.height == 2 * 3
-    for row in table.iter_rows(named=True):
-        part = replans.cells.filter(
-            pl.col("layer") == row["layer"], pl.col("replan").is_in([2 * row["bin"], 2 * row["bin"] + 1])
-        )
-        by_episode = part.group_by("task_id", "episode_index").agg(pl.col("ratio_lift").log(2.0).mean())
-        assert row["mean"] == pytest.approx(by_episode["ratio_lift"].mean())
-        assert row["low"] < row["mean"] < row["high"]
-        assert row["num_episodes"] == 4
-
-
-def test_colours_are_even_at_the_baseline_and_infinite_cells_say_so():
-    colors = diverging_colors()
-    less, even, more = colors(0.0), colors(0.5), colors(1.0)
-    assert min(even[:3]) > 0.9
-    assert less[0] > less[2]
-    assert more[2] > more[0]
-    figure = new_figure(4, 3)
-    axes = figure.subplots()
-    values = np.array([[np.inf, -np.inf, np.nan], [1.0, -2.0, 0.0]])
-    draw_log2_map(figure, axes, values, np.ones((2, 3), dtype=bool), "times")
-    assert [text.get_text() for text in axes.texts] == ["∞", "0", "2", "1/4", "1"]
-    image = axes.get_images()[0]
-    assert image.get_clim() == (-2.0, 2.0)
-    dots = axes.collections[0].get_offsets()
-    assert len(dots) == 3  # finite cells only

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
@@ -14,15 +12,13 @@ import zarr
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
-from scipy import stats
 
 from tests.kit.examples import examples
 from tests.kit.made_up_steps import flat
 from tests.kit.questions import question_about
-from vla_attention.analyze.heads import command as heads_command
 from vla_attention.analyze.heads.head_measures import ranked_heads
 from vla_attention.analyze.heads.head_study import study_heads
-from vla_attention.analyze.heads.row_metrics import RowOptions, row_metrics
+from vla_attention.analyze.heads.row_metrics import RowOptions
 from vla_attention.analyze.heads.text import heads_sections
 from vla_attention.analyze.measures.sinks import SinkRule, search_sinks, without_sinks
 from vla_attention.analyze.ratios.analysis import analyse
@@ -45,43 +41,6 @@ BOUND = mass_error_bound(10) + 1e-4
 def raw_rows(path: Path, episode: str) -> np.ndarray:
     """Rows (replan, layer, denoise, head, key), mean over the stored queries."""
     return zarr.open_group(path / "episodes" / episode, mode="r")["joint/rows"][:].astype(np.float64).mean(axis=4)
-
-
-@QUICK
-@given(data=st.data())
-def test_row_metrics_equal_scipy_on_raw_rows(data):
-    tokens = data.draw(episode_tokens())
-    queries = data.draw(st.sampled_from(["mean", "all"]))
-    grouping = data.draw(st.sampled_from(["default", "objects"]))
-    with tempfile.TemporaryDirectory() as folder:
-        path = write_store(Path(folder) / "a.zarr", tokens=tokens, tasks=(0,), episodes=1, queries=queries)
-        question = question_about(path, grouping=grouping)
-        tables = row_metrics(question, RowOptions(top=(1, 3)))
-        rows = raw_rows(path, "task000_episode000")
-    table = tables.cells
-    inside = {(row["row"], row["group"]): row["entropy"] for row in tables.groups.iter_rows(named=True)}
-    resolved = resolve(question.grouping, tokens)
-    valid = np.broadcast_to(valid_keys(tokens.key_role), (len(rows), rows.shape[-1]))
-    weights = np.broadcast_to(resolved.weights, (len(rows), rows.shape[-1], len(resolved.names)))
-    assert table.height == np.prod(rows.shape[:4])
-    for row, (replan, layer, denoise, head) in zip(
-        table.iter_rows(named=True), np.ndindex(rows.shape[:4]), strict=True
-    ):
-        seen = rows[replan, layer, denoise, head] * valid[replan]
-        assert row["block"] == question.selection.blocks[layer]
-        assert row["denoise_step"] == question.selection.denoise_steps[denoise]
-        assert (row["replan"], row["head"]) == (replan, head)
-        assert row["entropy"] == pytest.approx(stats.entropy(seen), abs=1e-3)
-        assert row["effective_keys"] == pytest.approx(np.exp(stats.entropy(seen)), rel=1e-3)
-        for k in (1, 3):
-            assert row[f"top{k}_mass"] == pytest.approx(np.sort(seen)[::-1][:k].sum() / seen.sum(), rel=1e-4)
-        for i, name in enumerate(resolved.names):
-            part = weights[replan, :, i] * valid[replan]
-            if (seen * part).sum() == 0:
-                assert inside.get((row["row"], name)) is None
-            else:
-                expected = np.log(part.sum()) - stats.entropy(seen * part, part)
-                assert inside[row["row"], name] == pytest.approx(expected, abs=2e-3)
 
 
 @QUICK
@@ -144,14 +103,6 @@ def test_a_head_of_the_grid_equals_an_analysis_of_that_head_alone(tmp_path):
     assert found["denoise_time"] == pytest.approx(0.1)
     for name in ("ratio_mean", "ratio_mean_low", "visual_fraction", "uniform_ratio"):
         assert found[name] == pytest.approx(step[name])
-
-
-def test_contribution_depth_needs_gram_matrices(tmp_path):
-    path = write_store(tmp_path / "a.zarr", contributions=True)
-    depth = study_heads(question_about(path)).depth
-    assert set(depth["of"]) == {"mass", "contribution"}
-    assert depth["centre"].is_between(0, 2).all()
-    assert set(study_heads(question_about(write_store(tmp_path / "b.zarr"))).depth["of"]) == {"mass"}
 
 
 # --- planted truths ---------------------------------------------------------------------------------------------------
@@ -282,25 +233,6 @@ def test_masses_without_sinks_are_those_of_the_remaining_keys(sunken):
         np.testing.assert_allclose(whole["visual_lift"].to_numpy(), averaged / baseline, rtol=3 * BOUND)
 
 
-def test_the_summary_without_sinks_names_the_keys_and_takes_a_folder_of_its_own(sunken, tmp_path, monkeypatch, capsys):
-    from vla_attention.analyze.__main__ import main
-
-    monkeypatch.chdir(tmp_path)
-    rule = ["--sink-factor", "5", "--sink-share", "0.7"]
-    assert main([str(sunken), "--without-sinks", *rule, "--no-plots"]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "patch (1, 1) (image; in 1 of 2 tasks" in said
-    assert "(bos; in 2 of 2 tasks" in said
-    folder = tmp_path / "results" / "a" / "default-without-sinks"
-    assert pl.read_parquet(folder / "sinks.parquet").height == 3
-    assert main([str(sunken), "--without-sinks", "--sink-factor", "1000", "--sink-mass", "1", "--no-plots"]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "nothing was taken out" in said
-    assert "valid keys none can take more than 1000 x its uniform share" in said
-    assert main([str(sunken), "--sink-factor", "5", "--no-plots"]) == 2
-    assert "give --without-sinks too" in capsys.readouterr().err
-
-
 # --- the command ------------------------------------------------------------------------------------------------------
 
 
@@ -334,28 +266,6 @@ def test_the_command_writes_tables_and_pictures_and_names_the_nearest_key(tmp_pa
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [
-        ["--layers", "2", "--heads", "1", "--denoise", "9"],
-        ["--group", "base=camera:base_0_rgb", "--no-rows"],
-        pytest.param(["--grouping", "objects"], marks=pytest.mark.thorough),
-        ["--group", "seen=role:image", "--group", "blind=span:right_wrist_0_rgb", "--ratio", "seen/blind"],
-        ["--group", "seen=role:image", "--group", "blind=span:right_wrist_0_rgb", "--ratio", "blind/blind"],
-    ],
-)
-def test_unusual_questions_are_answered(arguments, tmp_path, capsys):
-    from vla_attention.analyze.__main__ import main
-
-    path = write_store(tmp_path / "a.zarr", tasks=(0,), episodes=1, replans=1)
-    assert main(["heads", str(path), "--output", str(tmp_path / "out"), *arguments]) == 0
-    said = capsys.readouterr().out
-    assert max(map(len, said.splitlines())) <= 100 + len(str(tmp_path))
-    assert "nan" not in said.lower().split()
-    if "seen/blind" in arguments:
-        assert said.count(" inf ") >= 4
-
-
-@pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (["--top", "0"], "expected at least 1"),
@@ -372,13 +282,3 @@ def test_bad_arguments_end_in_one_sentence(arguments, said, tmp_path, capsys):
     error = capsys.readouterr().err
     assert said in error
     assert error.count("\n") == 1
-
-
-def test_the_help_has_examples_and_needs_no_library():
-    code = (
-        "import sys; from vla_attention.analyze.heads import command; command.build_parser().format_help(); "
-        "print('numpy' in sys.modules)"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "False"
-    assert "vla-attention heads runs/" in heads_command.build_parser().format_help()

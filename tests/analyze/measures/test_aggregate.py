@@ -16,7 +16,6 @@ from vla_attention.analyze.measures.aggregate import (
     task_tables,
 )
 from vla_attention.analyze.measures.frames import LAYERS_AVG
-from vla_attention.analyze.measures.masses import GROUP_MEASURES
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.schemas.groupings.grouping import Ratio
 
@@ -177,15 +176,6 @@ def test_tasks_are_means_over_episodes_with_intervals_around_them():
     assert overall["ratio_mean"] == pytest.approx(episodes.filter(layer=LAYERS_AVG)["ratio_mean"].mean())
 
 
-def test_one_episode_has_no_interval():
-    tasks = flat(
-        task_tables(episode_tables(replans_of(make_steps(num_tasks=1, num_episodes=1)), GROUPING), GROUPING, Sampling())
-    )
-    bounds = [name for name in tasks.columns if name.endswith(("_low", "_high"))]
-    assert bounds
-    assert all(tasks[name].null_count() == tasks.height for name in bounds)
-
-
 def test_results_do_not_depend_on_the_order_of_the_rows():
     shuffled = STEPS.sample(fraction=1.0, shuffle=True, seed=1)
     first, second = (
@@ -211,13 +201,6 @@ def test_groupings_without_a_ratio_give_masses_fractions_and_lifts_only():
     assert tasks.groups.filter(group="base")["fraction_low"].null_count() == 0
 
 
-def test_every_measure_of_a_group_is_a_column_of_every_table():
-    replans = replans_of(make_steps())
-    episodes = episode_tables(replans, GROUPING)
-    for tables in (replans, episodes, task_tables(episodes, GROUPING, Sampling())):
-        assert set(GROUP_MEASURES) <= set(tables.groups.columns)
-
-
 def test_same_task_ids_of_two_suites_stay_two_tasks():
     steps = pl.concat([make_steps(), make_steps(suite="libero_goal", seed=5)])
     tasks = task_tables(episode_tables(replans_of(steps), GROUPING), GROUPING, Sampling())
@@ -233,22 +216,3 @@ def test_layers_are_in_the_order_of_their_numbers():
     assert layer_order(replans) == ["2", "9", "10", LAYERS_AVG]
     assert overall_layer(replans) == LAYERS_AVG
     assert overall_layer(replans.filter(pl.col("layer") != LAYERS_AVG)) == "2"
-
-
-def test_groups_keep_the_order_of_the_grouping_when_the_first_cells_lack_one():
-    first = (pl.col("task_id") == 0) & (pl.col("replan") < 3)
-    steps = STEPS.with_columns(visual_mass=pl.when(first).then(0.0).otherwise(pl.col("visual_mass")))
-    tables = replans_of(steps)
-    having = [name for name in GROUPING.names if (steps[f"{name}_mass"] > 0).any()]
-    assert tables.groups_with_mass() == tuple(having)
-    # The first episodes have no cell of the second task.
-    assert tables.filter(pl.col("task_id") == 1).groups_with_mass() == tuple(having)
-    assert tables.filter(pl.col("task_id") == 1).group_names() == GROUPING.names
-
-
-def test_replans_are_in_the_order_of_suite_task_and_episode():
-    steps = pl.concat([make_steps(suite="libero_goal"), make_steps()])
-    cells = replans_of(steps).cells
-    identity = ["suite", "task_id", "episode_index"]
-    assert cells.select(identity).equals(cells.select(identity).sort(identity))
-    assert cells["suite"][0] == "libero_10"

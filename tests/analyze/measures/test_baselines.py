@@ -13,18 +13,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import vla_attention as va
-from tests.kit.golden_stores import FOLDER
 from tests.kit.questions import question_about
 from tests.kit.raw_rows import FEW
 from tests.kit.uniform_cases import TABLE, tokens_of_case, write_case
-from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.measures.baselines import baseline_notes, contribution_notes, uniform_keys
+from vla_attention.analyze.measures.baselines import uniform_keys
 from vla_attention.analyze.measures.question_settings import settings_from_keywords
 from vla_attention.analyze.measures.sinks import SinkRule, search_sinks
 from vla_attention.analyze.overlay.overlay_data import episode_overlay, ratios_of
 from vla_attention.analyze.overlay.overlay_study import study_overlay
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
-from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import StoreSpec, write_store
 from vla_attention.testing.strategies import episode_tokens
 
@@ -156,34 +153,3 @@ def test_layers_without_a_finite_ratio_are_in_neither_mean(tmp_path):
         assert ratios["uniform_ratio"].to_list() == pytest.approx(expected, rel=CLOSE), name
         if name == "one":
             assert ratios["ratio_lift"][2] == pytest.approx(1.0, rel=CLOSE)
-
-
-def test_a_baseline_of_version_1_that_may_be_of_too_many_keys_is_noted():
-    library, joint = (open_store(FOLDER / f"{name}.zarr") for name in ("library", "joint"))
-    assert {store.attributes.store_version for store in (library, joint)} == {1}
-    (note,) = baseline_notes([joint, library])
-    assert note.startswith("Baselines of library.zarr (version 1) are of the keys that any query of any layer sees; ")
-    assert baseline_notes([joint]) == ()
-    assert baseline_notes([replace(library, attributes=replace(library.attributes, store_version=2))]) == ()
-
-
-@pytest.mark.parametrize("command", ["", "heads", "words", "time", "groups", "overlay"])
-def test_every_analysis_says_so_once(tmp_path, capsys, command):
-    store = open_store(FOLDER / "library.zarr")
-    notes = baseline_notes([store]) + (() if command == "groups" else contribution_notes([store]))
-    where = [] if command == "groups" else ["--output", str(tmp_path / "out")]
-    plots = [] if command in ("groups", "overlay") else ["--no-plots"]
-    for name, count in (("library", 1), ("joint", 0)):
-        assert main([*filter(None, [command]), str(FOLDER / f"{name}.zarr"), *where, *plots]) == 0
-        said = capsys.readouterr()
-        for note in notes:
-            assert " ".join((said.out + said.err).split()).count(note) == count, name
-
-
-def test_the_report_has_it_among_its_caveats(tmp_path):
-    store = open_store(FOLDER / "library.zarr")
-    assert main(["report", str(FOLDER / "library.zarr"), "--output", str(tmp_path / "a.html")]) == 0
-    text = (tmp_path / "a.html").read_text(encoding="utf-8")
-    for note in baseline_notes([store]) + contribution_notes([store]):
-        assert text.count(note) == 2, "as a banner, and in the list"
-    assert "Baseline of version 1" in text

@@ -122,9 +122,3 @@ def test_rows_over_episodes_have_the_three_means_and_what_each_is_of(tmp_path):
             assert row[name] == pytest.approx(np.exp(means[name].log().mean()))
         for name in ("ratio_mean", "geometric_mean", "ratio_of_means", "ratio_lift"):
             assert row[f"{name}_low"] <= row[name] <= row[f"{name}_high"]
-
-
-def test_a_store_without_contributions_has_no_norms(tmp_path):
-    store = open_store(write_store(tmp_path / "a.zarr"))
-    selected = load_tokens([(store, episode) for episode in store.episodes], "joint")
-    assert contribution_table(selected, select(store.attributes)) is None

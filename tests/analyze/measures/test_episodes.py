@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 from polars.testing import assert_frame_equal
 
-import vla_attention as va
 from tests.kit.made_up_steps import default_grouping, make_steps, measured_of
 from vla_attention.analyze.measures import episodes
 from vla_attention.analyze.measures.aggregate import replan_tables
 from vla_attention.analyze.measures.episodes import _Parts, episode_tables, episode_tables_of
 from vla_attention.analyze.measures.frames import episode_id
-from vla_attention.schemas.stores.reader import StoredEpisode
-from vla_attention.testing.stores import write_store
 
 GROUPING = default_grouping()
 
@@ -78,22 +75,3 @@ def test_parts_are_reduced_as_loops_do():
             expected = dict(zip(found, (mean, spread, middle, there[0], there[-1]), strict=True))
             for name, value in expected.items():
                 assert found[name][i, column] == pytest.approx(value, rel=1e-12, abs=1e-15), name
-
-
-def test_another_grouping_of_an_open_store_reads_no_tokens_again(tmp_path, monkeypatch):
-    run = va.open(write_store(tmp_path / "a.zarr"))
-    read: list[str] = []
-    whole = StoredEpisode.read
-
-    def watched(self: StoredEpisode, name: str, index: object = ...) -> object:
-        read.append(name)
-        return whole(self, name, index)
-
-    monkeypatch.setattr(StoredEpisode, "read", watched)
-    run.ratios(grouping="cameras")
-    assert read.count("joint/key_role") == 4
-    read.clear()
-    run.ratios(grouping="instruction")
-    assert sorted(set(read)) == ["joint/atoms", "joint/row_sum"]
-    run.ratios(grouping="instruction", tasks=1)
-    assert read.count("joint/key_role") == 2

@@ -113,18 +113,6 @@ def test_a_ratio_with_a_side_that_is_cut_or_empty_is_no_number(store):
     assert undefined["contribution_ratio"].is_null().all()
 
 
-def test_a_group_that_takes_a_segment_at_some_replans_only_is_cut(store):
-    """A prompt's third digit exists at some replans; where it is padding, the group has no key of the padding."""
-    question = question_about(store)
-    bos = question.selected[0].tokens.layout.span("prompt").start
-    grouping = grouping_of(late=(f"keys:{bos + 10} & role:state",), all=("role:state",))
-    (resolved,) = resolve_all(grouping, question.selected[:1])
-    parts = whole_segments(question.selected[0], resolved, "joint")
-    assert set(parts) == {"all"}
-    assert not parts["all"][-1]
-    assert parts["all"].sum() == 1
-
-
 @pytest.mark.parametrize(("weight", "replans", "kept"), [(1.0, 3, True), (0.5, 3, False), (1.0, 1, False)])
 def test_a_segment_is_taken_whole_always_or_not_at_all(store, weight, replans, kept):
     """A half of every key is no whole segment, and neither are all keys at some replans only."""
@@ -153,7 +141,3 @@ def test_only_groups_that_are_whole_in_every_episode_are_measured(tmp_path):
     assert measured is not None
     assert "word_norm" not in measured.columns
     assert table_of(question_about(path, grouping_of(word=("word:the",)))) is None
-
-
-def test_a_store_without_contributions_has_no_norms_of_groups(tmp_path):
-    assert table_of(question_about(write_store(tmp_path / "a.zarr"), grouping_of())) is None

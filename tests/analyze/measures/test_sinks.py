@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,25 +19,21 @@ from vla_attention.analyze.heads.head_study import study_heads
 from vla_attention.analyze.heads.row_metrics import RowOptions, row_metrics
 from vla_attention.analyze.heads.text import sinks_section
 from vla_attention.analyze.measures.selected import resolve_all
-from vla_attention.analyze.measures.sink_kinds import kind_name, may_be_empty
+from vla_attention.analyze.measures.sink_kinds import may_be_empty
 from vla_attention.analyze.measures.sinks import (
     SinkRule,
     describe_sinks,
     key_sums,
     search_sinks,
-    sinks_of_sides,
     without_sinks,
 )
 from vla_attention.analyze.measures.steps import measure_episodes, step_tables
 from vla_attention.example_stores import CUBES
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
-from vla_attention.schemas.segments import segment_members, segments_of
-from vla_attention.testing import stores as made_up
 from vla_attention.testing.stores import StoreSpec, every_key_seen, write_store
 from vla_attention.testing.strategies import episode_tokens, groupings
-from vla_attention.testing.tokens import site_layout, small_layout, small_tokens, spell_prompt, tokens_of
+from vla_attention.testing.tokens import small_layout
 
 BOS = small_layout().span("prompt").start
 
@@ -127,18 +122,6 @@ def test_keys_of_the_policys_own_actions_are_no_sinks():
     assert not {key for item in without.selected for key in item.without} & set(actions["key"])
 
 
-def test_sinks_of_a_side_are_keys_that_the_ratio_counts():
-    question = question_about(CUBES)
-    sinks = search_sinks(question).sinks
-    assert sinks_of_sides(question, sinks).equals(sinks.filter(pl.col("role") != "state"))
-    assert sinks_of_sides(question_about(CUBES, groups=("state=role:state",)), sinks).equals(sinks)
-    words = question_about(CUBES, groups=("noun=word:cube", "state=role:state"), ratio="noun/state")
-    assert set(sinks_of_sides(words, sinks)["role"]) == {"state"}
-    verb = question_about(CUBES, groups=("verb=word:touch", "seen=role:image"), ratio="verb/seen")
-    of_verb = pl.col("description").str.contains("touch") | (pl.col("role") == "image")
-    assert sinks_of_sides(verb, sinks).equals(sinks.filter(of_verb))
-
-
 @pytest.mark.parametrize(
     ("role", "values", "empty"),
     [
@@ -175,38 +158,6 @@ def test_uniform_attention_has_no_sink_even_at_factor_one(keys):
     above, held = key_sums(rows, np.ones((1, keys), bool), 1.0)
     assert not above.any()
     np.testing.assert_allclose(held, 2.0 / keys, rtol=1e-4)
-
-
-def test_rows_that_are_all_masked_count_for_nothing():
-    rows = np.full((2, 1, 4), 0.25, np.float32)
-    valid = np.array([[True, True, False, False], [False] * 4])
-    above, held = key_sums(rows, valid, 1.0)
-    assert not above.any()
-    np.testing.assert_allclose(held, [[0.5, 0.5, 0.0, 0.0]])
-
-
-def plant_late_sink(task, episode, tokens, rows):
-    """The third state digit takes half of every row of the replans that have one."""
-    planted = rows.astype(np.float64).copy()
-    planted[..., BOS + 10] = np.where(planted[..., BOS + 10] > 0, 1.0, 0.0)
-    return planted / planted.sum(axis=-1, keepdims=True)
-
-
-def test_a_sink_has_the_role_of_the_replans_at_which_it_is_valid(tmp_path):
-    """Whether a late key of a changing prompt is a digit or padding depends on the replan, and on the episode."""
-    spec = StoreSpec(tasks=(0,), episodes=6, replans=3, plant_rows=plant_late_sink)
-    path = write_store(tmp_path / "a.zarr", spec=spec)
-    roles = np.stack([small_tokens(3, 0, [0, 0, i]).key_role[:, BOS + 10] for i in range(6)])
-    seen = roles != Role.PADDING
-    key = BOS + 10
-    assert 0 < seen.sum() < seen.size
-    (row,) = [
-        row
-        for row in search_sinks(question_about(path), SinkRule(3.0, 0.05)).sinks.iter_rows(named=True)
-        if row["key"] == key
-    ]
-    assert row["share_of_rows"] == pytest.approx(seen.mean(axis=1).mean())
-    assert row["role"] == "state"
 
 
 def out_by_task(sinks: pl.DataFrame) -> list[set[int]]:
@@ -315,63 +266,3 @@ def test_a_sink_of_some_heads_is_found_and_taken_out_where_it_is_widespread(tmp_
     kept = without_sinks(question, search_sinks(question, strict).sinks, strict)
     assert not any(item.without for item in kept.selected)
     assert "Sinks of fewer heads stay in: 2 keys, counted in every task by itself" in kept.notes[-1]
-
-
-def few_keys(replans: int) -> EpisodeTokens:
-    """Seven valid keys: fewer than the factor of the default rule."""
-    site = site_layout({"base_0_rgb": (1, 2)}, 14, text_keys=5, action_keys=1)
-    prompt = spell_prompt(site, [("put ", Role.INSTRUCTION), ("it", Role.INSTRUCTION)], "put it")
-    return tokens_of(site, [prompt] * replans)
-
-
-def test_with_few_keys_the_text_says_that_the_rule_cannot_fire(tmp_path, capsys):
-    def lean(task, episode, tokens, rows):
-        planted = np.where(tokens.valid[:, None, None, None, None], 1.0, 0.0) * np.ones(rows.shape)
-        planted[..., 2] *= 8.0 if task else 1.0
-        return planted / planted.sum(axis=-1, keepdims=True)
-
-    for task, said in ((0, "No key takes more than 10 x"), (1, "by mass")):
-        path = write_store(
-            tmp_path / f"{task}.zarr", spec=StoreSpec(tokens=few_keys(2), plant_rows=lean, tasks=(task,))
-        )
-        search = search_sinks(question_about(path))
-        assert search.sinks["key"].to_list() == ([2] if task else [])
-        text = " ".join(str(sinks_section(search, SinkRule())).split())
-        assert said in text
-        assert "valid keys none can take more than 10 x its uniform share" in text
-        assert "None." not in text
-
-
-@pytest.mark.parametrize(("length", "kind"), [(0.01, "small"), (3.0, "large")])
-def test_the_kind_of_a_sink_that_is_a_segment_is_told_from_contributions(tmp_path, monkeypatch, length, kind):
-    """The planted contribution of every key is mass x value; bos has a value of the given length, other keys 1."""
-
-    def vectors(spec, tokens, seed, replan):
-        segments = segments_of(tokens.layout, tokens.key_role[replan])
-        _, records = made_up.episode_records(replace(spec, contributions=False), seed[1], seed[2])
-        rows = records[replan].rows["joint"].rows
-        members = segment_members(tokens.layout, tokens.key_role[[replan]], segments)[0]
-        mass = (rows @ members.astype(float)).mean(axis=(2, 3))  # (layer, denoise, segment)
-        lengths = np.array([length if segment.role == "bos" else 1.0 for segment in segments])
-        along = mass * lengths
-        return (along[..., None, :, None] * np.eye(4)[0]).repeat(spec.num_action_queries, axis=2)
-
-    monkeypatch.setattr(made_up, "contribution_vectors", vectors)
-    spec = StoreSpec(
-        layers=(0, 1, 2, 3), heads=(0, 1, 2, 3), plant_rows=sink_of_some_heads, contributions=True, tasks=(0,)
-    )
-    path = write_store(tmp_path / "a.zarr", spec=spec)
-    row = search_sinks(question_about(path)).sinks.row(0, named=True)
-    assert row["value_ratio"] == pytest.approx(length, rel=1e-3)
-    assert kind_name(row["value_ratio"]) == kind
-
-    def patch_sink(task, episode, tokens, rows):
-        return sink_of_some_heads(task, episode, tokens, rows)[..., swapped]
-
-    swapped = np.arange(small_layout().num_keys)
-    swapped[[5, BOS]] = BOS, 5
-    other = write_store(tmp_path / "b.zarr", spec=replace(spec, plant_rows=patch_sink))
-    patch = search_sinks(question_about(other)).sinks.filter(key=5).row(0, named=True)
-    assert patch["sink_heads"] == 6
-    assert patch["value_ratio"] is None
-    assert kind_name(patch["value_ratio"]) == "?"

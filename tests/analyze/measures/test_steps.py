@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-import weakref
 from pathlib import Path
 
 import numpy as np
@@ -17,12 +16,10 @@ from polars.testing import assert_frame_equal
 from tests.kit.examples import examples
 from tests.kit.made_up_steps import flat
 from tests.kit.questions import question_about
-from vla_attention.analyze.measures import steps
-from vla_attention.analyze.measures.selected import load_tokens, resolve_all, resolve_episode, vocabulary_of
+from vla_attention.analyze.measures.selected import load_tokens, resolve_all, vocabulary_of
 from vla_attention.analyze.measures.steps import measure_episode, measure_episodes, step_tables
 from vla_attention.analyze.ratios.analysis import analyse
-from vla_attention.analyze.stores import parallel
-from vla_attention.analyze.stores.selection import parse_denoise_steps, select
+from vla_attention.analyze.stores.selection import select
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.builtin_groupings import default
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
@@ -30,7 +27,6 @@ from vla_attention.schemas.groupings.resolve import EmptyGroup, resolve
 from vla_attention.schemas.precision import mass_error_bound
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import StoreError
-from vla_attention.schemas.threads import Threads
 from vla_attention.testing.stores import StoreSpec, root_attributes, write_store
 from vla_attention.testing.strategies import episode_tokens, groupings
 
@@ -107,25 +103,6 @@ def test_fractions_lifts_and_ratios_follow_from_masses_and_counts(data):
         assert row["log2_ratio"] == pytest.approx(np.log2(row["ratio"]))
 
 
-def test_rows_are_only_read_when_the_grouping_cuts_through_a_segment(tmp_path, monkeypatch):
-    path = write_store(tmp_path / "a.zarr")
-    read: list[str] = []
-
-    def spy_on(method: str) -> None:
-        original = getattr(StoredEpisode, method)
-        monkeypatch.setattr(
-            StoredEpisode, method, lambda episode, name, *more: (read.append(name), original(episode, name, *more))[1]
-        )
-
-    spy_on("read")
-    spy_on("read_layers")
-    table_of(path, Grouping("spans", {"a": ("span:prompt & role:instruction",), "rest": ("*",)}))
-    assert "joint/atoms" in read
-    assert "joint/rows" not in read
-    table_of(path, Grouping("words", {"a": ("word:the",), "rest": ("*",)}))
-    assert "joint/rows" in read
-
-
 def test_a_selection_of_layers_steps_and_heads_takes_exactly_those(tmp_path):
     path = write_store(tmp_path / "a.zarr", heads=(1, 3), layers=(0, 2, 3), denoise_steps=(0, 4, 9))
     grouping = Grouping("g", {"words": ("word:the",), "rest": ("*",)})
@@ -168,12 +145,6 @@ def test_several_stores_are_analysed_as_one_when_they_fit(tmp_path):
         analyse(question_about([first, other]))
 
 
-def test_a_store_without_episodes_says_so(tmp_path):
-    store = open_store(write_store(tmp_path / "a.zarr", tasks=()))
-    with pytest.raises(StoreError, match="holds no complete episode yet"):
-        analyse(question_about(store))
-
-
 def test_call_numbers_are_translated_and_kept_as_labels():
     from dataclasses import replace
 
@@ -191,39 +162,6 @@ def test_call_numbers_are_translated_and_kept_as_labels():
     ):
         with pytest.raises(BadArgument, match=said):
             select(root, layers=wrong)
-
-
-def test_denoise_steps_by_name():
-    assert parse_denoise_steps(["first", "last"], (0, 4, 9)) == (0, 9)
-    assert parse_denoise_steps(["all"], (0, 4, 9)) == (0, 4, 9)
-    assert parse_denoise_steps(["4"], (0, 4, 9)) == (4,)
-    with pytest.raises(BadArgument, match="was not recorded"):
-        parse_denoise_steps(["5"], (0, 4, 9))
-
-
-def test_weights_of_a_few_episodes_are_in_memory_at_a_time(tmp_path, monkeypatch):
-    """Weights of objects are megabytes an episode; those of a word are the same at every replan, and kept once."""
-    monkeypatch.setenv("VLA_CACHE", "off")
-    path = write_store(tmp_path / "a.zarr", tasks=(0,), episodes=14, replans=4)
-    alive: set[int] = set()
-    most: list[int] = []
-
-    def resolved(*given):
-        found = resolve_episode(*given)
-        alive.add(id(found))
-        weakref.finalize(found, alive.discard, id(found))
-        most.append(len(alive))
-        return found
-
-    monkeypatch.setattr(steps, "resolve_episode", resolved)
-    monkeypatch.setattr(parallel, "threads_of_this_process", lambda: Threads(2, "a test"))
-    question = question_about(path, grouping="objects")
-    assert len(measure_episodes(question)) == len(most) == 14
-    assert max(most) < 8
-    tokens = question.selected[0].tokens
-    weights = resolve(Grouping("words", {"a": ("word:the",), "rest": ("*",)}), tokens).weights
-    assert weights.shape[0] == 4
-    assert weights.strides[0] == 0
 
 
 def test_a_group_without_keys_anywhere_is_refused_before_rows_are_read(tmp_path, monkeypatch):

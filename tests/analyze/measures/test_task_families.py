@@ -8,19 +8,13 @@ import pytest
 from scipy import stats
 
 import vla_attention as va
-from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.task_families import (
-    MixedFamilies,
     alike_instructions,
-    family_notes,
-    unknown_families,
 )
 from vla_attention.analyze.ratios.analysis import analyse
-from vla_attention.analyze.statistics.units import Estimand
-from vla_attention.schemas.errors import UnknownName
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import write_store
 
@@ -93,36 +87,6 @@ def test_of_fewer_than_four_families_the_interval_is_about_these_tasks(store, tm
     assert "tasks like these (with" not in said
 
 
-def test_an_item_of_fewer_families_is_named(store, tmp_path, capsys):
-    assert main(["words", str(store), "--no-plots", "--output", str(tmp_path / "out")]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "about tasks like these, by 4 families" in said
-    assert "In tasks of fewer than 4 families, and so about these tasks: " in said
-    summary = pl.read_parquet(tmp_path / "out" / "words_summary.parquet")
-    assert summary.filter(item="the")["intervals"].item() == "tasks-like-these"
-    assert set(summary.filter(item="drawer")["intervals"]) == {"these-tasks"}
-
-
-def test_one_run_may_know_what_another_does_not(tmp_path):
-    """Episodes that were captured before families were stored are of the family that the later ones name."""
-    path = write_store(tmp_path / "a.zarr", tasks=(0, 2), episodes=1)
-    assert question_about(path).units.families is None
-    write_store(path, mode="resume", tasks=(0, 2), episodes=2, task_families=FAMILIES)
-    question = question_about(path)
-    assert dict(question.sampling.families) == {("made_up", 0): "put A on B", ("made_up", 2): "open A"}
-    assert question.sampling.units(pl.DataFrame({"suite": 2 * ["made_up"], "task_id": [0, 2]})).num_families == 2
-
-
-def test_a_task_of_two_families_is_an_error_that_names_both(tmp_path):
-    path = write_store(tmp_path / "a.zarr", tasks=(0, 2), episodes=1, task_families=FAMILIES)
-    write_store(path, mode="resume", tasks=(0, 2), episodes=2, task_families={0: "put A on B", 2: "close A"})
-    of_both = r"task 2 of made_up are of the task families 'open A' and 'close A' .*task002_episode001.*one family\."
-    with pytest.raises(MixedFamilies, match=of_both):
-        asked(path)
-    asked(path, intervals=Estimand.THESE_TASKS)
-    asked(path, tasks=(0,))
-
-
 def test_the_families_of_several_suites_are_counted_together(store, tmp_path):
     other = write_store(tmp_path / "b.zarr", suite="other", tasks=(0, 1), task_families={0: "open A", 1: "fold A"})
     row = va.open([store, other]).ratios().filter(scope="combined", layer="layers_avg").row(0, named=True)
@@ -153,24 +117,3 @@ def test_instructions_that_differ_in_a_word_are_alike(instructions, number, exam
 )
 def test_other_instructions_are_not(instructions):
     assert alike_instructions(instructions) is None
-
-
-def test_a_store_without_families_warns_where_instructions_are_alike(tmp_path, capsys):
-    alike = write_store(tmp_path / "alike.zarr", tasks=(0, 1, 2, 3))  # the fourth has the instruction of the first
-    assert main([str(alike), "--no-plots", "--output", str(tmp_path / "out")]) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "WARNING: Of 4 tasks no family is known, and 2 of their instructions differ in at most one word" in said
-    assert main(["overlay", str(alike), "--no-plots", "--output", str(tmp_path / "out")]) == 0
-    assert "WARNING: Of" not in capsys.readouterr().out  # it prints no interval
-    for settings in ({"tasks": (0, 1, 2)}, {"intervals": "these-tasks"}, {"intervals": "independent-tasks"}):
-        question = asked(alike, **settings)
-        assert unknown_families(question.sampling, question.selected) == ""
-    question = asked(alike, intervals="independent-tasks")
-    assert family_notes(question.sampling, question.selected)[0].startswith(
-        "Intervals assume that no two of the 4 tasks"
-    )
-
-
-def test_an_unknown_kind_of_intervals_names_all_three():
-    with pytest.raises(UnknownName, match="tasks-like-these, independent-tasks, these-tasks"):
-        AnalysisSettings(intervals="tasks")

@@ -24,14 +24,10 @@ from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.objects.object_attention import ObjectTables, object_tables
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_study import followed_objects, iou_summary, leading_finder, objects_summary
-from vla_attention.analyze.objects.object_views import site_of_pictures
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.units import Estimand
-from vla_attention.analyze.words.word_study import site_of_words, words_table
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.analyze.words.word_study import words_table
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
-from vla_attention.schemas.layout import SiteLayout, Span
-from vla_attention.testing.stores import StoreSpec, root_attributes, write_store
 from vla_attention.testing.tokens import OBJECTS, random_rows
 
 QUICK = settings(
@@ -119,38 +115,6 @@ def test_shares_and_enrichment_equal_sums_over_raw_rows(follower_store):
         assert row["area_share"] == pytest.approx(np.mean(areas), rel=1e-5)
         if len(cameras) == 1:
             assert row["enrichment"] == pytest.approx((masses / seen).mean() / np.mean(areas), rel=1e-5)
-
-
-def prefers_one_camera(tokens):
-    """Uniform attention within each camera, with nine times as much to the second one."""
-    weight = np.ones(tokens.layout.num_keys)
-    span = tokens.layout.camera_span(CAMERAS[1])
-    weight[span.start : span.stop] = 9.0
-    return weight
-
-
-def test_enrichment_of_all_cameras_lies_between_theirs_whichever_is_preferred(tmp_path):
-    # The plate fills the second camera's picture, to which nine parts of ten of the attention go.
-    tokens = bowl_tokens(replans=2)
-    coverage = bowl_coverage(2, 16)
-    plate = [thing.name for thing in OBJECTS].index("plate_1")
-    coverage[CAMERAS[1]] *= 0.4 / coverage[CAMERAS[1]].sum(axis=2, keepdims=True)
-    coverage[CAMERAS[1]][:, :, plate] += 0.6
-    large = EpisodeTokens(tokens.layout, tokens.key_role, tokens.prompts, tokens.prompt_index, OBJECTS, coverage)
-
-    def preferring(task, episode, tokens, rows):
-        values = attend_uniformly(task, episode, tokens, rows) * prefers_one_camera(tokens)
-        return values / values.sum(axis=-1, keepdims=True)
-
-    path = write_bowl_store(tmp_path / "a.zarr", tokens=large, plant_rows=preferring, tasks=(0,), episodes=2)
-    objects = measured(path, ObjectSettings(spatial=False)).objects
-    of_plate = objects.filter(pl.col("item") == "plate_1", pl.col("camera") == "all")
-    # Attention that is even within each picture prefers no object: 1, where share / area is above 1.3.
-    np.testing.assert_allclose(of_plate["enrichment"], 1.0, rtol=1e-4)
-    np.testing.assert_allclose(of_plate["control_enrichment"], 1.0, rtol=1e-4)
-    assert (of_plate["share"] / of_plate["area_share"] > 1.3).all()
-    times = measured(path, ObjectSettings(spatial=False)).times.filter(item="plate_1", camera="all")
-    np.testing.assert_allclose(times["share"] / times["even_share"], 1.0, rtol=1e-4)
 
 
 def test_enrichment_of_all_cameras_is_a_mean_of_the_cameras(follower_store):
@@ -342,19 +306,6 @@ def test_a_block_that_has_two_numbers_counts_once_in_the_average(follower_store)
     assert_frame_equal(*(table.filter(pl.col("layer") == "layers_avg") for table in words))
 
 
-def test_sites_are_chosen_by_what_they_hold():
-    cross = SiteLayout("cross", (Span("text", "text", 0, 2),))
-    latent = SiteLayout("self", (Span("primary", "latent", 0, 1, camera="primary"), Span("blank", "latent", 1, 2)))
-    root = replace(root_attributes(StoreSpec()), sites=(latent, cross))
-    assert site_of_pictures(root, None) == "self"
-    assert site_of_words(root, None) == "cross"
-    assert site_of_words(replace(root, sites=(cross, latent)), None) == "cross"
-    with pytest.raises(BadArgument, match="Site 'cross' has no pictures; choose one with --site: self"):
-        site_of_pictures(root, "cross")
-    with pytest.raises(BadArgument, match="Site 'self': the keys of this site spell no words"):
-        site_of_words(root, "self")
-
-
 @pytest.mark.drawn
 def test_the_command_prints_writes_and_draws(follower_store, tmp_path, capsys):
     arguments = [
@@ -394,19 +345,3 @@ def test_a_mistake_ends_with_one_sentence(follower_store, tmp_path, capsys):
         error = capsys.readouterr().err
         assert said in error
         assert "Traceback" not in error
-
-
-def test_the_error_without_coverage_names_the_cause_and_the_remedy(tmp_path, capsys):
-    path = write_store(tmp_path / "bare.zarr", coverage=False, tasks=(0,), episodes=1)
-    for command in (
-        ["objects", str(path)],
-        ["groups", str(path), "--group", "x=object:@interest"],
-        ["groups", str(path), "--grouping", "objects"],
-    ):
-        assert main([*command, "--output", str(tmp_path / "out")]) == 2
-        error = capsys.readouterr().err
-        assert "no selected episode has object coverage" in error
-        assert "captures take it from the simulator's segmentation" in error
-        assert "masks" in error
-    with pytest.raises(BadArgument, match="no selected episode has object coverage"):
-        measured(path)

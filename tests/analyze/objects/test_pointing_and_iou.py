@@ -14,13 +14,10 @@ from hypothesis import strategies as st
 from tests.kit.examples import examples
 from vla_attention.analyze.objects.pointing_and_iou import (
     centre_of_mass,
-    distance_in_pictures,
     grown,
     intersection_over_union,
     near_patches,
     object_masks,
-    otsu_regions,
-    otsu_thresholds,
     patch_centres,
     percentile_regions,
     pointing_hits,
@@ -57,15 +54,6 @@ def test_centre_of_mass_is_that_of_scipy_moved_to_the_middle_of_patches(case):
                 continue
             wanted = np.array(scipy.ndimage.center_of_mass(values.reshape(rows, columns))) + 0.5
             np.testing.assert_allclose(found[replan, head], wanted, rtol=1e-9)
-
-
-def test_a_uniform_map_has_its_centre_in_the_middle_and_distances_are_parts_of_the_picture():
-    centres = patch_centres(4, 8)
-    middle = centre_of_mass(np.full(32, 0.25), centres)
-    assert middle.tolist() == [2.0, 4.0]
-    corner = centre_of_mass(np.eye(32)[31], centres)
-    assert corner.tolist() == [3.5, 7.5]
-    assert distance_in_pictures(middle, corner, 4, 8) == pytest.approx(math.hypot(1.5 / 4, 3.5 / 8))
 
 
 @QUICK
@@ -107,39 +95,6 @@ def test_iou_is_that_of_python_sets(case, percentile):
                     assert np.isnan(found[replan, head, item])
 
 
-def test_percentile_regions_have_the_stated_sizes():
-    values = np.random.default_rng(0).permutation(256).astype(np.float32)
-    assert [int(percentile_regions(values, p).sum()) for p in (80, 90, 95)] == [52, 26, 13]
-    assert percentile_regions(np.ones(9), 90).all()
-
-
-def between_class_variance(values: np.ndarray, threshold: float) -> float:
-    low, high = values[values <= threshold], values[values > threshold]
-    if not low.size or not high.size:
-        return 0.0
-    return low.size * high.size / values.size**2 * (low.mean() - high.mean()) ** 2
-
-
-@QUICK
-@given(st.lists(st.integers(0, 50), min_size=2, max_size=40), st.sampled_from([1.0, 1e-4]))
-def test_otsu_is_the_best_threshold_of_a_brute_force_search(values, scale):
-    values = np.array(values) * scale
-    threshold = float(otsu_thresholds(values))
-    if len(set(values)) == 1:
-        assert np.isnan(threshold)
-        assert not otsu_regions(values).any()
-        return
-    best = max(between_class_variance(values, candidate) for candidate in values)
-    assert between_class_variance(values, threshold) == pytest.approx(best, rel=1e-9)
-    assert np.array_equal(otsu_regions(values), values > threshold)
-
-
-def test_otsu_separates_two_clusters_whatever_else_the_axes_hold():
-    generator = np.random.default_rng(1)
-    maps = np.concatenate([generator.normal(1, 0.05, (3, 2, 20)), generator.normal(2, 0.05, (3, 2, 6))], axis=-1)
-    assert np.array_equal(otsu_regions(maps), np.broadcast_to(np.arange(26) >= 20, maps.shape))
-
-
 @QUICK
 @given(maps_and_masks(), st.sampled_from([50.0, 80.0]))
 def test_chance_iou_is_the_mean_over_all_shifts_of_the_map(case, percentile):
@@ -166,23 +121,6 @@ def test_replans_take_all_shifts_of_a_large_picture_alike(rows, columns, replans
     picture = region[0].reshape(rows, columns)
     moved = [np.roll(picture, by, (0, 1)).ravel() for by in np.ndindex(rows, columns)]
     assert found == pytest.approx(np.mean([(one & mask[0, :, 0]).sum() / (one | mask[0, :, 0]).sum() for one in moved]))
-
-
-def test_chance_is_higher_for_smooth_maps_than_for_scattered_patches():
-    """What a region in one piece scores by chance: a fixed blob against masks at random places."""
-    generator = np.random.default_rng(2)
-    row, column = np.divmod(np.arange(256), 16)
-    blob = np.exp(-((row - 7.5) ** 2 + (column - 7.5) ** 2) / 18)[None]
-    scores, shifted, scattered = [], [], []
-    for _ in range(400):
-        top, left = generator.integers(0, 13, 2)
-        mask = ((abs(row - top - 1.5) < 2) & (abs(column - left - 1.5) < 2))[None, :, None]
-        region, shuffled = (percentile_regions(one, 90) for one in (blob, generator.permutation(blob[0])[None]))
-        scores.append(intersection_over_union(np.roll(region, generator.integers(256)), mask)[0, 0])
-        shifted.append(shifted_iou(region, shifted_masks(mask, 16, 16))[0, 0])
-        scattered.append(intersection_over_union(shuffled, mask)[0, 0])
-    assert np.mean(shifted) == pytest.approx(np.mean(scores), rel=0.1)
-    assert np.mean(scattered) < 0.9 * np.mean(shifted)
 
 
 def test_masks_take_patches_from_the_stated_coverage_on():

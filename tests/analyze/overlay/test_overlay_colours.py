@@ -11,8 +11,6 @@ from vla_attention.analyze.overlay.colours import (
     COLOR_KEPT,
     OPACITY,
     Scale,
-    color_bar,
-    outline,
     overlay_image,
     patch_values,
     scale_for,
@@ -94,23 +92,3 @@ def test_undefined_and_missing_values() -> None:
         overlay_image(None, np.zeros((2, 2)), SCALE)
     with pytest.raises(BadArgument, match="two axes"):
         overlay_image(frame, np.zeros((2, 2, 2)), SCALE)
-
-
-def test_colours_get_lighter_and_more_opaque_with_the_value() -> None:
-    colors = SCALE.colors(np.linspace(0, 10, 21))
-    lightness = colors[:, :3] @ np.array([0.2126, 0.7152, 0.0722])
-    assert (np.diff(lightness) > 0).all()
-    np.testing.assert_allclose(colors[:, 3], OPACITY * np.linspace(0, 1, 21))
-    assert color_bar(SCALE, 100, 4).shape == (4, 100, 3)
-
-
-def test_an_outline_is_the_inner_border_of_the_members() -> None:
-    image = np.zeros((12, 12, 3), dtype=np.uint8)
-    member = np.zeros((3, 3), dtype=bool)
-    member[0:2, 1] = True
-    drawn = (outline(image, member, (255, 255, 255), width=1) == 255).all(axis=-1)
-    expected = np.zeros((12, 12), dtype=bool)
-    expected[0:8, 4:8] = True
-    expected[1:7, 5:7] = False
-    np.testing.assert_array_equal(drawn, expected)
-    assert not image.any()

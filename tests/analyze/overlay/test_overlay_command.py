@@ -17,12 +17,10 @@ from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.overlay.overlay_data import camera_names, draw, episode_overlay, ratios_of
 from vla_attention.capture.store.store_writer import open_run
-from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
-from vla_attention.schemas.layout import Role, SiteLayout, Span
+from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import PolicyCameraView
-from vla_attention.testing.tokens import INSTRUCTIONS, OBJECTS, small_prompt
 
 CAMERA = "base_0_rgb"
 
@@ -150,17 +148,6 @@ def test_without_frames_the_map_alone_is_drawn_with_a_note(tmp_path: Path, capsy
     assert every["replan"].n_unique() == 3
 
 
-def test_turned_pictures_keep_the_selectors_coordinates(tmp_path: Path) -> None:
-    store = write_turned_store(tmp_path / "a.zarr", upright=False, mirrored=True)
-    assert main(["overlay", str(store), "--no-plots", "--output", str(tmp_path / "out")]) == 0
-    table = pl.read_csv(tmp_path / "out/overlay_task000_episode000_all.csv").filter(pl.col("camera") == CAMERA)
-    for replan in range(3):
-        top = table.filter(pl.col("replan") == replan).sort("mass").row(-1, named=True)
-        row, column = place_of(replan)
-        assert (top["row"], top["column"]) == (row, column)
-        assert (top["shown_row"], top["shown_column"]) == (2 - row, 3 - column)
-
-
 @pytest.mark.parametrize(
     ("extra", "message"),
     [
@@ -180,14 +167,3 @@ def test_bad_input_is_one_sentence(
     captured = capsys.readouterr()
     assert message in captured.err
     assert "Traceback" not in captured.err
-
-
-def test_a_site_without_pictures_is_refused(tmp_path: Path) -> None:
-    layout = SiteLayout("joint", (Span("prompt", "text", 0, 14), Span("actions", "action", 14, 19)))
-    prompt, roles = small_prompt(layout, INSTRUCTIONS[0], "1 2")
-    key_role = np.tile(np.concatenate([roles, np.full(5, Role.ACTION, dtype=np.uint8)]), (2, 1))
-    tokens = EpisodeTokens(layout, key_role, (prompt,), np.zeros(2, dtype=np.int64), OBJECTS, {})
-    store = kit.write_store(tmp_path / "blind.zarr", tasks=(0,), episodes=1, tokens=tokens)
-    question = question_about(store)
-    with pytest.raises(BadArgument, match="no patches of pictures"):
-        camera_names(question, None)

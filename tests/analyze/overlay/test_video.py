@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vla_attention.analyze.overlay.video import check_video, write_video
-from vla_attention.schemas.errors import BadArgument, MissingDependency
+from vla_attention.analyze.overlay.video import write_video
 
 COLORS = ((200, 30, 40), (20, 160, 60), (30, 40, 220))
 
@@ -63,34 +62,3 @@ def test_a_disk_that_takes_no_more_is_an_error_and_leaves_no_part_of_an_mp4(tmp_
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout == f"[Errno 27] File too large: '{tmp_path / 'a.mp4'}'\n"
     assert [path.name for path in tmp_path.iterdir()] == ["whole.mp4"]
-
-
-def test_what_ffmpeg_says_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the extra [video]")
-    (tmp_path / "ffmpeg").write_text("#!/bin/sh\necho 'no such encoder' >&2\nexit 8\n")
-    (tmp_path / "ffmpeg").chmod(0o755)
-    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(tmp_path / "ffmpeg"))
-    with pytest.raises(BadArgument, match=r"could not write .*a\.mp4: no such encoder; choose --video gif"):
-        write_video(tmp_path / "a.mp4", noise(), 5, "mp4")
-    assert [path.name for path in tmp_path.iterdir()] == ["ffmpeg"]
-
-
-@pytest.mark.parametrize("fps", [0, 51, float("nan")])
-def test_bad_rates_are_refused(tmp_path: Path, fps: float) -> None:
-    with pytest.raises(BadArgument, match=r"0\.1 to 50"):
-        write_video(tmp_path / "a.gif", pictures(), fps, "gif")
-
-
-def test_pictures_of_different_sizes_leave_no_file(tmp_path: Path) -> None:
-    with pytest.raises(BadArgument, match="one size"):
-        write_video(tmp_path / "a.gif", [*pictures(), np.zeros((3, 3, 3), np.uint8)], 4, "gif")
-    with pytest.raises(BadArgument, match="at least one"):
-        write_video(tmp_path / "a.gif", [], 4, "gif")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_mp4_without_the_extra_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(MissingDependency, match=r"vla-attention\[video\]"):
-        check_video("mp4")
-    check_video("gif")

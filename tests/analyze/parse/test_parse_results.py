@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +12,7 @@ import pytest
 
 from tests.analyze.published.test_results_reader import ours
 from tests.kit.published_results import cosmos_episodes, pi_episodes, write_published
-from vla_attention.analyze.parse.command import build_parser, main
-from vla_attention.analyze.parse.plot_results_comparison import row_names
+from vla_attention.analyze.parse.command import main
 from vla_attention.analyze.show.numbers import format_number
 
 
@@ -156,14 +152,6 @@ def test_our_files_and_published_ones_are_compared_side_by_side(tmp_path, capsys
     assert len(err.splitlines()) == 1
 
 
-def test_runs_of_one_suite_are_not_pooled(tmp_path, capsys):
-    paths = [write_published(tmp_path / name, "libero_10", pi_episodes(seed=i)) for i, name in enumerate("ab")]
-    code, out, _ = run(capsys, "--results", *paths)
-    assert code == 0
-    assert re.findall(r"ANALYSIS: (.*)", out) == ["a/libero_10", "b/libero_10"]
-    assert "different runs of it" in out.replace("\n", " ")
-
-
 def test_ratios_that_are_all_infinite_are_reported_and_pictures_are_drawn(tmp_path, capsys):
     path = write_published(tmp_path, "libero_10", pi_episodes(dark=1.0))
     folder = tmp_path / "pictures"
@@ -190,15 +178,6 @@ def test_episodes_without_steps_count_and_are_named(tmp_path, capsys):
     assert "1 episode with steps, but without any in layers_avg" in " ".join(out.split())
 
 
-def test_a_summary_that_disagrees_is_said(tmp_path, capsys):
-    episodes = pi_episodes(tasks=1, episodes=1)
-    episodes[0]["summary"]["layer_26"]["visual_linguistic_ratio"]["mean"] = 40.0
-    _, out, _ = run(capsys, "--results", write_published(tmp_path, "s", episodes))
-    flat = " ".join(out.split())
-    assert "own summary disagrees with its steps in 1 number; the first: task 0 episode 0, layer 26" in flat
-    assert "summary 40, from the steps" in flat
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -222,41 +201,3 @@ def test_a_file_written_from_a_table_and_its_table_say_the_same(tmp_path, capsys
     _, out, _ = run(capsys, "--results", path)
     ratios = replans.cells.filter(layer="layers_avg")["ratio_mean"].to_numpy()
     assert f"  Mean:   {ratios.mean():.3f} ± {ratios.std():.3f}" in out
-
-
-def test_the_command_is_registered_under_its_published_name():
-    project = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    module, _, function = project["scripts"]["parse-attention-ratio-results"].partition(":")
-    assert (module, function) == ("vla_attention.analyze.__main__", "parse_attention_ratio_results")
-    done = subprocess.run(
-        [sys.executable, "-c", f"import sys; from {module} import {function} as run; sys.argv[1:] = ['--help']; run()"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout == build_parser().format_help()
-
-
-@pytest.mark.parametrize("few", [True, False])
-def test_rows_of_the_comparison_keep_different_names(few):
-    folders = [f"{'a_long_folder_name_' * 3}{i}{'_and_more_of_it' * 3}" for i in range(4)]
-    labels = [f"{folder}/{suite}" for folder in folders for suite in ("goal", "ten")]
-    for chosen in (labels, labels[::2], ["goal", "ten"]):
-        data = pl.DataFrame({"file": chosen, "layer": ["layers_avg"] * len(chosen)})
-        names = row_names(data, few)
-        assert len(set(names)) == len(chosen)
-        assert max(len(line) for name in names for line in name.splitlines()) <= 48
-
-
-def test_related_tasks_of_a_file_are_warned_of(tmp_path, capsys):
-    """A results file names no families: its intervals count all tasks as independent."""
-    episodes = pi_episodes()
-    tasks = sorted({episode["task_id"] for episode in episodes})
-    assert len(tasks) > 1
-    texts = dict(zip(tasks, ("lift the red cube", "lift the blue cube", "open the drawer"), strict=False))
-    for episode in episodes:
-        episode["task_description"] = texts.get(episode["task_id"], f"turn on stove number {episode['task_id']} now")
-    _, out, _ = run(capsys, "--results", write_published(tmp_path, "libero_10", episodes))
-    said = " ".join(out.split())
-    assert "(about tasks like these) WARNING: Of" in said
-    assert "('lift the red cube', 'lift the blue cube'). Such tasks are related" in said

@@ -22,7 +22,6 @@ SELF = SiteLayout(
         for i, name in enumerate(FRAMES)
     ),
 )
-CROSS = SiteLayout("cross", (Span("text", "text", 0, 16),))
 
 
 def root(**config):
@@ -63,15 +62,3 @@ def test_the_grouping_reference_is_one():
 )
 def test_anything_else_is_not(above, below):
     assert frame_proxy(root(), SELF, grouping(above, below)) is None
-
-
-def test_sides_of_several_groups_are_not_nor_groupings_without_ratio_nor_other_sites():
-    two = Grouping(
-        "g", {"a": ("frame:wrist",), "b": ("frame:primary",), "c": ("frame:blank",)}, Ratio(("a", "b"), ("c",))
-    )
-    assert frame_proxy(root(), SELF, two) is None
-    assert frame_proxy(root(), SELF, replace(two, ratio=None)) is None
-    proxy = grouping(("frame:primary",), ("frame:blank",))
-    assert frame_proxy(root(), CROSS, proxy) is None
-    # Another policy's store with latent frames, whose query frame nobody knows.
-    assert frame_proxy(root_attributes(StoreSpec()), SELF, proxy) is None

@@ -28,7 +28,6 @@ from vla_attention.analyze.published.results_tables import (
     NO_FINITE_AS_ZERO,
     ZEROS_COUNTED,
     disagreements,
-    labels_of,
     results_tables,
     spread_of,
 )
@@ -205,26 +204,6 @@ def test_tables_are_those_of_numpy(tmp_path):
         assert row["num_episodes"] == 4
 
 
-def test_spread_counts_what_it_leaves_out():
-    values = [1.0, 2.0, 4.0, float("inf"), None, 8.0]
-    spread = spread_of(pl.Series(values))
-    finite = np.array([1.0, 2.0, 4.0, 8.0])
-    assert (spread.num_replans, spread.num_infinite, spread.num_undefined) == (6, 1, 1)
-    assert (spread.mean, spread.std, spread.median) == (finite.mean(), finite.std(), np.median(finite))
-    assert [spread.q25, spread.q75] == np.quantile(finite, [0.25, 0.75]).tolist()
-
-
-def test_a_summary_that_its_steps_do_not_bear_out_is_noticed(tmp_path):
-    episodes = pi_episodes(tasks=1, episodes=2)
-    episodes[1]["summary"]["layer_26"]["visual_mass"]["std"] += 0.1
-    episodes[0]["summary"]["layer_99"] = episodes[0]["summary"]["layer_26"]
-    found = disagreements(read_results_file(write_published(tmp_path, "s", episodes)))
-    (changed,) = [item for item in found if item.stated.episode == 1]
-    assert (changed.stated.layer, changed.stated.measure, changed.stated.statistic) == ("26", "visual_mass", "std")
-    assert changed.stated.value - changed.computed == pytest.approx(0.1)
-    assert {item.stated.layer for item in found if item.stated.episode == 0} == {"99"}
-
-
 def test_layers_that_an_episode_lacks_and_episodes_without_steps_are_kept(tmp_path):
     episodes = pi_episodes(tasks=2, episodes=1)
     episodes[1]["per_step_ratios"], episodes[1]["summary"] = {}, {}
@@ -248,23 +227,6 @@ def test_files_folders_and_patterns_are_found_once(tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(FileNotFoundError, match="no results file in"):
         find_results([str(tmp_path / "empty")])
-
-
-def test_labels_are_suites_and_folders_only_where_they_are_needed(tmp_path):
-    paths = [
-        write_published(tmp_path / "x" / "one", "goal", cosmos_episodes()),
-        write_published(tmp_path / "x" / "two", "goal", cosmos_episodes()),
-        write_published(tmp_path / "y" / "two", "goal", cosmos_episodes()),
-        write_published(tmp_path / "x" / "one", "ten", cosmos_episodes()),
-    ]
-    same = tmp_path / "x" / "one" / "ten.json"
-    same.write_text(paths[3].read_text())
-    files = [read_results_file(path) for path in [*paths, same]]
-    assert labels_of(files) == [
-        *("one/goal", "x/two/goal", "y/two/goal"),
-        *("attention_ratio_results_ten", "ten"),
-    ]
-    assert labels_of(files[:1]) == ["goal"]
 
 
 def one_episode(**changes: Any) -> dict[str, Any]:
@@ -318,26 +280,6 @@ def test_what_does_not_fit_is_said_with_file_episode_and_field(tmp_path, documen
     with pytest.raises(ResultsError, match=rf"broken\.json: .*{message}") as caught:
         read_results_file(path)
     assert "\n" not in str(caught.value)
-
-
-def test_missing_fields_of_a_step_are_named(tmp_path):
-    episode = one_episode()
-    del episode["per_step_ratios"]["layer_25"][0]["linguistic_mass"]
-    path = write_published(tmp_path, "s", [episode])
-    with pytest.raises(ResultsError, match=r"layer_25\[0\] lacks 'linguistic_mass'"):
-        read_results_file(path)
-
-
-@pytest.mark.parametrize("content", [b"[{]", b"\xff\xfe", b"[" * 100_000])
-def test_what_is_no_json_is_no_results_file(tmp_path, content):
-    path = tmp_path / "broken.json"
-    path.write_bytes(content)
-    with pytest.raises(ResultsError, match=r"broken\.json"):
-        read_results_file(path)
-
-
-def test_a_single_episode_need_not_be_in_a_list(tmp_path):
-    assert read_results_file(write_published(tmp_path, "s", one_episode())).episodes.height == 1
 
 
 MASSES = st.tuples(*[st.one_of(st.just(0.0), st.just(1e-9), st.floats(1e-6, 1.0))] * 3)

@@ -18,7 +18,6 @@ from vla_attention.schemas.jsonable import from_json
 from vla_attention.schemas.results import (
     EpisodeResult,
     FrameProxy,
-    ResultsError,
     results_file_name,
     suite_of_results_file,
 )
@@ -198,11 +197,6 @@ def test_every_suite_has_its_own_file(tmp_path):
     assert [len(read_results(path)) for path in paths] == [6, 3]
 
 
-def test_no_episodes_are_an_empty_list(tmp_path):
-    write(tmp_path / "results.json", [])
-    assert read_results(tmp_path / "results.json") == []
-
-
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "results.json"
     documents = documents_of(replans_of(make_steps()), GROUPING)
@@ -217,10 +211,3 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
         write(path, broken())
     assert read_results(path) == results
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_grouping_without_a_ratio_says_what_is_missing():
-    grouping = custom_grouping(with_ratio=False)
-    replans = replans_of(make_steps(grouping, CUSTOM_KEYS), grouping)
-    with pytest.raises(ResultsError, match=r"cameras-and-words.*defines no ratio"):
-        episode_results(replans, grouping)

@@ -1,9 +1,6 @@
 from __future__ import annotations
 
-import subprocess
-import sys
 import warnings
-from pathlib import Path
 
 import polars as pl
 import pytest
@@ -11,14 +8,11 @@ import pytest
 from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, many_groups, replans_of
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.measures.aggregate import episode_tables, task_tables
-from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.ratios.plot_attention_fractions import plot_attention_fractions
 from vla_attention.analyze.ratios.plot_ratio_distribution import plot_ratio_distribution
 from vla_attention.analyze.ratios.plot_ratio_evolution import evolution_stem, plot_all_evolutions, plot_ratio_evolution
 from vla_attention.analyze.ratios.plot_ratio_per_task import plot_ratio_per_task
 from vla_attention.analyze.statistics.episode_intervals import Sampling
-
-ROOT = Path(__file__).resolve().parents[3]
 
 
 def only_zero_ratios():
@@ -92,17 +86,6 @@ def test_data_beside_the_picture_are_those_of_the_picture(tmp_path):
     assert data["ratio"].to_list() == pytest.approx(replans["ratio"].to_list())
 
 
-@pytest.mark.drawn
-def test_same_data_give_the_same_file(tmp_path):
-    grouping = default_grouping()
-    tasks = task_tables(episode_tables(replans_of(make_steps(), grouping), grouping), grouping, Sampling())
-    for folder in ("a", "b"):
-        plot_attention_fractions(tasks, grouping, tmp_path / folder)
-    for kind in ("png", "pdf", "csv"):
-        name = f"attention_fractions.{kind}"
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
-
-
 @pytest.mark.thorough
 def test_all_evolutions_keep_suites_apart(tmp_path):
     grouping = default_grouping()
@@ -114,36 +97,3 @@ def test_all_evolutions_keep_suites_apart(tmp_path):
     assert len(done) == 2 * 3
     assert len(set(paths)) == len(paths) == 2 * 3 * 3
     assert {path.parent.name for path in paths} == {"libero_10", "libero_goal"}
-
-
-def test_names_of_evolution_files():
-    stem = evolution_stem(3, "Put the $5 mug_1 on the plate, then stop!", 2, "25")
-    assert stem == "task3_put_the_5_mug_1_on_the_plate_then_stop_ep2_layer25_ratio_evolution"
-    assert evolution_stem(0, "", 0, LAYERS_AVG) == "task0_task_ep0_layers_avg_ratio_evolution"
-    assert len(evolution_stem(0, "word " * 100, 0, "1")) < 120
-
-
-def test_importing_analyze_and_its_plots_does_not_import_matplotlib():
-    modules = [
-        "measures.aggregate",
-        "ratios.summary_text",
-        "published.results_writer",
-        "statistics.intervals",
-        "show.plot_style",
-    ]
-    modules += [f"ratios.plot_{name}" for name in ("ratio_distribution", "ratio_per_task", "ratio_evolution")]
-    modules += ["ratios.plot_attention_fractions"]
-    imported = ", ".join(f"vla_attention.analyze.{name}" for name in modules)
-    code = f"import sys, {imported}; print('matplotlib' in sys.modules)"
-    result = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert result.stdout.strip() == "False"
-
-
-def test_drawing_leaves_the_settings_of_the_caller_alone(tmp_path):
-    import matplotlib as mpl
-
-    before = mpl.rcParams.copy()
-    grouping = default_grouping()
-    tasks = task_tables(episode_tables(replans_of(make_steps(), grouping), grouping), grouping, Sampling())
-    plot_attention_fractions(tasks, grouping, tmp_path)
-    assert mpl.rcParams.copy() == before

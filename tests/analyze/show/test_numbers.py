@@ -7,9 +7,6 @@ from vla_attention.analyze.show.numbers import (
     format_number,
     format_percent,
     format_percent_interval,
-    interval_name,
-    of_tasks,
-    plural,
 )
 
 
@@ -38,15 +35,3 @@ def test_intervals():
 )
 def test_percent(share, decimals, text):
     assert format_percent(share, decimals) == text
-
-
-def test_the_name_of_an_interval_has_its_level():
-    assert interval_name(0.95) == "95% interval"
-    assert interval_name(0.995) == "99.5% interval"
-
-
-def test_counts_with_their_nouns():
-    assert plural(1, "task") == "1 task"
-    assert plural(0, "task") == "0 tasks"
-    assert of_tasks(16, 8) == "16 episodes of 8 tasks"
-    assert of_tasks(1, 1) == "1 episode of 1 task"

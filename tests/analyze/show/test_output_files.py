@@ -5,7 +5,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from vla_attention.analyze.show.output_files import files_lines, write_csv, write_parquet, write_text, writing
+from vla_attention.analyze.show.output_files import write_csv, write_parquet, write_text, writing
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.store_format import StoreNotFound
 
@@ -31,16 +31,6 @@ def test_what_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
         raise StoreNotFound("no store")
 
 
-def test_tables_become_files_and_are_listed(tmp_path: Path) -> None:
-    table = pl.DataFrame({"ratio": [1.5, float("inf"), None]})
-    files = [*write_parquet(tmp_path / "out", a=table), *write_csv(tmp_path / "out", a=table)]
-    assert pl.read_parquet(files[0]).equals(table)
-    assert files[1].read_text() == "ratio\n1.5\ninf\n\n"
-    inside = [tmp_path / "out" / "episodes" / f"{i}.png" for i in range(3)]
-    printed = " ".join(" ".join(files_lines(tmp_path / "out", [*files, *inside])).split())
-    assert printed == f"5 files in {tmp_path / 'out'}: a (.parquet .csv); 3 in episodes/"
-
-
 def test_a_table_in_parts_is_the_table_and_each_part_is_made_when_it_is_written(tmp_path: Path) -> None:
     whole = pl.DataFrame({"n": range(400_000), "name": ["a", None, "b,c", "d"] * 100_000, "x": [0.5, None] * 200_000})
     alive: list[int] = []
@@ -64,14 +54,3 @@ def test_a_table_in_parts_is_the_table_and_each_part_is_made_when_it_is_written(
     assert max(most) < 30
     write_csv(tmp_path, whole=whole, parts=(whole[start : start + 30_000] for start in range(0, 400_000, 30_000)))
     assert (tmp_path / "parts.csv").read_bytes() == (tmp_path / "whole.csv").read_bytes()
-
-
-def test_an_error_in_a_part_is_raised_as_it_is_and_leaves_no_file(tmp_path: Path) -> None:
-    def parts():
-        yield pl.DataFrame({"n": [1]})
-        raise StoreNotFound("There is no store a.zarr.")
-
-    for write in (write_parquet, write_csv):
-        with pytest.raises(StoreNotFound, match="There is no store"):
-            write(tmp_path, table=parts())
-    assert not list(tmp_path.iterdir())

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import polars as pl
 import pytest
-from matplotlib.figure import Figure
 
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.show.picture_formats import picture_formats, pictures_saved_as
-from vla_attention.analyze.show.plot_style import new_figure, save_figure
+from vla_attention.analyze.show.picture_formats import picture_formats
 from vla_attention.testing.stores import write_store
 
 
@@ -33,26 +30,3 @@ def test_a_pdf_without_pictures_is_refused(capsys, command):
         main([command, "a.zarr", "--no-plots", "--pdf"])
     assert stopped.value.code == 2
     assert "--pdf: not allowed with argument --no-plots" in capsys.readouterr().err
-
-
-def test_the_formats_are_back_after_an_error():
-    def fail() -> None:
-        with pictures_saved_as(["png"]):
-            assert picture_formats() == ("png",)
-            raise KeyError
-
-    with pytest.raises(KeyError):
-        fail()
-    assert picture_formats() == ("png", "pdf")
-
-
-@pytest.mark.drawn
-def test_a_picture_is_drawn_once_for_a_format(tmp_path, monkeypatch):
-    drawn = []
-    draw = Figure.draw
-    monkeypatch.setattr(Figure, "draw", lambda figure, renderer: drawn.append(renderer) or draw(figure, renderer))
-    figure = new_figure(3, 2)
-    figure.add_subplot().plot([1, 2])
-    save_figure(figure, tmp_path, "line", pl.DataFrame({"x": [1, 2]}), ("png",))
-    assert len(drawn) == 1
-    assert (tmp_path / "line.png").read_bytes()[:4] == b"\x89PNG"

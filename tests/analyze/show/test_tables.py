@@ -4,26 +4,16 @@ from __future__ import annotations
 
 from vla_attention.analyze.show.tables import (
     Cell,
-    Table,
-    count,
-    episode_count,
     estimate,
     interval,
     percent,
     signed,
-    texts,
-    words,
 )
 
 ROWS = [
     {"name": "x", "n": 1, "share": 0.125, "share_low": 0.1, "share_high": 0.25, "text": "one two " * 20},
     {"name": "yy", "n": 10, "share": None, "share_low": None, "share_high": None, "text": ""},
 ]
-
-
-def test_columns_are_aligned_with_a_rule_below_the_header():
-    table = Table([words("a", "name"), count("bb", "n")], ROWS)
-    assert str(table).splitlines() == ["a   bb", "······", "x    1", "yy  10"]
 
 
 def test_a_unit_stands_behind_every_value_of_a_text_and_in_the_header_of_the_page():
@@ -42,19 +32,3 @@ def test_estimates_stand_beside_their_intervals_which_sort_by_width():
     assert interval("share", times=100).text(ROWS[0]) == "[10, 25]"
     assert interval("share", of=lambda row: None).text(ROWS[0]) == "-"
     assert signed("share", "share").text(ROWS[0]) == "+0.125"
-
-
-def test_running_text_stands_last_and_is_wrapped_into_the_width():
-    table = Table([texts("said", "text", running=True), words("a", "name")], ROWS)
-    head, rows = table.laid_out(width=40)
-    assert head == ["a   said"]
-    assert all(line.startswith(("x   one", "    ")) for line in rows[0])
-    assert len(rows[0]) > 1
-    assert max(map(len, rows[0])) <= 40
-    assert rows[1] == ["yy"]
-
-
-def test_episodes_are_counted_with_their_tasks_where_there_are_several():
-    row = {"num_episodes": 4, "num_tasks": 2}
-    assert [episode_count(several).text(row) for several in (True, False)] == ["4 (2)", "4"]
-    assert [episode_count(several).header for several in (True, False)] == ["episodes (tasks)", "episodes"]

@@ -8,14 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import linalg, stats
 
-from vla_attention.analyze.statistics.effect_sizes import contrast, mean_difference, standardised_mean
+from vla_attention.analyze.statistics.effect_sizes import contrast, mean_difference
 from vla_attention.analyze.statistics.family_errors import family_error
 from vla_attention.analyze.statistics.intervals import (
     estimates,
     mean_over_episodes,
     ratio_of_means_over_episodes,
 )
-from vla_attention.analyze.statistics.student import student_quantile, two_sided_p
 from vla_attention.analyze.statistics.units import Estimand, Units
 
 SIZES = (3, 6, 3, 3, 2)
@@ -106,14 +105,6 @@ def test_the_quotient_of_means_is_linearised():
     assert one.degrees == pytest.approx(degrees)
 
 
-def test_degrees_need_not_be_whole():
-    for degrees in (1.2, 3.4049, 4.61, 22.7, 350.5):
-        for level in (0.5, 0.95, 0.999):
-            assert student_quantile(level, degrees) == pytest.approx(stats.t.ppf(0.5 + level / 2, degrees), rel=1e-9)
-        for t in (0.0, 0.3, 2.5, 40.0):
-            assert two_sided_p(t, degrees) == pytest.approx(2 * stats.t.sf(t, degrees), rel=1e-9, abs=1e-13)
-
-
 def test_related_tasks_are_not_counted_as_independent():
     """Families differ by 1 and their tasks by 0.4: intervals by families cover, those over tasks miss a third."""
     generator, tasks = np.random.default_rng(11), np.arange(17)
@@ -163,18 +154,3 @@ def test_classes_of_few_families_are_compared_in_these_tasks():
     assert found.difference.error is not None
     # About tasks like these nothing can be said.
     assert mean_difference(twice, np.tile(is_first, 2), units).error is None
-
-
-def test_effect_sizes_leave_out_one_family_after_the_other():
-    values = GENERATOR.normal(0.5, size=17)
-    one = standardised_mean(values, Units.of(np.arange(17), families=FAMILIES))
-    left_out = [
-        standardised_mean(values[family != FAMILIES], Units.of(np.arange((family != FAMILIES).sum()))).value
-        for family in range(5)
-    ]
-    # Each is corrected for its own number of pairs; the jackknife keeps the correction of all.
-    factor = lambda n: 1 - 3 / (4 * (n - 1) - 1)  # noqa: E731
-    plain = np.array([value / factor((family != FAMILIES).sum()) for family, value in enumerate(left_out)]) * factor(17)
-    assert one.error == pytest.approx(np.sqrt(4 / 5 * ((plain - plain.mean()) ** 2).sum()))
-    assert one.degrees == 4
-    assert standardised_mean(values, Units.of(np.arange(17), families=FAMILIES // 2)).error is None  # three families

@@ -35,6 +35,7 @@ def test_what_was_read_of_an_episode_is_not_kept(damaged):
     assert all("seal" not in vars(episode) for episode in store.episodes)
 
 
+@pytest.mark.thorough
 def test_damaged_episodes_are_left_out_by_workers_too(damaged, tmp_path, capsys):
     printed = []
     for options in ([], ["--workers", "2"]):

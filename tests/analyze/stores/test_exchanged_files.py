@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 
 import vla_attention as va
-from tests.kit.attacks import SECOND, arrays_of, attacks, edit_root, encode_again, exchange, first, root_leaves, two
+from tests.kit.attacks import attacks, edit_root, encode_again, first, root_leaves
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.api import OpenStores
@@ -88,10 +88,6 @@ def check_answers(stores: tuple[Path, Path], answers: dict[str, list[pl.DataFram
     return refused
 
 
-def test_the_attacks_are_on_every_array(originals):
-    assert sorted(arrays_of(first(originals[0]))) == sorted(ARRAYS)
-
-
 def all_bytes(store: Path) -> dict[str, bytes]:
     return {str(file.relative_to(store)): file.read_bytes() for file in store.rglob("*") if file.is_file()}
 
@@ -162,27 +158,6 @@ def test_every_command_ends_with_one_sentence_that_names_the_episode(stores, tmp
     assert array in said
     assert "\n" not in said
     assert not output.exists()
-
-
-def test_compare_and_copy_end_so_too(stores, tmp_path, capsys):
-    exchange(*(episode / "joint/atoms" for episode in two(stores[1])))
-    assert main(["compare", *map(str, stores), "--allow-mismatch", "seed", "--output", str(tmp_path / "out")]) == 2
-    assert "joint/atoms of episode task000_episode000" in capsys.readouterr().err
-    assert main(["copy", str(stores[1]), str(tmp_path / "c.zarr")]) == 2
-    said = capsys.readouterr().err
-    assert "task000_episode000" in said
-    assert "--skip-corrupt" not in said  # copy has no such argument
-
-
-def test_exchanged_episodes_are_left_out_by_name_when_asked(stores, tmp_path, capsys):
-    exchange(*(episode / "joint/rows" for episode in two(stores[0])))
-    assert main([str(stores[0]), "--no-plots", "--skip-corrupt", "--output", str(tmp_path / "out")]) == 0
-    printed = capsys.readouterr().out
-    whole = " ".join((tmp_path / "out/summary.txt").read_text().split())
-    for name in ("task000_episode000", SECOND):
-        assert name in printed
-        assert re.search(f"{name} of .* is left out: Array joint/rows", whole)
-    assert set(pl.read_parquet(tmp_path / "out/episodes.parquet")["task_id"]) == {1}
 
 
 def test_an_episode_copied_under_another_name_counts_once_when_asked(stores, originals, tmp_path, capsys):

@@ -8,12 +8,6 @@ import pytest
 from vla_attention.analyze.stores.parallel import each_episode, map_episodes
 
 
-def test_results_come_in_order_and_progress_counts_each():
-    counted = []
-    assert map_episodes(_square, range(20), counted.append) == [i * i for i in range(20)]
-    assert counted == [1] * 20
-
-
 def test_the_first_error_ends_it():
     begun = []
     gate = threading.Event()
@@ -28,19 +22,6 @@ def test_results_are_handed_out_one_by_one_and_few_episodes_are_begun_ahead():
     assert [next(results) for _ in range(3)] == [0, 1, 2]
     results.close()
     assert len(begun) < 50
-
-
-def test_a_function_that_no_other_process_could_find_is_refused():
-    def inside(i: int) -> int:
-        return i
-
-    for function in (inside, partial(inside, 3), lambda i: i):
-        with pytest.raises(TypeError, match="defined inside of a function"):
-            map_episodes(function, range(3))
-
-
-def _square(i: int) -> int:
-    return i * i
 
 
 def _fail_first(i: int, begun: list[int], gate: threading.Event) -> int:

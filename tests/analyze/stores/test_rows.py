@@ -12,17 +12,13 @@ import pytest
 import zarr
 
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.measures.question import ask
-from vla_attention.analyze.measures.question_settings import AnalysisSettings
-from vla_attention.analyze.measures.steps import measure_episodes
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import select
 from vla_attention.schemas.precision import round_mantissa
 from vla_attention.schemas.stores.content_rules import add_up, row_sum_bound
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
-from vla_attention.testing.stores import StoreSpec, reseal, write_store
-from vla_attention.testing.tokens import libero_tokens
+from vla_attention.testing.stores import reseal, write_store
 
 
 def raw_rows(path: Path) -> np.ndarray:
@@ -46,13 +42,6 @@ def test_rows_are_numpys_means_of_the_stored_ones_to_the_last_bit(tmp_path, quer
         np.testing.assert_array_equal(part.rows, expected)
         seen.append((part.layer, part.denoise))
     assert seen == [(0, 0), (0, 1), (1, 0), (1, 1)]
-
-
-def test_a_caller_can_keep_heads_apart_whatever_the_selection_says(tmp_path):
-    path = write_store(tmp_path / "a.zarr", tasks=(0,), episodes=1, heads=(0, 1, 3))
-    store = open_store(path)
-    first = next(layer_rows(store.attributes, store.episodes[0], select(store.attributes), "joint", per_head=True))
-    np.testing.assert_array_equal(first.rows, raw_rows(path)[:, 0, 0, :, 0])
 
 
 @pytest.mark.parametrize("per_head", [True, False])
@@ -151,32 +140,3 @@ def test_what_is_quickly_held_to_add_up_does(bits, keys):
         assert add_up(exact, sums, bits) <= expected
         assert add_up(exact, sums, bits) == expected or bound < 1e-4
     assert not add_up(np.where(np.arange(keys) == 3, np.float32(np.nan), rounded), sums, bits)
-
-
-@pytest.mark.skipif(not Path("/proc/self/io").exists(), reason="the system does not count the bytes that are read")
-def test_three_layers_of_eighteen_read_a_quarter_of_the_bytes_at_most(tmp_path):
-    spec = StoreSpec(
-        tasks=(0,), episodes=2, layers=tuple(range(18)), num_layers=18, frames=False, tokens=libero_tokens(16)
-    )
-    path = write_store(tmp_path / "a.zarr", spec=spec)
-
-    def bytes_read(layers: tuple[int, ...] | None) -> int:
-        before = read_so_far()
-        settings = AnalysisSettings(groups=("soup=word:soup", "v=role:image"), ratio="v/soup", layers=layers)
-        measure_episodes(ask([open_store(path)], settings))
-        return read_so_far() - before
-
-    bytes_read((0,))  # modules that are imported on first use
-    every, three = bytes_read(None), bytes_read((3, 4, 17))
-    assert every > (path / "episodes").stat().st_size + sum(shard_sizes(path)) * 0.9  # the counter counts
-    assert three < every / 4
-
-
-def read_so_far() -> int:
-    found = re.search(r"rchar: (\d+)", Path("/proc/self/io").read_text())
-    assert found is not None
-    return int(found[1])
-
-
-def shard_sizes(path: Path) -> list[int]:
-    return [file.stat().st_size for file in path.rglob("joint/rows/c.*")]

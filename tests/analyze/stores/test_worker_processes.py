@@ -5,23 +5,17 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import subprocess
-import sys
-import time
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 from polars.testing import assert_frame_equal
 
 import vla_attention as va
-from tests.kit.episode_work import damaged, defect, die_always, die_once, process_of, square
+from tests.kit.episode_work import damaged, defect, process_of, square
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.measures.steps import measure_episodes
 from vla_attention.analyze.stores.parallel import Threads, each_episode, episodes_with, map_episodes, workers
-from vla_attention.analyze.stores.worker_processes import WorkersDied
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions, KeyKnockout
 from vla_attention.schemas.stores.store_format import CorruptEpisode
@@ -78,6 +72,7 @@ def test_every_question_has_the_same_answer_to_the_last_bit(two, store, tmp_path
         assert_frame_equal(one, other, check_exact=True)
 
 
+@pytest.mark.thorough
 def test_a_process_that_is_killed_in_the_middle_is_replaced(store):
     question = question_about(store)
     with episodes_with(Threads()):
@@ -98,17 +93,6 @@ def test_a_process_that_is_killed_in_the_middle_is_replaced(store):
         assert one.mass.tobytes() == other.mass.tobytes()
 
 
-def test_an_episode_with_which_a_process_dies_is_begun_again(tmp_path):
-    with workers(2):
-        assert map_episodes(partial(die_once, marker=tmp_path / "died"), range(8)) == list(range(8))
-    assert (tmp_path / "died").exists()
-
-
-def test_an_episode_with_which_processes_always_die_ends_with_a_sentence():
-    with workers(2), pytest.raises(WorkersDied, match=r"ended 3 times without a result, the last time at .*3"):
-        map_episodes(die_always, range(8))
-
-
 def test_errors_are_raised_as_in_this_process(two):
     results = each_episode(damaged, range(100))
     assert [next(results), next(results)] == [0, 1]
@@ -119,66 +103,7 @@ def test_errors_are_raised_as_in_this_process(two):
     assert map_episodes(square, range(3)) == [0, 1, 4]
 
 
-def test_no_process_is_left_behind(store):
-    before = set(multiprocessing.active_children())
-    with workers(2):
-        va.open(store).ratios()
-        assert len(set(multiprocessing.active_children()) - before) == 2
-    assert set(multiprocessing.active_children()) <= before
-
-
-def runs(pid: str) -> bool:
-    """Whether a process has not ended; one that its new parent has not waited for yet has."""
-    try:
-        status = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8")
-    except FileNotFoundError:
-        return False
-    return status.rpartition(")")[2].split()[0] not in "ZX"
-
-
-@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks at /proc")
-def test_processes_end_when_their_asker_is_killed():
-    code = """
-import os, signal
-from tests.kit.episode_work import process_of
-from vla_attention.analyze.stores.parallel import map_episodes, workers
-if __name__ == "__main__":
-    with workers(2):
-        print(*sorted(set(map_episodes(process_of, range(40)))), flush=True)
-        os.kill(os.getpid(), signal.SIGKILL)
-"""
-    # Workers hold the other end of this pipe: it ends when the last of them has.
-    done = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, timeout=120, check=False)
-    assert done.returncode == -signal.SIGKILL
-    until = time.monotonic() + 30
-    while left := [pid for pid in done.stdout.split() if runs(pid)]:  # the pipe ends a moment before the process does
-        assert time.monotonic() < until, left
-        time.sleep(0.05)
-
-
-@pytest.mark.parametrize("stdin", [False, True])
-def test_a_script_needs_no_guard(store, tmp_path, stdin):
-    script = tmp_path / "script.py"
-    script.write_text(
-        "import vla_attention as va\n"
-        "with va.workers(2):\n"
-        f"    print(len(va.open({str(store)!r}).masses('episodes')))\n"
-        "print(__name__)\n"
-    )
-    done = subprocess.run(
-        [sys.executable, *([] if stdin else [str(script)])],
-        input=script.read_text() if stdin else None,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
-    rows, name = done.stdout.split()
-    assert (int(rows), name) == (len(va.open(store).masses("episodes")), "__main__")
-
-
+@pytest.mark.thorough
 def test_the_command_line_takes_a_number_of_workers(store, tmp_path, capsys):
     before = set(multiprocessing.active_children())
     for folder, options in (("a", []), ("b", ["--workers", "2"])):

@@ -13,17 +13,11 @@ from scipy import stats
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.measures.alignment import (
-    around_event,
-    change_and_placebo,
-    change_at_event,
     closing_replan,
     on_episode_time,
     replan_starts,
 )
-from vla_attention.analyze.show.answer import text_of
-from vla_attention.analyze.time.text import time_sections
-from vla_attention.analyze.time.time_courses import ALL, FAILURE, GRIPPER_CLOSING, SUCCESS, TimeSettings, time_courses
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.analyze.time.time_courses import ALL, FAILURE, SUCCESS, TimeSettings, time_courses
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.store_format import StoreError
 from vla_attention.testing.stores import StoreSpec, write_store
@@ -122,34 +116,6 @@ def test_values_that_are_not_finite_take_no_part_in_a_bin():
     assert np.isnan(found[1])
 
 
-def test_replans_that_do_not_fit_their_episode_are_refused():
-    assert replan_starts(np.array([10, 15, 20]), 10, 11, "it").tolist() == [0, 5, 10]
-    for steps, wait, length in (([10, 15], 5, 20), ([10, 10], 10, 20), ([10, 15], 10, 5), ([], 10, 5)):
-        with pytest.raises(StoreError, match="do not fit"):
-            replan_starts(np.array(steps, dtype=np.int64), wait, length, "it")
-
-
-def test_only_executed_actions_close_the_gripper():
-    planned = np.full((3, 8, 7), -1.0)
-    planned[0, 5:, -1] = 1.0  # planned, and replaced by the next replan
-    planned[1, 4, -1] = 0.2
-    starts = np.array([0, 5, 10])
-    assert closing_replan(planned, starts, 12) == 1
-    planned[1, 4, -1] = 0.0  # leaves the fingers where they are
-    assert closing_replan(planned, starts, 12) is None
-    planned[2, 3, -1] = 1.0  # after the episode's end
-    assert closing_replan(planned, starts, 12) is None
-    assert closing_replan(planned, starts, 14) == 2
-
-
-def test_values_around_an_event_are_missing_outside_the_episode():
-    values = np.arange(5.0)[:, None]
-    assert around_event(values, 1, 2)[:, 0] == pytest.approx([np.nan, 0, 1, 2, 3], nan_ok=True)
-    assert around_event(values, 4, 2)[:, 0] == pytest.approx([2, 3, 4, np.nan, np.nan], nan_ok=True)
-    assert change_at_event(around_event(values, 2, 2), 2) == pytest.approx([3.0 - 0.5])
-    assert np.isnan(change_at_event(around_event(values, 0, 2), 2)).all()
-
-
 def expected_logs():
     """Straight from the arrays of the store's recipe: log ratio (replan,) by (task, episode)."""
     return {name: log_ratio(*name) for name in NAMES}
@@ -176,87 +142,6 @@ def test_the_course_is_that_of_plain_numpy(courses):
         assert (found["value"] < found["high"]).all()
 
 
-def mean_over_tasks(values: dict[tuple[int, int], float]) -> float:
-    """Mean over tasks of the means over their episodes; keys are (task, episode)."""
-    tasks = {task for task, _ in values}
-    return float(np.mean([np.mean([value for name, value in values.items() if name[0] == task]) for task in tasks]))
-
-
-def test_the_aligned_course_and_the_change_at_the_closing_are_those_of_plain_numpy(courses):
-    logs = expected_logs()
-    closers = [name for name in NAMES if closes_at(*name) is not None]
-    found = courses.course.filter(alignment=GRIPPER_CLOSING, outcome=ALL, quantity="ratio").sort("position")
-    for row in found.iter_rows(named=True):
-        at = [(name, closes_at(*name) + int(row["position"])) for name in closers]
-        inside = {name: logs[name][replan] for name, replan in at if 0 <= replan < REPLANS}
-        assert row["num_episodes"] == len(inside)
-        assert row["value"] == pytest.approx(np.exp(mean_over_tasks(inside)), rel=1e-5)
-    closing = courses.closing.sort("task_id", "episode_index")["closing_replan"].to_list()
-    assert closing == [closes_at(*name) for name in NAMES]
-    changes = {}
-    for name in closers:
-        event = closes_at(*name)
-        changes[name] = logs[name][event : event + 4].mean() - logs[name][max(0, event - 3) : event].mean()
-    row = courses.change.filter(quantity="ratio").row(0, named=True)
-    assert row["change"] == pytest.approx(np.exp(mean_over_tasks(changes)), rel=1e-5)
-    elsewhere = {}
-    for name in closers:
-        slopes = {}
-        for replan in range(1, REPLANS):
-            before, after = range(max(0, replan - 3), replan), range(replan, min(REPLANS, replan + 4))
-            apart = 5 * (np.mean(after) - np.mean(before))
-            slopes[replan] = (logs[name][list(after)].mean() - logs[name][list(before)].mean()) / apart, apart
-        own = slopes.pop(closes_at(*name))[1]
-        elsewhere[name] = own * np.mean([slope for slope, _ in slopes.values()])
-    assert row["placebo"] == pytest.approx(np.exp(mean_over_tasks(elsewhere)), rel=1e-5)
-    beyond = {name: changes[name] - elsewhere[name] for name in closers}
-    assert row["beyond"] == pytest.approx(np.exp(mean_over_tasks(beyond)), rel=1e-5)
-    assert row["beyond_low"] < row["beyond"] < row["beyond_high"] < 1
-    assert row["q"] <= 0.05
-    # The planted truth is a half.
-    assert row["low"] < 0.5 < row["high"] < 0.6
-    assert row["num_episodes"] == len(closers) == 15
-
-
-@given(st.integers(2, 14), st.integers(1, 9), st.data())
-@settings(deadline=None)
-def test_a_steady_drift_has_no_change_beyond_that_elsewhere(replans, window, data):
-    """Whatever the sides' lengths, the steps between replans, and values that are missing."""
-    event = data.draw(st.integers(1, replans - 1))
-    starts = np.cumsum(data.draw(st.lists(st.integers(1, 9), min_size=replans, max_size=replans)))
-    values = np.stack([3.0 - 0.2 * starts, 0.1 * starts, np.full(replans, 2.0)], axis=1)
-    values[data.draw(st.integers(0, replans - 1)), 1] = np.nan
-    change, placebo = change_and_placebo(values, starts, event, window)
-    known = np.isfinite(placebo)
-    assert known[0] == known[2] == (replans > 2)
-    assert change[known] == pytest.approx(placebo[known], abs=1e-9)
-    assert change == pytest.approx(change_at_event(around_event(values, event, window), window), nan_ok=True)
-    if known[0]:
-        values[event:, 0] += 1.0
-        change, placebo = change_and_placebo(values, starts, event, window)
-        assert 0.0 < (change - placebo)[0] < 1.0 + 1e-9  # the other replans' sides hold a part of the step
-
-
-def drifting(task, episode, tokens, rows):
-    """As `plant_rows`, with a drift all along and nothing at the closing."""
-    visual = (tokens.key_role == Role.IMAGE)[:, None, None, None, None, :]
-    noise = np.random.default_rng([10, task, episode]).normal(0, 0.05, REPLANS)
-    logs = 0.1 * np.arange(REPLANS) + noise
-    made = np.where(rows > 0, np.exp(logs[:, None, None, None, None, None] * visual), 0.0)
-    return made / made.sum(axis=-1, keepdims=True)
-
-
-def test_a_steady_drift_is_no_change_at_the_closing(tmp_path):
-    path = write_store(tmp_path / "drift.zarr", spec=replace(SPEC, plant_rows=drifting))
-    found = time_courses(question_about(path), TimeSettings(num_bins=5, window=3))
-    row = found.change.filter(quantity="ratio").row(0, named=True)
-    assert row["low"] > 1.1  # the change alone
-    assert row["beyond_low"] < 1 < row["beyond_high"]
-    assert row["q"] > 0.05
-    said = " ".join(text_of(time_sections(question_about(path), found, TimeSettings(5, 3))).split())
-    assert "none shows a change beyond that elsewhere" in said
-
-
 def test_the_planted_effect_of_success_is_found(courses):
     logs = expected_logs()
     means = {name: values.mean() / np.log(2) for name, values in logs.items()}
@@ -266,23 +151,6 @@ def test_the_planted_effect_of_success_is_found(courses):
     assert row["cliffs_delta"] == pytest.approx(2 * stats.mannwhitneyu(first, second).statistic / 64 - 1)
     assert row["within_tasks_low"] < 0.8 / np.log(2) < row["within_tasks_high"]
     assert row["within_tasks_low"] > 0.3
-
-
-def test_the_text_says_what_was_found(question, courses):
-    text = text_of(time_sections(question, courses, TimeSettings(5, 3)))
-    assert max(map(len, text.splitlines())) <= 101
-    assert "closes in 15 of 16 episodes" in text
-    assert "Geyer" in text
-    assert "untrained" in text
-
-
-def test_one_class_alone_is_said_and_not_computed(tmp_path):
-    spec = StoreSpec(plant_success=lambda task, episode: False)
-    question = question_about(write_store(tmp_path / "failed.zarr", spec=spec))
-    found = time_courses(question)
-    assert found.course["outcome"].unique().to_list() == [ALL]
-    assert found.outcomes["difference"].null_count() == found.outcomes.height
-    assert "0 solved and 4 failed; at least 2 of either" in text_of(time_sections(question, found, TimeSettings()))
 
 
 @pytest.mark.drawn
@@ -296,39 +164,12 @@ def test_the_command_writes_tables_and_pictures(store, tmp_path, capsys):
             assert (tmp_path / "out" / f"{stem}.{kind}").stat().st_size > 0
 
 
-def test_groups_without_a_ratio_have_a_course_of_fractions(store, tmp_path):
-    arguments = [
-        "time",
-        str(store),
-        "--group",
-        "base=camera:base_0_rgb",
-        "--group",
-        "rest=*",
-        "--output",
-        str(tmp_path / "out"),
-    ]
-    assert main(arguments) == 0
-    table = pl.read_parquet(tmp_path / "out" / "time_course.parquet")
-    assert set(table["quantity"]) == {"base", "rest"}
-
-
-@pytest.mark.parametrize(("arguments", "said"), [(["--bins", "1"], "--bins 1"), (["--window", "0"], "--window 0")])
-def test_settings_out_of_range_are_one_sentence(store, arguments, said, capsys):
-    assert main(["time", str(store), *arguments]) == 2
-    error = capsys.readouterr().err
-    assert said in error
-    assert len(error.splitlines()) == 1
-    with pytest.raises(BadArgument):
-        TimeSettings(num_bins=1)
-
-
 def test_replans_beyond_the_end_of_an_episode_are_refused(store, tmp_path, capsys, monkeypatch):
     from vla_attention.schemas.stores.reader import StoredEpisode
 
     plain = StoredEpisode.attributes.func  # type: ignore[attr-defined]
 
     def shortened(self):
-        from dataclasses import replace
 
         return replace(plain(self), num_steps=3)
 
@@ -337,3 +178,23 @@ def test_replans_beyond_the_end_of_an_episode_are_refused(store, tmp_path, capsy
     error = capsys.readouterr().err
     assert "do not fit into its 3 steps" in error
     assert not json.dumps(error).count("Traceback")
+
+
+def test_replans_that_do_not_fit_their_episode_are_refused():
+    assert replan_starts(np.array([10, 15, 20]), 10, 11, "it").tolist() == [0, 5, 10]
+    for steps, wait, length in (([10, 15], 5, 20), ([10, 10], 10, 20), ([10, 15], 10, 5), ([], 10, 5)):
+        with pytest.raises(StoreError, match="do not fit"):
+            replan_starts(np.array(steps, dtype=np.int64), wait, length, "it")
+
+
+def test_only_executed_actions_close_the_gripper():
+    planned = np.full((3, 8, 7), -1.0)
+    planned[0, 5:, -1] = 1.0  # planned, and replaced by the next replan
+    planned[1, 4, -1] = 0.2
+    starts = np.array([0, 5, 10])
+    assert closing_replan(planned, starts, 12) == 1
+    planned[1, 4, -1] = 0.0  # leaves the fingers where they are
+    assert closing_replan(planned, starts, 12) is None
+    planned[2, 3, -1] = 1.0  # after the episode's end
+    assert closing_replan(planned, starts, 12) is None
+    assert closing_replan(planned, starts, 14) == 2

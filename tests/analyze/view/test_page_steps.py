@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,28 +40,3 @@ def test_what_happened_first_is_said(tmp_path):
     assert plain == ["touched akita_black_bowl_1 first (step 7)"]
     assert other == [*plain, 'did "push the plate\u202e" (step 3)']
     assert none == []
-
-
-Changed = Callable[[dict[str, Any]], Any]
-WRONG: dict[str, tuple[Changed, str]] = {
-    "a touch too few": (lambda s: s["first_touch"].pop(), "first touches of"),
-    "a moment beyond": (lambda s: s["first_touch"].__setitem__(1, 15), "steps.first_touch[1] is 15"),
-    "no whole moment": (lambda s: s["first_touch"].__setitem__(1, 0.5), "steps.first_touch[1] is 0.5"),
-    "a path": (lambda s: s["bodies"].__setitem__(1, "../a"), "steps.bodies[1] is"),
-    "no goals": (lambda s: s.pop("goals"), "steps.goals is nothing"),
-    "too many goals": (lambda s: s.update(goals=s["goals"] * 6000), "steps.goals is a list of 12000"),
-    "a goal of nobody": (lambda s: s["goals"][0].pop("task_id"), "steps.goals[0].task_id is nothing"),
-}
-
-
-def test_wrong_steps_are_a_sentence(tmp_path):
-    stores = []
-    for number, (change, _) in enumerate(WRONG.values()):
-        stores.append(write_store(tmp_path / f"{number}.zarr", tasks=(0, 1), plant_steps=small_steps))
-        file = stores[-1] / f"episodes/{EPISODE}/zarr.json"
-        document = json.loads(file.read_text())
-        change(document["attributes"]["steps"])
-        file.write_text(json.dumps(document))
-    for (name, (_, sentence)), answer in zip(WRONG.items(), answers_of(stores), strict=True):
-        assert sentence in answer["failure"], name
-        assert answer["told"], name

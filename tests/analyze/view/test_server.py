@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from pathlib import Path
 
 import pytest
@@ -41,12 +40,6 @@ def test_it_listens_on_the_loopback_only(server):
     assert server.server_address[0] == "127.0.0.1"
     assert len(server.token) >= 32
     assert server.link == f"http://127.0.0.1:{server.server_address[1]}/{server.token}/"
-
-
-def test_two_servers_have_different_tokens(store):
-    with served(store) as one, served(store) as other:
-        assert one.token != other.token
-        assert ask_target(one, f"/{other.token}/stores.json").status == 403
 
 
 def test_the_page_and_its_files_are_sent_with_their_rules(server):
@@ -94,22 +87,7 @@ def test_parts_of_files_are_sent(server, store):
     assert (several.status, several.body) == (200, content)
 
 
-def test_the_bytes_that_are_sent_are_counted(store):
-    with served(store) as running:
-        name = rows_file(store).relative_to(store).as_posix()
-        ask(running, f"stores/0/{name}", Range="bytes=0-99")
-        ask(running, f"stores/0/{name}", Range="bytes=100-149")
-        ask(running, f"stores/0/{name}", "HEAD")
-        assert running.sent == {f"0/{name}": 150}
-
-
-def test_head_has_the_length_and_no_bytes(server, store):
-    reply = ask(server, "stores/0/zarr.json", "HEAD")
-    assert (reply.status, reply.body) == (200, b"")
-    assert int(reply.headers["content-length"]) == (store / "zarr.json").stat().st_size
-
-
-@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "PATCH", "TRACE", "CONNECT", "get", "X" * 3000])
+@pytest.mark.parametrize("method", ["POST", "OPTIONS", "get", "X" * 3000])
 def test_other_methods_are_refused(server, method):
     reply = ask(server, "stores.json", method)
     assert reply.status == 405
@@ -139,19 +117,11 @@ def test_two_hosts_are_refused(server):
     "path",
     [
         "stores/0/../../../etc/passwd",
-        "stores/0/%2e%2e/%2e%2e/secret",
         "stores/0/episodes/..%2f..%2f..%2fsecret",
-        "stores/0/episodes/%2fetc%2fpasswd",
-        "stores/0//etc/passwd",
         "stores/0/episodes/..\\..\\secret",
-        "stores/0/episodes/%00",
-        "stores/0/episodes",
         "stores/0/episodes/",
-        "stores/0/episodes/task000_episode000",
-        "stores/0/episodes/nothing",
         "stores/0/secret",
         "stores/7/zarr.json",
-        "nothing",
     ],
 )
 def test_nothing_outside_of_the_store_is_sent(server, store, path):
@@ -191,27 +161,11 @@ def test_links_out_of_the_store_and_what_is_no_file_are_not_sent(tmp_path):
     ("request_", "statuses"),
     [
         (b"GET /TOKEN/ HTTP/1.1\r\nHost: 127.0.0.1\r\nX: " + b"y" * 70_000 + b"\r\n\r\n", {431}),
-        (b"GET /TOKEN/ HTTP/1.1\r\nHost: 127.0.0.1\r\n" + b"X: y\r\n" * 200 + b"\r\n", {431}),
         (b"GET /TOKEN/" + b"a" * 70_000 + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n", {414}),
-        (b"GET /TOKEN/ HTTP/9.9\r\nHost: 127.0.0.1\r\n\r\n", {400, 505}),
         (b"GET /TOKEN/ HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 5\r\n\r\nhello", {400}),
         (b"GET /TOKEN/ HTTP/1.1\r\nHost: 127.0.0.1\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n", {400}),
-        (b"GET\r\n\r\n", {400}),
         (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + bytes(range(256)), {0, 400}),
-        (b"\r\n\r\n", {0}),
         (b"", {0}),
-    ],
-    ids=[
-        "long header",
-        "many headers",
-        "long target",
-        "version",
-        "body",
-        "chunked",
-        "no target",
-        "TLS",
-        "blank",
-        "empty",
     ],
 )
 def test_malformed_requests_are_refused_and_the_server_goes_on(server, request_, statuses):
@@ -235,15 +189,6 @@ def test_the_document_lists_stores_and_episodes(server, store):
         ]
     }
     assert ask(server, "stores/0.summary.json").headers["content-type"] == "application/json"
-
-
-def test_stores_of_one_name_are_told_apart(tmp_path, store):
-    other = tmp_path / "b" / "a.zarr"
-    shutil.copytree(store, other)
-    with served(store, other) as running:
-        found = json.loads(ask(running, "stores.json").body)["stores"]
-        assert [entry["name"] for entry in found] == [str(store), str(other)]
-        assert ask(running, "stores/1/zarr.json").body == (other / "zarr.json").read_bytes()
 
 
 def test_episodes_that_are_captured_meanwhile_are_listed(tmp_path):
@@ -276,12 +221,6 @@ def test_packed_stores_and_stores_elsewhere_are_served(tmp_path, store):
         broken = ask(running, f"stores/1/{name}", Range="bytes=0-9")
         assert broken.status == 502
         assert b"cannot be read" in broken.body
-
-
-@pytest.mark.parametrize("port", [-1, 65536])
-def test_ports_that_do_not_exist_are_refused(port):
-    with pytest.raises(BadArgument, match="1 to 65535"):
-        ViewerServer((), port)
 
 
 def test_a_port_in_use_is_refused(server):

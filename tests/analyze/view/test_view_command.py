@@ -5,27 +5,18 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import sys
-import webbrowser
-import zipfile
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import vla_attention as va
-from tests.kit.http_ranges import serve
 from tests.kit.stopped_programs import after_call, run_stopped
 from tests.kit.viewer import ask, served
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.show.browser import has_screen, open_page
 from vla_attention.analyze.view.paths import PAGE_FILES
 from vla_attention.analyze.view.summary_process import summary_parts
-from vla_attention.schemas.stores.digest import seal_digest
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
-from vla_attention.testing.stores import StoreSpec, small_effects, write_store
+from vla_attention.testing.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2)
 
@@ -57,14 +48,6 @@ def test_the_summary_has_the_numbers_of_the_analysis(store):
             assert found[name] == row[column], name
 
 
-def test_before_the_numbers_there_are_the_episodes(store):
-    with served(store) as running:
-        running.stores[0].summary.begin(running.stores[0].store)
-        document = json.loads(ask(running, "stores/0.summary.json").body)
-        names = [entry["name"] for entry in json.loads(ask(running, "stores.json").body)["stores"][0]["episodes"]]
-    assert [row["name"] for row in document["episodes"]] == names
-
-
 def test_a_damaged_episode_has_no_numbers_and_the_others_have(store, tmp_path):
     damaged = tmp_path / "a.zarr"
     shutil.copytree(store, damaged)
@@ -74,26 +57,6 @@ def test_a_damaged_episode_has_no_numbers_and_the_others_have(store, tmp_path):
     assert "task001_episode000" in failed
     rows = {row["name"]: row for part in parts for row in part.get("episodes", ())}
     assert [rows[name]["ratio"] is None for name in sorted(rows)] == [False, False, True, False]
-
-
-def test_the_units_of_effects_come_first_or_why_there_are_none(tmp_path):
-    path = write_store(tmp_path / "a.zarr", spec=replace(SPEC, plant_effects=small_effects))
-    _, part, *rest = summary_parts(open_store(path))
-    actions = np.concatenate([episode.read("actions").reshape(-1, 7) for episode in open_store(path).episodes])
-    assert part == {"effect_units": {"spread": pytest.approx(actions.std(axis=0))}}
-    assert not any("effect_units" in each for each in rest)
-    (path / "episodes/task001_episode000/actions/zarr.json").unlink()
-    _, part, *_ = summary_parts(open_store(path))
-    assert "task001_episode000" in part["effect_units"]["failed"]
-    assert not any("effect_units" in each for each in summary_parts(open_store(write_store(tmp_path / "b.zarr"))))
-
-
-def test_a_site_without_both_sides_has_no_ratio(tmp_path):
-    store = write_site_store(tmp_path / "a.zarr", SiteStoreSpec(kind="split"))
-    *_, last = summary_parts(open_store(store))
-    assert "failed" not in last
-    assert last["episodes"][0]["replans"]
-    assert last["episodes"][0]["ratio"] is None
 
 
 def test_a_site_is_the_page_its_documents_and_a_link_to_the_store(store, tmp_path, capsys):
@@ -130,17 +93,10 @@ def upload(folder: Path, target: Path) -> dict[str, bytes]:
 FOREIGN = {
     "notes.txt": lambda store, secret: (store / "notes.txt").write_text("mine"),
     "keys (a link)": lambda store, secret: (store / "keys").symlink_to(secret),
-    "episodes/zarr.json (a link)": lambda store, secret: replace_by_link(store / "episodes/zarr.json", secret / "id"),
-    "episodes/drafts/": lambda store, secret: (store / "episodes/drafts").mkdir(),
-    "episodes/task000_episode000/.DS_Store": lambda store, secret: (
-        store / "episodes/task000_episode000/.DS_Store"
-    ).write_text("mine"),
     "episodes/task000_episode000/joint/rows/keys (a link)": lambda store, secret: (
         store / "episodes/task000_episode000/joint/rows/keys"
     ).symlink_to(secret),
-    "episodes/task000_episode000/state/zarr.json (a link)": lambda store, secret: replace_by_link(
-        store / "episodes/task000_episode000/state/zarr.json", store / "episodes/task000_episode001/state/zarr.json"
-    ),
+    "episodes/zarr.json (a link)": lambda store, secret: replace_by_link(store / "episodes/zarr.json", secret / "id"),
 }
 
 
@@ -161,27 +117,6 @@ def test_a_site_publishes_nothing_but_the_store(store, tmp_path, capsys, name):
     assert not (tmp_path / "site").exists()
 
 
-@pytest.mark.filterwarnings("ignore:Ignored in", "ignore:Left out")
-def test_a_site_of_a_packed_store_publishes_nothing_but_the_store(store, tmp_path, capsys):
-    packed = tmp_path / "p.zarr"
-    assert main(["copy", str(store), str(packed), "--packed"]) == 0
-    folder = packed / "episodes/task000_000"
-    shutil.copyfile(folder / "task000_episode000.zip", folder / "task000_episode009.zip")
-    (folder / "mine.zip").write_text("mine")
-    replace_by_link(folder / "task000_episode001.zip", folder / "task000_episode000.zip")
-    with zipfile.ZipFile(packed / "episodes/task001_000/task001_episode000.zip", "a") as found:
-        found.writestr("mine", "mine")
-    index = json.loads((packed / "index.json").read_text())
-    size = (packed / "episodes/task001_000/task001_episode000.zip").stat().st_size
-    index["episodes"]["task001_episode000"] |= {"bytes": size, "tail": 0}
-    (packed / "index.json").write_text(json.dumps(index | {"digest": seal_digest(index)}))
-    assert main(["view", str(packed), "--site", str(tmp_path / "site")]) == 2
-    said = capsys.readouterr().err
-    for name in ("mine.zip", "task000_episode001.zip (a link)", "task000_episode009.zip"):
-        assert f"episodes/task000_000/{name}" in said
-    assert "episodes/task001_episode000/mine" in said
-
-
 def test_what_an_upload_takes_along(store, tmp_path, capsys):
     """Of a second site in the same place, too: the links of the first are gone, and others are refused."""
     other = write_store(tmp_path / "b.zarr", spec=SPEC, suite="other")
@@ -199,17 +134,6 @@ def test_what_an_upload_takes_along(store, tmp_path, capsys):
         (site / link).unlink()
 
 
-def test_a_site_of_a_store_elsewhere_names_its_address(store, tmp_path, capsys):
-    pytest.importorskip("aiohttp")
-    assert main(["copy", str(store), str(tmp_path / "p.zarr"), "--packed"]) == 0
-    with serve(tmp_path) as elsewhere:
-        assert main(["view", f"{elsewhere.url}/p.zarr", "--site", str(tmp_path / "site")]) == 0
-    assert "CORS" in capsys.readouterr().out
-    (entry,) = json.loads((tmp_path / "site/stores.json").read_text())["stores"]
-    assert entry["root"] == f"{elsewhere.url}/p.zarr/"
-    assert entry["packed"]
-
-
 @pytest.mark.parametrize("place", ["a.zarr", "file", "full", "hub/datasets"])
 def test_a_site_is_written_into_no_store_and_over_nothing_else(store, tmp_path, capsys, place):
     (tmp_path / "file").write_text("mine")
@@ -222,11 +146,6 @@ def test_a_site_is_written_into_no_store_and_over_nothing_else(store, tmp_path, 
     assert main(["view", str(store), "--site", str(tmp_path / place)]) == 2
     assert "Cannot write a site into" in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == before
-
-
-def test_addresses_that_browsers_cannot_read_are_refused_for_a_site(tmp_path, capsys):
-    assert main(["view", "s3://bucket/a.zarr", "--site", str(tmp_path / "site")]) == 2
-    assert "Browsers cannot read s3://bucket/a.zarr" in capsys.readouterr().err
 
 
 def test_what_is_no_store_is_refused_with_a_sentence(tmp_path, capsys):
@@ -249,46 +168,3 @@ def test_it_ends_with_one_sentence(store, signal, code, word, tmp_path, monkeypa
     # Started again on the same port, it has the same link.
     again = ["view", str(store), "--no-open", "--port", found[3]]
     assert run_stopped("vla_attention.analyze", again, moment, signal=signal).stdout == done.stdout
-
-
-def test_a_browser_is_opened_before_a_screen_only():
-    assert has_screen("linux", {"DISPLAY": ":0"})
-    assert has_screen("linux", {"WAYLAND_DISPLAY": "wayland-0"})
-    assert has_screen("darwin", {})
-    assert not has_screen("linux", {})
-    assert not has_screen("linux", {"DISPLAY": ""})
-    assert not has_screen("darwin", {"SSH_CONNECTION": "1 2 3 4"})
-
-
-def test_a_report_is_opened_or_the_reason_is_said(store, tmp_path, capsys, monkeypatch):
-    opened: list[str] = []
-    monkeypatch.setattr(webbrowser, "open", lambda address: opened.append(address) or True)
-    page = tmp_path / "report.html"
-    words = ["report", str(store), "--quick", "--episodes", "0", "--output", str(page), "--open"]
-    monkeypatch.setenv("DISPLAY", ":0")
-    assert main(words) == 0
-    assert opened == [page.as_uri()]
-    assert capsys.readouterr().out.endswith("on 4 episodes.\n")
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(sys, "platform", "linux")
-    assert (
-        open_page(page)
-        == f"There is no screen or no browser here, so {page} was not opened; copy it to where there is one."
-    )
-    assert opened == [page.as_uri()]
-
-
-def test_the_analysis_ends_by_naming_the_report_and_the_viewer(store, tmp_path, capsys, monkeypatch):
-    words = ["--no-plots", "--output", str(tmp_path / "out")]
-    long = tmp_path / f"{'long' * 20}.zarr"
-    shutil.copytree(store, long)
-    assert main([str(long), *words]) == 0
-    assert capsys.readouterr().out.endswith(
-        "One page of it: vla-attention report STORE --open; to explore it: vla-attention view STORE\n"
-    )
-    monkeypatch.chdir(store.parent)
-    assert main(["a.zarr", *words]) == 0
-    assert capsys.readouterr().out.endswith(
-        "One page of it: vla-attention report a.zarr --open\nTo explore it: vla-attention view a.zarr\n"
-    )

@@ -9,16 +9,13 @@ import polars as pl
 import pytest
 import zarr
 
-from tests.kit.bowl_scene import bowl_tokens, write_bowl_store
+from tests.kit.bowl_scene import write_bowl_store
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.statistics.episode_intervals import Sampling
-from vla_attention.analyze.words.text import leading_sentence
-from vla_attention.analyze.words.word_study import leading_words, study_words, words_summary, words_table
+from vla_attention.analyze.words.word_study import leading_words, words_summary, words_table
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
-from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import write_store
 from vla_attention.testing.tokens import random_rows
 
@@ -179,35 +176,3 @@ def test_a_mistake_ends_with_one_sentence(reader_store, tmp_path, capsys):
         error = capsys.readouterr().err
         assert said in error
         assert "Traceback" not in error
-
-
-def test_a_single_episode_has_no_interval_and_is_drawn_all_the_same(tmp_path, capsys):
-    path = write_bowl_store(tmp_path / "one.zarr", tasks=(0,), episodes=1, layers=(1,), tokens=bowl_tokens(replans=1))
-    assert main(["words", str(path), "--output", str(tmp_path / "out")]) == 0
-    assert "layer 1; 1 episode of 1 task" in capsys.readouterr().out
-    summary = pl.read_parquet(tmp_path / "out" / "words_summary.parquet")
-    assert summary["lift_low"].null_count() == summary.height
-
-
-def read_first_noun(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
-    """'bowl' is read most where an instruction has it."""
-    rows = random_rows(tokens, rows.shape[1:-1], seed=10 * task + episode, spread=0.2)
-    for replan, which in enumerate(tokens.prompt_index):
-        keys = [key for word in tokens.words[which] if word.text == "bowl" for key in word.keys]
-        rows[replan, ..., keys] *= 20
-    return rows / rows.sum(axis=-1, keepdims=True)
-
-
-def test_a_word_that_shares_no_episode_with_others_is_compared_between_tasks_and_that_is_said(tmp_path):
-    """One task of three says 'bowl', the others 'drawer' and 'stove': their scenes differ as well."""
-    path = write_store(tmp_path / "a.zarr", tasks=(0, 1, 2), episodes=5, frames=False, plant_rows=read_first_noun)
-    study = study_words([open_store(path)], AnalysisSettings(intervals="these-tasks"))
-    word = study.leaders[0]
-    assert word.name == {"item": "bowl"}
-    apart = {name["item"] for name in word.apart}
-    assert apart >= {"drawer", "stove"}
-    assert not apart & {"the", "plate", "put"}
-    said = leading_sentence(study)
-    assert "'bowl' has a higher lift" in said
-    assert "'bowl' shares too few episodes with 'open', 'top', 'drawer'" in said
-    assert "the differences to these are between tasks" in said
