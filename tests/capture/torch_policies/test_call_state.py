@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import random
 from collections import deque
 
@@ -36,8 +35,6 @@ def called(runner: Runner):
     return {
         "method": runner.act,
         "closure": lambda: runner.act(),
-        "partial": functools.partial(lambda one: one.act(), runner),
-        "partial of a method": functools.partial(runner.act),
     }
 
 

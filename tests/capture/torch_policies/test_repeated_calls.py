@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 import vla_attention as va
-from tests.kit.small_torch_policy import HORIZON, PROMPT, WIDTH, SmallPolicy, given, small_layout
+from tests.kit.small_torch_policy import HORIZON, PROMPT, WIDTH, given, small_layout
 from tests.kit.small_torch_variants import PATCHES, OneModulePolicy, TokenPolicy, one_module_layout, token_layout
 from tests.kit.stateful_policies import (
     BufferPolicy,
@@ -21,7 +21,6 @@ from tests.kit.stateful_policies import (
     SamplingPolicy,
     layout_with_prefix,
 )
-from vla_attention.analyze.__main__ import main
 from vla_attention.capture.policies.noise import noise_seed
 from vla_attention.schemas.errors import BadArgument, Note
 from vla_attention.schemas.groupings.vocabulary import SceneObject
@@ -200,62 +199,18 @@ def test_actions_rows_and_states_are_those_of_a_run_without_effects(tmp_path, ki
         assert np.abs(changes["without_word_bowl"]).max() > 1e-4
 
 
-def test_one_action_of_a_chunk_is_what_its_effect_is_of(tmp_path):
-    store, _, _ = fill(tmp_path / "a.zarr", QueuePolicy(), replans=1)
-    assert store.episodes[0].read("actions").shape == (1, 1, 2)
-    assert store.episodes[0].read("effects/change").shape[1:] == (1, 2)
-    assert store.attributes.policy.action_horizon == HORIZON
-
-
-def test_commands_read_the_store(tmp_path, capsys):
-    store, _, _ = fill(tmp_path / "a.zarr", SamplingPolicy(), episodes=3)
-    arguments = [str(tmp_path / "a.zarr"), "--output", str(tmp_path / "out"), "--no-plots"]
-    assert main(["effects", *arguments[:3]]) == 0
-    assert "'bowl'" in capsys.readouterr().out
-    table = va.open(store.path).effects()
-    assert {"without_word_bowl", "front_blank", "prompt_synonyms_bowl_plate"} <= set(table["condition"])
-
-
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
         ({"effects": "word"}, "EffectSettings.items has no 'word'; expected text, cameras, objects, tokens"),
         ({"layout": small_layout()}, "by the reader 'all': no rule of the layout 'small' says which calls are passes"),
-        ({"layout": small_layout()}, "use EffectSettings(..., readers=('action',))"),
-        (
-            {"layout": small_layout(), "effects": va.EffectSettings(("text",), ("pictures",))},
-            "by the reader 'pictures': no rule of the layout 'small' says which calls are passes over a prefix",
-        ),
-        (
-            {"effects": va.EffectSettings(("text",), denoise_steps=2)},
-            "with 2 denoise steps: a call of your own is repeated as it is",
-        ),
-        ({"knockout": "word:bowl"}, "Cannot measure effects beside interventions on attention"),
         ({"repeat": None}, "Cannot measure effects at environment step 0 of task000_episode000: the call cannot be"),
-        ({"repeat": lambda *_: lambda call, more: None}, "needs the arguments call, more; expected one"),
-        ({"repeat": lambda *_: 3}, "The repeat of a replan is 3; expected a callable"),
-        ({"siblings": "pick the plate"}, "The siblings of an episode are 'pick the plate'; expected a list"),
     ],
 )
 def test_what_cannot_be_measured_is_a_sentence(tmp_path, settings, sentence):
     with pytest.raises(BadArgument) as caught:
         fill(tmp_path / "a.zarr", SamplingPolicy(), **settings)
     assert sentence in str(caught.value)
-
-
-def test_several_environments_and_calls_without_actions_are_refused(tmp_path):
-    policy = SamplingPolicy()
-    settings = {"layout": layout_with_prefix(), "effects": "text", "durable": False}
-    with va.record(tmp_path / "a.zarr", policy, **settings) as run:
-        facts = {"task_id": 0, "episode_index": 0, "instruction": ""}
-        with pytest.raises(BadArgument, match="of several environments in one call"), run.episodes([facts]):
-            pass
-        with (
-            pytest.raises(BadArgument, match=r"its actions are not known. Set replan.actions"),
-            run.episode(**facts) as episode,
-            episode.replan(env_step=0, repeat=lambda: policy.sample(**inputs(0))),
-        ):
-            policy.sample(**inputs(0))
 
 
 def test_a_repeat_that_raises_is_said_once_and_its_entries_are_absent(tmp_path):
@@ -319,31 +274,6 @@ def test_what_repeats_leave_where_nothing_sees_it_is_noticed(tmp_path):
     assert "gives other actions than the recorded call when nothing is changed" in said[0]
     assert "are refused" in said[1]
     assert list(changes_of(store)) == ["unchanged"]
-
-
-def test_a_repeat_without_an_argument_measures_knockouts_only(tmp_path):
-    store, _, said = fill(
-        tmp_path / "a.zarr", SamplingPolicy(), lambda policy, replan: lambda: policy.sample(**inputs(replan))
-    )
-    (sentence,) = said
-    assert "takes no argument: no word and no picture is exchanged. Give lambda call: ..." in sentence
-    names = set(changes_of(store, 1))
-    assert {"unchanged", "noise", "without_word_bowl", "without_visual_queries_all"} <= names
-    assert not {"prompt_synonyms_bowl_plate", "front_blank"} & names
-
-
-def test_noise_that_is_given_has_no_floor_and_without_siblings_no_word_is_exchanged(tmp_path):
-    class Given(SmallPolicy):
-        def sample(self, **inputs):
-            return self.act(**inputs, noise=given()["noise"])
-
-    store, _, said = fill(tmp_path / "a.zarr", Given(), siblings=())
-    assert [line.split(":")[0] for line in said] == [
-        "No word is exchanged",
-        "The repeated call draws no noise from a generator that is known",
-    ]
-    assert "noise" not in changes_of(store)
-    assert "without_word_bowl" in changes_of(store)
 
 
 def test_a_prompt_of_another_length_is_not_exchanged(tmp_path):
@@ -475,52 +405,6 @@ def test_sites_of_which_nothing_is_recorded_are_changed_too(tmp_path, monkeypatc
     monkeypatch.setattr(nn.functional, "scaled_dot_product_attention", without)
     expected = policy.act(prefix, noise) - replan.actions
     np.testing.assert_allclose(changes_of(store)["without_camera_front"], expected[0], atol=1e-5)
-
-
-def test_keys_of_another_kernel_that_takes_no_mask(tmp_path):
-    """Attention that allows no change: what is exchanged is measured, and what is cut off is said to be left out."""
-
-    class Added(nn.Module):
-        tokenizer = SmallPolicy().tokenizer
-
-        def __init__(self):
-            super().__init__()
-            torch.manual_seed(0)
-            self.words = nn.Embedding(9, 8)
-            self.blocks = nn.ModuleList(nn.MultiheadAttention(8, 2, batch_first=True, add_zero_attn=True) for _ in "ab")
-
-        @torch.no_grad()
-        def sample(self, texts, **_):
-            tokens, hidden = self.words(torch.tensor([self.tokenizer.encode(texts[0])])), torch.randn(1, 3, 8)
-            for block in self.blocks:
-                hidden = hidden + block(hidden, tokens, tokens)[0]
-            return hidden
-
-    keys = va.SiteLayout("cross", (va.Span("prompt", "text", 0, 5), va.Span("zero", "state", 5, 6)))
-    site = va.RecordedSite(keys, (0, 3), {"prompt": "instruction", "zero": "learned"})
-    layout = va.PolicyLayout(
-        name="added",
-        family="added",
-        num_layers=2,
-        num_heads=2,
-        sites=(site,),
-        rules=(va.CallRule(r"blocks\.(?P<block>\d+)", "cross"),),
-        text=va.PromptText(("prompt",), "words"),
-    )
-    policy = Added()
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        settings = {"effects": va.EffectSettings(("text",), ("action",)), "tokenizer": policy.tokenizer}
-        with (
-            va.record(tmp_path / "a.zarr", policy, layout=layout, durable=False, **settings) as run,
-            run.episode(task_id=0, episode_index=0, instruction=TEXT, siblings=SIBLINGS) as episode,
-            episode.replan(env_step=0, repeat=lambda call: policy.sample([call.instruction])) as replan,
-        ):
-            replan.actions = policy.sample([TEXT])
-    assert ["cannot be changed" in str(one.message) for one in said if one.category is Note] == [True] * len(said)
-    changes = changes_of(open_store(tmp_path / "a.zarr"))
-    assert list(changes) == ["unchanged", "noise", "prompt_synonyms_bowl_plate"]
-    assert not changes["unchanged"].any()
 
 
 def test_a_prefix_that_is_no_pass_over_the_sites_keys(tmp_path):

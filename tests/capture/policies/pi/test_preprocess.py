@@ -83,12 +83,6 @@ def test_actions_relative_to_the_state(inputs, expected, stats):
     np.testing.assert_allclose(got, expected["z_actions7_extra_delta"], rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_normalisation_goes_back_and_forth(stats, mode):
-    x = np.linspace(-2, 2, 8)
-    np.testing.assert_allclose(stats.state.unnormalise(stats.state.normalise(x, mode), mode), x, atol=1e-12)
-
-
 def test_longer_statistics_are_cut_and_longer_data_passes_through():
     long = Statistics(mean=np.arange(32.0), std=np.ones(32))
     assert long.normalise(np.arange(8.0), "z-score").tolist() == [0.0] * 8
@@ -141,11 +135,8 @@ def test_statistics_come_from_the_checkpoint_s_assets(tmp_path, stats):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("{", "not valid JSON"),
         ("{}", "no 'norm_stats'"),
-        ("[]", "holds a list"),
         ('{"norm_stats": {"state": {"mean": [0], "std": [1]}}}', "no mean and std for 'actions'"),
-        ('{"norm_stats": {"state": {"mean": [0], "std": [1, 1]}}}', "unequal lengths for 'state'"),
         ('{"norm_stats": {"state": {"mean": ["a"], "std": [1]}}}', "other values than numbers as 'mean'"),
     ],
 )
@@ -156,11 +147,6 @@ def test_damaged_statistics(tmp_path, content, message):
     with pytest.raises(UnreadableCheckpoint, match=message) as caught:
         read_norm_stats(tmp_path)
     assert isinstance(caught.value, UserError)
-
-
-def test_quantile_mode_without_quantiles():
-    with pytest.raises(UnreadableCheckpoint, match="no q01 and q99"):
-        Statistics(mean=np.zeros(1), std=np.ones(1)).normalise(np.zeros(1), "quantile")
 
 
 def numbers(dim, **more):
