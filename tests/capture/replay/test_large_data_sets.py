@@ -8,12 +8,10 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import polars as pl
 import pytest
 
 from tests.kit.lerobot_data_sets import (
     Encoding,
-    encoded,
     made_up_episodes,
     numbered_picture,
     write_data_set,
@@ -86,18 +84,4 @@ def test_a_video_of_several_hundred_megabytes(tmp_path):
     write_video(video, pictures, 10, Encoding("libx264", {"preset": "ultrafast", "qp": "3", "g": "2"}))
     assert video.stat().st_size > 250_000_000
     check_pictures(folder, length, 150_000_000)
-    check_replay(folder, tmp_path / "run.zarr")
-
-
-@pytest.mark.parametrize("groups", ["a group of rows for each episode", "one group of rows"])
-def test_tables_with_several_hundred_megabytes_of_pictures(tmp_path, groups):
-    length = 120
-    folder = small(tmp_path / "robot", length, video=False)
-    (table,) = folder.glob("data/**/*.parquet")
-    cells = [{"bytes": encoded("PNG", noisy(number), compress_level=0), "path": "a"} for number in range(3 * length)]
-    kind = pl.Struct({"bytes": pl.Binary, "path": pl.String})
-    rows = pl.read_parquet(table).with_columns(pl.Series(CAMERA, cells, dtype=kind))
-    rows.write_parquet(table, row_group_size=length if "each" in groups else None, compression="snappy")
-    assert table.stat().st_size > 300_000_000
-    check_pictures(folder, length, table.stat().st_size)
     check_replay(folder, tmp_path / "run.zarr")

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from vla_attention.capture.rollout.background_writing import BackgroundWriting
-from vla_attention.schemas.stores.store_format import StoreExists
 
 
 class Stopped(Exception):
@@ -113,36 +112,6 @@ def test_what_waits_is_bounded() -> None:
         episode.commit(False, 0, None)
         assert len(writing.commits_after_notice()) == 1
     assert store.log[1:4] == ["one: 0", "one: 2", "one: 3"]
-
-
-def test_a_dropped_episode_is_closed_and_may_begin_again() -> None:
-    store = MadeUpStore()
-    store.may_append.clear()
-    with Writing() as writing:
-        first = begin(writing, store, "one")
-        first.append(record(0, 1))
-        assert store.appends.wait(60)
-        first.append(record(1, 1))
-        first.drop()
-        again = begin(writing, store, "again")
-        again.append(record(0, 1))
-        again.commit(True, 1, None)
-        store.may_append.set()
-        assert [committed.episode for committed in writing.commits_after_notice()] == [again]
-    assert store.log[:3] == ["one: open", "one: 0", "one: close"]  # not its second replan
-
-
-def test_an_episode_of_another_process_is_no_failure() -> None:
-    store = MadeUpStore()
-    store.refuses = StoreExists("somebody was faster")
-    with Writing() as writing:
-        episode = begin(writing, store, "one")
-        episode.append(record(0))
-        episode.commit(True, 1, None)
-        (committed,) = writing.commits_after_notice()
-        assert committed.folder is store.refuses
-        begin(writing, store, "next").append(record(0))
-    assert "one: close" in store.log
 
 
 def test_a_failure_is_raised_where_the_work_comes_from() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Terminated, Termination
-from vla_attention.capture.jobs.worker_records import PlannedTask, RecordWriter, planned_tasks, read_records
+from vla_attention.capture.jobs.worker_records import read_records
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.rollout.episode_loop import (
     EpisodeJob,
@@ -73,11 +73,6 @@ def test_every_episode_is_recorded_and_noted(store: RunStore, capsys: pytest.Cap
     said = capsys.readouterr().out
     assert said.count(f"{names[0]} begins") == 1
     assert said.count("success after 4 steps, 1 replans") == 4
-
-
-def test_outcomes_are_told_where_an_environment_ran(store: RunStore, capsys: pytest.CaptureFixture[str]) -> None:
-    loop_of(store, MadeUpSource(store), "call").record_all(JOBS)
-    assert "success" not in capsys.readouterr().out
 
 
 def test_what_another_process_commits_before_our_claim_is_not_recorded(store: RunStore, monkeypatch) -> None:
@@ -144,17 +139,6 @@ def test_sigterm_drops_one_episode_and_says_what_is_missing(store: RunStore, cap
     assert f"Stopped by SIGTERM: dropped {JOBS[1].name} at call 2; committed 1 episode ({JOBS[0].name}); 3 of" in said
     assert [record.state for record in read_records(store.path)] == ["stopped"]
     assert holders(store.path) == []
-
-
-def test_plans_of_workers_are_joined(store: RunStore) -> None:
-    assert plan_of(JOBS) == tuple(PlannedTask(task.task_id, task.name, task.instruction, 2) for task in TASKS)
-    some = EpisodeJob(TASKS[1], 7, 4, "")
-    (planned,) = plan_of([some])
-    assert (planned.episodes, planned.indices) == (1, (7,))
-    for jobs in (JOBS, [some]):
-        RecordWriter(store.path, this_worker(), plan_of(jobs))
-    joined = planned_tasks(read_records(store.path))
-    assert {number: sorted(task.wanted) for number, task in joined.items()} == {0: [0, 1], 1: [0, 1, 7]}
 
 
 def test_a_store_without_an_episode_goes_unless_somebody_records_into_it(store: RunStore) -> None:

@@ -278,7 +278,8 @@ def step_of(content, name):
         ("pre", lambda c: step_of(c, "relative_actions_processor")["config"].update(enabled=True), "relative"),
         ("pre", lambda c: step_of(c, "tokenizer_processor")["config"].update(padding_side="left"), "padding_side"),
         ("pre", lambda c: step_of(c, "normalizer_processor")["config"]["norm_map"].update(STATE="MIN_MAX"), "MIN_MAX"),
-        ("pre", lambda c: step_of(c, "normalizer_processor")["config"]["norm_map"].update(VISUAL="MEAN_STD"), "images")],
+        ("pre", lambda c: step_of(c, "normalizer_processor")["config"]["norm_map"].update(VISUAL="MEAN_STD"), "images"),
+    ],
 )  # fmt: skip
 def test_unsupported_pipelines_are_refused_by_name(checkpoint, file, change, expected):
     edit(checkpoint / f"policy_{file}processor.json", change)
