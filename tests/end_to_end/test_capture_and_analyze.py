@@ -60,25 +60,6 @@ def test_episodes_hold_the_inputs_of_the_policy(captured_store):
     assert coverage[:, :, names.index("robot")].sum() > 0
 
 
-def test_default_analysis_writes_every_documented_file(captured_store, tmp_path, capsys):
-    folder = tmp_path / "results"
-    assert analyze([str(captured_store), "--output", str(folder), "--save-viz", "--layers", "0", "2"]) == 0
-    for name in (
-        "steps.parquet",
-        "episodes.parquet",
-        "tasks.parquet",
-        "tasks_groups.parquet",
-        "summary.txt",
-        "attention_ratio_results_robosuite.json",
-        "ratio_distribution.png",
-        "ratio_per_task.png",
-        "attention_fractions.png",
-    ):
-        assert (folder / name).stat().st_size > 0, name
-    assert len(list(folder.rglob("*_layer2_ratio_evolution.png"))) == 4
-    assert "untrained" in capsys.readouterr().out.splitlines()[0]
-
-
 def test_results_file_has_the_published_structure(captured_store, tmp_path):
     assert analyze([str(captured_store), "--output", str(tmp_path), "--no-plots", "--layers", "2", "3"]) == 0
 

@@ -14,14 +14,13 @@ import pytest
 import torch
 import zarr
 
-from tests.kit.cosmos_checkpoint import WEIGHTS_NAME, write_dummy_folder
+from tests.kit.cosmos_checkpoint import write_dummy_folder
 from tests.kit.written_tables import written_steps
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.environments.suites import find_suite, list_tasks
 from vla_attention.capture.policies.cosmos.config import CosmosConfig, DitConfig, VaeConfig
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG
-from vla_attention.capture.policies.cosmos.locate import STATISTICS_NAME
 
 #: The published policy's 28 blocks, nine latent frames of 14 x 14 tokens, 512 text positions and five calls; narrow
 #: inside.
@@ -143,35 +142,6 @@ def test_default_and_reference_with_pictures(libero_store, tmp_path, capsys):
 def folder(tmp_path: Path) -> Path:
     """A checkpoint of test size; its faults are found before its size matters."""
     return write_dummy_folder(tmp_path / "checkpoint", DUMMY_CONFIG, ["stack the red cube"], dtype=torch.float32)
-
-
-def refused(folder: Path, capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """The sentence that the command ends with, after checking the form of it."""
-    store = folder.parent / "a.zarr"
-    given = ["cosmos", "--ckpt-path", folder, "--task-id", 0, "--device", "cpu", "--output", store, *arguments]
-    capsys.readouterr()
-    assert capture([str(argument) for argument in given]) == 2
-    said = capsys.readouterr().err.strip()
-    # A note that T5's tokenizer is absent may be a line of its own; the error itself is one line.
-    *notes, sentence = said.splitlines()
-    assert all(note.startswith("T5's tokenizer") for note in notes)
-    assert sentence.startswith("vla-capture: ")
-    assert not store.exists()
-    return sentence
-
-
-@pytest.mark.parametrize(
-    ("missing", "expected"),
-    [(STATISTICS_NAME, "--dataset-stats-path"), (WEIGHTS_NAME, "has no .pt file")],
-)
-def test_a_missing_file_is_named_with_what_to_do(folder, missing, expected, capsys):
-    (folder / missing).unlink()
-    said = refused(folder, capsys)
-    assert expected in said
-    assert str(folder) in said
-    if missing != WEIGHTS_NAME:
-        assert missing in said
-        assert "elsewhere" in refused(folder, capsys, expected, "elsewhere")
 
 
 @pytest.mark.simulator

@@ -18,18 +18,6 @@ def lines_of(said: str) -> dict[str, tuple[str, str]]:
     return {what: (status, text) for status, what, text in found}
 
 
-@pytest.mark.thorough
-def test_the_run_of_the_policy_that_comes_along(tmp_path, capfd):
-    store = tmp_path / "a.zarr"
-    options = ["--task-id", "0", "3", "--num-episodes", "4", "--max-steps", "50", "--output", str(store)]
-    assert capture(["doctor", *options, "--num-envs", "1"]) == 0
-    said = capfd.readouterr().out
-    found = lines_of(said)
-    assert {"drawing", "robosuite", "store", "checkpoint", "size"} <= set(found)
-    assert said.endswith("Nothing is missing for the run.\n")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_missing_assets_are_said_before_anything_is_written(tmp_path, capfd, monkeypatch):
     monkeypatch.delenv(ASSETS_VARIABLE, raising=False)
     run = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "libero_10", "--output", str(tmp_path / "a.zarr")]

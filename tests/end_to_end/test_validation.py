@@ -6,17 +6,14 @@ import json
 from dataclasses import replace
 
 import numpy as np
-import polars as pl
 import pytest
 
 import benchmarks.validation.calls as validation_calls
 from benchmarks.validation.__main__ import main
 from benchmarks.validation.calls import NOISE, changed_episodes, units_of
 from benchmarks.validation.changes import without
-from benchmarks.validation.known import contrasts
 from benchmarks.validation.page import blocks
-from benchmarks.validation.policies import KnownPolicy, load_policy
-from benchmarks.validation.prediction import correlations
+from benchmarks.validation.policies import load_policy
 from benchmarks.validation.tables import spearman
 from tests.kit.made_up_demonstrations import INSTRUCTIONS, write_demonstrations
 from tests.kit.reruns import BASE, base_actions, write_base
@@ -31,47 +28,12 @@ def quiet(line: str) -> None:
     """Say nothing."""
 
 
-def numbers_of(values):
-    """A table of one number per task, as of one policy."""
-    rows = [("cubes", task, 0, "ratio_lift", value) for task, value in enumerate(values)]
-    names = ["suite", "task_id", "episode_index", "number", "value"]
-    return pl.DataFrame(rows, schema=names, orient="row")
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_rank_correlation_is_that_of_scipy(seed):
     scipy_stats = pytest.importorskip("scipy.stats")
     generator = np.random.default_rng(seed)
     first, second = generator.integers(0, 6, (2, 12)).astype(float)  # with ties
     assert spearman(first, second) == pytest.approx(scipy_stats.spearmanr(first, second).statistic)
-
-
-def test_rank_correlations_are_averaged_as_they_are():
-    orders = {0: [1.0, 2, 3, 4], 1: [1.0, 3, 2, 4]}  # correlations of 1 and 0.8
-    rows = [
-        {"family": "words", "item": str(i), "suite": "cubes", "task_id": task, "episode_index": 0, "effect": float(i)}
-        | {"keys": 2.0 - (i == 0), "mass": mass}
-        | dict.fromkeys(("lift", "mass without sinks", "contribution norm"), None)
-        for task, order in orders.items()
-        for i, mass in enumerate(order)
-    ]
-    found = {row["measure"]: row for row in correlations(pl.DataFrame(rows, infer_schema_length=None))}
-    assert set(found) == {"mass", "keys"}
-    assert found["mass"]["value"] == pytest.approx(0.9)
-    assert found["keys"]["value"] == pytest.approx(np.sqrt(0.6))
-
-
-@pytest.mark.parametrize(
-    ("reader", "other", "verdict"),
-    [
-        ([0.5, 0.6, 0.4, 0.5], [2.0, 2.1, 1.9, 2.0], "separates"),
-        ([0.5, 2.0, 0.4, 2.2], [2.0, 0.5, 1.9, 0.6], "does not"),
-    ],
-)
-def test_a_reader_has_the_smaller_lift(reader, other, verdict):
-    policies = [KnownPolicy("a", "a", "cubes", "words"), KnownPolicy("b", "b", "cubes", "redundant")]
-    rows = contrasts(policies, {"a": numbers_of(reader), "b": numbers_of(other)})
-    assert {row["number"]: row["verdict"] for row in rows}["ratio_lift"] == verdict
 
 
 def test_units_leave_out_what_is_mostly_noise_as_vla_analyze_effects_does(tmp_path, monkeypatch):

@@ -3,50 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from vla_attention.capture.doctor.machine import (
     find_drawing,
-    find_gpu,
     find_simulator,
     something_missing,
 )
 from vla_attention.capture.environments.libero_installation import ASSET_SUBFOLDERS, ASSETS_VARIABLE
 from vla_attention.capture.environments.suites import find_suite
-
-GIGABYTE = 10**9
-
-
-def torch_with(gpus: int, cuda: str | None = "12.8", bfloat16: bool = True) -> Any:
-    """Something like torch on a machine with that many GPUs."""
-    properties = SimpleNamespace(name="NVIDIA H100", major=9, minor=0)
-    return SimpleNamespace(
-        __version__="2.8.0",
-        version=SimpleNamespace(cuda=cuda),
-        cuda=SimpleNamespace(
-            is_available=lambda: gpus > 0,
-            get_device_properties=lambda device: properties,
-            mem_get_info=lambda device: (70 * GIGABYTE, 80 * GIGABYTE),
-            is_bf16_supported=lambda including_emulation: bfloat16,
-        ),
-    )
-
-
-@pytest.mark.parametrize(
-    ("cuda", "driver", "said"),
-    [(None, False, "is built without CUDA"), ("12.8", False, "there is no NVIDIA driver")],
-)
-def test_without_a_gpu_the_reason_is_given(tmp_path: Path, cuda: str | None, driver: bool, said: str):
-    version = tmp_path / "version"
-    if driver:
-        version.write_text("550", encoding="ascii")
-    for device, status in (("auto", "note"), ("cpu", "note"), ("cuda:0", "missing")):
-        found = find_gpu(device, torch_with(0, cuda), version)
-        assert (found.status, said in found.text) == (status, True)
-        assert found.to_do
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from tests.kit.cosmos_helpers import INSTRUCTION
 from tests.kit.policy_inputs import make_observation
 from vla_attention.capture.effects.arguments import EffectSettings
 from vla_attention.capture.effects.conditions import UNCHANGED, exchanges, planned_effects, refuse_both
-from vla_attention.capture.effects.measurement import EffectMeasurement, siblings_of
+from vla_attention.capture.effects.measurement import EffectMeasurement
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
 from vla_attention.capture.interventions.resolution import (
     ReplanPlace,
@@ -246,11 +246,6 @@ def test_words_are_exchanged_for_those_in_their_places():
         PromptChange("synonyms", synonyms={"plate": "stove"}),
         PromptChange("synonyms", synonyms={"red": "blue"}),
     ]
-
-
-def test_siblings_are_of_one_family():
-    tasks = [(0, "a", "one"), (1, "b", "one"), (2, "c", ""), (3, "d", ""), (4, "a", "one")]
-    assert siblings_of(tasks) == {0: ("b", "a"), 1: ("a",), 2: (), 3: (), 4: ("a", "b")}
 
 
 def test_what_a_policy_has_not_is_refused():

@@ -143,15 +143,6 @@ def test_a_rerun_of_changed_attention_is_refused(pi_store, tmp_path, capsys):
     assert not (tmp_path / "a.zarr").exists()
 
 
-def test_the_floor_is_another_noise_than_the_rerun_s(pi_store, tmp_path):
-    base = open_store(pi_store).attributes.protocol.seed
-    target = tmp_path / "a.zarr"
-    words = ["rerun", str(pi_store), "--check", "0", "--num-episodes", "1", "--noise-seed", str(base + 1)]
-    assert main([*words, "--output", str(target), "--effects", "text"]) == 0
-    assert open_store(target).attributes.recording.effects.seed == base + 2
-    assert all(np.abs(change).max() > 1e-3 for change in changes(open_store(target), "noise").values())
-
-
 def test_resume_continues_and_another_choice_is_another_run(with_effects, tmp_path, capsys):
     path = capture(tmp_path / "pi.zarr", "pi", *EFFECTS)
     words = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", "0", "1"]
@@ -159,17 +150,6 @@ def test_resume_continues_and_another_choice_is_another_run(with_effects, tmp_pa
     assert main([*words, *EFFECTS]) == 0
     assert main([*words, "--effects", "text"]) == 2
     assert "recording.effects" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [(["--effects", "text", "--knockout", "role:image"], "beside interventions on attention")],
-)
-def test_what_is_refused_before_the_first_episode(tmp_path, capsys, options, sentence):
-    words = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", "0"]
-    assert main([*words, "--output", str(tmp_path / "a.zarr"), *options]) == 2
-    assert sentence in capsys.readouterr().err
-    assert not (tmp_path / "a.zarr").exists()
 
 
 def damaged(path: Path, edit) -> list[str]:

@@ -109,31 +109,6 @@ def meant(cubes: CubesEnvironment, number: int) -> int:
     return find_target(CUBE_TASKS[number].target, cubes.simulator._beginning)
 
 
-def test_tasks_with_as_many_cubes_share_a_scene():
-    for suite, number, count in (("cubes", 0, 14), ("cubes", 15, 3), ("cubes_harder", 0, 20), ("cubes_marked", 3, 12)):
-        environment = made(suite, number)
-        try:
-            assert len(environment.goals) == count
-            assert number in {goal.task_id for goal in environment.goals}
-            tasks = list_tasks(find_suite(suite))
-            assert all(goal.instruction == tasks[goal.task_id].instruction for goal in environment.goals)
-            assert "mark" not in environment.bodies
-        finally:
-            environment.close()
-
-
-def test_a_robosuite_task_has_its_own_goal_alone():
-    environment = made("robosuite", 2)
-    try:
-        environment.reset(0, 7)
-        environment.step(np.array(WAIT_ACTION), observe=False)
-        assert [goal.task_name for goal in environment.goals] == ["PickPlaceCan"]
-        assert environment.bodies == (HAND, "Can", "bin1", "bin2")
-        assert environment.moment().held.tolist() == [False]
-    finally:
-        environment.close()
-
-
 # ----------------------------------------------------------------------------------------------------- LIBERO
 
 

@@ -49,17 +49,6 @@ def test_tasks_of_a_family_differ_in_what_they_name_only():
                 place = words.split().index(word, place + 1)
 
 
-def test_cubes_are_named_by_colour_or_by_side():
-    found = {}
-    for task in list_tasks(find_suite("cubes")):
-        found.setdefault(task.task_family, []).append(task.instruction)
-    assert found["lift the cube on the SIDE"] == ["lift the cube on the left", "lift the cube on the right"]
-    # The scenes of four cubes have no template of their own.
-    assert found["lift the COLOUR cube"] == 2 * [f"lift the {colour} cube" for colour in ("red", "green", "blue")]
-    assert len(found) == 5
-    assert families("cubes_harder")["put the COLOUR cube on the COLOUR cube"] == 6
-
-
 @pytest.mark.parametrize(
     ("instruction", "family"),
     [

@@ -103,15 +103,6 @@ def test_resumed_runs_apply_them_bit_for_bit_and_others_are_refused(tmp_path, ca
         assert f"Cannot resume {path}: its interventions." in capsys.readouterr().err
 
 
-def test_cosmos(tmp_path):
-    pytest.importorskip("diffusers")
-    words = ("--knockout", "camera:primary", "--knockout-queries", "all", "--knockout-steps", "0", "--image")
-    store = captured(tmp_path / "c.zarr", "--task-id", "0", *words, "wrist=rotated", family="cosmos")
-    rows, span = store.episodes[0].read("self/rows"), store.attributes.sites[0].camera_span("primary")
-    assert (rows[:, :, 0, ..., span.start : span.stop] == 0).all()
-    assert (rows[:, :, 1, ..., span.start : span.stop] > 0).all()
-
-
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
@@ -126,23 +117,3 @@ def test_mistakes_are_found_before_anything_is_written(tmp_path, capsys, words, 
     assert expected in said
     assert "\n" not in said
     assert not (tmp_path / "a.zarr").exists()
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (("--knockout", "words:all", "--prompt", "empty"), "'words:all' of an intervention has no key at replan 0 of"),
-        (("--knockout", "span:prompt | role:image | role:action"), "leaves a query without any key at site 'joint'"),
-    ],
-)
-def test_mistakes_that_a_policy_call_shows(tmp_path, capsys, words, expected):
-    assert run(tmp_path / "a.zarr", "--task-id", "0", *words) == 2
-    said = capsys.readouterr().err.strip().splitlines()[-1]
-    assert expected in said
-
-
-def test_empty_groups_are_allowed_on_request(base, tmp_path, capsys):
-    words = ("--knockout", "words:all & role:image", "--image", "base_0_rgb=filled:cube", "--allow-empty")
-    same = captured(tmp_path / "a.zarr", "--task-id", "0", *words)
-    assert "In 2 of 2 replans a group of an intervention had no key" in capsys.readouterr().out
-    np.testing.assert_array_equal(same.episodes[0].read("actions"), base.episodes[0].read("actions"))

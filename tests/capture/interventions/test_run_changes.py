@@ -46,21 +46,6 @@ def test_names_before_the_run(policy):
         editors(changes("object:plate_1"), policy)
 
 
-def test_an_object_out_of_view(policy):
-    strict = changes("object:bowl_1")
-    assert list(editors(strict, policy, 0.5)) == ["joint"]
-    with pytest.raises(EmptyGroup, match=r"'object:bowl_1' .* no key at replan 4 of task000_episode000"):
-        editors(strict, policy, replan=4)
-    lax = changes("object:bowl_1", allow_empty=True)
-    assert editors(lax, policy, 0.5) is not None
-    assert lax.describe_empty() is None
-    assert editors(lax, policy) is None
-    assert editors(changes("object:of_another_scene", allow_empty=True), policy) is None
-    assert lax.describe_empty() == (
-        "In 1 of 2 replans a group of an intervention had no key, and nothing was changed for it."
-    )
-
-
 def test_all_stored_replans(tmp_path):
     store = open_store(write_store(tmp_path / "a.zarr", tasks=(0, 1), episodes=2, replans=3))
     tokens = store.episodes[0].tokens(store.attributes, "joint")

@@ -18,7 +18,7 @@ from vla_attention.capture.jobs.worker_records import (
     read_records,
 )
 from vla_attention.schemas.errors import Note
-from vla_attention.schemas.stores.claims import Claims, jobs_folder
+from vla_attention.schemas.stores.claims import jobs_folder
 from vla_attention.schemas.stores.worker import Worker
 from vla_attention.testing.stores import StoreSpec, write_store
 from vla_attention.testing.tokens import INSTRUCTIONS
@@ -98,20 +98,6 @@ def test_dropped_episodes_are_shown_with_the_reason_until_they_are_recorded(stor
     (status,) = json.loads(capsys.readouterr().out)
     (dropped,) = next(task["dropped"] for task in status["tasks"] if task["task_id"] == 2)
     assert (dropped["name"], dropped["by"]) == ("task002_episode003", "node7 (job 98_2)")
-
-
-def test_claimed_episodes_and_json(store, capsys):
-    claims = Claims(store, NODE)
-    assert claims.acquire("task000_episode002") is None
-    assert main(["status", str(store), "--json", "--expected", "3"]) == 0
-    (status,) = json.loads(capsys.readouterr().out)
-    assert status["complete"] is False
-    assert [task["missing"] for task in status["tasks"]] == [[2], [2]]
-    (writing,) = status["writing"]
-    assert (writing["episode"], writing["worker"]["job_name"]) == ("task000_episode002", "98_2")
-    assert 0 <= writing["silent_s"] < 60
-    assert main(["status", str(store)]) == 0
-    assert "being written: task000_episode002 by node7 (job 98_2)" in capsys.readouterr().out
 
 
 def test_records_of_an_earlier_store_with_the_same_name_are_ignored(store):

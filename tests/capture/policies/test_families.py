@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import polars as pl
 import pytest
@@ -75,20 +73,3 @@ def test_a_third_family_captures_and_is_analysed(tmp_path, capfd):
     assert "made again without any change: bit-equal" in capfd.readouterr().out
     assert main(["rerun", str(store)]) == 2
     assert "its policy has the action_horizon 3, and this one has 4" in capfd.readouterr().err
-
-
-@pytest.mark.usefixtures("toy_is_registered")
-def test_several_tasks_fill_one_store_and_their_status_is_theirs(tmp_path, capfd):
-    """`--task-id 2 0` runs both, `status` expects both, and a task more joins with --resume."""
-    store = tmp_path / "toy.zarr"
-    arguments = ["toy", "--num-episodes", "1", "--max-steps", "2", "--no-contributions", "--output", str(store)]
-    assert main([*arguments, "--task-id", "2", "0"]) == 0
-    assert sorted(path.name for path in (store / "episodes").glob("task*")) == [
-        "task000_episode000",
-        "task002_episode000",
-    ]
-    assert main([*arguments, "--task-id", "2", "3", "0", "--resume"]) == 0
-    assert "2 of 3 episodes are complete already; 1 to run." in capfd.readouterr().out
-    assert main(["status", str(store), "--check", "--json"]) == 0
-    tasks = json.loads(capfd.readouterr().out)[0]["tasks"]
-    assert [task["task_id"] for task in tasks if task["committed"] == task["expected"] == 1] == [0, 2, 3]

@@ -104,38 +104,6 @@ def test_a_file_s_replay_is_continued(tmp_path, data, file, capsys):
     assert "replan_steps is 2, this run's is 1" in capsys.readouterr().err
 
 
-def test_knockouts_are_paired_with_the_unchanged_replay(tmp_path, data, file, capsys):
-    base, changed = tmp_path / "base.zarr", tmp_path / "without_front.zarr"
-    replay = ("replay", data, "--policy", file)
-    assert run(*replay, "--output", base) == 0
-    knockout = ("--knockout", "camera:front", "--rerun-of", base)
-    assert run(*replay, *knockout, "--output", changed) == 0
-
-    for name in ("task000_episode000", "task001_episode001"):
-        one, other = (zarr.open_group(store / "episodes" / name, mode="r") for store in (base, changed))
-        assert one.attrs["noise_seed"] == other.attrs["noise_seed"]
-        assert not np.array_equal(one["actions"][:], other["actions"][:])
-        front = other["joint/key_role"][:] == 1
-        assert not (other["joint/rows"][:] * front[:, None, None, None, None]).any()
-        assert (one["joint/rows"][:] * front[:, None, None, None, None]).any()
-
-    # another noise seed is the scale of the effects
-    noise = tmp_path / "noise.zarr"
-    assert run(*replay, "--noise-seed", 8, "--rerun-of", base, "--output", noise) == 0
-    one, other = (zarr.open_group(store / "episodes" / "task000_episode000", mode="r") for store in (base, noise))
-    assert other.attrs["noise_seed"][0] == noise_seed(8, 0, 0, 0)
-    assert not np.array_equal(one["actions"][:], other["actions"][:])
-    capsys.readouterr()
-    for options, message in (
-        (("--every", 1), "other --every or --seed"),
-        (("--state", "none"), "other data set, or columns of it"),
-    ):
-        assert run(*replay, *knockout, *options, "--output", tmp_path / "no.zarr") == 2
-        assert message in capsys.readouterr().err
-    assert run(*replay, "--rerun-of", base, "--output", tmp_path / "no.zarr") == 2
-    assert "--rerun-of needs an intervention" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("content", "options", "message"),
     [

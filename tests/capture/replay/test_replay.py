@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import os
 import shutil
-import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zarr
-from safetensors.numpy import load_file, save_file
 
 from tests.kit.lerobot_data_sets import H264, episodes_of_store, made_up_episodes, number_of, write_data_set
 from tests.kit.pi_golden import GOLDEN
 from tests.kit.small_tokenizer import train_small_tokenizer
-from tests.kit.spoiled_policy import spoil_actions
 from tests.kit.still_scene import capture_without_simulator
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.capture.jobs.termination import EXIT_TERMINATED
-from vla_attention.capture.replay import family_replay
 from vla_attention.schemas.stores.reader import open_store
 
 LIBERO_COLUMNS = {"base_0_rgb": "image", "left_wrist_0_rgb": "wrist_image"}
@@ -162,100 +155,6 @@ def test_another_instruction_and_known_outcomes(tmp_path):
         assert stored.attrs["success"] is solved
         assert stored.attrs["instruction"] == "close the box"
         assert "dataset_actions" not in stored
-
-
-def test_a_call_that_turns_nan_costs_its_episode(tmp_path, monkeypatch, capsys):
-    data = write_data_set(tmp_path / "data", "v2.1", made_up_episodes((4, 4, 4), tuple(LIBERO_COLUMNS.values())))
-    store = tmp_path / "replay.zarr"
-    words = ("replay", data, *TINY, "--every", 2, "--output", store)
-    assert run(*words, "--overwrite") == 0
-    whole = sorted(path.name for path in (store / "episodes").glob("task*"))
-    task, number = int(whole[1][4:7]), int(whole[1][15:])
-    capsys.readouterr()
-    spoil_actions(monkeypatch, open_store(store).attributes.protocol.seed, task, number)
-    assert run(*words, "--overwrite") == 2
-    said = capsys.readouterr()
-    assert f"is missing: {whole[1]}. The policy's numbers turned NaN or infinite at replan 1 (frame 2)" in said.err
-    assert said.err.count("\n") == 1
-    assert "2 episodes added." in said.out
-    monkeypatch.undo()
-    assert run(*words, "--resume") == 0
-    assert sorted(path.name for path in (store / "episodes").glob("task*")) == whole
-    assert analyze(["verify", str(store)]) == 0
-
-
-def test_sigterm_ends_before_the_next_call(tmp_path, monkeypatch, capsys):
-    data = write_data_set(tmp_path / "data", "v2.1", made_up_episodes((6, 6), tuple(LIBERO_COLUMNS.values())))
-    store, calls = tmp_path / "replay.zarr", []
-    record_call = family_replay.record_call
-
-    def stopped(*given: object) -> object:
-        calls.append(given)
-        if len(calls) == 4:  # of three in the first episode, and the first of the second
-            os.kill(os.getpid(), signal.SIGTERM)
-        return record_call(*given)
-
-    monkeypatch.setattr(family_replay, "record_call", stopped)
-    words = ("replay", data, *TINY, "--every", 2, "--output", store)
-    assert run(*words) == EXIT_TERMINATED
-    assert len(calls) == 4
-    assert len(list((store / "episodes").glob("task*"))) == 1
-    assert "at call 0; committed 1 episode" in capsys.readouterr().out
-    assert run(*words, "--resume") == 0
-    assert len(list((store / "episodes").glob("task*"))) == 2
-
-
-def lerobot_checkpoint(folder: Path, cameras: dict[str, str], state: int, action: int) -> Path:
-    """The small golden pi0.5 of LeRobot, for a robot of other sizes and other names of cameras."""
-    shutil.copytree(GOLDEN / "pi05_batch2" / "checkpoint_lerobot", folder / "checkpoint")
-    shutil.copy(GOLDEN / "pi05_batch2" / "case.json", folder)
-    path = folder / "checkpoint" / "config.json"
-    config = json.loads(path.read_text())
-    picture = {"type": "VISUAL", "shape": [3, 56, 56]}
-    config["input_features"] = {
-        **dict.fromkeys(cameras, picture),
-        "observation.state": {"type": "STATE", "shape": [state]},
-    }
-    config["output_features"] = {"action": {"type": "ACTION", "shape": [action]}}
-    path.write_text(json.dumps(config))
-    for file in (folder / "checkpoint").glob("policy_*.safetensors"):
-        sizes = {"observation.state": state, "action": action}
-        old = load_file(file)
-        tensors = {
-            name: np.resize(values, sizes[name.rpartition(".")[0]]).astype(np.float32) for name, values in old.items()
-        }
-        save_file(tensors, file)
-    path = folder / "checkpoint" / "policy_preprocessor.json"
-    content = json.loads(path.read_text())
-    for step in content["steps"]:
-        if step["registry_name"] == "rename_observations_processor":
-            step["config"]["rename_map"] = {column: feature for feature, column in cameras.items() if column != feature}
-    path.write_text(json.dumps(content))
-    return folder / "checkpoint"
-
-
-def test_a_lerobot_checkpoint_for_a_robot_of_its_own(tmp_path, tokenizer, capsys):
-    top, hand, side = (f"observation.images.{name}" for name in ("top", "hand", "side"))
-    checkpoint = lerobot_checkpoint(tmp_path, {top: "observation.images.overhead", hand: hand, side: side}, 12, 11)
-    made = made_up_episodes((6,), ("observation.images.overhead", hand), state=12, action=11)
-    data = write_data_set(tmp_path / "bimanual", "v3.0", made, video=H264)
-    model = ("--checkpoint", checkpoint, "--tokenizer", tokenizer, "--output", tmp_path / "replay.zarr")
-    assert run("replay", data, *model) == 2
-    error = capsys.readouterr().err
-    assert "The policy's camera 'side' has no pictures in the data set 'bimanual'" in error
-    assert "--camera side=NAME, or --camera side=none" in error
-    assert run("replay", data, *model, "--camera", "side=none") == 0
-    stored = episode(tmp_path / "replay.zarr", 0, 0)
-    assert stored["actions"].shape == (2, 6, 11)
-    assert stored["state"].shape == (2, 12)
-    assert sorted(stored["camera_frames"]) == ["hand", "top"]
-    root = open_store(tmp_path / "replay.zarr").attributes
-    # pictures of present cameras come before the masked ones, as in LeRobot
-    assert [span.name for span in root.sites[0].spans][:3] == ["top", "hand", "side"]
-    assert [(camera.name, camera.source) for camera in root.policy.cameras] == [
-        ("top", "observation.images.overhead"),
-        ("hand", hand),
-    ]
 
 
 def test_a_replay_can_be_rerun_with_interventions(tmp_path, capsys):

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.capture.rerun.conftest import capture
 from tests.kit.spoiled_policy import spoil_actions
 from vla_attention.capture.__main__ import main
 from vla_attention.capture.policies.pi.embedded import dummy_policy
@@ -118,16 +117,6 @@ def test_wrong_stores_and_settings_are_one_sentence(pi_store, tmp_path, capsys):
     assert "into the store itself" in refused(capsys, "rerun", pi_store, "--output", pi_store, "--overwrite")
     assert "no episode of task 7; it has tasks 0, 1" in refused(capsys, "rerun", pi_store, "--task-id", "7")
     assert "its weights have the digest" in refused(capsys, "rerun", pi_store, "--checkpoint", "untrained")
-
-
-def test_other_settings_of_the_same_weights_are_named(cosmos_store, capsys):
-    said = refused(capsys, "rerun", cosmos_store, "--num-denoising-steps-action", "2")
-    assert "its policy has the num_denoise_steps 3, and this one has 1" in said
-
-
-def test_stores_without_pictures_are_refused(tmp_path, pi_store, capsys):
-    bare = capture(tmp_path / "bare.zarr", "pi", "--no-frames")
-    assert "it has no pictures (it was captured with --no-frames" in refused(capsys, "rerun", bare)
 
 
 def test_a_damaged_episode_is_refused(pi_store, tmp_path, capsys):

@@ -133,18 +133,6 @@ def test_wrong_interventions_are_one_sentence_and_leave_no_store(pi_store, cosmo
     assert "has none" in said("--knockout", "role:instruction", "--knockout-queries", "prefix", base=cosmos_store)
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--knockout", "role:image", "--knockout-layers", "99"), "There is no layer 99"),
-        (("--knockout", "camera:bsae"), "there is no camera 'bsae'"),
-    ],
-)
-def test_mistakes_of_the_changes_come_before_a_store_that_exists(pi_store, cosmos_store, capsys, words, message):
-    sentence = refused(capsys, "rerun", pi_store, "--output", cosmos_store, *words)
-    assert message in sentence
-
-
 def test_the_prompt_of_a_task_that_is_not_run_again_is_known(pi_store, tmp_path):
     target = tmp_path / "other.zarr"
     words = ("--prompt", "task:1", "--task-id", "0", "--num-episodes", "1", "--check", "0")

@@ -7,7 +7,6 @@ import signal
 import struct
 import subprocess
 import sys
-import threading
 import time
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
@@ -124,95 +123,6 @@ def test_an_episode_begins_again_at_most_twice(scene, tmp_path, capsys):
     assert not (tmp_path / "a.zarr.partial").exists()
     assert holders(tmp_path / "a.zarr") == []
     assert analyze(["verify", str(tmp_path / "a.zarr")]) == 0
-
-
-class Hanging(StillScene):
-    """Hangs once, in an action of episode 1, when episode 0 is committed: no other simulator owes an answer then."""
-
-    hangs: list[int]
-    committed: threading.Event
-    ended: threading.Event
-    clock: SimpleNamespace
-
-    def reset(self, initial_state_index: int, seed: int) -> None:
-        super().reset(initial_state_index, seed)
-        self.index, self.steps = initial_state_index, 0
-
-    def step(self, action: np.ndarray, observe: bool) -> Any:
-        self.steps += 1
-        if self.index == 1 and self.steps == 12 and self.hangs[0]:
-            assert self.committed.wait(60)
-            self.hangs[0] -= 1
-            self.clock.now += 10 * pipeline.NO_ANSWER_S
-            assert self.ended.wait(60)
-            raise SystemExit
-        return super().step(action, observe)
-
-
-@pytest.mark.thorough
-def test_a_simulator_that_hangs_is_ended_and_its_episode_begins_again(scene, tmp_path, monkeypatch, capsys):
-    words = ["--task-id", "0", "--num-episodes", "2"]
-    assert record(tmp_path / "one.zarr", 1, *words) == 0
-    clock, note, close = SimpleNamespace(now=0.0), pipeline.PipelinedLoop.note_commit, ThreadOfTests.close
-    Hanging.hangs, Hanging.clock = [1], clock
-    Hanging.committed, Hanging.ended = threading.Event(), threading.Event()
-    scene.make = Hanging
-
-    def note_commit(loop: Any, result: Any) -> None:
-        note(loop, result)
-        Hanging.committed.set()
-
-    def end(simulator: ThreadOfTests) -> None:
-        Hanging.ended.set()
-        close(simulator)
-
-    monkeypatch.setattr(pipeline.PipelinedLoop, "note_commit", note_commit)
-    monkeypatch.setattr(ThreadOfTests, "close", end)
-    monkeypatch.setattr(pipeline, "time", SimpleNamespace(monotonic=lambda: clock.now))
-    assert record(tmp_path / "a.zarr", 2, *words) == 0
-    assert Hanging.hangs == [0]
-    said = "task000_episode001: its simulator ended (killed after 1200 s without an answer); the episode begins again."
-    assert capsys.readouterr().out.count(said) == 1
-    assert len(ThreadOfTests.started) == 3
-    assert_same_episodes(tmp_path / "one.zarr", tmp_path / "a.zarr")
-
-
-class Chained(StillScene):
-    """As in LIBERO, an episode needs the resets of those before it, and environments tell each other what they know."""
-
-    made: list[int]
-    first: threading.Barrier
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.known = 0
-
-    def missing_resets(self, initial_state_index: int, seed: int) -> int:
-        return max(0, initial_state_index - max(0, self.known - 1))
-
-    def reset(self, initial_state_index: int, seed: int) -> None:
-        if initial_state_index < 2:  # the first two begin at the same time, and cannot know of each other
-            self.first.wait(60)
-        time.sleep(0.2)  # long enough for the other one to begin the same reset, if nothing kept it from that
-        self.made += range(max(0, self.known - 1), initial_state_index + 1)
-        self.known = max(self.known, initial_state_index + 2)
-        super().reset(initial_state_index, seed)
-
-    def known_resets(self, seed: int) -> list[int]:
-        return list(range(self.known))
-
-    def learn_resets(self, seed: int, resets: Any) -> None:
-        self.known = max(self.known, len(resets))
-
-
-@pytest.mark.thorough
-def test_a_simulator_waits_for_a_reset_that_another_one_is_making(scene, tmp_path):
-    Chained.made, Chained.first = [], threading.Barrier(2)
-    scene.make = Chained
-    assert record(tmp_path / "a.zarr", 2, "--task-id", "0", "--num-episodes", "9") == 0
-    # The reset of episode 0 is made in both simulators, all others once.
-    assert sorted(Chained.made) == [0, *range(9)]
-    assert store_status(tmp_path / "a.zarr").complete
 
 
 class Broken(StillScene):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 from vla_attention.capture.store.disk_estimate import (
     EPISODE_OVERHEAD,
     DiskEstimate,
-    SampleOfReplans,
     estimate_disk,
     format_bytes,
 )
@@ -19,10 +17,7 @@ from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import PatchGrid, SiteLayout, Span
 from vla_attention.testing.stores import (
     StoreSpec,
-    denoise_times,
-    episode_records,
     root_attributes,
-    small_steps,
     write_store,
 )
 from vla_attention.testing.tokens import OBJECTS, small_prompt
@@ -109,43 +104,3 @@ def test_episodes_and_replans_multiply():
 )
 def test_format_bytes(count, text):
     assert format_bytes(count) == text
-
-
-SPEC = StoreSpec(
-    tokens=large_tokens(40),
-    tasks=(0,),
-    episodes=1,
-    layers=(0, 1, 2),
-    num_layers=3,
-    heads=(0, 1, 2, 3),
-    denoise_steps=(0, 4, 9),
-    contributions=True,
-    plant_steps=small_steps,
-)
-
-
-def sample_of(spec: StoreSpec, replans: int) -> SampleOfReplans:
-    start, records = episode_records(spec, 0, 0)
-    steps = small_steps(spec, 0, 0, 5 * replans)
-    return SampleOfReplans(root_attributes(spec), start, denoise_times(spec), records[:replans], steps)
-
-
-def bytes_written(spec: StoreSpec, folder: Path) -> int:
-    episode = write_store(folder / "a.zarr", spec=spec) / "episodes" / "task000_episode000"
-    return sum(file.stat().st_size for file in episode.rglob("*") if file.is_file())
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [{"mantissa_bits": 10}, {"layers": (0, 2), "contributions": False}],
-    ids=str,
-)
-def test_a_long_episode_takes_what_eight_replans_say(tmp_path, changes):
-    spec = replace(SPEC, **changes)
-    asked = root_attributes(spec).recording
-    # A run without pictures is tried without them; all else is taken from one sample.
-    sample = sample_of(replace(SPEC, frames=spec.frames), 8)
-    sizes = sample.size(asked)
-    assert sizes.bytes_of(40) == pytest.approx(bytes_written(spec, tmp_path), rel=0.1)
-    estimate = sizes.estimate(40, 3)
-    assert estimate.total_bytes == pytest.approx(3 * sizes.bytes_of(40), rel=1e-3)

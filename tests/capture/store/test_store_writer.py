@@ -21,7 +21,7 @@ from tests.kit.examples import examples
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.capture.store import codecs as store_codecs
-from vla_attention.capture.store.codecs import replans_per_block, write_whole
+from vla_attention.capture.store.codecs import write_whole
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.json_files import FOLDER
 from vla_attention.schemas.precision import mass_error_bound
@@ -140,29 +140,6 @@ def test_episodes_around_the_size_of_a_block(tmp_path, monkeypatch, replans):
     check_equals_spec(path, spec)
 
 
-@given(numbers=st.integers(1, 10**7), replans=st.integers(1, 500))
-def test_replans_per_block(numbers, replans):
-    block = replans_per_block(4 * numbers, replans)
-    assert block * numbers % 8 == 0
-    assert 1 <= block <= 8 * math.ceil(replans / 8)
-    chunk = 4 * numbers * block
-    assert chunk <= max(store_codecs.TARGET_CHUNK_BYTES + 8 * 4 * numbers, 8 * 4 * numbers)
-    if 8 * math.ceil(replans / 8) * 4 * numbers <= store_codecs.TARGET_CHUNK_BYTES:
-        assert block >= replans  # what fits into one chunk is one chunk
-
-
-def test_long_side_arrays_are_cut_into_chunks_of_one_file(tmp_path, monkeypatch):
-    monkeypatch.setattr(store_codecs, "TARGET_CHUNK_BYTES", 500)
-    spec = StoreSpec(replans=7, tasks=(0,), episodes=1)
-    path = write_store(tmp_path / "a.zarr", spec=spec)
-    episode = open_store(path).episodes[0]
-    assert episode.array("frames/base_0_rgb").chunks[0] == 1
-    assert episode.array("joint/key_role").chunks[0] == 7
-    for name in ("frames/base_0_rgb", "joint/atoms", "actions"):
-        assert len(files_of(episode.folder, name)) == 1
-    check_equals_spec(path, spec)
-
-
 @pytest.fixture(scope="module")
 def written(tmp_path_factory) -> tuple[Path, StoreSpec]:
     spec = StoreSpec(replans=9)
@@ -198,15 +175,6 @@ def test_core_codecs_only_and_a_checksum_on_every_chunk(written):
         )
         assert document["data_type"] in ("uint8", "float32", "float64")
         assert len(document["dimension_names"]) == len(document["shape"])
-
-
-def test_one_layer_and_denoise_step_to_a_chunk_of_rows(written):
-    array = open_store(written[0]).episodes[0].array("joint/rows")
-    assert array.chunks == (12, 1, 1, 2, 1, 39)  # 9 replans; 78 numbers each, so that 4 make a multiple of 8
-    assert math.prod(array.chunks) % 8 == 0
-    chain = codec_chains(array.metadata.to_dict()["codecs"])[0]  # type: ignore[arg-type]
-    blosc = next(codec["configuration"] for codec in chain if codec["name"] == "blosc")
-    assert (blosc["cname"], blosc["shuffle"], blosc["typesize"]) == ("lz4", "bitshuffle", 4)
 
 
 def test_chunks_that_hold_only_the_fill_value_are_written(tmp_path):

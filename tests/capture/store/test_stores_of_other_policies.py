@@ -12,7 +12,7 @@ import pytest
 from vla_attention.capture.store.episode_writer import ReplanRefused
 from vla_attention.capture.store.replan_records import ReplanRecord
 from vla_attention.capture.store.store_writer import open_run
-from vla_attention.schemas.layout import Role, SiteLayout, prompt_at
+from vla_attention.schemas.layout import SiteLayout, prompt_at
 from vla_attention.schemas.stores import episode_checks
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
@@ -121,18 +121,3 @@ def test_pieces_of_the_prompt_are_at_the_same_places_of_every_sites_text(tmp_pat
     (first, *_), (shifted, *_) = of_self.prompts, tuple(prompt_at(sites, moved, prompt) for prompt in of_self.prompts)
     assert [piece.key for piece in shifted.pieces] == [piece.key - 16 for piece in first.pieces]
     assert shifted.text == first.text
-
-
-def test_absent_is_a_role_of_every_kind_of_span(tmp_path):
-    spec = SiteStoreSpec(contributions=False)
-
-    def mask_out(record: ReplanRecord) -> ReplanRecord:
-        rows, roles = record.rows["cross"].rows.copy(), record.key_role["cross"].copy()
-        rows[..., 16] += rows[..., 12:16].sum(axis=-1)
-        rows[..., 12:16] = 0.0
-        roles[12:16] = Role.ABSENT
-        cross = replace(record.rows["cross"], rows=rows)
-        return replace(record, rows={**record.rows, "cross": cross}, key_role={**record.key_role, "cross": roles})
-
-    append(tmp_path / "a.zarr", spec, dict.fromkeys(range(spec.replans), mask_out))
-    assert verify_store(open_store(tmp_path / "a.zarr")) == []

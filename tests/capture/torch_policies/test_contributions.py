@@ -135,15 +135,6 @@ def test_where_it_cannot_be_said_there_are_none_and_a_sentence_says_why(tmp_path
     assert va.open(tmp_path / "a.zarr").masses().height > 0
 
 
-def test_contributions_that_were_asked_for_and_are_unknown_are_an_error(tmp_path):
-    policy = ResidualPolicy(UNKNOWN["tanh"][0])
-    run = va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), contributions=True, durable=False)
-    with run, pytest.raises(ContributionsUnknown, match=r"computes tanh .* record with contributions=False"):
-        fill(run, policy)
-    assert not list((tmp_path / "a.zarr" / "episodes").glob("task*"))
-    recorded(tmp_path / "without", policy, contributions=False)
-
-
 def test_a_policy_that_begins_to_do_otherwise_is_an_error(tmp_path):
     policy = ResidualPolicy(WAYS["plain"].add)
     with va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), durable=False) as run:

@@ -8,7 +8,7 @@ from torch import nn
 from torch.nn.functional import scaled_dot_product_attention as sdpa
 
 import vla_attention as va
-from tests.kit.attention_modules import Attention, Policy
+from tests.kit.attention_modules import Policy
 from vla_attention.capture.torch_policies.inspect_calls import NoAttention, folded_paths
 
 
@@ -37,16 +37,6 @@ def test_the_table():
     assert (first.times, second.times) == ((1, 1), (5, 5))
     assert (first.heads, second.heads, second.kv_heads, second.batch) == (4, 4, 2, 2)
     assert max(table.errors) < 3e-6
-
-
-def test_a_few_numbers_of_keys_of_one_module_keep_their_rows():
-    policy, pixels = Attention(lambda q, k, v, mask: sdpa(q, k, v)).eval(), torch.randn(1, 9, 32)
-    table = va.inspect(policy, lambda: [policy(pixels, pixels[:, :keys]) for keys in (9, 4, 9)])
-    assert [(row.modules, row.keys, row.times) for row in table.rows] == [
-        (("",), (9, 9), (2, 2)),
-        (("",), (4, 4), (1, 1)),
-    ]
-    assert "(policy)" in str(table)
 
 
 @pytest.mark.parametrize(

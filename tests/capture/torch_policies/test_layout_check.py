@@ -19,7 +19,7 @@ from tests.kit.small_torch_variants import (
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.capture.torch_policies.inspect_calls import NoAttention
 from vla_attention.capture.torch_policies.layout_check import NotRepeatable
-from vla_attention.schemas.errors import BadArgument, UnknownName
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.layout import PatchGrid, SiteLayout, Span
 
@@ -65,12 +65,6 @@ def test_a_right_layout_fits(policy):
     moved = [change.moved for change in found.changes]
     first = 4 + PROMPT
     assert moved == [(0, 1, 2, 3), (1,), (7,), (5, 7), (first,), (11, 12, 13), (first, 11, 12, 13)]
-    lines = str(found).splitlines()
-    assert lines[0] == "Layout 'small', keys of 'joint' at block 0: every change moves its keys and no others"
-    assert lines[1].split() == ["changed", "site", "should", "move", "moved", "fits"]
-    assert lines[2].split() == ["camera:front", "joint", "image_front", "image_front", "yes"]
-    assert lines[4].split()[:5] == ["word:bowl", "joint", "prompt", "(key", "7)"]
-    assert repr(found) == str(found)
 
 
 def with_spans(*spans, **changes):
@@ -106,13 +100,6 @@ def test_a_wrong_layout_does_not(policy, layout, selector, verdict):
     assert str(found).splitlines()[-1].endswith(verdict)
     if not found.fits:
         assert "1 of 1 do not fit" in str(found)
-
-
-def test_a_change_that_is_named_wrongly(policy):
-    perturb = {"span:state": call(policy, states=BATCH["states"] + 1, texts=["pick the plate"])}
-    assert check(policy, small_layout(), perturb).changes[0].verdict == "no: prompt (key 7) moved"
-    perturb = {"span:state": call(policy)}
-    assert check(policy, small_layout(), perturb).changes[0].verdict == "no: state did not move"
 
 
 def test_a_prompt_of_changing_length_and_generated_tokens():
@@ -168,8 +155,6 @@ def test_mistakes_are_sentences(policy):
         va.check_layout(policy, own, layout, {"word:bowl": own})
     with pytest.raises(SelectorError, match=r"there is no camera 'frond'\. Did you mean 'front'"):
         va.check_layout(policy, own, layout, {"camera:frond": own})
-    with pytest.raises(UnknownName, match=r"Unknown site 'jont'\. Did you mean 'joint'"):
-        va.check_layout(policy, own, layout, {"span:state": own}, site="jont")
     with pytest.raises(
         CallsDoNotFit, match=r"calls at the unchanged call do not fit .* has 2 heads|must compute 3 times"
     ):

@@ -18,7 +18,7 @@ from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.session import WeightsChanged
 from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
 from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
-from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
@@ -131,19 +131,6 @@ def test_a_float32_softmax_over_bfloat16_values(tmp_path, knockout):
     rows, result = rows_of(tmp_path, policy, knockout=knockout)
     assert torch.equal(result, own) == (knockout is None)
     np.testing.assert_allclose(rows, expected(policy, (4, 5) if knockout else ()), atol=2e-6)
-
-
-def test_a_float32_softmax_under_autocast(tmp_path):
-    policy = OddPolicy(lambda block, q, k, v: torch.softmax(logits(q, k).float(), dim=-1) @ v)
-
-    def act(recorded: bool = True) -> Tensor:
-        with torch.autocast("cpu", torch.bfloat16):
-            return policy.act()
-
-    own = act()
-    rows, result = rows_of(tmp_path, policy, act)
-    assert torch.equal(result, own)
-    np.testing.assert_allclose(rows, expected(policy), atol=5e-3)
 
 
 class MultiheadBlock(nn.Module):
@@ -329,45 +316,6 @@ def test_weights_that_change_during_a_run_are_refused(tmp_path):
         ):
             policy.act()
     assert len(open_store(tmp_path / "a.zarr").episodes) == 2
-
-
-def one_replan(path, facts=None, actions=None, success=None, **given):
-    policy = OddPolicy(sdpa)
-    with record(path / "a.zarr", policy, layout=layout(), durable=False) as run:
-        facts = {"task_id": 0, "episode_index": 0, "instruction": ""} | (facts or {})
-        with run.episode(**facts) as episode:
-            with episode.replan(**({"env_step": 0} | given)) as replan:
-                policy.act()
-                replan.actions = actions
-            episode.success = success
-    store = open_store(path / "a.zarr")
-    assert verify_store(store) == []
-    return store.episodes[0]
-
-
-def test_numbers_of_numpy_and_torch(tmp_path):
-    facts = {"task_id": np.int64(3), "episode_index": torch.tensor(2), "seed": np.uint32(7)}
-    episode = one_replan(tmp_path, facts, success=np.bool_(True), env_step=np.int32(5))
-    assert (episode.attributes.task_id, episode.attributes.episode_index) == (3, 2)
-    assert (episode.attributes.success, episode.attributes.num_steps) == (True, 6)
-    assert episode.read("env_step").tolist() == [5]
-
-
-WRONG = {
-    "env_step is half": ({"env_step": 1.5}, "env_step of a replan is 1.5; expected a whole number"),
-    "seed": ({"noise_seed": 2**70}, "expected a number of 64 bits"),
-    "state": ({"state": "abc"}, r"state of a replan is no array of numbers \(given: str\)"),
-    "frames": (
-        {"frames": np.zeros((8, 8, 3), np.uint8)},
-        "frames of a replan is of type ndarray; expected a dictionary",
-    ),
-}
-
-
-@pytest.mark.parametrize(("given", "sentence"), WRONG.values(), ids=WRONG)
-def test_what_is_no_number_has_a_sentence(tmp_path, given, sentence):
-    with pytest.raises(UserError, match=sentence):
-        one_replan(tmp_path, **given)
 
 
 def reuse_logits(block, q, k, v):

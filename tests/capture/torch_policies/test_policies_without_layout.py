@@ -21,10 +21,9 @@ from tests.kit.cached_torch_policies import (
     looped_layout,
 )
 from tests.kit.small_torch_policy import HORIZON, WIDTH, SmallPolicy, given, small_layout
-from tests.kit.small_torch_variants import CausalAttention, token_layout
+from tests.kit.small_torch_variants import token_layout
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.capture.torch_policies.record import record
-from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 
@@ -73,11 +72,6 @@ def test_caches_whose_keys_have_no_places(tmp_path, attention, layout, text, sho
     assert re.search(f"Recording refuses {re.escape('layers.{0,1}')}, {shown}{way_out}", table)
     with pytest.raises(CallsDoNotFit, match=sentence + way_out):
         record_call(tmp_path, policy, layout, lambda: policy.act(PICTURE, text))
-
-
-def test_a_cache_that_grows_is_not_refused():
-    policy = cached_policy(CausalAttention)
-    assert "refuse" not in str(va.inspect(policy, lambda: policy.act(PICTURE, "pick the bowl")))
 
 
 def sinks(block, q, k, v):
@@ -185,15 +179,3 @@ def test_guidance_as_a_batch_of_two(tmp_path, knockout):
     assert guided.read("actions").shape == (1, HORIZON, 2)
     for array in ("joint/rows", "joint/contribution", "joint/key_role"):
         np.testing.assert_allclose(guided.read(array), plain.read(array), atol=1e-5)
-
-
-@pytest.mark.parametrize("given", [{"rows": [2], "batch": 2}, {"rows": [0, 1], "batch": 2}])
-def test_rows_that_a_batch_does_not_have(tmp_path, given):
-    policy = SmallPolicy()
-    facts = {"task_id": 0, "episode_index": 0, "instruction": ""}
-    with (
-        record(tmp_path / "a.zarr", policy, layout=small_layout(), durable=False) as run,
-        pytest.raises(BadArgument, match=r"1 episodes at the rows .* expected a row of its own for each"),
-        run.episodes([facts], **given),
-    ):
-        pass

@@ -13,16 +13,11 @@ import vla_attention as va
 from tests.capture.torch_policies.test_odd_policies import OddPolicy, layout
 from tests.kit.attention_modules import Attention, Policy, Seen
 from vla_attention.capture.torch_policies import seen_functions
-from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.capture.torch_policies.watch import watch_attention
 from vla_attention.schemas.stores.reader import open_store
 
 HIDDEN, MEMORY = torch.randn(2, 5, 32), torch.randn(2, 7, 32)
 NAMES = [(owner, name, getattr(owner, name)) for owner, name in seen_functions._NAMES]
-
-
-def fused(query, key, value, mask):
-    return functional.scaled_dot_product_attention(query, key, value, mask)
 
 
 def by_hand(query, key, value, mask):
@@ -38,22 +33,6 @@ def nothing_left():
     return all(getattr(owner, name) is before for owner, name, before in NAMES) and not any(
         isinstance(mode, seen_functions._EveryFunction) for mode in _get_current_function_mode_stack()
     )
-
-
-@pytest.mark.parametrize("attend", [fused, by_hand])
-def test_names_are_enough_for_policies_that_use_them(attend):
-    policy, every, named = small_policy(attend), Seen(), Seen()
-    with watch_attention(policy, every) as functions:
-        expected = policy(HIDDEN, MEMORY)
-    assert functions.by_names
-    with watch_attention(policy, named, every_function=False) as functions:
-        result = policy(HIDDEN, MEMORY)
-    assert functions.by_names
-    assert torch.equal(result, expected)
-    assert named.shapes == every.shapes
-    assert len(named.shapes) == 2
-    assert all(torch.equal(a, b) for a, b in zip(named.rows, every.rows, strict=True))
-    assert nothing_left()
 
 
 class Scaled(TorchFunctionMode):
@@ -148,27 +127,6 @@ def test_a_session_looks_at_every_function_until_it_knows_better(tmp_path, monke
     assert asked == ways
     rows = [episode.read("joint/rows") for episode in open_store(tmp_path / "a.zarr").episodes]
     assert all((one == rows[0][0]).all() for episode in rows for one in episode)
-
-
-def test_a_later_call_by_another_name_is_an_error_that_says_so(tmp_path):
-    names: list[object] = []
-    policy = OddPolicy(lambda block, *given: names.pop(0)(*given))
-
-    def record_two_calls(run):
-        with run.episode(task_id=0, episode_index=0, instruction="") as episode:
-            for step in range(2):
-                with episode.replan(env_step=step):
-                    # Inside of the block, something else stands under the name.
-                    named = functional.scaled_dot_product_attention
-                    names[:] = [imported_by_name if step else named, named]
-                    policy.act()
-        return episode
-
-    with va.record(tmp_path / "a.zarr", policy, layout=layout(), durable=False) as run:
-        with pytest.raises(CallsDoNotFit, match=r"(?s)replan 1.*block 0: 0.*again with run\.every_function = True"):
-            record_two_calls(run)
-        run.every_function = True
-        assert record_two_calls(run).num_replans == 2
 
 
 def test_a_module_that_attends_counts_its_own_end():

@@ -389,24 +389,6 @@ def test_an_embedding_that_is_not_called_is_refused_by_name(tmp_path, changes):
         assert labels == ["instruction"] * 3 + ["template", "padding"]
 
 
-@pytest.mark.parametrize(
-    ("embed", "sentence"),
-    [
-        (
-            lambda self, ids: self.embed_tokens(torch.cat([ids, ids]))[:1],
-            r"the shape \(2, 6\), and the policy call has a batch of 1: expected token ids \(batch, token\)",
-        )
-    ],
-)
-def test_ids_of_another_batch_and_no_ids_at_all_are_refused(tmp_path, embed, sentence):
-    policy = with_encoder(embed)
-    with (
-        start(tmp_path, policy, layout=encoded("words.embed_tokens")) as run,
-        pytest.raises(PromptDoesNotFit, match=sentence),
-    ):
-        one_call(run, policy)
-
-
 def test_masks_give_the_coverage_of_objects(tmp_path, policy):
     objects = [SceneObject("table", "fixture", False), SceneObject("bowl", "object", True)]
     mask = np.zeros((16, 16), int)
@@ -429,20 +411,6 @@ def test_a_prompt_may_be_given_as_pieces(tmp_path, policy):
     assert [piece.key for piece in episode.attributes.prompts[0].pieces] == [5, 6, 7]
     labels = [Role(code).label for code in episode.read("joint/key_role")[0]]
     assert labels[4:10] == ["template", "instruction", "instruction", "instruction", "template", "padding"]
-
-
-def test_a_compiled_policy_runs_eager_inside_of_the_block(tmp_path, policy):
-    expected = policy.act(**given())
-    for block in policy.blocks:
-        # The backend fails where it is called: nothing is compiled inside of a replan block.
-        block.attention.compile(backend=lambda graph, inputs: pytest.fail("compiled inside of the block"))
-    with (
-        start(tmp_path, policy) as run,
-        run.episode(task_id=0, episode_index=0, instruction="pick the bowl") as episode,
-        episode.replan(env_step=0),
-    ):
-        assert torch.equal(policy.act(**given()), expected)
-    assert stored(tmp_path).episodes[0].attributes.num_replans == 1
 
 
 def test_a_call_of_another_thread_is_not_taken_for_the_block_s(tmp_path, policy):

@@ -39,15 +39,6 @@ def test_actions_are_bit_equal_with_and_without_recording(dummy, prepared):
     assert plain.actions.shape == (16, 7)
 
 
-def test_rows_of_both_sites_are_probabilities_over_their_keys(dummy, prepared):
-    recorders = recorders_for(dummy, "all")
-    dummy.act(prepared, 195, recorders)
-    for site in dummy.sites:
-        rows = recorders[site.name].finish()
-        assert rows.rows.shape == (3, 3, 2, dummy.num_action_queries, site.num_keys)
-        np.testing.assert_allclose(rows.row_sum, 1.0, atol=1e-5)
-
-
 def test_queries_are_pooled_by_action_step(dummy, prepared):
     plan = RecordingPlan((1,), (0,), (0, 1), "steps", "self")
     pools, keep = dummy.query_pools(), KeepAll()
@@ -80,14 +71,6 @@ def test_another_query_frame_has_other_rows(dummy, prepared):
     with pytest.raises(BadArgument, match="latent frame 'primary' do not stand for action steps"):
         other.action_shares()
     assert dummy.action_shares().shape == (16, 16, 7)
-
-
-def test_words_and_pictures_and_noise_change_the_actions(dummy, prepared):
-    actions = dummy.act(prepared, 195)
-    assert np.array_equal(dummy.act(prepared, 195), actions)
-    assert not np.array_equal(dummy.act(prepared, 196), actions)
-    assert not np.array_equal(dummy.act(dummy.prepare(make_observation(0), OTHER_INSTRUCTION), 195), actions)
-    assert not np.array_equal(dummy.act(dummy.prepare(make_observation(1), INSTRUCTION), 195), actions)
 
 
 def test_the_published_layout():
@@ -167,22 +150,6 @@ def test_denoise_times_and_noise_seeds(dummy):
     assert times[0] == pytest.approx(80 / 81)
     assert times[-1] == pytest.approx(0.8)
     assert dummy.replan_noise_seed(195, 3, 2, 7) == 195
-
-
-def test_options_reach_the_policy():
-    pytest.importorskip("diffusers")
-    policy = build_cosmos_policy(
-        "untrained-tiny",
-        device="cpu",
-        num_denoising_steps_action=4,
-        chunk_size=8,
-        num_open_loop_steps=5,
-        query_frame="frame4",
-    )
-    assert policy.num_denoise_steps == 4
-    assert policy.action_horizon == 8
-    assert policy.default_replan_steps == 5
-    assert policy.act(policy.prepare(make_observation(0), INSTRUCTION), 0).shape == (8, 7)
 
 
 @pytest.mark.parametrize(

@@ -105,19 +105,9 @@ def test_pictures_of_data_sets_are_not_turned():
     assert np.array_equal(lerobot_image(picture, 28, turned=False), turned)
 
 
-def test_padded_statistics_say_nothing_of_the_robot(tmp_path):
-    folder = openpi_checkpoint(tmp_path, "pi05_batch2", "anything", 32, 32)
-    robot = openpi_robot(folder, DROID, relative_actions=0)
-    assert (robot.state_dim, robot.action_dim) == (8, 8)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
-    [
-        ({"numbers": {"joint_position": 6, "gripper_position": 1, "actions": 8}}, "states have 8 numbers, .* 7:"),
-        ({"numbers": {"joint_position": 7, "gripper_position": 1}}, "the actions is not known; give --action COLUMN"),
-        ({"cameras": ()}, "'base_0_rgb' has no pictures .* whose cameras are none"),
-    ],
+    [({"numbers": {"joint_position": 6, "gripper_position": 1, "actions": 8}}, "states have 8 numbers, .* 7:")],
 )
 def test_what_does_not_fit_the_checkpoint_is_said(tmp_path, changes, message):
     folder = openpi_checkpoint(tmp_path, "pi05_batch2", "droid", 8, 8)

@@ -54,16 +54,3 @@ def test_other_families_are_named(tmp_path, config, family, weights):
     with pytest.raises(UnsupportedCheckpoint, match="another model family") as caught:
         detect_format(tmp_path)
     assert family.removeprefix("type '").removesuffix("'") in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("files", "expected"),
-    [
-        (["holiday.jpg"], r"expected openpi's PyTorch format.*JAX.*LeRobot's.*found holiday\.jpg"),
-        (["29999/params/_METADATA", "30000/params/_METADATA"], r"give one of its folders 29999, 30000"),
-        ([], "found none"),
-    ],
-)
-def test_other_folders_get_a_hint(tmp_path, files, expected):
-    with pytest.raises(UnsupportedCheckpoint, match=expected):
-        detect_format(make(tmp_path, *files))

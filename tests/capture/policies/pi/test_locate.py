@@ -17,7 +17,6 @@ from vla_attention.capture.policies.hub import (
     hub_cache,
     hub_version,
     in_hub_cache,
-    split_hub_name,
 )
 from vla_attention.capture.policies.identity import downloads_of
 from vla_attention.capture.policies.pi.loading import build_pi_policy
@@ -43,14 +42,6 @@ def module(monkeypatch, name, **content):
     monkeypatch.setitem(sys.modules, name, types.SimpleNamespace(**content))
 
 
-def test_local_folders_come_first(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "org" / "name").mkdir(parents=True)
-    assert find_checkpoint("org/name").is_dir()
-    assert str(find_checkpoint("a/b/c")) == "a/b/c"
-    assert str(find_checkpoint("nothing")) == "nothing"
-
-
 def test_a_hub_name_is_downloaded_by_the_hub_s_client(monkeypatch, tmp_path):
     asked = []
 
@@ -65,19 +56,6 @@ def test_a_hub_name_is_downloaded_by_the_hub_s_client(monkeypatch, tmp_path):
     assert asked == [(name, None, list(HUB_FILES)), (name, "v1.0", list(HUB_FILES))]
     # safetensors and JSON only: nothing that has to be unpickled is downloaded
     assert not [pattern for pattern in HUB_FILES if pattern.endswith((".bin", ".pt", ".pth", ".pkl"))]
-
-
-@pytest.mark.parametrize(
-    ("name", "split"),
-    [
-        ("org/name@v2", ("org/name", "v2")),
-        (f"org/na.me@{'0123456789' * 4}", ("org/na.me", "0123456789" * 4)),
-        ("org/name@../x", None),
-        ("name", None),
-    ],
-)
-def test_names_and_revisions(name, split):
-    assert split_hub_name(name) == split
 
 
 COMMIT, OTHER = "a" * 40, "b" * 40

@@ -1,7 +1,6 @@
 """openpi's JAX checkpoints: written by openpi and orbax, and read without them."""
 
 import dataclasses
-import json
 import shutil
 
 import numpy as np
@@ -189,14 +188,4 @@ def test_missing_chunks_are_an_error_and_not_zeros(checkpoint, pi0_case):
     data = sorted((checkpoint / "params" / "ocdbt.process_0" / "d").iterdir(), key=lambda file: file.stat().st_size)
     data[-1].unlink()
     with pytest.raises(UnreadableCheckpoint, match="files are missing or damaged"):
-        load_openpi_jax(checkpoint, config=pi0_case.config)
-
-
-def test_unknown_arrays_are_listed_before_anything_is_read(checkpoint, pi0_case):
-    path = checkpoint / "params" / "_METADATA"
-    metadata = json.loads(path.read_text())
-    keys = [{"key": key, "key_type": 2} for key in ("params", "action_in_proj", "lora_a", "value")]
-    metadata["tree_metadata"]["extra"] = {"key_metadata": keys}
-    path.write_text(json.dumps(metadata))
-    with pytest.raises(CheckpointMismatch, match=r"1 arrays.*action_in_proj/lora_a"):
         load_openpi_jax(checkpoint, config=pi0_case.config)

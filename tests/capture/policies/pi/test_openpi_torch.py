@@ -53,18 +53,6 @@ def test_loaded_model_meets_the_reference(pi05_case):
     np.testing.assert_allclose(keep.stacked(), pi05_case.expected["attn"], rtol=0, atol=5e-5)
 
 
-def test_bfloat16_file_loads_in_either_precision(checkpoint, pi05_case):
-    def to_bfloat16(tensors):
-        for name in tensors:
-            tensors[name] = tensors[name].bfloat16()
-
-    rewrite(checkpoint, to_bfloat16)
-    for dtype in (torch.float32, torch.bfloat16):
-        model = load_openpi_torch(checkpoint, config=pi05_case.config, dtype=dtype)
-        assert model.action_in_proj.weight.dtype == torch.float32
-        assert model.state_dict()[TABLE].dtype == dtype
-
-
 def test_embed_tokens_wins_over_the_tied_name(checkpoint, pi05_case):
     def add_table(tensors):
         tensors[TABLE] = torch.full_like(tensors[TIED], 7.0)
@@ -85,12 +73,6 @@ def test_sizes_are_read_from_the_tensors(name):
     # Whether the prompt has the state is in no tensor.
     found = infer_config(expected_shapes(config), config_json)
     assert found == dataclasses.replace(config, discrete_state_input=False)
-
-
-def test_a_named_variant_of_other_sizes_is_refused():
-    config_json = {"action_dim": 32, "action_horizon": 10, "paligemma_variant": "gemma_300m"}
-    with pytest.raises(CheckpointMismatch, match="paligemma_variant 'gemma_300m'"):
-        infer_config(expected_shapes(find_config("pi05_libero")), config_json)
 
 
 #: The rows of gemma_2b's projections (8 query heads and one key head of 256) as other heads.

@@ -98,19 +98,3 @@ def spoil(case, what):
 
     elif what == "damaged":
         (case / "expected.npz").write_bytes((case / "expected.npz").read_bytes()[:1000])
-
-
-@pytest.mark.parametrize(
-    ("what", "arguments", "expected"),
-    [
-        ("no case", [], "it has no case.json, but checkpoint"),
-        ("damaged", [], "cannot be read as arrays"),
-        ("", ["--format", "orbax"], "it carries openpi, lerobot"),
-    ],
-)
-def test_cases_that_cannot_be_used(case, capsys, what, arguments, expected):
-    spoil(case, what)
-    code, _, err = parity(capsys, case, *arguments)
-    assert code == 2
-    assert expected in err
-    assert "\n" not in err

@@ -9,11 +9,10 @@ import torch
 from safetensors.torch import save_file
 
 from tests.kit.pi_golden import GOLDEN
-from tests.kit.policy_inputs import assert_same_input, make_observation
+from tests.kit.policy_inputs import assert_same_input
 from tests.kit.thorough import thorough_except
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound
 from vla_attention.capture.policies.identity import PolicySource
-from vla_attention.capture.policies.noise import initial_noise
 from vla_attention.capture.policies.pi.config import find_config
 from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, build_random_model, builtin_stats
 from vla_attention.capture.policies.pi.loading import load_pi_policy
@@ -156,26 +155,11 @@ def test_recording_does_not_change_a_bit_of_the_actions(policy, observation):
     assert np.isfinite(plain).all()
 
 
-def test_actions_depend_on_seed_picture_and_words_only(policy, observation):
-    base = policy.act(policy.prepare(observation, INSTRUCTION), 0)
-    np.testing.assert_array_equal(policy.act(policy.prepare(observation, INSTRUCTION), 0), base)
-    assert (policy.act(policy.prepare(observation, INSTRUCTION), 1) != base).any()
-    assert (policy.act(policy.prepare(observation, "turn on the stove"), 0) != base).any()
-    assert (policy.act(policy.prepare(make_observation(5), INSTRUCTION), 0) != base).any()
-
-
 def test_relative_actions_move_with_the_state(dummy_pi0, observation):
     given = dummy_pi0.prepare(observation, INSTRUCTION)
     moved = dataclasses.replace(given, state=given.state + 1.0)  # the model still sees the old state
     difference = dummy_pi0.act(moved, 0) - dummy_pi0.act(given, 0)
     np.testing.assert_allclose(difference, np.tile([1, 1, 1, 1, 1, 1, 0], (4, 1)), atol=1e-9)
-
-
-def test_noise_does_not_depend_on_torch():
-    noise = initial_noise(3, (1, 2, 3))
-    assert noise.dtype == np.float32
-    torch.manual_seed(99)
-    np.testing.assert_array_equal(noise, initial_noise(3, (1, 2, 3)))
 
 
 def test_digest_sees_a_single_changed_weight_and_handles_bfloat16():
