@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
-import torch
-import xarray as xr
 import zarr
 
 from tests.kit.written_tables import written_steps
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.capture.jobs.worker_records import read_records
 
 pytestmark = pytest.mark.simulator
 
@@ -50,21 +44,6 @@ def test_two_runs_give_the_same_bytes_whatever_ran_before(captured_store, run_ca
             assert (first / file).read_bytes() == (second / file).read_bytes(), file
 
 
-def test_the_number_of_threads_is_printed_and_recorded(run_capture, tmp_path, monkeypatch, capsys):
-    before = torch.get_num_threads()
-    monkeypatch.setattr(os, "environ", dict(os.environ))
-    store = tmp_path / "a.zarr"
-    run_capture("--task-id", 0, "--num-episodes", 1, "--output", store, "--threads", 2)
-    assert torch.get_num_threads() == 2
-    torch.set_num_threads(before)
-    assert capsys.readouterr().out.startswith("Threads: 2 (--threads).\n")
-    assert [record.threads for record in read_records(store)] == [2]
-    # Kept with the machine, which another job may replace, and no part of the run's configuration.
-    root = json.loads((store / "zarr.json").read_text())["attributes"]
-    assert root.pop("provenance")["threads"] == "2"
-    assert "threads" not in json.dumps(root)
-
-
 def test_episodes_hold_the_inputs_of_the_policy(captured_store):
     episode = zarr.open_group(captured_store / "episodes/task001_episode000", mode="r")
     attributes = dict(episode.attrs)
@@ -79,29 +58,6 @@ def test_episodes_hold_the_inputs_of_the_policy(captured_store):
     np.testing.assert_allclose(coverage.sum(axis=2), 1.0, atol=1e-6)
     assert coverage[:, :, names.index("cubeA")].sum() > 0
     assert coverage[:, :, names.index("robot")].sum() > 0
-
-
-def test_default_analysis_writes_every_documented_file(captured_store, tmp_path, capsys):
-    folder = tmp_path / "results"
-    assert analyze([str(captured_store), "--output", str(folder), "--save-viz", "--layers", "0", "2"]) == 0
-    printed = capsys.readouterr().out
-    for name in (
-        "steps.parquet",
-        "episodes.parquet",
-        "tasks.parquet",
-        "tasks_groups.parquet",
-        "summary.txt",
-        "attention_ratio_results_robosuite.json",
-        "ratio_distribution.png",
-        "ratio_per_task.png",
-        "attention_fractions.png",
-    ):
-        assert (folder / name).stat().st_size > 0, name
-    assert len(list(folder.rglob("*_layer2_ratio_evolution.png"))) == 4
-    assert "untrained" in printed.splitlines()[0]
-    assert f"{folder / 'summary.txt'}" in printed
-    assert len(printed.splitlines()) <= 40
-    assert "uniform" in printed
 
 
 def test_results_file_has_the_published_structure(captured_store, tmp_path):
@@ -191,29 +147,6 @@ def test_masses_equal_a_computation_by_hand_from_the_raw_arrays(captured_store, 
     np.testing.assert_allclose(steps["cube_mass"].to_numpy().reshape(by_hand.shape), by_hand, rtol=1e-5)
 
 
-def test_list_names_layout_words_objects_and_layers(captured_store, capsys):
-    assert analyze([str(captured_store), "--list"]) == 0
-    printed = capsys.readouterr().out
-    for text in (
-        "base_0_rgb",
-        "masked_image 4",
-        "words      lift, the, red, cube",
-        "cubeA",
-        "layers     0, 1, 2 of 3",
-        "steps 0, 2",
-    ):
-        assert text in printed
-
-
-def test_store_opens_with_xarray_alone(captured_store):
-    joint = xr.open_zarr(captured_store, group="episodes/task000_episode000/joint", consolidated=False)
-    joint = joint.assign_coords(joint.attrs)
-    assert joint["rows"].dims == ("replan", "layer", "denoise", "head", "query", "key")
-    assert joint["layer"].values.tolist() == [0, 1, 2]
-    assert joint["denoise"].values.tolist() == [0, 2]
-    np.testing.assert_allclose(joint["rows"].sum("key"), joint["row_sum"], rtol=2**-10)
-
-
 def test_recording_does_not_change_what_the_robot_does(captured_store, run_capture, tmp_path):
     little = tmp_path / "little.zarr"
     run_capture(
@@ -253,20 +186,6 @@ def test_contributions_of_the_segments_add_up_to_the_update(captured_store):
     assert masked
     assert not gram[..., masked, :].any()
     assert (np.linalg.eigvalsh(gram) > -1e-4 * gram[..., -1:, -1]).all()
-
-
-def test_output_dir_and_save_viz_run_the_analysis_too(run_capture, tmp_path):
-    run_capture("--task-id", 0, "--num-episodes", 1, "--output-dir", tmp_path, "--save-viz", "--layers", 2)
-    assert (tmp_path / "robosuite.zarr" / "zarr.json").is_file()
-    assert (tmp_path / "attention_ratio_results_robosuite.json").is_file()
-    assert len(list(tmp_path.rglob("*_layer2_ratio_evolution.png"))) == 1
-
-
-def test_console_commands_are_installed():
-    for command in ("vla-capture", "vla-analyze"):
-        program = shutil.which(command) or str(Path(sys.executable).with_name(command))
-        shown = subprocess.run([program, "--help"], capture_output=True, text=True, check=True)
-        assert "examples:" in shown.stdout
 
 
 @pytest.mark.libero

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zarr
-from safetensors.torch import load_file, save_file
 
 from tests.kit.small_tokenizer import train_small_tokenizer
+from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
-from vla_attention.schemas.errors import listing
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "pi"
 #: folder -> format, prompt and normalisation in the manifest
@@ -33,7 +29,9 @@ def small_tokenizer(tmp_path_factory) -> Path:
 
 
 @pytest.mark.simulator
-@pytest.mark.parametrize("name", CHECKPOINTS)
+@pytest.mark.parametrize(
+    "name", thorough_except(("pi0_batch2/checkpoint", "pi05_batch2/checkpoint_lerobot"), CHECKPOINTS)
+)
 def test_a_checkpoint_drives_the_simulator_and_its_store_is_analysed(name, small_tokenizer, tmp_path, capsys):
     store = tmp_path / "store.zarr"
     arguments = [
@@ -51,8 +49,7 @@ def test_a_checkpoint_drives_the_simulator_and_its_store_is_analysed(name, small
     assert capture(["pi", "--checkpoint", str(GOLDEN / name), *map(str, arguments)]) == 0
     said = capsys.readouterr()
     checkpoint_format, prompt, normalisation = CHECKPOINTS[name]
-    assert f"in format {checkpoint_format}" in said.out
-    assert "of which 5 are executed" in said.out
+
     # the state does not fit into this model's 24 text slots: LeRobot cuts it, visibly
     assert ("Warning: the prompt" in said.err) == (prompt == "task-state-action")
 
@@ -73,7 +70,6 @@ def test_a_checkpoint_drives_the_simulator_and_its_store_is_analysed(name, small
     expected = ("lerobot", 1000, 360) if checkpoint_format == "lerobot" else ("openpi", 7, 256)
     assert (protocol["name"], protocol["seed"], protocol["image_size"]) == expected
     assert protocol["replan_steps"] == 5
-    assert f"Protocol: {expected[0]} (docs/protocol.md), seed {expected[1]}, pictures of {expected[2]} pix" in said.out
 
     episode = zarr.open_group(store / "episodes/task000_episode000", mode="r")
     camera = policy["cameras"][0]["name"]
@@ -89,8 +85,6 @@ def test_a_checkpoint_drives_the_simulator_and_its_store_is_analysed(name, small
     np.testing.assert_allclose(covered.sum(axis=-1), 1, atol=1e-5)
 
     capsys.readouterr()
-    assert analyze([str(store), "--list"]) == 0
-    assert f"protocol {expected[0]}, seed {expected[1]}, pictures of {expected[2]} pixels" in capsys.readouterr().out
     other = "openpi" if expected[0] == "lerobot" else "lerobot"
     resumed = ["--resume", "--protocol", other, "--seed", expected[1]]
     assert f"its protocol.name is '{expected[0]}', this run's is '{other}'" in refused(
@@ -121,92 +115,14 @@ def refused(arguments, capsys) -> str:
     return said
 
 
-def copied(name: str, folder: Path) -> Path:
-    """A copy of a golden checkpoint, with its case.json beside it."""
-    shutil.copytree(GOLDEN / name, folder / "checkpoint")
-    shutil.copy(GOLDEN / name.split("/")[0] / "case.json", folder)
-    return folder / "checkpoint"
-
-
-def edit_json(path: Path, change) -> None:
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
-
-
-def truncate(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-
-
-def drop_largest(folder: Path) -> None:
-    max((file for file in folder.rglob("*") if file.is_file()), key=lambda file: file.stat().st_size).unlink()
-
-
-def shorten(path: Path) -> None:
-    def change(content):
-        for key, numbers in content["norm_stats"]["state"].items():
-            content["norm_stats"]["state"][key] = numbers[:7]
-
-    edit_json(path, change)
-
-
-def misname(path: Path) -> None:
-    tensors = load_file(path)
-    tensors["something.else"] = tensors.pop("time_mlp_in.bias")
-    tensors["action_in_proj.bias"] = tensors["action_in_proj.bias"][:5].clone()
-    save_file(tensors, path)
-
-
-STATS = "assets/physical-intelligence/libero/norm_stats.json"
 TORCH, JAX, LEROBOT = "pi05_batch2/checkpoint_openpi_torch", "pi0_batch2/checkpoint", "pi05_batch2/checkpoint_lerobot"
-
-
-@pytest.mark.parametrize(
-    ("name", "spoil", "expected"),
-    [
-        (TORCH, lambda c: truncate(c / "model.safetensors"), ["model.safetensors", "damaged or its copy incomplete"]),
-        (LEROBOT, lambda c: truncate(c / "model.safetensors"), ["damaged or its copy incomplete"]),
-        (JAX, lambda c: drop_largest(c / "params"), ["files are missing or damaged"]),
-        (JAX, lambda c: (c / "params/manifest.ocdbt").unlink(), ["files are missing or damaged"]),
-        (TORCH, lambda c: misname(c / "model.safetensors"),
-         ["1 missing: time_mlp_in.bias", "1 extra: something.else",
-          "1 of the wrong shape: action_in_proj.bias is (5,)"]),
-        (TORCH, lambda c: shorten(c / STATS), ["'state' have 7 numbers; 8 are needed"]),
-        (JAX, lambda c: (c / STATS).unlink(), ["no norm_stats.json"]),
-        (LEROBOT, lambda c: edit_json(c / "config.json", lambda j: j.update(use_peft=True)), ["use_peft True"]),
-        (LEROBOT, lambda c: edit_json(c / "config.json", lambda j: j.update(type="smolvla")),
-         ["another model family", "smolvla"]),
-        (TORCH, lambda c: edit_json(c / "config.json", lambda j: j.update(model_type="openvla")), ["OpenVLA"]),
-        (LEROBOT, lambda c: (c / "policy_preprocessor.json").unlink(), ["no policy_preprocessor.json"]),
-        (TORCH, lambda c: (c / "model.safetensors").unlink(), ["is not a pi checkpoint", "found assets, config.json"]),
-        (TORCH, lambda c: (c.parent / "case.json").unlink(), ["32 wide", "--model-config PATH"]),
-        (JAX, lambda c: (c.parent / "case.json").unlink(), ["tensors are not those of the model"]),
-        (JAX, lambda c: edit_json(c.parent / "case.json", lambda j: j["config"]["paligemma"].update(width=128)),
-         ["wrong shape"]),
-    ],
-)  # fmt: skip
-def test_spoiled_checkpoints(name, spoil, expected, small_tokenizer, tmp_path, capsys):
-    checkpoint = copied(name, tmp_path)
-    spoil(checkpoint)
-    store = tmp_path / "a.zarr"
-    said = refused(["--checkpoint", checkpoint, "--tokenizer", small_tokenizer, "--output", store], capsys)
-    for words in expected:
-        assert words in said
-    assert not store.exists()
 
 
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
         (["--paligemma-variant", "gemma_300m"], "contradicts the policy"),
-        (["--action-expert-variant", "dummy"], "contradicts the policy"),
-        (["--num-image-tokens", "256"], "16 keys; leave the option out"),
-        (["--checkpoint-format", "lerobot"], "not in LeRobot's format"),
         (["--config-name", "pi0_libero"], "tensors are not those of the model"),
-        (["--model-config", "none.json"], "There is no 'none.json'"),
-        (["--discrete-state-input"], "is for pi0.5"),
-        (["--tokenizer", "none.model"], "There is no tokenizer file"),
-        (["--tokenizer", str(EMBEDDED_TOKENIZER)], "the model 'pi0' has 300: it is another model's tokenizer"),
         (["--replan-steps", "8"], "expected 1 to 7"),
     ],
 )
@@ -216,11 +132,3 @@ def test_arguments_that_contradict_a_checkpoint(arguments, expected, small_token
         capsys,
     )
     assert expected in said
-
-
-def test_a_checkpoint_without_a_tokenizer(tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("OPENPI_DATA_HOME", str(tmp_path))
-    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
-    said = refused(["--checkpoint", GOLDEN / JAX, "--output", tmp_path / "a.zarr"], capsys)
-    assert "give --tokenizer PATH" in said
-    assert listing([GOLDEN / JAX / "tokenizer" / "tokenizer.model"]) in said

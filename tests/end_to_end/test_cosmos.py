@@ -8,13 +8,9 @@ import numpy as np
 import pytest
 import zarr
 
-from tests.kit.questions import question_about
 from tests.kit.written_tables import written_steps
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.analyze.effects.conditions import GroupOfKeys
-from vla_attention.analyze.effects.group_attention import group_attention
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.schemas.layout import Role
 
 pytestmark = pytest.mark.simulator
 
@@ -52,28 +48,8 @@ def cosmos_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return store
 
 
-def test_the_store_is_whole_and_lists_both_sites(cosmos_store, capsys):
+def test_the_store_is_whole(cosmos_store):
     assert analyze(["verify", str(cosmos_store)]) == 0
-    capsys.readouterr()
-    assert analyze([str(cosmos_store), "--list"]) == 0
-    printed = capsys.readouterr().out
-    assert "Site 'self'" in printed
-    assert "Site 'cross'" in printed
-    assert "words      stack, the, red, cube, on, top, of, green" in printed
-
-
-def test_a_group_of_an_intervention_is_found_at_its_own_site(cosmos_store):
-    """The question is at `self`; words are keys of `cross`, and both are measured."""
-    groups = [GroupOfKeys((text,)) for text in ("word:cube", "role:image", "word:mug")]
-    found = group_attention(question_about(cosmos_store), groups)
-    assert [found[group].site for group in groups] == ["cross", "self", None]
-    episode = zarr.open_group(cosmos_store / "episodes/task001_episode000", mode="r")
-    rows, roles = episode["self/rows"][:], episode["self/key_role"][:]
-    wanted = (rows.mean(axis=(1, 2, 3, 4)) * (roles == Role.IMAGE)).sum(axis=1)
-    np.testing.assert_allclose(found[groups[1]].values["task001_episode000"][:, 0], wanted, rtol=2e-3)
-    assert (found[groups[0]].values["task001_episode000"][:, 0] > 0).all()
-    at_self = group_attention(question_about(cosmos_store, site="self"), groups[:1])
-    assert at_self[groups[0]].site is None
 
 
 def test_rows_of_both_sites_sum_to_one_and_contributions_to_the_update(cosmos_store):
@@ -101,11 +77,7 @@ def test_objects_lie_where_the_picture_shows_them(cosmos_store):
 
 def test_each_site_is_analysed_by_itself(cosmos_store, tmp_path, capsys):
     assert analyze([str(cosmos_store), "--output", str(tmp_path / "self"), "--no-plots"]) == 0
-    said = capsys.readouterr().out
-    assert len(said.splitlines()) <= 40
-    printed = " ".join(said.split())
-    assert "The ratio |visual| / |linguistic| is" in printed
-    assert "must not be divided by a mass of another" in printed
+    assert "must not be divided by a mass of another" in " ".join(capsys.readouterr().out.split())
     steps = written_steps(tmp_path / "self")
     assert "ratio" not in steps.columns
     assert (steps["visual_mass"] > 0).all()
@@ -136,14 +108,7 @@ def test_queries_can_be_pooled_by_action_step(tmp_path):
 
 @pytest.mark.parametrize(
     ("arguments", "expected"),
-    [
-        (["--query-frame", "actoin"], "Did you mean 'action'"),
-        (["--visual-frame", "frame99"], "frame0 to frame"),
-        (["--prefer-S", "12"], "No call has --prefer-S 12"),
-        (["--prefer-call", "middle"], "expected 'last' or 'first'"),
-        (["--ckpt-path", "no/such/folder/anywhere"], "no/such/folder"),
-        (["--layers", "28"], "There is no layer 28"),
-    ],
+    [(["--query-frame", "actoin"], "Did you mean 'action'"), (["--prefer-S", "12"], "No call has --prefer-S 12")],
 )
 def test_bad_input_is_one_sentence(arguments, expected, tmp_path, capsys):
     given = ["cosmos", "--ckpt-path", "untrained-tiny", "--output", str(tmp_path / "a.zarr"), *arguments]

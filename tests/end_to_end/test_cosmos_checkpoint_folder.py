@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
-import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,14 +14,13 @@ import pytest
 import torch
 import zarr
 
-from tests.kit.cosmos_checkpoint import WEIGHTS_NAME, write_dummy_folder
+from tests.kit.cosmos_checkpoint import write_dummy_folder
 from tests.kit.written_tables import written_steps
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.environments.suites import find_suite, list_tasks
 from vla_attention.capture.policies.cosmos.config import CosmosConfig, DitConfig, VaeConfig
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG
-from vla_attention.capture.policies.cosmos.locate import EMBEDDINGS_NAME, STATISTICS_NAME
 
 #: The published policy's 28 blocks, nine latent frames of 14 x 14 tokens, 512 text positions and five calls; narrow
 #: inside.
@@ -85,22 +82,11 @@ def rows_of(store: Path, site: str) -> np.ndarray:
 
 @pytest.mark.libero
 @pytest.mark.simulator
-def test_the_store_has_the_published_sizes_and_both_sites(libero_store, capsys):
+def test_the_store_has_the_published_sizes_and_both_sites(libero_store):
     assert analyze(["verify", str(libero_store)]) == 0
     # 20 steps, 16 actions a call: two replans; layers 25 to 27; the first and the last of five calls.
     assert rows_of(libero_store, "self").shape == (2, 3, 2, 2, 1, NUM_KEYS)
     assert rows_of(libero_store, "cross").shape == (2, 3, 2, 2, 1, 512)
-    capsys.readouterr()
-    assert analyze([str(libero_store), "--list"]) == 0
-    printed = capsys.readouterr().out
-    for said in (
-        "Site 'self': 1764 keys",
-        "Site 'cross': 512 keys",
-        "layers     25, 26, 27 of 28",
-        "words      put, both, the, alphabet, soup",
-        "primary             588..783  image 196  14 x 14 patches",
-    ):
-        assert said in printed
 
 
 @pytest.mark.libero
@@ -123,6 +109,7 @@ def test_the_results_of_the_command_have_the_published_fields_and_sums(libero_ru
             assert (step["query_frame"], step["visual_frame"], step["text_frame"]) == ("action", "curr_last", "frame0")
 
 
+@pytest.mark.thorough
 @pytest.mark.libero
 @pytest.mark.simulator
 def test_default_and_reference_with_pictures(libero_store, tmp_path, capsys):
@@ -157,78 +144,6 @@ def folder(tmp_path: Path) -> Path:
     return write_dummy_folder(tmp_path / "checkpoint", DUMMY_CONFIG, ["stack the red cube"], dtype=torch.float32)
 
 
-def refused(folder: Path, capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """The sentence that the command ends with, after checking the form of it."""
-    store = folder.parent / "a.zarr"
-    given = ["cosmos", "--ckpt-path", folder, "--task-id", 0, "--device", "cpu", "--output", store, *arguments]
-    capsys.readouterr()
-    assert capture([str(argument) for argument in given]) == 2
-    said = capsys.readouterr().err.strip()
-    # A note that T5's tokenizer is absent may be a line of its own; the error itself is one line.
-    *notes, sentence = said.splitlines()
-    assert all(note.startswith("T5's tokenizer") for note in notes)
-    assert sentence.startswith("vla-capture: ")
-    assert not store.exists()
-    return sentence
-
-
-@pytest.mark.parametrize(
-    ("missing", "expected"),
-    [
-        (STATISTICS_NAME, "--dataset-stats-path"),
-        (EMBEDDINGS_NAME, "--t5-text-embeddings-path"),
-        (WEIGHTS_NAME, "has no .pt file"),
-    ],
-)
-def test_a_missing_file_is_named_with_what_to_do(folder, missing, expected, capsys):
-    (folder / missing).unlink()
-    said = refused(folder, capsys)
-    assert expected in said
-    assert str(folder) in said
-    if missing != WEIGHTS_NAME:
-        assert missing in said
-        assert "elsewhere" in refused(folder, capsys, expected, "elsewhere")
-
-
-class Malicious:
-    """Creates a file when an unsafe reader unpickles it."""
-
-    def __init__(self, trace: Path):
-        self.trace = trace
-
-    def __reduce__(self):
-        return os.system, (f"touch {self.trace}",)
-
-
-@pytest.mark.parametrize("name", [EMBEDDINGS_NAME, WEIGHTS_NAME, "tokenizer/tokenizer.pth"])
-def test_a_malicious_pickle_is_refused_and_nothing_of_it_is_executed(folder, name, tmp_path, capsys):
-    trace, path = tmp_path / "executed", folder / name
-    if name == EMBEDDINGS_NAME:
-        content = {**pickle.loads(path.read_bytes()), "another": Malicious(trace)}
-        path.write_bytes(pickle.dumps(content))
-    else:
-        content = {**torch.load(path, weights_only=False), "net.another": Malicious(trace)}
-        torch.save(content, path)
-    said = refused(folder, capsys)
-    assert "was refused" in said
-    assert "system" in said
-    assert "nothing of it was executed" in said
-    assert not trace.exists()
-    # The file really is malicious.
-    pickle.loads(path.read_bytes()) if name == EMBEDDINGS_NAME else torch.load(path, weights_only=False)
-    assert trace.exists()
-
-
-def test_frames_and_calls_that_do_not_exist_name_those_that_do(folder, capsys):
-    said = refused(folder, capsys, "--query-frame", "actoin")
-    assert "Unknown latent frame 'actoin'. Did you mean 'action'?" in said
-    assert "blank, proprio, wrist, primary, action, future_proprio, future_wrist, future_primary, value" in said
-    assert "frame0 to frame8" in said
-    assert "Unknown latent frame 'frame9'" in refused(folder, capsys, "--text-frame", "frame9")
-    said = refused(folder, capsys, "--prefer-S", "1000")
-    assert "No call has --prefer-S 1000: all 5 calls of this policy have S = 1764" in said
-
-
 @pytest.mark.simulator
 def test_an_instruction_without_embedding_names_the_near_ones(folder, capsys):
     """The error comes at the first replan: the store exists then, without an episode."""
@@ -248,30 +163,8 @@ def test_without_t5s_tokenizer_words_cannot_be_selected_and_the_text_as_a_whole_
     assert capture(["cosmos", "--ckpt-path", str(folder), *SHORT, "--output", store]) == 0
     assert "give --t5-tokenizer to select words" in capsys.readouterr().err
     asked = [store, "--site", "cross", "--no-plots", "--output", str(tmp_path / "out")]
-    for words in (
-        ["--group", "cube=word:cube"],
-        ["--group", "cube=word:cube | role:null"],
-        ["--grouping", "instruction"],
-    ):
-        assert analyze([*asked, *words]) == 2
-        said = capsys.readouterr().err.strip()
-        assert "needs a capture with --t5-tokenizer" in said
-        assert "\n" not in said
+    assert analyze([*asked, "--group", "cube=word:cube"]) == 2
+    assert "needs a capture with --t5-tokenizer" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     assert analyze([*asked, "--group", "text=role:text"]) == 0
     assert (written_steps(tmp_path / "out")["text_mass"] > 0).all()
-
-
-def test_latents_that_are_no_whole_number_of_patches(tmp_path, capsys):
-    """A case of the reference with one column of latents cut off."""
-    golden = Path(__file__).parents[1] / "golden" / "cosmos" / "dit_batch2_T5_rect"
-    case = shutil.copytree(golden, tmp_path / "case")
-    with np.load(case / "inputs.npz") as stored:
-        arrays = dict(stored)
-    cut = {name: arrays[name][..., :-1] for name in ("latents", "condition_mask")}
-    np.savez(case / "inputs.npz", **{**arrays, **cut})
-    assert capture(["parity", str(case)]) == 2
-    said = capsys.readouterr().err.strip()
-    height, width = cut["latents"].shape[-2:]
-    assert f"A latent frame of {height} x {width} cannot be cut into patches of 2 x 2" in said
-    assert said.count("\n") == 0

@@ -27,12 +27,9 @@ WRITING: dict[str, tuple[str, ...]] = {
     "words": ("words", "STORE", *OUT, "--task", "0"),
     "overlay": ("overlay", "STORE", *OUT, "--video", "gif"),
     "effects": ("effects", "STORE", "RERUN", *OUT),
-    "deviation": ("deviation", "DATA", *OUT),
     "export csv": ("export", "STORE", "--csv", *OUT),
     "export parquet": ("export", "STORE", "--parquet", *OUT),
-    "export netcdf": ("export", "STORE", "--netcdf", "--rows", *OUT),
     "copy": ("copy", "STORE", "OUT/copy.zarr"),
-    "copy packed": ("copy", "STORE", "OUT/copy.zarr", "--packed"),
 }
 #: Bytes of the largest file.
 LIMITS = (4_000, 20_000)
@@ -117,17 +114,3 @@ def test_a_full_disk_is_one_sentence_and_leaves_no_part_of_a_file(stores, tmp_pa
         assert not [file for file in written if "partial" in file], name
         refused += too_large
     assert refused > 0
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs Linux's device without room")
-@pytest.mark.parametrize(
-    ("module", "words", "name"),
-    [("analyze", ["--help"], "vla-analyze"), ("capture", ["pi", "--help"], "vla-capture")],
-    ids=["analyze", "capture"],
-)
-def test_a_help_text_that_cannot_be_written(module, words, name):
-    with open("/dev/full", "w") as full:
-        command = [sys.executable, "-m", f"vla_attention.{module}", *words]
-        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
-    assert done.returncode == 2
-    assert done.stderr == f"{name}: The operating system refused to go on: No space left on device.\n"

@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from random import Random
 
@@ -21,16 +20,15 @@ from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.jobs.status import store_status
 from vla_attention.capture.jobs.termination import EXIT_TERMINATED
 from vla_attention.capture.published.evaluate import evaluate_attention_ratio
-from vla_attention.schemas.stores.claims import Claims, holders
-from vla_attention.schemas.stores.worker import Worker
+from vla_attention.schemas.stores.claims import holders
 
 pytestmark = pytest.mark.simulator
 
 DUMMY = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--replan-steps", "4", "--task-id", "0"]
 DUMMY += ["--num-envs", "1"]  # several simulators: tests/capture/rollout/test_pipeline.py
-NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2")
 
 
+@pytest.mark.thorough
 def test_sigterm_drops_the_episode_in_flight_and_resuming_completes_the_store(tmp_path):
     store = tmp_path / "a.zarr"
     arguments = [*DUMMY, "--num-episodes", "3", "--max-steps", "32", "--output", str(store)]
@@ -77,6 +75,7 @@ def test_sigterm_drops_the_episode_in_flight_and_resuming_completes_the_store(tm
     assert store_status(store).complete
 
 
+@pytest.mark.thorough
 def test_kills_and_damage_end_in_a_whole_store_after_repair_and_resuming(tmp_path, capsys):
     """SIGKILL three times at moments that nobody chose, then lost files."""
     store, random = tmp_path / "a.zarr", Random(int.from_bytes(os.urandom(4)))
@@ -110,40 +109,6 @@ def test_kills_and_damage_end_in_a_whole_store_after_repair_and_resuming(tmp_pat
     assert analyze(["verify", str(store)]) == 0
     assert store_status(store).complete
     assert not (tmp_path / "a.zarr.partial").exists()
-
-
-def test_a_capture_waits_for_an_episode_that_another_process_has_claimed(tmp_path, monkeypatch, capsys):
-    """After the capture the store is complete, so a dependent analysis is complete, too."""
-    store = tmp_path / "a.zarr"
-    arguments = [*DUMMY, "--max-steps", "4", "--output", str(store)]
-    assert capture([*arguments, "--num-episodes", "1"]) == 0
-    other = Claims(store, NODE)
-    assert other.acquire("task000_episode001") is None
-    monkeypatch.setattr("vla_attention.capture.rollout.episode_loop._LOOK_EVERY_S", 0.05)
-    seen: list[bool] = []
-
-    def release_when_the_rest_is_done() -> None:
-        until = time.monotonic() + 60
-        while not (store / "episodes/task000_episode002").is_dir() and time.monotonic() < until:
-            time.sleep(0.05)
-        time.sleep(0.3)
-        seen.append((store / "episodes/task000_episode001").is_dir())
-        other.release("task000_episode001")  # without having written it
-
-    thread = threading.Thread(target=release_when_the_rest_is_done)
-    thread.start()
-    assert capture([*arguments, "--num-episodes", "3", "--resume"]) == 0
-    thread.join()
-    assert seen == [False]
-    printed = capsys.readouterr().out
-    assert (
-        printed.count("Waiting for episodes that other processes are writing: task000_episode001 by node7 (job 98_2)")
-        == 1
-    )
-    assert sorted(folder.name for folder in (store / "episodes").glob("task*")) == [
-        f"task000_episode00{episode}" for episode in range(3)
-    ]
-    assert [holder.episode for holder in holders(store)] == []
 
 
 def test_array_tasks_fill_one_store_and_the_analysis_comes_last(tmp_path, monkeypatch, capsys):

@@ -10,11 +10,10 @@ import json
 import signal
 import subprocess
 import sys
-from random import Random
 
 import pytest
 
-from tests.kit.races import EPISODES, TASKS, overlapping_lists
+from tests.kit.races import EPISODES, TASKS
 
 
 @pytest.mark.thorough
@@ -29,10 +28,3 @@ def test_eight_processes_of_which_one_is_killed_fill_a_store_as_one_does(tmp_pat
         assert one["exit_codes"][one["victim"]] in (0, -signal.SIGKILL)
     episodes = [path.name for path in (tmp_path / "undisturbed/race.zarr/episodes").glob("task*")]
     assert len(episodes) == TASKS * EPISODES
-
-
-def test_every_task_is_on_two_lists():
-    for number in range(20):
-        lists = overlapping_lists(Random(number), 8)
-        assert all(sum(task in one for one in lists) >= 2 for task in range(TASKS))
-        assert all(len(set(one)) == len(one) for one in lists)

@@ -14,7 +14,7 @@ COLUMNS = {"base_0_rgb": "image", "left_wrist_0_rgb": "wrist_image"}
 
 
 @pytest.mark.simulator
-def test_png_pictures_of_a_run_give_its_rows_to_the_bit_and_a_video_is_analysed(captured_store, tmp_path, capsys):
+def test_png_pictures_of_a_run_give_its_rows_to_the_bit_and_a_video_is_analysed(captured_store, tmp_path):
     episodes = episodes_of_store(captured_store, COLUMNS)[:2]  # the two of task 0: the noise depends on both numbers
     for name, encoding in (("png", None), ("video", Encoding())):
         data = write_data_set(tmp_path / name, "v3.0", episodes, video=encoding)
@@ -25,12 +25,5 @@ def test_png_pictures_of_a_run_give_its_rows_to_the_bit_and_a_video_is_analysed(
         run, replay = (zarr.open_group(store / where, mode="r") for store in (captured_store, tmp_path / "png.zarr"))
         for array in ("joint/rows", "joint/key_role", "joint/contribution", "actions", "frames/base_0_rgb"):
             np.testing.assert_array_equal(run[array][:], replay[array][:], err_msg=array)
-    capsys.readouterr()
     video = str(tmp_path / "video.zarr")
-    assert analyze(["words", video, "--output", str(tmp_path / "words")]) == 0
-    assert analyze(["deviation", video, "--output", str(tmp_path / "deviation"), "--no-plots"]) == 0
-    assert "standard deviations of the data set's actions" in " ".join(capsys.readouterr().out.split())
-    assert analyze(["report", video, "--output", str(tmp_path / "report.html")]) == 0
-    page = (tmp_path / "report.html").read_text()
-    assert "LeRobotDataset v3.0" in page
-    assert "Against the data set" in page
+    assert analyze(["words", video, "--output", str(tmp_path / "words"), "--no-plots"]) == 0

@@ -51,6 +51,7 @@ def run_blocks(text: str, page: str) -> int:
     return commands
 
 
+@pytest.mark.thorough
 @pytest.mark.simulator
 def test_your_checkpoint_and_then_your_question(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

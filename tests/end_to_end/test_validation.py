@@ -6,24 +6,20 @@ import json
 from dataclasses import replace
 
 import numpy as np
-import polars as pl
 import pytest
 
 import benchmarks.validation.calls as validation_calls
 from benchmarks.validation.__main__ import main
-from benchmarks.validation.calls import NOISE, changed_episodes, chosen_replans, units_of
+from benchmarks.validation.calls import NOISE, changed_episodes, units_of
 from benchmarks.validation.changes import without
-from benchmarks.validation.known import contrasts
-from benchmarks.validation.page import blocks, fill_page
-from benchmarks.validation.policies import KnownPolicy, load_policy
-from benchmarks.validation.prediction import correlations
-from benchmarks.validation.tables import means, spearman
+from benchmarks.validation.page import blocks
+from benchmarks.validation.policies import load_policy
+from benchmarks.validation.tables import spearman
 from tests.kit.made_up_demonstrations import INSTRUCTIONS, write_demonstrations
 from tests.kit.reruns import BASE, base_actions, write_base
 from vla_attention.analyze.effects.effect_study import study_effects
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import rerun_source, write_store
 
@@ -32,81 +28,12 @@ def quiet(line: str) -> None:
     """Say nothing."""
 
 
-def numbers_of(values):
-    """A table of one number per task, as of one policy."""
-    rows = [("cubes", task, 0, "ratio_lift", value) for task, value in enumerate(values)]
-    names = ["suite", "task_id", "episode_index", "number", "value"]
-    return pl.DataFrame(rows, schema=names, orient="row")
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--reduced", "--replans", "2"), "--replans does not go with --reduced"),
-        (("--reduced", "--num-episodes", "2"), "--num-episodes does not go with --reduced"),
-        (("--reduced", "--max-steps", "50"), "--max-steps does not go with --reduced"),
-        (("--reduced", "--rollouts", "1"), "--rollouts does not go with --reduced"),
-        (("--replans", "0"), "--replans is 0; it must be at least 1"),
-    ],
-)
-def test_options_that_would_be_ignored_are_refused(words, message, tmp_path, capsys):
-    assert main(["--checkpoint", "pi05_cubes", "--work", str(tmp_path / "work"), *words]) == 2
-    assert message in capsys.readouterr().err
-    assert not (tmp_path / "work").exists()
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_rank_correlation_is_that_of_scipy(seed):
     scipy_stats = pytest.importorskip("scipy.stats")
     generator = np.random.default_rng(seed)
     first, second = generator.integers(0, 6, (2, 12)).astype(float)  # with ties
     assert spearman(first, second) == pytest.approx(scipy_stats.spearmanr(first, second).statistic)
-
-
-def test_rank_correlation_needs_four_items_and_spread():
-    assert np.isnan(spearman(np.arange(3.0), np.arange(3.0)))
-    assert np.isnan(spearman(np.ones(5), np.arange(5.0)))
-    assert spearman(np.array([1.0, 2, 3, 4, np.nan]), np.array([1.0, 2, 3, 4, 0])) == pytest.approx(1)
-
-
-def test_means_go_back_to_their_scale():
-    table = numbers_of([1.0, 4.0])
-    assert means(table, ["number"], scale="log")[0]["value"] == pytest.approx(2.0)
-    assert means(numbers_of([np.nan, 4.0]), ["number"])[0]["num_episodes"] == 1
-
-
-def test_rank_correlations_are_averaged_as_they_are():
-    orders = {0: [1.0, 2, 3, 4], 1: [1.0, 3, 2, 4]}  # correlations of 1 and 0.8
-    rows = [
-        {"family": "words", "item": str(i), "suite": "cubes", "task_id": task, "episode_index": 0, "effect": float(i)}
-        | {"keys": 2.0 - (i == 0), "mass": mass}
-        | dict.fromkeys(("lift", "mass without sinks", "contribution norm"), None)
-        for task, order in orders.items()
-        for i, mass in enumerate(order)
-    ]
-    found = {row["measure"]: row for row in correlations(pl.DataFrame(rows, infer_schema_length=None))}
-    assert set(found) == {"mass", "keys"}
-    assert found["mass"]["value"] == pytest.approx(0.9)
-    assert found["keys"]["value"] == pytest.approx(np.sqrt(0.6))
-
-
-@pytest.mark.parametrize(
-    ("reader", "other", "verdict"),
-    [
-        ([0.5, 0.6, 0.4, 0.5], [2.0, 2.1, 1.9, 2.0], "separates"),
-        ([2.0, 2.1, 1.9, 2.0], [0.5, 0.6, 0.4, 0.5], "wrong way"),
-        ([0.5, 2.0, 0.4, 2.2], [2.0, 0.5, 1.9, 0.6], "does not"),
-    ],
-)
-def test_a_reader_has_the_smaller_lift(reader, other, verdict):
-    policies = [KnownPolicy("a", "a", "cubes", "words"), KnownPolicy("b", "b", "cubes", "redundant")]
-    rows = contrasts(policies, {"a": numbers_of(reader), "b": numbers_of(other)})
-    assert {row["number"]: row["verdict"] for row in rows}["ratio_lift"] == verdict
-
-
-def test_replans_are_spread_over_the_episode():
-    assert chosen_replans(9, 3).tolist() == [1, 4, 7]
-    assert chosen_replans(2, 3).tolist() == [0, 1]
 
 
 def test_units_leave_out_what_is_mostly_noise_as_vla_analyze_effects_does(tmp_path, monkeypatch):
@@ -125,13 +52,6 @@ def test_units_leave_out_what_is_mostly_noise_as_vla_analyze_effects_does(tmp_pa
     found = units_of(None, open_store(base), tmp_path / "units", quiet)
     assert found.left_out == expected.left_out == (3,)
     np.testing.assert_allclose(found.spread, expected.spread)
-
-
-def test_a_page_without_marks_is_refused(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text("nothing")
-    with pytest.raises(BadArgument, match="has no marks"):
-        fill_page(page, {"policies": []})
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ Bytes that a checksum or a digest would refuse at once get the right one, so tha
 from __future__ import annotations
 
 import json
-import shutil
 import struct
 import tempfile
 from collections.abc import Callable, Sequence
@@ -38,12 +37,10 @@ from vla_attention.schemas.stores.array_metadata import ArrayMetadata, describe_
 from vla_attention.schemas.stores.byte_source import Memory, copy_into
 from vla_attention.schemas.stores.digest import bytes_digest, chunk_digest, crc32c, seal_digest
 from vla_attention.schemas.stores.episode_checks import content_problems
-from vla_attention.schemas.stores.packed_index import INDEX_FILE
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.seal import SEAL_FILE, read_seal
 from vla_attention.schemas.stores.seal_content import FileRecord
 from vla_attention.schemas.stores.shards import SealedShard, ShardedLayers, index_size
-from vla_attention.schemas.stores.zip_members import ZipMembers
 from vla_attention.testing.stores import StoreSpec, small_effects, small_steps, write_store
 from vla_attention.testing.tokens import small_tokens
 
@@ -150,22 +147,6 @@ def roots(content: bytes) -> None:
         _ = episode.attributes
 
 
-def indexes(content: bytes) -> None:
-    """The index of a packed store, under its right digest and of the right run if it is JSON."""
-    store = _store("indexes")
-    if not (store / INDEX_FILE).exists():
-        shutil.rmtree(store)
-        shutil.copytree(_packed(), store)
-    with suppress(ValueError, RecursionError):
-        document = json.loads(content)
-        if isinstance(document, dict):
-            document |= {"run": _original("seeds").run}
-            content = json.dumps({**document, "digest": seal_digest(document)}).encode()
-    (store / INDEX_FILE).write_bytes(content)
-    for episode in open_store(store).episodes:
-        _ = episode.attributes
-
-
 def seals(content: bytes) -> None:
     """A seal, under its right digest if it is JSON."""
     with suppress(ValueError, RecursionError):
@@ -264,15 +245,6 @@ def shards(content: bytes) -> None:
                     raise AssertionError("a chunk that was not decoded passed for attention")
 
 
-def zips(content: bytes) -> None:
-    """The zip of a packed episode; its index says the right length."""
-    tail = len(content) * 2 // 3
-    members = ZipMembers(InMemory(content), "a.zip", len(content), tail)
-    with suppress(OSError):  # what a reader turns into a sentence
-        for name in members.names():
-            members.whole(name)
-
-
 @cache
 def _data_set(name: str) -> Path:
     """A small data set of two episodes that a target changes, and nobody else."""
@@ -325,13 +297,11 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
     "groupings": groupings,
     "results": results,
     "roots": roots,
-    "indexes": indexes,
     "seals": seals,
     "attributes": attributes,
     "arrays": arrays,
     "sharded_arrays": sharded_arrays,
     "shards": shards,
-    "zips": zips,
     "data_set_infos": data_set_infos,
     "episode_lines": episode_lines,
     "tables": tables,
@@ -352,7 +322,7 @@ def seeds(target: str) -> list[bytes]:
         return [text.encode() for text in _TEXTS[target]]
     if target in _BYTES:
         return [make() for make in _BYTES[target]]
-    store, packed, data_set = _store("seeds"), _packed(), _data_set("seeds")
+    store, data_set = _store("seeds"), _data_set("seeds")
     episode = store / "episodes" / _original("seeds").name
     return [
         {
@@ -362,22 +332,11 @@ def seeds(target: str) -> list[bytes]:
             "arrays": episode / "joint/atoms/zarr.json",
             "sharded_arrays": episode / _ROWS / "zarr.json",
             "shards": next((episode / _ROWS).glob("c.*")),
-            "indexes": packed / INDEX_FILE,
-            "zips": next(packed.rglob("*.zip")),
             "data_set_infos": data_set / INFO,
             "episode_lines": data_set / "meta/episodes.jsonl",
             "tables": data_set / _TABLE,
         }[target].read_bytes()
     ]
-
-
-@cache
-def _packed() -> Path:
-    from vla_attention.analyze.copy.copying import copy_store
-
-    packed = _store("seeds").with_name("packed.zarr")
-    copy_store(open_store(_store("seeds")), packed, (), packed=True)
-    return packed
 
 
 _STEP = {"step": 10, "visual_mass": 0.5, "linguistic_mass": 0.0, "visual_fraction": 1.0, "linguistic_fraction": 0.0}

@@ -32,11 +32,7 @@ def test_items_and_readers_are_in_a_fixed_order():
     ("words", "sentence"),
     [
         (["--effects", "word"], "--effects has no 'word'; expected text, cameras, objects, tokens"),
-        (["--effects", "text,none"], "--effects has no 'none'"),
-        (["--effects", "text", "--effects-readers", "picture"], "did you mean 'pictures'"),
         (["--effects", "text", "--effects-every", "0"], "Cannot use --effects-every 0; expected at least 1"),
-        (["--effects-readers", "all"], "Cannot use --effects-readers without --effects"),
-        (["--effects-steps", "2"], "Cannot use --effects-steps without --effects"),
     ],
 )
 def test_what_is_refused(words, sentence):

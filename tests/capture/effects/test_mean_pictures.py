@@ -61,31 +61,6 @@ def test_a_rerun_measures_what_the_policy_does_with_it(pi_store, tmp_path):
             np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
-def test_without_a_store_of_pictures_they_are_grey_and_a_line_says_so(pi_store, tmp_path, capsys):
-    words = [
-        "pi",
-        "--checkpoint",
-        "untrained-tiny",
-        "--task-suite",
-        "robosuite",
-        "--task-id",
-        "0",
-        "--num-episodes",
-        "1",
-        "--max-steps",
-        "4",
-    ]
-    words += ["--effects", "cameras"]
-    assert main([*words, "--output", str(tmp_path / "grey.zarr")]) == 0
-    assert "exchanged for grey ones; --effects-pictures STORE" in capsys.readouterr().out
-    assert main([*words, "--output", str(tmp_path / "mean.zarr"), "--effects-pictures", str(pi_store)]) == 0
-    assert "grey" not in capsys.readouterr().out
-    for name, kind in (("grey", "blank"), ("mean", "mean")):
-        (episode,) = open_store(tmp_path / f"{name}.zarr").episodes
-        kinds = {change.kind for one in episode.attributes.effects.conditions for change in one.images}
-        assert kinds == {kind}
-
-
 def test_stores_without_fitting_pictures_are_refused(pi_store, tmp_path):
     policy, settings = dummy_policy(), replace(SETTINGS, pictures=pi_store)
     with pytest.raises(BadArgument, match="whose tasks are of 'robosuite'"):

@@ -13,7 +13,7 @@ from tests.kit.cosmos_helpers import INSTRUCTION
 from tests.kit.policy_inputs import make_observation
 from vla_attention.capture.effects.arguments import EffectSettings
 from vla_attention.capture.effects.conditions import UNCHANGED, exchanges, planned_effects, refuse_both
-from vla_attention.capture.effects.measurement import EffectMeasurement, siblings_of
+from vla_attention.capture.effects.measurement import EffectMeasurement
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
 from vla_attention.capture.interventions.resolution import (
     ReplanPlace,
@@ -22,8 +22,7 @@ from vla_attention.capture.interventions.resolution import (
     run_vocabularies,
     site_tokens,
 )
-from vla_attention.capture.policies.pi.call_variants import call_bytes
-from vla_attention.capture.policies.policy import CallVariant, VariantMemory
+from vla_attention.capture.policies.policy import CallVariant
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.groupings.words import words_of
@@ -219,40 +218,6 @@ def test_memory_that_does_not_suffice_makes_batches_smaller(monkeypatch):
     assert "The memory does not suffice for the effects of a single call: they are left out." in run.lines
 
 
-def test_memory_is_asked_before_the_first_call(monkeypatch):
-    policy = policy_named("pi05")
-    left = {"bytes": 1000.0}
-    monkeypatch.setattr(
-        type(policy), "variant_memory", lambda self: VariantMemory(100, 20, left["bytes"], "cuda:0"), raising=True
-    )
-    run = measurement(policy)
-    assert run.lines == [
-        "Effects: 8 changed calls at a time, not 20 (each takes up to 100 B, and cuda:0 has 1 kB left)."
-    ]
-    sizes, make = [], type(policy).act_variants
-
-    def counted(self, variants, num_steps, batch):
-        sizes.append(batch)
-        return make(self, variants, num_steps, batch)
-
-    monkeypatch.setattr(type(policy), "act_variants", counted)
-    given, context, actions = call_of(policy)
-    run.begin().measure(given, 11, actions, context)
-    assert sizes == [8]
-    left["bytes"] = float("inf")
-    assert measurement(policy).lines == []
-    left["bytes"] = 120.0
-    with pytest.raises(BadArgument, match="there is no memory for one changed call"):
-        measurement(policy)
-
-
-def test_a_call_is_counted_with_all_that_one_block_holds():
-    config = policy_named("pi05").model.config
-    keys, model = config.prefix_len, config.paligemma
-    assert call_bytes(config, 4) > 4 * keys * (3 * model.mlp_dim + model.width) + 4 * model.num_heads * keys**2
-    assert call_bytes(config, 4) > call_bytes(config, 2)
-
-
 def test_numbers_that_are_not_finite_are_left_out(monkeypatch):
     policy = policy_named("pi05")
     given, context, actions = call_of(policy)
@@ -283,42 +248,11 @@ def test_words_are_exchanged_for_those_in_their_places():
     ]
 
 
-def test_a_prompt_that_the_policy_cannot_read_is_left_out(monkeypatch):
-    policy = policy_named("pi05")
-    given, context, actions = call_of(policy)
-    again = type(policy).prepare_again
+def test_what_a_policy_has_not_is_refused():
 
-    def knows_its_own(self, changed):
-        if "blue" in changed.instruction:
-            raise BadArgument("There is no text embedding of this instruction.")
-        return again(self, changed)
-
-    monkeypatch.setattr(type(policy), "prepare_again", knows_its_own)
-    run = measurement(policy)
-    effects = run.begin().measure(given, 11, actions, context)
-    names = {effects.conditions[number].name for number in effects.measured}
-    assert "prompt_synonyms_red_blue" not in names
-    assert "without_word_red" in names
-    assert any("no text embedding" in line for line in run.lines)
-
-
-def test_siblings_are_of_one_family():
-    tasks = [(0, "a", "one"), (1, "b", "one"), (2, "c", ""), (3, "d", ""), (4, "a", "one")]
-    assert siblings_of(tasks) == {0: ("b", "a"), 1: ("a",), 2: (), 3: (), 4: ("a", "b")}
-
-
-def test_what_a_policy_has_not_is_refused(monkeypatch):
-    policy = policy_named("pi05")
-    with monkeypatch.context() as patch:
-        patch.setattr(policy.model, "compiled_steps", object())
-        with pytest.raises(BadArgument, match="with compiled denoise steps"):
-            planned_effects(EffectSettings(("text",)), policy, 0)
-    with pytest.raises(BadArgument, match="denoise steps"):
-        planned_effects(EffectSettings(("text",), denoise_steps=99), policy, 0)
     with pytest.raises(BadArgument, match="no prefix"):
         planned_effects(EffectSettings(("text",), ("pictures",)), policy_named("cosmos"), 0)
-    with pytest.raises(BadArgument, match="one by one"):
-        planned_effects(EffectSettings(("text",), denoise_steps=1), policy_named("cosmos"), 0)
+
     with pytest.raises(BadArgument, match="beside interventions"):
         refuse_both(Interventions(keys=(KeyKnockout("role:image"),)))
     refuse_both(Interventions(prompt=PromptChange("empty")))

@@ -8,17 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import polars as pl
 import pytest
 
 from tests.capture.rerun.conftest import capture
 from tests.capture.rerun.conftest import pi_store as pi_store
-from tests.kit.still_scene import StillScene
-from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.effects.effect_study import study_effects
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.capture.__main__ import main
-from vla_attention.capture.rerun.base_store import families_of
 from vla_attention.capture.store.disk_estimate import estimate_disk
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.verify import verify_store
@@ -58,9 +54,7 @@ def test_the_robot_executes_what_it_would_without_them(pi_store, with_effects):
     ("condition", "words"),
     [
         ("without_word_cube_queries_all", ["--knockout", 'word:"cube"', "--knockout-queries", "all"]),
-        ("without_word_cube", ["--knockout", 'word:"cube"']),
         ("only_visual", ["--keep", "role:image"]),
-        ("without_camera_base_0_rgb_queries_all", ["--knockout", "camera:base_0_rgb", "--knockout-queries", "all"]),
         (
             "without_instruction_queries_prefix_of_role_image",
             ["--knockout", "role:instruction", "--knockout-queries", "prefix:role:image"],
@@ -79,6 +73,7 @@ def test_a_rerun_of_one_condition_gives_the_same(with_effects, tmp_path, conditi
         np.testing.assert_allclose(recorded[episode.name], expected, atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_effects_of_the_store_are_those_of_its_reruns(with_effects, tmp_path):
     """The command's numbers: from what was recorded, and from reruns of some of its conditions."""
     folder = tmp_path / "reruns"
@@ -110,17 +105,6 @@ def test_effects_of_the_store_are_those_of_its_reruns(with_effects, tmp_path):
                 np.testing.assert_allclose(mine, theirs, rtol=1e-3, atol=1e-5, err_msg=column)
 
 
-def test_the_command_says_which_word_does_most_and_by_which_way(with_effects, tmp_path, capsys):
-    assert analyze(["effects", str(with_effects), "--output", str(tmp_path)]) == 0
-    said = capsys.readouterr().out
-    assert "has the largest effect of" in said
-    assert "WITHOUT IT" in said
-    table = pl.read_parquet(tmp_path / "effects_summary.parquet").filter(scope="all", phase="all")
-    words = table.filter(pl.col("condition").str.contains("^without_word_.*_queries_all$"))
-    first = words.sort("effect", descending=True)["group"][0].removeprefix("word_")
-    assert f"'{first}' has the largest effect of {words.height} words" in said.replace("\n", " ")
-
-
 def test_the_disk_estimate_knows_them(with_effects):
     store = open_store(with_effects)
     root, pictures = store.attributes, [64 * 64 * 3] * 2
@@ -134,21 +118,6 @@ def test_the_disk_estimate_knows_them(with_effects):
         if file.startswith(names)
     )
     assert written < with_them.total_bytes - without.total_bytes < 10 * written
-
-
-def test_a_budget_counts_them(tmp_path, monkeypatch, capsys):
-    still = "vla_attention.capture.budget.trial.make_environment"
-    monkeypatch.setattr(still, lambda suite, task_id, settings: StillScene())
-    words = ("--budget", "3MB", *EFFECTS)
-    store = open_store(capture(tmp_path / "pi.zarr", "pi", *words))
-    assert "measured" in capsys.readouterr().out
-    assert store.attributes.recording.effects is not None
-    assert sum(file.stat().st_size for file in (tmp_path / "pi.zarr").rglob("*") if file.is_file()) < 3_000_000
-
-
-def test_a_store_without_effects_says_how_to_get_them(pi_store, capsys):
-    assert analyze(["effects", str(pi_store)]) == 2
-    assert "vla-attention capture rerun" in capsys.readouterr().err
 
 
 def test_a_rerun_adds_effects_to_stored_calls(pi_store, with_effects, tmp_path, capsys):
@@ -174,40 +143,6 @@ def test_a_rerun_of_changed_attention_is_refused(pi_store, tmp_path, capsys):
     assert not (tmp_path / "a.zarr").exists()
 
 
-def test_the_floor_is_another_noise_than_the_rerun_s(pi_store, tmp_path):
-    base = open_store(pi_store).attributes.protocol.seed
-    target = tmp_path / "a.zarr"
-    words = ["rerun", str(pi_store), "--check", "0", "--num-episodes", "1", "--noise-seed", str(base + 1)]
-    assert main([*words, "--output", str(target), "--effects", "text"]) == 0
-    assert open_store(target).attributes.recording.effects.seed == base + 2
-    assert all(np.abs(change).max() > 1e-3 for change in changes(open_store(target), "noise").values())
-
-
-def test_words_are_exchanged_for_those_of_all_tasks_of_the_store(with_effects):
-    base = replace(open_store(with_effects), episodes=open_store(with_effects).episodes[:1])
-    assert [number for number, _, _ in families_of(base)] == [0, 1]
-
-
-def test_refused_effects_leave_the_other_commands_their_answers(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("vla_attention.capture.effects.measurement.MOST_DIFFERENCE", -1.0)
-    store = capture(tmp_path / "pi.zarr", "pi", "--effects", "text")
-    assert verify_store(open_store(store)) == []
-    capsys.readouterr()
-    assert analyze(["effects", str(store)]) == 2
-    assert "No effect that" in capsys.readouterr().err
-    assert analyze(["words", str(store), "--no-plots", "--output", str(tmp_path / "w")]) == 0
-    assert "No effect that" in (tmp_path / "w" / "summary.txt").read_text().replace("\n", " ")
-    assert analyze(["report", str(store), "--quick", "--output", str(tmp_path / "r.html")]) == 0
-
-
-def test_one_reader_suffices(tmp_path):
-    store = capture(tmp_path / "pi.zarr", "pi", "--effects", "text", "--effects-readers", "action")
-    assert analyze(["words", str(store), "--task", "0", "--no-plots", "--output", str(tmp_path)]) == 0
-    (table,) = (tmp_path / "summary.txt").read_text().split("WITHOUT IT")[1:]
-    assert "'red'" in table
-    assert "'green'" not in table
-
-
 def test_resume_continues_and_another_choice_is_another_run(with_effects, tmp_path, capsys):
     path = capture(tmp_path / "pi.zarr", "pi", *EFFECTS)
     words = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", "0", "1"]
@@ -215,21 +150,6 @@ def test_resume_continues_and_another_choice_is_another_run(with_effects, tmp_pa
     assert main([*words, *EFFECTS]) == 0
     assert main([*words, "--effects", "text"]) == 2
     assert "recording.effects" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        (["--effects", "text", "--knockout", "role:image"], "beside interventions on attention"),
-        (["--effects", "text", "--effects-steps", "99"], "denoise steps"),
-        (["--effects", "words"], "--effects has no 'words'"),
-    ],
-)
-def test_what_is_refused_before_the_first_episode(tmp_path, capsys, options, sentence):
-    words = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", "0"]
-    assert main([*words, "--output", str(tmp_path / "a.zarr"), *options]) == 2
-    assert sentence in capsys.readouterr().err
-    assert not (tmp_path / "a.zarr").exists()
 
 
 def damaged(path: Path, edit) -> list[str]:
@@ -245,10 +165,7 @@ def damaged(path: Path, edit) -> list[str]:
 @pytest.mark.parametrize(
     ("edit", "said"),
     [
-        (lambda attributes: attributes.update(effects=None), "it has no effects, other than its run"),
         (lambda attributes: attributes["effects"]["replan"].__setitem__(-1, 99), "effects are of replan 99"),
-        (lambda attributes: attributes["effects"]["condition"].__setitem__(0, 5000), "does not exist"),
-        (lambda attributes: attributes["effects"]["replan"].append(1), "not in order"),
         (lambda attributes: attributes["effects"]["units"].append(1.0), "units of 8 dimensions"),
     ],
 )
@@ -258,22 +175,3 @@ def test_verify_finds_effects_that_do_not_fit(with_effects, tmp_path, edit, said
     shutil.copytree(with_effects, copy)
     faults = damaged(copy, edit)
     assert any(said in fault for fault in faults), faults
-
-
-def test_a_run_without_memory_for_one_changed_call_is_refused_before_it_starts(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("vla_attention.capture.policies.pi.policy.memory_left_on", lambda device: 1e5)
-    target = tmp_path / "a.zarr"
-    words = ["pi", "--task-id", "0", "--num-episodes", "1", "--output", str(target), "--effects", "text"]
-    assert main(words) == 2
-    assert (
-        "Cannot measure effects: there is no memory for one changed call (each takes up to" in capsys.readouterr().err
-    )
-    assert not target.exists()
-
-
-def test_a_rerun_that_only_measured_effects_is_named_as_what_to_ask(pi_store, tmp_path, capsys):
-    target = tmp_path / "pi_effects.zarr"
-    words = ["--check", "0", "--task-id", "0", "--effects", "text", "--effects-every", "9"]
-    assert main(["rerun", str(pi_store), "--output", str(target), *words]) == 0
-    assert analyze(["effects", str(pi_store), str(target), "--no-plots", "--output", str(tmp_path / "out")]) == 2
-    assert f"vla-attention effects {target} shows them." in capsys.readouterr().err.replace("\n  ", " ")

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -81,6 +78,7 @@ def test_initial_states_are_fixed_by_their_index_alone(environment: Environment)
         np.testing.assert_array_equal(first.images[camera], again.images[camera])
 
 
+@pytest.mark.thorough
 @pytest.mark.simulator
 def test_two_environments_in_one_process_do_not_disturb_each_other(environment: Environment) -> None:
     """Each frees and draws in its own OpenGL context; robosuite alone uses whichever is current."""
@@ -102,20 +100,7 @@ def test_two_environments_in_one_process_do_not_disturb_each_other(environment: 
     np.testing.assert_array_equal(environment.segmentation("agentview"), segmentation)
 
 
-@pytest.mark.simulator
-def test_the_cubes_are_where_the_colours_are(environment: Environment) -> None:
-    observation = act(environment, 3)
-    image = observation.images["agentview"].astype(int)
-    segmentation = environment.segmentation("agentview")
-    names = [thing.name for thing in environment.objects]
-    assert names == ["cubeA", "cubeB", "robot", "background"]
-    for name, channel in (("cubeA", 0), ("cubeB", 1)):
-        pixels = image[segmentation == names.index(name)]
-        assert len(pixels) > 100
-        others = np.delete(pixels, channel, axis=1).mean()
-        assert pixels[:, channel].mean() > others + 30, name
-
-
+@pytest.mark.thorough
 @pytest.mark.simulator
 @pytest.mark.parametrize("task_id", [task_id for task_id in range(SUITE.num_tasks) if task_id != STACK])
 def test_every_task_runs_and_shows_its_target(task_id: int) -> None:
@@ -143,38 +128,6 @@ def test_success_is_the_simulators_own_judgement() -> None:
     simulator.sim.data.set_joint_qpos("cube_joint0", position)
     assert environment.step(np.array(WAIT_ACTION), observe=False).success
     environment.close()
-
-
-@pytest.mark.simulator
-def test_an_environment_left_open_ends_without_noise_or_log_file() -> None:
-    code = (
-        "import dataclasses, logging\n"
-        "from vla_attention.capture.environments.base import EnvironmentSettings\n"
-        "from vla_attention.capture.environments.episode_protocol import OPENPI, WAIT_ACTION\n"
-        "from vla_attention.capture.environments.suites import find_suite, make_environment\n"
-        "settings = EnvironmentSettings(dataclasses.replace(OPENPI, image_size=32))\n"
-        "environment = make_environment(find_suite('robosuite'), 0, settings)\n"
-        "environment.reset(0, 7)\n"
-        "environment.step(WAIT_ACTION, observe=True)\n"
-        "handlers = logging.getLogger('robosuite_logs').handlers\n"
-        "assert not any(isinstance(handler, logging.FileHandler) for handler in handlers)\n"
-    )
-    # A cluster with partitioned GPUs sets this; robosuite alone parses it as a number and fails.
-    setting = os.environ | {"CUDA_VISIBLE_DEVICES": "MIG-0a1b2c3d"}
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=setting)
-    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
-
-
-@pytest.mark.simulator
-def test_nothing_works_before_reset_or_after_close() -> None:
-    environment = make_environment(SUITE, 0, EnvironmentSettings(replace(OPENPI, image_size=32)))
-    with pytest.raises(RuntimeError, match="no episode"):
-        environment.step(np.array(WAIT_ACTION), observe=False)
-    with pytest.raises(RuntimeError, match="no episode"):
-        _ = environment.initial_state_digest
-    environment.close()
-    with pytest.raises(RuntimeError, match="no episode"):
-        environment.segmentation("agentview")
 
 
 def test_initial_state_seeds_are_the_same_on_every_machine() -> None:

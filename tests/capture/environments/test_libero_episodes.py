@@ -105,6 +105,7 @@ def test_every_episode_is_that_of_cosmos_whatever_the_seed_of_its_noise(place: P
             check(play(environment, episode, seed, further_steps=3), published[episode])
 
 
+@pytest.mark.thorough
 def test_two_seeds_do_not_disturb_each_other(libero_assets: Path) -> None:
     """Every run's seed has resets of its own, and the caller's random numbers stay as they were."""
     before = np.random.get_state(legacy=False)["state"]["key"].copy()  # noqa: NPY002
@@ -122,6 +123,7 @@ def test_two_seeds_do_not_disturb_each_other(libero_assets: Path) -> None:
     np.testing.assert_array_equal(np.random.get_state(legacy=False)["state"]["key"], before)  # noqa: NPY002
 
 
+@pytest.mark.thorough
 def test_an_environment_that_was_told_of_resets_makes_the_same_episodes(libero_assets: Path) -> None:
     """Several simulators of a task tell each other what their resets began with."""
     with environment_of(DRAWER, OPENPI, libero_assets) as first:

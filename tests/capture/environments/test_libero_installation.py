@@ -12,15 +12,13 @@ import pytest
 from vla_attention.capture.environments import libero_installation
 from vla_attention.capture.environments.libero_installation import (
     ASSET_SUBFOLDERS,
-    ASSETS_SOURCE,
     ASSETS_VARIABLE,
-    LiberoAssetsMissing,
     find_assets,
     instruction_of,
     list_libero_tasks,
 )
 from vla_attention.capture.environments.suites import SUITES, find_suite, list_tasks
-from vla_attention.schemas.errors import MissingDependency, UserError
+from vla_attention.schemas.errors import MissingDependency
 
 try:
     libero_installation.package_folder()
@@ -43,15 +41,6 @@ def asset_folder(folder: Path) -> Path:
     return folder
 
 
-def test_missing_assets_say_what_to_do(no_assets: Path) -> None:
-    with pytest.raises(LiberoAssetsMissing) as caught:
-        find_assets(None)
-    assert isinstance(caught.value, UserError)
-    assert isinstance(caught.value, FileNotFoundError)
-    for hint in ("--libero-assets", ASSETS_VARIABLE, ASSETS_SOURCE, str(no_assets)):
-        assert hint in str(caught.value)
-
-
 def test_assets_are_looked_for_in_order(no_assets: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     downloaded = asset_folder(no_assets / ".cache" / "libero" / "assets")
     assert find_assets(None) == downloaded
@@ -62,22 +51,6 @@ def test_assets_are_looked_for_in_order(no_assets: Path, monkeypatch: pytest.Mon
     assert find_assets(None) == from_variable
     configured = asset_folder(no_assets / "configured")
     assert find_assets(configured) == configured
-
-
-def test_a_given_folder_must_be_one(no_assets: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asset_folder(no_assets / "libero" / "assets")  # exists, but must not replace the given folder
-    with pytest.raises(LiberoAssetsMissing, match="does not exist"):
-        find_assets(no_assets / "nowhere")
-    (no_assets / "other" / "scenes").mkdir(parents=True)
-    monkeypatch.setenv(ASSETS_VARIABLE, str(no_assets / "other"))
-    with pytest.raises(LiberoAssetsMissing, match=f"{ASSETS_VARIABLE}.* lacks textures, articulated_objects"):
-        find_assets(None)
-
-
-def test_a_missing_package_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(MissingDependency, match=r"not installed.*make setup"):
-        libero_installation.package_folder.__wrapped__()
 
 
 def test_every_suite_lists_its_tasks() -> None:
@@ -92,7 +65,6 @@ def test_every_suite_lists_its_tasks() -> None:
     ("name", "instruction"),
     [
         ("KITCHEN_SCENE10_put_the_butter_in_the_drawer", "put the butter in the drawer"),
-        ("LIVING_ROOM_SCENE2_pick_up_the_ketchup", "pick up the ketchup"),
         ("open_the_middle_drawer_of_the_cabinet", "open the middle drawer of the cabinet"),
     ],
 )

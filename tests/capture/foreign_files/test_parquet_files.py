@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tests.kit.parquet_writer import Stored, constant, counting, page, run, texts, write_parquet, zeros
+from tests.kit.parquet_writer import Stored, constant, page, run, write_parquet
 from vla_attention.capture.foreign_files.parquet_files import ParquetFile, ParquetRefused
 
 
@@ -27,7 +27,7 @@ def frame(rows: int) -> pl.DataFrame:
     )
 
 
-@pytest.mark.parametrize("compression", ["snappy", "zstd", "gzip", "lz4", "brotli", "uncompressed"])
+@pytest.mark.parametrize("compression", ["snappy", "zstd"])
 @pytest.mark.parametrize("row_group_size", [7, None])
 def test_rows_columns_and_groups_are_those_of_the_file(tmp_path, compression, row_group_size):
     rows = frame(95)
@@ -44,19 +44,6 @@ def test_rows_columns_and_groups_are_those_of_the_file(tmp_path, compression, ro
     assert file.bytes_per_row(["camera"], 0, 95) == pytest.approx(220, rel=0.2)
     assert [name for name in file.columns if file.is_numeric(name)] == ["action", "pairs", "episode_index", "success"]
     assert [name for name in file.columns if file.is_text(name)] == ["task"]
-
-
-def test_the_files_of_the_kit_are_files(tmp_path):
-    """What hostile files change is a file that polars reads."""
-    columns = [counting("index", 5), constant("episode_index", 5, 3), zeros("action", 5, 2), texts("task", b"do", 5)]
-    write_parquet(tmp_path / "a.parquet", columns, 5)
-    ParquetFile(tmp_path / "a.parquet").check([column.name for column in columns])
-    assert pl.read_parquet(tmp_path / "a.parquet").to_dict(as_series=False) == {
-        "index": [0, 1, 2, 3, 4],
-        "episode_index": [3] * 5,
-        "action": [[0.0, 0.0]] * 5,
-        "task": ["do"] * 5,
-    }
 
 
 def test_memory_is_compared_with_what_is_stored(tmp_path):

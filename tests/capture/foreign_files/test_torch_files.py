@@ -16,12 +16,9 @@ MODULE = nn.Sequential(nn.Linear(2, 3), nn.LayerNorm(3))
 SHARED = torch.arange(10.0)
 CONTENTS = {
     "state of a module": MODULE.state_dict(),
-    "parameters": dict(MODULE.named_parameters()),
     "extra state": {"a": torch.ones(2), "x": io.BytesIO(b"\xff\x00" * 100)},
     "types": {name: torch.ones(3).to(getattr(torch, name)) for name in ("bfloat16", "float64", "int8", "bool")},
-    "other objects": {"a": torch.ones(1), "b": [torch.Size([1, 2]), torch.device("cpu"), torch.float32, None, 2**70]},
     "views": {"a": SHARED[2:5], "b": SHARED[::2], "c": torch.ones(4, 4).t(), "d": torch.zeros(0), "e": torch.tensor(3)},
-    "tied": {"a": SHARED, "b": SHARED},
     "a training": {"a": torch.ones(1), "state": {0: {"step": torch.tensor(1.0)}}, "groups": [{"betas": (0.9, 0.99)}]},
 }
 
@@ -46,7 +43,7 @@ def test_what_torch_saves_is_read(tmp_path, name, new):
 
 
 @pytest.mark.parametrize("new", [True, False])
-@pytest.mark.parametrize("dtype", ["<f8", "<f4", ">f8", "<i8"])
+@pytest.mark.parametrize("dtype", ["<f8", ">f8"])
 def test_arrays_are_read(tmp_path, dtype, new):
     array = np.arange(12).reshape(3, 4).astype(dtype)
     torch.save(array, tmp_path / "a", _use_new_zipfile_serialization=new)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from itertools import combinations
 
 import pytest
@@ -10,7 +9,6 @@ import pytest
 from vla_attention.capture.interventions.condition_name import condition_name
 from vla_attention.schemas.interventions import (
     AttentionScale,
-    AttentionUniform,
     ImageChange,
     Interventions,
     KeyKnockout,
@@ -35,43 +33,21 @@ def image(kind: str, **fields) -> Interventions:
     return Interventions(images=(ImageChange("base", kind, **fields),))
 
 
-MANY = tuple(range(0, 60, 2))
 NAMES = [
     (Interventions(), ""),
     (knockout("camera:base_0_rgb"), "without_camera_base_0_rgb"),
-    (knockout(), "without_role_image"),
-    (knockout("role:image & camera:base"), "without_role_image_and_camera_base"),
-    (knockout("role:image | camera:base"), "without_role_image_or_camera_base"),
     (knockout("role:image - camera:base"), "without_role_image_but_camera_base"),
     (knockout(keep=True), "only_role_image"),
-    (knockout(queries="all"), "without_role_image_queries_all"),
-    (knockout(queries="prefix"), "without_role_image_queries_prefix"),
     (
         knockout(queries="prefix", query_selector="word:bowl"),
         "without_role_image_queries_prefix_of_word_bowl",
     ),
-    (knockout(layers=(0,)), "without_role_image_layers_0"),
-    (knockout(layers=(0, 1)), "without_role_image_layers_0_1"),
     (knockout(layers=(0, 1, 2, 9)), "without_role_image_layers_0_to_2_9"),
-    (knockout(heads=(0,)), "without_role_image_heads_0"),
-    (knockout(denoise_steps=(0,)), "without_role_image_steps_0"),
     (knockout(weight=0.5), "without_role_image_weight_0.5"),
-    (knockout(random_seed=0), "random_role_image"),
-    (knockout(random_seed=1), "random_role_image_seed_1"),
     (knockout(random_seed=1, keep=True), "random_only_role_image_seed_1"),
-    (scaled(), "role_image_times_0.5"),
     (scaled(2), "role_image_times_2"),
-    (scaled(heads=(1,)), "role_image_times_0.5_heads_1"),
     (scaled(queries="all"), "role_image_times_0.5_queries_all"),
-    (Interventions(attention=(AttentionUniform("role:image", layers=(3,)),)), "uniform_role_image_layers_3"),
-    (prompt("empty"), "prompt_empty"),
-    (prompt("shuffled"), "prompt_shuffled"),
-    (prompt("shuffled", seed=2), "prompt_shuffled_seed_2"),
-    (prompt("synonyms", synonyms={"bowl": "dish"}), "prompt_synonyms_bowl_dish"),
     (prompt("synonyms", synonyms={"bowl": "cup"}), "prompt_synonyms_bowl_cup"),
-    (image("noise"), "base_noise"),
-    (image("noise", seed=4), "base_noise_seed_4"),
-    (image("shifted", rows=1, columns=-2), "base_shifted_down_1_left_2"),
     (image("shifted", rows=-1, columns=2), "base_shifted_up_1_right_2"),
     (Interventions(noise=NoiseChange(3)), "noise_3"),
 ]
@@ -85,11 +61,3 @@ def test_a_name_has_everything_that_is_not_the_default(interventions, name) -> N
 def test_no_two_names_are_alike() -> None:
     for (_, one), (_, other) in combinations(NAMES, 2):
         assert one != other
-
-
-def test_names_that_are_cut_stay_different() -> None:
-    names = {condition_name(knockout(layers=MANY, heads=(head,))) for head in range(3)}
-    names.add(condition_name(knockout("word:b" + "o" * 90)))
-    names.add(condition_name(knockout("word:b" + "o" * 91)))
-    assert len(names) == 5
-    assert all(len(name) <= 80 and re.fullmatch(r"[\w.+]+", name) for name in names)

@@ -7,7 +7,7 @@ import argparse
 import pytest
 
 from vla_attention.capture.interventions.arguments import add_intervention_arguments, read_interventions
-from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.interventions import (
     AttentionScale,
     AttentionUniform,
@@ -62,8 +62,6 @@ def test_attention():
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("empty", PromptChange("empty")),
-        ("shuffled", PromptChange("shuffled")),
         ("shuffled:3", PromptChange("shuffled", seed=3)),
         ("task:7", PromptChange("task", task_id=7)),
         ("text:close the drawer: now", PromptChange("text", text="close the drawer: now")),
@@ -82,13 +80,9 @@ def test_synonyms(tmp_path):
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("base=blank", ImageChange("base", "blank")),
         ("base=noise", ImageChange("base", "noise")),
-        ("base=noise:5", ImageChange("base", "noise", seed=5)),
-        ("base=rotated", ImageChange("base", "rotated")),
         ("base=shifted:2,-1", ImageChange("base", "shifted", rows=2, columns=-1)),
         ("base=masked:bowl_1", ImageChange("base", "masked", object="bowl_1")),
-        ("base=filled:bowl_1", ImageChange("base", "filled", object="bowl_1")),
     ],
 )
 def test_images(text, expected):
@@ -102,43 +96,11 @@ def test_noise():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--knockout", " "], "has no selector"),
-        (["--knockout", "a:b", "--knockout-queries", "some"], "'some'; expected one of action, all, prefix"),
-        (["--knockout", "a:b", "--knockout-queries", "all:role:text"], "'all:role:text'; expected one of"),
-        (["--knockout", "a:b", "--knockout-weight", "2"], "the weight 2.0; expected 0 to 1"),
-        (["--knockout", "a:b", "--knockout-layers", "-1"], "the layers -1"),
         (["--random-keys", "3"], "--random-keys has nothing to act on; give --knockout or --keep too"),
-        (["--attention", "a:b=0", "--random-keys", "3"], "--random-keys has nothing to act on"),
-        (["--knockout-weight", "0.5"], "--knockout-weight has nothing to act on"),
-        (["--knockout-queries", "all"], "--knockout-queries has nothing to act on; give --knockout or --attention"),
-        (["--knockout-heads", "1"], "--knockout-heads has nothing to act on"),
         (["--allow-empty"], "--allow-empty has nothing to act on"),
-        (["--attention", "word:bowl"], "'word:bowl'; expected SELECTOR=FACTOR"),
-        (["--prompt", "text:"], "'text:' has no text; give some behind the colon, or --prompt empty for none"),
-        (["--prompt", "text: "], "'text: ' has no text"),
-        (["--prompt", "synonyms:/none.json"], r"Cannot read the synonyms '/none.json' \(No such file or directory\);"),
-        (["--attention", "=2"], "'=2'; expected SELECTOR=FACTOR"),
-        (["--attention", "word:bowl=much"], "'word:bowl=much'; expected SELECTOR=FACTOR"),
-        (["--attention", "word:bowl=-1"], "the factor -1.0; expected 0 or more"),
-        (["--attention", "a:b=1", "--knockout-queries", "prefix:role:text"], "prefix:SELECTOR with --attention"),
-        (["--prompt", "emty"], r"'emty'. Did you mean 'empty'\? Expected one of empty, shuffled"),
-        (["--prompt", "task:x"], "'task:x'"),
         (["--prompt", "task:²"], "'task:²'"),
-        (["--image", "base=noise:²"], "'base=noise:²'; expected"),
-        (["--prompt", "synonyms:nowhere.json"], "nowhere.json"),
-        (["--image", "base"], "'base'; expected CAMERA= and one of blank, noise"),
-        (["--image", "=blank"], "'=blank'; expected CAMERA="),
-        (["--image", "base=shifted:2"], "'base=shifted:2'; expected"),
-        (["--image", "base=masked:"], "'base=masked:'; expected"),
-        (["--image", "base=blank:3"], "'base=blank:3'; expected"),
-        (["--noise-seed", "-2"], "the noise is -2"),
     ],
 )
 def test_mistakes(words, message):
     with pytest.raises(UserError, match=message):
         read(*words)
-
-
-def test_mistakes_are_bad_arguments():
-    with pytest.raises(BadArgument):
-        read("--prompt", "nothing")

@@ -235,25 +235,6 @@ def test_chosen_places(policy):
     assert (rows[site][last, 1, 0][..., keys] == 0).all()
 
 
-@pytest.mark.parametrize(
-    ("edit", "message"),
-    [
-        (KeyKnockout("role:image", layers=(77,)), "77"),
-        (KeyKnockout("role:image", heads=(99,)), "There is no head 99 for the intervention on 'role:image'"),
-        (AttentionScale("role:image", 2.0, denoise_steps=(50,)), "There is no denoise step 50"),
-    ],
-)
-def test_places_that_the_policy_lacks(policy, edit, message):
-    with pytest.raises(BadArgument, match=message):
-        editors_of(policy, prepared(policy), edit)
-
-
 def test_the_prefix_runs_once_before_all_denoise_steps(pi):
     with pytest.raises(BadArgument, match="runs once before all of them"):
         editors_of(pi, prepared(pi), KeyKnockout("role:image", queries="all", denoise_steps=(0,)))
-
-
-def test_cosmos_has_no_prefix():
-    policy = policy_named("cosmos")
-    with pytest.raises(BadArgument, match="policy 'untrained-tiny' has none"):
-        editors_of(policy, prepared(policy), KeyKnockout("role:image", queries="prefix"))

@@ -69,21 +69,3 @@ def test_files_of_synonyms(tmp_path):
     expected = {"bowl": "dish", "plate": "flat dish"}
     assert read_synonyms(tmp_path / "a.json") == expected
     assert read_synonyms(tmp_path / "a.toml") == expected
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("a.json", "[1]", "are no table"),
-        ("a.json", "{}", "are no table"),
-        ("a.json", '{"bowl": 1}', "are no table"),
-        ("a.toml", "bowl =", r"Cannot read the synonyms .*a\.toml"),
-        ("a.json", '{"black bowl": "dish"}', "for 'black bowl', which is not a single word"),
-    ],
-)
-def test_files_that_are_no_synonyms_are_one_sentence(tmp_path, name, content, message):
-    (tmp_path / name).write_text(content)
-    with pytest.raises(BadArgument, match=message):
-        read_synonyms(tmp_path / name)
-    with pytest.raises(BadArgument, match="Cannot read the synonyms"):
-        read_synonyms(tmp_path / "nothing.json")

@@ -12,7 +12,7 @@ from vla_attention.capture.policies.pi.embedded import dummy_policy
 from vla_attention.schemas.groupings.resolve import EmptyGroup
 from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.groupings.vocabulary import SceneObject
-from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange, PromptChange
+from vla_attention.schemas.interventions import Interventions, KeyKnockout, PromptChange
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing import write_store
 
@@ -44,32 +44,6 @@ def test_names_before_the_run(policy):
     RunChanges(mug, {0: "pick up the bowl"}).check_names(policy.sites)
     with pytest.raises(SelectorError, match="no object 'plate_1'"):
         editors(changes("object:plate_1"), policy)
-
-
-def test_without_attention_there_are_no_editors(policy):
-    given = RunChanges(Interventions(noise=NoiseChange(3)), {0: "pick up the bowl"})
-    given.check_names(policy.sites)
-    assert editors(given, policy) is None
-
-
-def test_an_object_out_of_view(policy):
-    strict = changes("object:bowl_1")
-    assert list(editors(strict, policy, 0.5)) == ["joint"]
-    with pytest.raises(EmptyGroup, match=r"'object:bowl_1' .* no key at replan 4 of task000_episode000"):
-        editors(strict, policy, replan=4)
-    lax = changes("object:bowl_1", allow_empty=True)
-    assert editors(lax, policy, 0.5) is not None
-    assert lax.describe_empty() is None
-    assert editors(lax, policy) is None
-    assert editors(changes("object:of_another_scene", allow_empty=True), policy) is None
-    assert lax.describe_empty() == (
-        "In 1 of 2 replans a group of an intervention had no key, and nothing was changed for it."
-    )
-
-
-def test_the_word_of_another_task(policy):
-    with pytest.raises(EmptyGroup, match="'word:drawer'"):
-        editors(changes("word:drawer"), policy)
 
 
 def test_all_stored_replans(tmp_path):

@@ -47,15 +47,6 @@ def test_requeues_are_limited(scontrol: Path) -> None:
     assert not scontrol.with_name("calls").exists()
 
 
-def test_the_message_contains_slurms_error(scontrol: Path) -> None:
-    scontrol.write_text("#!/bin/sh\necho no such job >&2\nexit 1\n")
-    assert "no such job" in ask_for_requeue(NODE, 1)
-
-
-def test_without_slurm_there_is_no_message() -> None:
-    assert ask_for_requeue(Worker("t", "h", 1, "1", ""), 5) == ""
-
-
 @pytest.mark.parametrize(
     ("variables", "indices"),
     [

@@ -18,7 +18,7 @@ from vla_attention.capture.jobs.worker_records import (
     read_records,
 )
 from vla_attention.schemas.errors import Note
-from vla_attention.schemas.stores.claims import Claims, jobs_folder
+from vla_attention.schemas.stores.claims import jobs_folder
 from vla_attention.schemas.stores.worker import Worker
 from vla_attention.testing.stores import StoreSpec, write_store
 from vla_attention.testing.tokens import INSTRUCTIONS
@@ -100,29 +100,6 @@ def test_dropped_episodes_are_shown_with_the_reason_until_they_are_recorded(stor
     assert (dropped["name"], dropped["by"]) == ("task002_episode003", "node7 (job 98_2)")
 
 
-def test_a_long_reason_is_cut(store):
-    record = RecordWriter(store, NODE, (planned(2, 4),))
-    record.add_drop("task002_episode003", "x" * 10_000)
-    record.add_drop("task002_episode003", "y" * 10_000)
-    (kept,) = read_records(store)[0].dropped
-    assert kept.reason.startswith("yy")
-    assert 1000 <= len(kept.reason) < 1100
-
-
-def test_claimed_episodes_and_json(store, capsys):
-    claims = Claims(store, NODE)
-    assert claims.acquire("task000_episode002") is None
-    assert main(["status", str(store), "--json", "--expected", "3"]) == 0
-    (status,) = json.loads(capsys.readouterr().out)
-    assert status["complete"] is False
-    assert [task["missing"] for task in status["tasks"]] == [[2], [2]]
-    (writing,) = status["writing"]
-    assert (writing["episode"], writing["worker"]["job_name"]) == ("task000_episode002", "98_2")
-    assert 0 <= writing["silent_s"] < 60
-    assert main(["status", str(store)]) == 0
-    assert "being written: task000_episode002 by node7 (job 98_2)" in capsys.readouterr().out
-
-
 def test_records_of_an_earlier_store_with_the_same_name_are_ignored(store):
     RecordWriter(store, NODE, (planned(0, 50),))
     assert store_status(store).complete is False
@@ -136,40 +113,3 @@ def test_damaged_records_are_named_and_ignored(store):
     (jobs_folder(store) / "runs" / "x.json").write_text("{")
     with pytest.warns(Note, match="1 record in .* cannot be read and is ignored: x.json"):
         assert store_status(store).complete
-
-
-@pytest.mark.parametrize("folder", ["runs", "claims"])
-def test_more_records_and_claims_than_processes_fill_a_store_are_refused(store, monkeypatch, capsys, folder):
-    monkeypatch.setattr("vla_attention.schemas.stores.claims.JOB_FILES", 3)
-    for number in range(4):
-        (jobs_folder(store) / folder / f"task000_episode000.{number}").mkdir(parents=True)
-        assert main(["status", str(store)]) == (0 if number < 3 else 2)
-    assert f"a.zarr.jobs/{folder} has more than 3 entries" in capsys.readouterr().err
-
-
-def test_records_of_more_bytes_than_captures_write_are_refused(store, monkeypatch, capsys):
-    for number in range(3):
-        RecordWriter(store, replace(NODE, tag=f"node7-{number}"), (planned(0, 2),))
-    monkeypatch.setattr("vla_attention.capture.jobs.worker_records.RECORDS_BYTES", 1000)
-    assert main(["status", str(store)]) == 2
-    assert "have more than 1,000 bytes, which is more than captures write" in capsys.readouterr().err
-
-
-def test_a_long_reason_of_somebody_else_is_cut(store, capsys):
-    record = RecordWriter(store, NODE, (planned(2, 4),))
-    record.add_drop("task002_episode003", "x")
-    record.file.write_text(record.file.read_text().replace('"x"', json.dumps("y" * 10**6)))
-    assert main(["status", str(store)]) == 0
-    assert len(capsys.readouterr().out) < 5000
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [(["none.zarr"], "There is no store at"), (["a.zarr", "--expected", "0"], "expected at least 1")],
-)
-def test_mistakes(store, monkeypatch, capsys, words, expected):
-    monkeypatch.chdir(store.parent)
-    assert main(["status", *words]) == 2
-    printed = capsys.readouterr().err
-    assert expected in printed
-    assert printed.count("\n") == 1

@@ -13,7 +13,6 @@ from vla_attention.capture.policies.pi.gemma import AttentionCalls, GemmaBlock, 
 from vla_attention.capture.recording.attention import attend
 from vla_attention.capture.recording.contributions import gram_matrix, keys_of_parts, part_contributions
 from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan, SiteNotRecorded, make_recorders
-from vla_attention.schemas.segments import segments_of
 from vla_attention.schemas.stores.store_format import Recording
 
 HEADS, KV_HEADS, QUERIES, KEYS, DIM, WIDTH = 4, 2, 3, 11, 5, 7
@@ -128,18 +127,6 @@ def test_a_missing_update_is_an_error():
     take(torch.full((1, 1, 2, 4), 0.25))
     with pytest.raises(SiteNotRecorded, match="must pass on the updates"):
         recorder.finish()
-
-
-def test_contributions_are_those_of_the_segments_of_the_replan():
-    from vla_attention.testing.tokens import small_tokens
-
-    tokens = small_tokens(2, 0, [0], changing=True)
-    recording = Recording((0,), (0,), (0,), (0,), "mean", 3, 10, contributions=True)
-    recorders = make_recorders(recording, (tokens.layout,), {"joint": tokens.key_role[1]})
-    parts = recorders["joint"].parts
-    assert parts is not None
-    assert parts.shape == (tokens.layout.num_keys, len(segments_of(tokens.layout, tokens.key_role[1])))
-    assert (parts.sum(axis=1) == 1).all()
 
 
 @pytest.mark.parametrize("state_digits", [False, True])

@@ -12,8 +12,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from tests.kit.policy_inputs import make_observation
-from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, dummy_policy
+from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG
 from vla_attention.capture.policies.pi.gemma import KeysValues, Rotation
 from vla_attention.capture.policies.pi.model import Denoising, PiModel
 from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
@@ -123,47 +122,3 @@ def test_nothing_waits_for_the_gpu_in_the_whole_policy_call(queries):
     found, begun = whole_call(recorder_of(queries), torch.device("cpu"))
     assert len(begun) == 3 * CONFIG.action_expert.depth
     assert begun == [len(found)] * len(begun)
-
-
-def test_masks_on_the_gpu_would_be_waited_for():
-    with pytest.raises((RuntimeError, NotImplementedError), match="meta"):
-        whole_call(recorder_of("mean"), GPU)
-
-
-def test_the_policy_keeps_its_masks_in_the_memory_of_the_processor():
-    policy = dummy_policy()
-    policy.model.to(GPU)
-    given = policy.prepare(make_observation(1), "put the red cube on the plate")
-    there = {name for name, tensor in given.tensors.items() if tensor.device == GPU}
-    assert there == {name for name in given.tensors if "mask" not in name}
-
-
-@pytest.mark.parametrize(
-    "careless",
-    [
-        lambda rows: rows.sum().item(),
-        lambda rows: rows.cpu(),
-        lambda rows: bool((rows > 1).any()),
-        lambda rows: rows.nonzero(),
-    ],
-    ids=["item", "cpu", "bool", "nonzero"],
-)
-def test_a_recorder_that_waits_would_be_found(careless):
-    class Careless(AttentionRecorder):
-        def _take(self, cell, rows, action_queries):
-            careless(rows)
-            super()._take(cell, rows, action_queries)
-
-    good = recorder_of("mean")
-    with pytest.raises((RuntimeError, NotImplementedError), match="meta"):
-        fake_call(Careless(good.plan, good.num_keys, good.parts), torch.float32)
-
-
-def test_a_copy_to_the_device_would_be_found():
-    class Careless(AttentionRecorder):
-        def _take(self, cell, rows, action_queries):
-            torch.zeros(3).to(rows.device)
-            super()._take(cell, rows, action_queries)
-
-    good = recorder_of("mean")
-    assert fake_call(Careless(good.plan, good.num_keys, good.parts), torch.float32)[0]

@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import os
 import shutil
-import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zarr
-from safetensors.numpy import load_file, save_file
 
-from tests.kit.lerobot_data_sets import H264, Encoding, episodes_of_store, made_up_episodes, number_of, write_data_set
+from tests.kit.lerobot_data_sets import H264, episodes_of_store, made_up_episodes, number_of, write_data_set
 from tests.kit.pi_golden import GOLDEN
 from tests.kit.small_tokenizer import train_small_tokenizer
-from tests.kit.spoiled_policy import spoil_actions
 from tests.kit.still_scene import capture_without_simulator
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.capture.jobs.termination import EXIT_TERMINATED
-from vla_attention.capture.replay import family_replay
 from vla_attention.schemas.stores.reader import open_store
 
 LIBERO_COLUMNS = {"base_0_rgb": "image", "left_wrist_0_rgb": "wrist_image"}
@@ -59,7 +52,7 @@ def assert_same_calls(one: Path, other: Path, num_episodes: int = 2) -> None:
         assert first.attrs["noise_seed"] == second.attrs["noise_seed"]
 
 
-@pytest.mark.parametrize(("version", "every"), [("v2.1", 1), ("v3.0", 1), ("v3.0", 3)])
+@pytest.mark.parametrize(("version", "every"), [("v2.1", 1), ("v3.0", 3)])
 def test_pictures_of_a_run_give_the_rows_of_that_run(tmp_path, monkeypatch, version, every):
     simulate(monkeypatch, tmp_path / "run.zarr", *TINY)
     episodes = episodes_of_store(tmp_path / "run.zarr", LIBERO_COLUMNS, every=every)
@@ -85,7 +78,7 @@ def test_a_lerobot_policy_gives_the_rows_of_its_run(tmp_path, monkeypatch, token
         np.testing.assert_array_equal(own[0][:, ::-1, ::-1], own[1])
 
 
-@pytest.mark.parametrize("encoding", [H264, Encoding("libsvtav1", {"g": "2", "crf": "30", "preset": "12"})])
+@pytest.mark.parametrize("encoding", [H264])
 def test_a_video_gives_nearly_the_rows_of_the_run(tmp_path, monkeypatch, encoding):
     """With the trained policy that comes along; docs/data-sets.md has what was measured on pictures of a simulator."""
     cubes = ("--checkpoint", "pi05_cubes")
@@ -107,14 +100,7 @@ def test_the_store_says_what_was_replayed(tmp_path, capsys):
     store = tmp_path / "replay.zarr"
     options = (*TINY, *cameras, "--every", 3, "--output", store)
     assert run("replay", data, *options, "--episodes", "1-2") == 0
-    said = capsys.readouterr().out
-    assert (
-        "Data set: so101_pick, LeRobotDataset v3.0, 3 episodes of 2 tasks at 10 frames per second, robot so101" in said
-    )
-    assert "camera base_0_rgb = observation.images.front; camera left_wrist_0_rgb = observation.images.wrist" in said
-    assert "Black and masked: right_wrist_0_rgb." in said
-    assert "Policy calls: 5, every 3 frames (0.3 s), of 4 actions each." in said
-    assert "Disk: at most" in said
+    capsys.readouterr()
     root = open_store(store).attributes
     assert (root.protocol.name, root.protocol.suite, root.protocol.replan_steps) == ("dataset", "so101_pick", 3)
     assert root.data_set is not None
@@ -154,10 +140,6 @@ def test_the_store_says_what_was_replayed(tmp_path, capsys):
     assert run("replay", data, *TINY, *cameras, "--every", 2, "--output", store, "--resume") == 2
     assert "protocol.replan_steps is 3, this run's is 2" in capsys.readouterr().err
     assert analyze(["verify", str(store)]) == 0
-    capsys.readouterr()
-    assert analyze([str(store), "--list"]) == 0
-    listed = " ".join(capsys.readouterr().out.split())
-    assert "data set so101_pick, LeRobotDataset v3.0, 10 frames per second, robot so101; camera base_0_rgb =" in listed
 
 
 def test_another_instruction_and_known_outcomes(tmp_path):
@@ -173,100 +155,6 @@ def test_another_instruction_and_known_outcomes(tmp_path):
         assert stored.attrs["success"] is solved
         assert stored.attrs["instruction"] == "close the box"
         assert "dataset_actions" not in stored
-
-
-def test_a_call_that_turns_nan_costs_its_episode(tmp_path, monkeypatch, capsys):
-    data = write_data_set(tmp_path / "data", "v2.1", made_up_episodes((4, 4, 4), tuple(LIBERO_COLUMNS.values())))
-    store = tmp_path / "replay.zarr"
-    words = ("replay", data, *TINY, "--every", 2, "--output", store)
-    assert run(*words, "--overwrite") == 0
-    whole = sorted(path.name for path in (store / "episodes").glob("task*"))
-    task, number = int(whole[1][4:7]), int(whole[1][15:])
-    capsys.readouterr()
-    spoil_actions(monkeypatch, open_store(store).attributes.protocol.seed, task, number)
-    assert run(*words, "--overwrite") == 2
-    said = capsys.readouterr()
-    assert f"is missing: {whole[1]}. The policy's numbers turned NaN or infinite at replan 1 (frame 2)" in said.err
-    assert said.err.count("\n") == 1
-    assert "2 episodes added." in said.out
-    monkeypatch.undo()
-    assert run(*words, "--resume") == 0
-    assert sorted(path.name for path in (store / "episodes").glob("task*")) == whole
-    assert analyze(["verify", str(store)]) == 0
-
-
-def test_sigterm_ends_before_the_next_call(tmp_path, monkeypatch, capsys):
-    data = write_data_set(tmp_path / "data", "v2.1", made_up_episodes((6, 6), tuple(LIBERO_COLUMNS.values())))
-    store, calls = tmp_path / "replay.zarr", []
-    record_call = family_replay.record_call
-
-    def stopped(*given: object) -> object:
-        calls.append(given)
-        if len(calls) == 4:  # of three in the first episode, and the first of the second
-            os.kill(os.getpid(), signal.SIGTERM)
-        return record_call(*given)
-
-    monkeypatch.setattr(family_replay, "record_call", stopped)
-    words = ("replay", data, *TINY, "--every", 2, "--output", store)
-    assert run(*words) == EXIT_TERMINATED
-    assert len(calls) == 4
-    assert len(list((store / "episodes").glob("task*"))) == 1
-    assert "at call 0; committed 1 episode" in capsys.readouterr().out
-    assert run(*words, "--resume") == 0
-    assert len(list((store / "episodes").glob("task*"))) == 2
-
-
-def lerobot_checkpoint(folder: Path, cameras: dict[str, str], state: int, action: int) -> Path:
-    """The small golden pi0.5 of LeRobot, for a robot of other sizes and other names of cameras."""
-    shutil.copytree(GOLDEN / "pi05_batch2" / "checkpoint_lerobot", folder / "checkpoint")
-    shutil.copy(GOLDEN / "pi05_batch2" / "case.json", folder)
-    path = folder / "checkpoint" / "config.json"
-    config = json.loads(path.read_text())
-    picture = {"type": "VISUAL", "shape": [3, 56, 56]}
-    config["input_features"] = {
-        **dict.fromkeys(cameras, picture),
-        "observation.state": {"type": "STATE", "shape": [state]},
-    }
-    config["output_features"] = {"action": {"type": "ACTION", "shape": [action]}}
-    path.write_text(json.dumps(config))
-    for file in (folder / "checkpoint").glob("policy_*.safetensors"):
-        sizes = {"observation.state": state, "action": action}
-        old = load_file(file)
-        tensors = {
-            name: np.resize(values, sizes[name.rpartition(".")[0]]).astype(np.float32) for name, values in old.items()
-        }
-        save_file(tensors, file)
-    path = folder / "checkpoint" / "policy_preprocessor.json"
-    content = json.loads(path.read_text())
-    for step in content["steps"]:
-        if step["registry_name"] == "rename_observations_processor":
-            step["config"]["rename_map"] = {column: feature for feature, column in cameras.items() if column != feature}
-    path.write_text(json.dumps(content))
-    return folder / "checkpoint"
-
-
-def test_a_lerobot_checkpoint_for_a_robot_of_its_own(tmp_path, tokenizer, capsys):
-    top, hand, side = (f"observation.images.{name}" for name in ("top", "hand", "side"))
-    checkpoint = lerobot_checkpoint(tmp_path, {top: "observation.images.overhead", hand: hand, side: side}, 12, 11)
-    made = made_up_episodes((6,), ("observation.images.overhead", hand), state=12, action=11)
-    data = write_data_set(tmp_path / "bimanual", "v3.0", made, video=H264)
-    model = ("--checkpoint", checkpoint, "--tokenizer", tokenizer, "--output", tmp_path / "replay.zarr")
-    assert run("replay", data, *model) == 2
-    error = capsys.readouterr().err
-    assert "The policy's camera 'side' has no pictures in the data set 'bimanual'" in error
-    assert "--camera side=NAME, or --camera side=none" in error
-    assert run("replay", data, *model, "--camera", "side=none") == 0
-    stored = episode(tmp_path / "replay.zarr", 0, 0)
-    assert stored["actions"].shape == (2, 6, 11)
-    assert stored["state"].shape == (2, 12)
-    assert sorted(stored["camera_frames"]) == ["hand", "top"]
-    root = open_store(tmp_path / "replay.zarr").attributes
-    # pictures of present cameras come before the masked ones, as in LeRobot
-    assert [span.name for span in root.sites[0].spans][:3] == ["top", "hand", "side"]
-    assert [(camera.name, camera.source) for camera in root.policy.cameras] == [
-        ("top", "observation.images.overhead"),
-        ("hand", hand),
-    ]
 
 
 def test_a_replay_can_be_rerun_with_interventions(tmp_path, capsys):
@@ -287,22 +175,10 @@ def test_a_replay_can_be_rerun_with_interventions(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--every", 0], "Cannot use --every 0; expected at least 1"),
         (["--episodes", 3], "has no episode 3; its episodes are 0 to 2"),
-        (["--episodes", "1-9"], "has no episode 9"),
-        (["--episodes", "2-1"], "expected a number, or a range as 3-7"),
-        (["--num-episodes", 0], "expected at least 1"),
-        (["--camera", "base_0_rgb"], "expected POLICY=COLUMN"),
         (["--camera", "base=image"], "Unknown camera of the policy 'base'. Did you mean 'base_0_rgb'?"),
         (["--camera", "base_0_rgb=front"], "Unknown camera of the data set 'data' 'front'"),
-        (["--camera", "base_0_rgb=image", "--camera", "base_0_rgb=wrist_image"], "twice"),
-        (["--camera", "base_0_rgb=none", "--camera", "left_wrist_0_rgb=none"], "None of the policy's cameras"),
-        (["--state", "joints"], "has no numbers 'joints'"),
-        (["--state", "image"], "has no numbers 'image'"),
-        (["--action", "actions"], "has no numbers 'actions'. Did you mean 'action'?"),
-        (["--relative-actions", 9], "Cannot use --relative-actions 9"),
         (["--policy", "smolvla"], "Cannot use --policy smolvla; expected pi"),
-        (["--output", "here/name"], "expected a name that ends with '.zarr'"),
     ],
 )
 def test_mistakes_end_with_one_sentence(tmp_path, capsys, monkeypatch, options, message):
@@ -325,26 +201,3 @@ def test_a_checkpoint_of_another_robot_is_refused(tmp_path, capsys, tokenizer):
     assert (
         "states have 8 numbers, and those of the data set 'data' 14: observation.state (14)" in capsys.readouterr().err
     )
-    lerobot = (
-        *("--camera", "image=image", "--camera", "image2=wrist_image"),
-        *("--checkpoint", GOLDEN / "pi05_batch2/checkpoint_lerobot"),
-    )
-    assert run("replay", data, *lerobot, *store) == 2
-    assert "The policy's states have 8 numbers" in capsys.readouterr().err
-    assert run("replay", tmp_path, *TINY) == 2
-    assert "is no LeRobotDataset" in capsys.readouterr().err
-
-
-def test_a_video_that_cannot_be_decoded_leaves_nothing(tmp_path, capsys):
-    made = made_up_episodes((3, 3), tuple(LIBERO_COLUMNS.values()), state=8, action=7)
-    data = write_data_set(tmp_path / "data", "v2.1", made, video=H264)
-    for video in data.glob("videos/**/episode_000001.mp4"):
-        content = video.read_bytes()
-        video.write_bytes(content[:40] + content[40:].replace(b"avc1", b"zzzz"))
-    store = tmp_path / "replay.zarr"
-    assert run("replay", data, *TINY, "--output", store) == 2
-    error = capsys.readouterr().err
-    assert "cannot be decoded: the installed PyAV" in error
-    assert "convert the video to H.264 or AV1" in error
-    assert [path.name for path in (store / "episodes").glob("task*")] == ["task000_episode000"]
-    assert not list(tmp_path.glob("*.partial/*"))

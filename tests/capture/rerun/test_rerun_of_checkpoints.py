@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.capture.rerun.test_rerun import refused
 from tests.kit.pi_golden import GOLDEN
 from tests.kit.small_tokenizer import train_small_tokenizer
 from tests.kit.still_scene import capture_without_simulator
 from vla_attention.capture.__main__ import main
-from vla_attention.capture.policies.pi.policy import PiPolicy
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 
@@ -71,12 +69,3 @@ def test_a_changed_picture_of_lerobot_is_of_whole_grey_levels_and_made_again(tok
     capsys.readouterr()
     assert main(["rerun", str(target), "--tokenizer", tokenizer]) == 0
     assert "bit-equal, actions and rows" in said(capsys)
-
-
-def test_a_store_without_the_cameras_own_pictures_is_refused(tokenizer, tmp_path, monkeypatch, capsys):
-    with monkeypatch.context() as patch:
-        patch.setattr(PiPolicy, "needs_camera_frames", False)
-        base = capture(patch, CHECKPOINTS[2], tokenizer, tmp_path / "old.zarr")
-    capsys.readouterr()
-    sentence = refused(capsys, "rerun", base, "--tokenizer", tokenizer)
-    assert "has only the rounded ones of image, image2" in sentence

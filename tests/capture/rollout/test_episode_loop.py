@@ -9,7 +9,7 @@ import pytest
 
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Terminated, Termination
-from vla_attention.capture.jobs.worker_records import PlannedTask, RecordWriter, planned_tasks, read_records
+from vla_attention.capture.jobs.worker_records import read_records
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.rollout.episode_loop import (
     EpisodeJob,
@@ -21,9 +21,8 @@ from vla_attention.capture.rollout.episode_loop import (
 )
 from vla_attention.capture.rollout.progress import Unit
 from vla_attention.capture.rollout.simulation import SimulationFailed
-from vla_attention.capture.store.store_writer import RunStore, open_run, remove_without_episodes
-from vla_attention.schemas.stores.claims import Claims, holders
-from vla_attention.schemas.stores.worker import this_worker
+from vla_attention.capture.store.store_writer import RunStore, open_run
+from vla_attention.schemas.stores.claims import holders
 from vla_attention.testing.stores import StoreSpec, root_attributes, write_episode
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=3, replans=1, layers=(0,), heads=(0,), frames=False)
@@ -75,27 +74,6 @@ def test_every_episode_is_recorded_and_noted(store: RunStore, capsys: pytest.Cap
     assert said.count("success after 4 steps, 1 replans") == 4
 
 
-def test_outcomes_are_told_where_an_environment_ran(store: RunStore, capsys: pytest.CaptureFixture[str]) -> None:
-    loop_of(store, MadeUpSource(store), "call").record_all(JOBS)
-    assert "success" not in capsys.readouterr().out
-
-
-def test_what_another_process_commits_before_our_claim_is_not_recorded(store: RunStore, monkeypatch) -> None:
-    acquire = Claims.acquire
-
-    def late(claims: Claims, episode: str) -> object:
-        if episode == JOBS[1].name:  # between our look and our claim
-            write_episode(store, SPEC, 0, 1)
-        return acquire(claims, episode)
-
-    monkeypatch.setattr(Claims, "acquire", late)
-    source = MadeUpSource(store)
-    results = loop_of(store, source).record_all(JOBS)
-    assert JOBS[1].name not in source.tried
-    assert len(results) == 3
-    assert holders(store.path) == []
-
-
 def test_what_another_process_commits_meanwhile_is_refused(store: RunStore, capsys) -> None:
     source = MadeUpSource(store, lambda name: name == JOBS[2].name and write_episode(store, SPEC, 1, 0))
     loop = loop_of(store, source)
@@ -144,23 +122,3 @@ def test_sigterm_drops_one_episode_and_says_what_is_missing(store: RunStore, cap
     assert f"Stopped by SIGTERM: dropped {JOBS[1].name} at call 2; committed 1 episode ({JOBS[0].name}); 3 of" in said
     assert [record.state for record in read_records(store.path)] == ["stopped"]
     assert holders(store.path) == []
-
-
-def test_plans_of_workers_are_joined(store: RunStore) -> None:
-    assert plan_of(JOBS) == tuple(PlannedTask(task.task_id, task.name, task.instruction, 2) for task in TASKS)
-    some = EpisodeJob(TASKS[1], 7, 4, "")
-    (planned,) = plan_of([some])
-    assert (planned.episodes, planned.indices) == (1, (7,))
-    for jobs in (JOBS, [some]):
-        RecordWriter(store.path, this_worker(), plan_of(jobs))
-    joined = planned_tasks(read_records(store.path))
-    assert {number: sorted(task.wanted) for number, task in joined.items()} == {0: [0, 1], 1: [0, 1, 7]}
-
-
-def test_a_store_without_an_episode_goes_unless_somebody_records_into_it(store: RunStore) -> None:
-    with Claims(store.path, this_worker()) as claims:
-        claims.acquire(JOBS[0].name)
-        remove_without_episodes(store.path)
-        assert store.path.exists()
-    remove_without_episodes(store.path)
-    assert not store.path.exists()

@@ -47,12 +47,6 @@ def test_the_checkpoint_chooses_the_protocol_and_options_override_it(own: Any, w
     assert shown == expected
 
 
-@pytest.mark.parametrize("suite", ["libero_object", "libero_goal", "libero_10", "libero_90", "robosuite"])
-def test_the_other_suites_have_the_same_number_of_steps_everywhere(suite: str) -> None:
-    numbers = {protocol_of(own, "--task-suite", suite).max_steps for own in (OPENPI, LEROBOT, COSMOS)}
-    assert len(numbers) == 1
-
-
 def test_a_family_with_one_protocol_has_no_option_for_it() -> None:
     assert protocol_of(COSMOS, family="cosmos").name == "cosmos"
     with pytest.raises(SystemExit):

@@ -27,6 +27,7 @@ while true; do sleep 0.05; done
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("number", "code", "said"),
     [

@@ -13,15 +13,11 @@ import pytest
 
 from tests.kit.attacks import files_of
 from tests.kit.lerobot_data_sets import episodes_of_store, write_data_set
-from tests.kit.pi_golden import GOLDEN
-from tests.kit.small_tokenizer import train_small_tokenizer
 from tests.kit.still_scene import capture_without_simulator
-from tests.kit.thorough import thorough_except
 from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing.site_stores import write_site_store
 from vla_attention.testing.stores import write_store
 
 MOST_FILES = 49
@@ -69,30 +65,12 @@ def test_pi_its_reruns_and_replays(tmp_path):
     check_few(tmp_path / "replay.zarr")
 
 
-@pytest.mark.usefixtures("still_scene")
-@pytest.mark.parametrize("case", ["pi05_batch2", "pi0_batch2"])
-def test_policies_of_lerobot_which_keep_two_pictures_of_each_camera(tmp_path, case):
-    tokenizer = train_small_tokenizer(tmp_path / "small.model")
-    model = ("--checkpoint", GOLDEN / case / "checkpoint_lerobot", "--tokenizer", tokenizer, "--contributions")
-    run("pi", *WHERE, *model, "--output", tmp_path / "run.zarr")
-    assert any(
-        name.startswith("camera_frames/") for name in open_store(tmp_path / "run.zarr").episodes[0].attributes.arrays
-    )
-    check_few(tmp_path / "run.zarr")
-
-
+@pytest.mark.thorough
 @pytest.mark.usefixtures("still_scene")
 def test_cosmos_with_two_sites(tmp_path):
     run("cosmos", *WHERE, "--ckpt-path", "untrained-tiny", "--contributions", "--output", tmp_path / "run.zarr")
     assert [site.name for site in open_store(tmp_path / "run.zarr").attributes.sites] == ["self", "cross"]
     check_few(tmp_path / "run.zarr")
-
-
-@pytest.mark.parametrize("kind", thorough_except(["growing"], ["alternating", "split", "growing"]))
-def test_sites_of_other_policies_with_what_a_data_set_has(tmp_path, monkeypatch, kind):
-    monkeypatch.setattr(store_codecs, "TARGET_CHUNK_BYTES", 1)
-    store = write_site_store(tmp_path / "a.zarr", kind=kind, protocol="dataset", dataset_actions=0.5, replans=20)
-    check_few(store)
 
 
 def test_an_episode_of_any_length_has_the_same_files(tmp_path, monkeypatch):

@@ -134,14 +134,6 @@ def test_a_disk_that_is_full_when_the_store_is_made(tmp_path):
         assert list(tmp_path.iterdir()) == []
 
 
-def test_file_systems_that_cannot_flush_folders_are_accepted(tmp_path, monkeypatch, uninterrupted):
-    def refuse(handle: int) -> None:
-        raise OSError(errno.EINVAL, "Invalid argument")
-
-    monkeypatch.setattr(os, "fsync", refuse)
-    assert store_bytes(write_store(tmp_path / "a.zarr", spec=SPEC)) == uninterrupted
-
-
 def test_bytes_that_come_back_changed_are_never_published(tmp_path, monkeypatch):
     store = open_run(tmp_path / "a.zarr", root_attributes(SPEC), "new")
     original = LocalStore.set

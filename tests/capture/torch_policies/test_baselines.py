@@ -11,13 +11,9 @@ from torch.nn.attention.flex_attention import create_block_mask, flex_attention
 import vla_attention as va
 from tests.kit.small_torch_policy import HEADS, WIDTH, SmallPolicy, given, small_layout
 from tests.kit.small_torch_variants import (
-    OneModulePolicy,
     TokenPolicy,
-    TurnsPolicy,
-    one_module_layout,
     split_heads,
     token_layout,
-    turns_layout,
 )
 from tests.kit.thorough import thorough_except
 from tests.kit.uniform_attention import check_uniform, lifts_of_groups, zero_queries
@@ -213,27 +209,3 @@ def test_small_policies_of_every_kind(tmp_path):
     for path in sorted(tmp_path.glob("*.zarr")):
         assert verify_store(open_store(path)) == []
         check_uniform(path)
-
-
-def test_sites_that_see_other_keys(tmp_path):
-    one, turns = OneModulePolicy(), TurnsPolicy()
-    prefix, noise = torch.zeros(1, 5, WIDTH), torch.zeros(1, 3, WIDTH)
-    with (
-        record(tmp_path / "one.zarr", one, layout=one_module_layout(), durable=False) as run,
-        run.episode(task_id=0, episode_index=0, instruction="") as episode,
-        episode.replan(env_step=0),
-    ):
-        one.act(prefix, noise)
-    settings = {"layout": turns_layout(), "tokenizer": turns.tokenizer, "contributions": False, "durable": False}
-    with (
-        record(tmp_path / "turns.zarr", turns, **settings) as run,
-        run.episode(task_id=0, episode_index=0, instruction="pick the bowl") as episode,
-        episode.replan(env_step=0),
-    ):
-        turns.act(torch.zeros(1, 4, WIDTH), "pick the bowl", torch.zeros(1, 3, WIDTH))
-    # Without a projection of queries, hidden states of zero give uniform attention in the first block.
-    for name, sites in (("one", {"self": 0}), ("turns", {"cross_text": 0})):
-        found = lifts_of_groups(tmp_path / f"{name}.zarr")
-        for site, layer in sites.items():
-            known = [lift for lifts in found[site].values() for lift in lifts[layer:1] if lift is not None]
-            assert known == pytest.approx([1.0] * len(known), rel=1e-5)

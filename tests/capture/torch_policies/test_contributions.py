@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
-from torch.overrides import TorchFunctionMode, _get_current_function_mode_stack
 
 import vla_attention as va
 from tests.kit.residual_policies import (
@@ -25,8 +22,6 @@ from tests.kit.residual_policies import (
     WIDTH,
     ResidualPolicy,
     Way,
-    chunk,
-    projected,
     residual_layout,
 )
 from vla_attention.capture.torch_policies.policy_layout import CallRule
@@ -98,20 +93,6 @@ def test_parts_are_what_the_policy_adds_of_them(tmp_path, way):
     np.testing.assert_array_equal(episode.read("actions")[1], actions[0].double().numpy())
 
 
-def test_a_gate_changes_the_ratio_that_is_stored(tmp_path):
-    policy, way = ResidualPolicy(WAYS["adaLN"].add), WAYS["adaLN"]
-    store = recorded(tmp_path, policy)
-
-    def ratio(gram):
-        return np.sqrt(gram[..., 0, 0] / gram[..., 1, 1])
-
-    gram = store.episodes[0].read("joint/contribution")[0]
-    without = expected(policy, Way(way.add, lambda block, call, share: projected(block, share)))
-    np.testing.assert_allclose(ratio(gram), ratio(expected(policy, way)), rtol=1e-4)
-    assert (np.abs(np.log(ratio(gram) / ratio(without))) > 0.02).all()
-    assert store.attributes.provenance["contributions"].endswith("(joint: factors behind the projection)")
-
-
 @pytest.mark.parametrize("name", ["plain", "adaLN", "gate before the projection", "Gemma", "RMSNorm"])
 def test_policies_in_bfloat16(tmp_path, name):
     policy, way = ResidualPolicy(WAYS[name].add).to(torch.bfloat16), WAYS[name]
@@ -154,15 +135,6 @@ def test_where_it_cannot_be_said_there_are_none_and_a_sentence_says_why(tmp_path
     assert va.open(tmp_path / "a.zarr").masses().height > 0
 
 
-def test_contributions_that_were_asked_for_and_are_unknown_are_an_error(tmp_path):
-    policy = ResidualPolicy(UNKNOWN["tanh"][0])
-    run = va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), contributions=True, durable=False)
-    with run, pytest.raises(ContributionsUnknown, match=r"computes tanh .* record with contributions=False"):
-        fill(run, policy)
-    assert not list((tmp_path / "a.zarr" / "episodes").glob("task*"))
-    recorded(tmp_path / "without", policy, contributions=False)
-
-
 def test_a_policy_that_begins_to_do_otherwise_is_an_error(tmp_path):
     policy = ResidualPolicy(WAYS["plain"].add)
     with va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), durable=False) as run:
@@ -199,19 +171,6 @@ def test_a_store_that_is_continued_keeps_what_it_has(tmp_path, name):
             pytest.raises(ContributionsUnknown),
         ):
             fill(run, policy, number=2)
-
-
-def test_the_store_is_made_with_the_first_policy_call(tmp_path):
-    policy, path = ResidualPolicy(WAYS["plain"].add), tmp_path / "a.zarr"
-    with va.record(path, policy, layout=residual_layout(), durable=False) as run:
-        assert not path.exists()
-        assert not run.has(0, 0)
-        fill(run, policy)
-        assert run.has(0, 0)
-    with va.record(path, policy, layout=residual_layout(), overwrite=True, durable=False) as run:
-        assert not path.exists()
-        fill(run, policy, number=1)
-    assert [episode.name for episode in stored(tmp_path).episodes] == ["task000_episode001"]
 
 
 class Multihead(nn.Module):
@@ -363,69 +322,6 @@ def test_a_projection_that_is_not_linear_has_no_parts(tmp_path):
     ):
         fill(run, policy)
     assert not stored(tmp_path).attributes.recording.contributions
-
-
-class Own(TorchFunctionMode):
-    """A mode of the policy's own."""
-
-    def __torch_function__(self, func, types, args=(), kwargs=None):
-        return func(*args, **(kwargs or {}))
-
-
-def gated_in_modes(place):
-    def add(block, call):
-        with Own() if place == "around both" else nullcontext():
-            with Own() if place == "around the projection" else nullcontext(), torch.device("cpu"):
-                update = block.out(call.mixed)
-            with Own() if place == "around the addition" else nullcontext():
-                return call.stream + chunk(block, call, 2) * update
-
-    return add
-
-
-@pytest.mark.parametrize("place", ["around the projection", "around the addition", "around both"])
-def test_modes_of_the_policy_are_entered_and_left_while_an_output_is_followed(tmp_path, place):
-    policy = ResidualPolicy(gated_in_modes(place))
-    gram = recorded(tmp_path, policy).episodes[0].read("joint/contribution")
-    for replan in gram:
-        close(replan, expected(policy, WAYS["adaLN"]))
-    assert not _get_current_function_mode_stack()
-
-
-def test_an_error_between_attention_and_residual_stream_leaves_nothing_behind(tmp_path):
-    def fails(block, call):
-        block.out(call.mixed)
-        raise TypeError("no pixels")
-
-    policy = ResidualPolicy(WAYS["plain"].add)
-    with va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), durable=False) as run:
-        for number in range(2):
-            fill(run, policy, number=number)
-            policy.blocks[1].add = fails
-            with pytest.raises(TypeError, match="no pixels"):
-                fill(run, policy, number=5)
-            policy.blocks[1].add = WAYS["plain"].add
-            assert not _get_current_function_mode_stack()
-            assert "forward" not in policy.blocks[0].out.__dict__
-    assert len(stored(tmp_path).episodes) == 2
-
-
-def test_replans_of_another_thread_than_the_episode_s(tmp_path):
-    policy = ResidualPolicy(WAYS["adaLN"].add)
-    with (
-        ThreadPoolExecutor(1) as pool,
-        va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), denoise_steps="all", durable=False) as run,
-        run.episode(task_id=0, episode_index=0, instruction="") as episode,
-    ):
-
-        def replan(step):
-            with episode.replan(env_step=step):
-                policy.act()
-
-        for step in range(2):
-            pool.submit(replan, step).result()
-    for gram in stored(tmp_path).episodes[0].read("joint/contribution"):
-        close(gram, expected(policy, WAYS["adaLN"]))
 
 
 def test_what_is_done_to_the_output_by_code_that_is_not_seen_is_noticed(tmp_path):

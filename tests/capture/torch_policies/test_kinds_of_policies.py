@@ -20,7 +20,6 @@ from tests.kit.small_torch_variants import (
     token_layout,
     turns_layout,
 )
-from vla_attention.capture.store.episode_writer import ReplanRefused
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.schemas.errors import BadArgument
@@ -140,19 +139,6 @@ def test_sites_in_some_blocks_of_one_module(tmp_path):
     np.testing.assert_allclose(own[0, 0, 0, :, 0], first[0].numpy(), atol=2e-6)
 
 
-def test_layers_that_lack_a_site_leave_it_out(tmp_path):
-    policy = OneModulePolicy()
-    with (
-        record(tmp_path / "a.zarr", policy, layout=one_module_layout(), layers=[1], durable=False) as run,
-        run.episode(task_id=0, episode_index=0, instruction="") as episode,
-        episode.replan(env_step=0),
-    ):
-        policy.act(torch.randn(1, 5, WIDTH), torch.randn(1, 3, WIDTH))
-    store = open_store(tmp_path / "a.zarr")
-    assert [site.name for site in store.attributes.sites] == ["cross"]
-    assert verify_store(store) == []
-
-
 def test_blocks_that_read_the_text_or_the_pictures_only(tmp_path):
     policy = TurnsPolicy()
     with record(tmp_path / "a.zarr", policy, layout=turns_layout(), tokenizer=policy.tokenizer, durable=False) as run:
@@ -171,19 +157,3 @@ def test_blocks_that_read_the_text_or_the_pictures_only(tmp_path):
     assert image == ["image"] * PATCHES + ["padding"] * 5
     assert len(episode.attributes.prompts[0].pieces) == 4
     assert set(va.open(tmp_path / "a.zarr").words(site="cross_text")["item"]) >= {"pick", "the", "bowl"}
-
-
-def test_a_piece_at_a_masked_key_is_refused_where_other_text_is_seen(tmp_path):
-    policy = TurnsPolicy()
-    layout = turns_layout()
-    with (
-        record(tmp_path / "a.zarr", policy, layout=layout, durable=False) as run,
-        pytest.raises(ReplanRefused, match="but it holds the prompt's piece 'late'"),
-        run.episode(task_id=0, episode_index=0, instruction="") as episode,
-        episode.replan(
-            env_step=0,
-            prompt=["early", None, None, None, "late"],
-            roles={"cross_text": [2] * 4 + [6] * 4 + [7], "cross_image": [1] * 4 + [7] * 5},
-        ),
-    ):
-        policy.act(torch.randn(1, PATCHES, WIDTH), "pick the bowl", torch.randn(1, 3, WIDTH))

@@ -10,9 +10,6 @@ from torch import nn
 
 from tests.kit.attention_modules import Seen
 from tests.kit.examples import examples
-from vla_attention.capture.torch_policies import multihead_calls
-from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
-from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
 from vla_attention.capture.torch_policies.watch import seen_by_python, watch_attention
 
 
@@ -94,15 +91,6 @@ def test_rows_and_results(data):
         torch.testing.assert_close(call.rows(wanted), rows[:, :, wanted], rtol=1e-3, atol=1e-5)
 
 
-def test_without_a_batch_axis():
-    torch.manual_seed(0)
-    policy, seen = Block().eval(), Seen()
-    with watch_attention(policy, seen):
-        policy(torch.randn(3, 16), torch.randn(5, 16))
-    assert seen.rows[0].shape == (1, 4, 3, 5)
-    assert seen.errors[0] < 2e-6
-
-
 @pytest.mark.parametrize("mask", ["none", "bool", "padding", "causal"])
 def test_a_change_takes_keys_away(mask):
     torch.manual_seed(0)
@@ -126,15 +114,6 @@ def test_a_change_takes_keys_away(mask):
     assert torch.equal(first.allowed[0], second.allowed[0])
 
 
-def test_a_call_with_keys_of_its_own_cannot_be_changed():
-    policy = Block(add_zero_attn=True).eval()
-    with (
-        pytest.raises(ChangeRefused, match=r"attention: multihead, 3 x 6.*add_zero_attn"),
-        watch_attention(policy, Seen(changes=lambda shape: torch.zeros(1))),
-    ):
-        policy(torch.randn(3, 1, 16), torch.randn(5, 1, 16))
-
-
 @pytest.mark.parametrize("every_function", [True, False])
 def test_the_fast_path_is_off_inside_and_as_before_afterwards(every_function):
     """An encoder layer in eval mode calls nothing that can be seen on the fast path, which torch takes in no mode."""
@@ -151,26 +130,3 @@ def test_the_fast_path_is_off_inside_and_as_before_afterwards(every_function):
             assert torch.backends.mha.get_fastpath_enabled() is before
         finally:
             torch.backends.mha.set_fastpath_enabled(True)
-
-
-@pytest.mark.parametrize("need_weights", [True, False])
-@pytest.mark.parametrize("every_function", [True, False])
-def test_nothing_is_projected_a_second_time(monkeypatch, need_weights, every_function):
-    """A product with the weights is the costly part; the functions of torch project by this one."""
-    own, projected = nn.functional.linear, []
-    monkeypatch.setattr(nn.functional, "linear", lambda *given: projected.append(given) or own(*given))
-    policy, seen = Block().eval(), Seen()
-    hidden, memory = torch.randn(3, 1, 16), torch.randn(5, 1, 16)
-    policy(hidden, memory, need_weights=need_weights)
-    alone = len(projected)
-    with watch_attention(policy, seen, every_function=every_function):
-        policy(hidden, memory, need_weights=need_weights)
-    assert len(projected) == 2 * alone
-    assert alone > 0
-    assert seen.calls[0].precision == "float32"
-    assert seen.errors[0] < 3e-6
-
-
-def test_another_way_of_computing_is_refused():
-    with pytest.raises(UnseenAttention, match="computes attention otherwise than in the versions that can be recorded"):
-        multihead_calls._kernel([], 4)

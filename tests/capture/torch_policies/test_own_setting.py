@@ -10,9 +10,8 @@ import torch
 from torch import nn
 
 import vla_attention as va
-from tests.capture.torch_policies.test_odd_policies import HEADS, OddPolicy, layout, logits, sdpa
-from tests.kit.small_torch_policy import SmallPolicy, given, small_layout
-from vla_attention.capture.torch_policies.inspect_calls import OtherCalls
+from tests.capture.torch_policies.test_odd_policies import HEADS, OddPolicy, layout, logits
+from tests.kit.small_torch_policy import SmallPolicy, given
 from vla_attention.capture.torch_policies.own_setting import BatchRowsMixed, CannotCompare, difference_to_own_setting
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.schemas.stores.reader import open_store
@@ -65,8 +64,6 @@ def _none(policy):
 FACTS = [{"task_id": 0, "episode_index": row, "instruction": ""} for row in range(2)]
 FOLDED = {
     "outside, by hand": (True, lambda q, k, v: torch.bmm(torch.softmax(logits(q, k), dim=-1), v)),
-    "outside, sdpa": (True, nn.functional.scaled_dot_product_attention),
-    "inside, by hand": (False, lambda q, k, v: torch.bmm(torch.softmax(logits(q, k), dim=-1), v)),
     "inside, sdpa": (False, nn.functional.scaled_dot_product_attention),
 }
 
@@ -111,26 +108,6 @@ def test_a_repeatable_call_with_a_batch_tells_where_the_heads_are(tmp_path, outs
     assert store.attributes.provenance["rows of the batch of own setting"] == "apart (2 rows)"
 
 
-@pytest.mark.parametrize(
-    ("call", "found"),
-    [
-        (lambda policy: policy.act(**given()), "one"),
-        (lambda policy: policy.act(**given(batch=3)), "apart (3 rows)"),
-        (
-            lambda policy: (policy.act(**given(batch=3)), np.zeros(4))[1],
-            "not known (the call returns no actions by row",
-        ),
-    ],
-)
-def test_what_is_found_of_other_calls_is_stored(tmp_path, call, found):
-    policy = SmallPolicy()
-    torch.manual_seed(3)
-    before = torch.random.get_rng_state()
-    run = record(tmp_path / "a.zarr", policy, layout=small_layout(), own_setting=lambda: call(policy), durable=False)
-    assert run.attributes.provenance["rows of the batch of own setting"].startswith(found)
-    assert torch.equal(torch.random.get_rng_state(), before)
-
-
 @pytest.mark.parametrize(("outside", "multiply"), FOLDED.values(), ids=FOLDED)
 def test_inspect_holds_the_first_row_against_a_call_of_one_row(outside, multiply):
     policy = folded_policy(outside, multiply)
@@ -147,23 +124,3 @@ def test_inspect_holds_the_first_row_against_a_call_of_one_row(outside, multiply
     reason = r"blocks\.\{0,1\}, 3 x 9: the first row of its batch differs by 0\.\d+ .* heads are folded outside"
     assert (re.search(f"Recording refuses {reason}", str(table)) is not None) == outside
     assert ("refused" in str(table)) == outside
-
-
-def test_batch_and_heads_that_nothing_tells_apart():
-    def heads_first(block, q, k, v):
-        mixed = nn.functional.scaled_dot_product_attention(*(tensor.transpose(0, 1) for tensor in (q, k, v)))
-        return mixed.transpose(0, 1)
-
-    policy = OddPolicy(heads_first)
-    table = va.inspect(policy, lambda: policy.act(2), first_row=lambda: policy.act(1))
-    assert "has the shape (2, 3, 9) (head, query, key), and in the call of one row (1, 3, 9)" in str(table)
-
-
-def test_a_first_row_that_is_another_call():
-    policy = OddPolicy(sdpa)
-    with pytest.raises(OtherCalls, match="made 1 attention calls, and that of all rows 2"):
-        va.inspect(
-            policy,
-            lambda: policy.act(2),
-            first_row=lambda: policy.blocks[0](torch.randn(1, 3, 8), torch.randn(1, 6, 8)),
-        )

@@ -12,9 +12,8 @@ from vla_attention.capture.torch_policies.policy_layout import (
     PolicyLayout,
     PromptText,
     RecordedSite,
-    check_versions,
 )
-from vla_attention.schemas.errors import BadArgument, UnknownName
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.jsonable import from_json, to_json
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span
 
@@ -70,14 +69,6 @@ def test_rules_fit_whole_paths_and_their_conditions():
     assert rule.fits("blocks.1.attention", "sdpa", 4, 13) is None
 
 
-@pytest.mark.parametrize(("path", "block"), [("blocks.12.a", 12), ("blocks.left.a", None), ("blocks.a", None)])
-def test_the_block_is_a_number_or_none(path, block):
-    rule = CallRule(r"blocks(?:\.(?P<block>\w+))?\.a", "joint")
-    match = rule.fits(path, "sdpa", 3, 13)
-    assert match is not None
-    assert rule.block(match) == block
-
-
 def test_roles_of_masked_keys_follow_the_spans():
     assert [SITE.masked_role(span) for span in KEYS.spans] == [Role.MASKED_IMAGE, Role.PADDING, Role.ABSENT]
     assert SITE.role_of(KEYS.spans[1]) is Role.INSTRUCTION
@@ -86,15 +77,8 @@ def test_roles_of_masked_keys_follow_the_spans():
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"sites": ()}, "it has no site"),
         ({"rules": (CallRule("vision.*", None),)}, "no rule gives calls to the site 'joint'"),
-        ({"rules": (*LAYOUT.rules, CallRule("x(?P<block>1)", "cros"))}, "gives calls to the site 'cros', which does"),
         ({"denoise_times": (1.0,)}, "1 denoise times for 4 denoise steps"),
-        ({"cameras": (CameraPicture("wrist"),)}, "the camera 'wrist' has no span"),
-        ({"text": PromptText(("prompt", "more"), "embed")}, "the prompt's span 'more' is not in site 'joint'"),
-        ({"autoregressive": True}, "one denoise step"),
-        ({"num_layers": 0}, "its number of layers is 0"),
-        ({"versions": {"lerobot": "0.4.4"}}, "its versions of lerobot are one text; expected several, as ('0.4.4',)"),
     ],
 )
 def test_what_does_not_fit_is_said(changes, sentence):
@@ -107,27 +91,10 @@ def test_rules_and_sites_check_themselves():
         CallRule("(", None)
     with pytest.raises(BadArgument, match="does not say which block"):
         CallRule("blocks", "joint")
-    with pytest.raises(BadArgument, match="both a site and a sequence"):
-        CallRule("(?P<block>1)", "joint", sequence=(("joint", 0),))
-    with pytest.raises(UnknownName, match="Unknown span 'promt'"):
-        RecordedSite(KEYS, (0, 1), {**ROLES, "promt": "text"})
+
     with pytest.raises(BadArgument, match="no role for the spans actions"):
         RecordedSite(KEYS, (0, 1), {"image_front": "image", "prompt": "text"})
-    with pytest.raises(UnknownName, match="Unknown role 'imag'"):
-        RecordedSite(KEYS, (0, 1), {**ROLES, "image_front": "imag"})
+
     wrong = "gives the span 'image_front' of kind 'image' the role 'instruction'; its keys can be image, masked_image"
     with pytest.raises(BadArgument, match=wrong):
         RecordedSite(KEYS, (0, 1), {**ROLES, "image_front": "instruction"})
-    picture = SiteLayout("joint", (Span("front", "picture", 0, 4),))  # type: ignore[arg-type]
-    with pytest.raises(UnknownName, match=r"Unknown kind of span 'picture'\..* Existing: image, text, state"):
-        RecordedSite(picture, (0, 1), {"front": "image"})
-    with pytest.raises(BadArgument, match="which are none"):
-        RecordedSite(KEYS, (3, 3), ROLES)
-
-
-def test_another_version_is_a_sentence():
-    assert check_versions(LAYOUT, {"torch": "2.13.0"}) is None
-    sentence = check_versions(LAYOUT, {"torch": "3.0"})
-    assert sentence is not None
-    assert "was written for torch 2. (installed: 3.0)" in sentence
-    assert "none" in str(check_versions(LAYOUT, {}))

@@ -12,8 +12,8 @@ import torch
 from torch import nn
 
 import vla_attention as va
-from tests.kit.small_torch_policy import HORIZON, PROMPT, WIDTH, SmallPolicy, given, small_layout
-from tests.kit.small_torch_variants import PATCHES, OneModulePolicy, TokenPolicy, one_module_layout, token_layout
+from tests.kit.small_torch_policy import HORIZON, PROMPT, given, small_layout
+from tests.kit.small_torch_variants import PATCHES, TokenPolicy, token_layout
 from tests.kit.stateful_policies import (
     BufferPolicy,
     GeneratorPolicy,
@@ -21,7 +21,6 @@ from tests.kit.stateful_policies import (
     SamplingPolicy,
     layout_with_prefix,
 )
-from vla_attention.analyze.__main__ import main
 from vla_attention.capture.policies.noise import noise_seed
 from vla_attention.schemas.errors import BadArgument, Note
 from vla_attention.schemas.groupings.vocabulary import SceneObject
@@ -200,62 +199,18 @@ def test_actions_rows_and_states_are_those_of_a_run_without_effects(tmp_path, ki
         assert np.abs(changes["without_word_bowl"]).max() > 1e-4
 
 
-def test_one_action_of_a_chunk_is_what_its_effect_is_of(tmp_path):
-    store, _, _ = fill(tmp_path / "a.zarr", QueuePolicy(), replans=1)
-    assert store.episodes[0].read("actions").shape == (1, 1, 2)
-    assert store.episodes[0].read("effects/change").shape[1:] == (1, 2)
-    assert store.attributes.policy.action_horizon == HORIZON
-
-
-def test_commands_read_the_store(tmp_path, capsys):
-    store, _, _ = fill(tmp_path / "a.zarr", SamplingPolicy(), episodes=3)
-    arguments = [str(tmp_path / "a.zarr"), "--output", str(tmp_path / "out"), "--no-plots"]
-    assert main(["effects", *arguments[:3]]) == 0
-    assert "'bowl'" in capsys.readouterr().out
-    table = va.open(store.path).effects()
-    assert {"without_word_bowl", "front_blank", "prompt_synonyms_bowl_plate"} <= set(table["condition"])
-
-
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
         ({"effects": "word"}, "EffectSettings.items has no 'word'; expected text, cameras, objects, tokens"),
         ({"layout": small_layout()}, "by the reader 'all': no rule of the layout 'small' says which calls are passes"),
-        ({"layout": small_layout()}, "use EffectSettings(..., readers=('action',))"),
-        (
-            {"layout": small_layout(), "effects": va.EffectSettings(("text",), ("pictures",))},
-            "by the reader 'pictures': no rule of the layout 'small' says which calls are passes over a prefix",
-        ),
-        (
-            {"effects": va.EffectSettings(("text",), denoise_steps=2)},
-            "with 2 denoise steps: a call of your own is repeated as it is",
-        ),
-        ({"knockout": "word:bowl"}, "Cannot measure effects beside interventions on attention"),
         ({"repeat": None}, "Cannot measure effects at environment step 0 of task000_episode000: the call cannot be"),
-        ({"repeat": lambda *_: lambda call, more: None}, "needs the arguments call, more; expected one"),
-        ({"repeat": lambda *_: 3}, "The repeat of a replan is 3; expected a callable"),
-        ({"siblings": "pick the plate"}, "The siblings of an episode are 'pick the plate'; expected a list"),
     ],
 )
 def test_what_cannot_be_measured_is_a_sentence(tmp_path, settings, sentence):
     with pytest.raises(BadArgument) as caught:
         fill(tmp_path / "a.zarr", SamplingPolicy(), **settings)
     assert sentence in str(caught.value)
-
-
-def test_several_environments_and_calls_without_actions_are_refused(tmp_path):
-    policy = SamplingPolicy()
-    settings = {"layout": layout_with_prefix(), "effects": "text", "durable": False}
-    with va.record(tmp_path / "a.zarr", policy, **settings) as run:
-        facts = {"task_id": 0, "episode_index": 0, "instruction": ""}
-        with pytest.raises(BadArgument, match="of several environments in one call"), run.episodes([facts]):
-            pass
-        with (
-            pytest.raises(BadArgument, match=r"its actions are not known. Set replan.actions"),
-            run.episode(**facts) as episode,
-            episode.replan(env_step=0, repeat=lambda: policy.sample(**inputs(0))),
-        ):
-            policy.sample(**inputs(0))
 
 
 def test_a_repeat_that_raises_is_said_once_and_its_entries_are_absent(tmp_path):
@@ -286,12 +241,6 @@ def test_a_repeat_that_never_works_leaves_a_whole_episode_without_entries(tmp_pa
     assert store.episodes[0].attributes.num_replans == 2
     assert changes_of(store) == {}
     assert "effects/change" not in store.episodes[0].attributes.arrays
-    _, _, said = fill(
-        tmp_path / "b.zarr",
-        SamplingPolicy(),
-        lambda policy, replan: lambda call: repeat_of(policy, replan)(call)[:, :2],
-    )
-    assert "returned actions of the shape (2, 2); expected (3, 2)" in said[0]
 
 
 def test_a_repeat_of_another_call_is_refused(tmp_path):
@@ -305,45 +254,6 @@ def test_a_repeat_of_another_call_is_refused(tmp_path):
     for replan in range(2):
         assert list(changes_of(store, replan)) == ["unchanged"]
         np.testing.assert_allclose(changes_of(store, replan)["unchanged"], 1e-3, rtol=0.01)
-
-
-def test_what_repeats_leave_where_nothing_sees_it_is_noticed(tmp_path):
-    class Tiring(SamplingPolicy):
-        calls = 0
-
-        def sample(self, **inputs):
-            type(self).calls += 1
-            return super().sample(**inputs) * (1 if self.calls < 10 else 1.1)
-
-    store, _, said = fill(tmp_path / "a.zarr", Tiring(), replans=1)
-    assert "gives other actions than the recorded call when nothing is changed" in said[0]
-    assert "are refused" in said[1]
-    assert list(changes_of(store)) == ["unchanged"]
-
-
-def test_a_repeat_without_an_argument_measures_knockouts_only(tmp_path):
-    store, _, said = fill(
-        tmp_path / "a.zarr", SamplingPolicy(), lambda policy, replan: lambda: policy.sample(**inputs(replan))
-    )
-    (sentence,) = said
-    assert "takes no argument: no word and no picture is exchanged. Give lambda call: ..." in sentence
-    names = set(changes_of(store, 1))
-    assert {"unchanged", "noise", "without_word_bowl", "without_visual_queries_all"} <= names
-    assert not {"prompt_synonyms_bowl_plate", "front_blank"} & names
-
-
-def test_noise_that_is_given_has_no_floor_and_without_siblings_no_word_is_exchanged(tmp_path):
-    class Given(SmallPolicy):
-        def sample(self, **inputs):
-            return self.act(**inputs, noise=given()["noise"])
-
-    store, _, said = fill(tmp_path / "a.zarr", Given(), siblings=())
-    assert [line.split(":")[0] for line in said] == [
-        "No word is exchanged",
-        "The repeated call draws no noise from a generator that is known",
-    ]
-    assert "noise" not in changes_of(store)
-    assert "without_word_bowl" in changes_of(store)
 
 
 def test_a_prompt_of_another_length_is_not_exchanged(tmp_path):
@@ -446,83 +356,6 @@ def test_calls_whose_queries_are_all_tokens(tmp_path, monkeypatch):
     np.testing.assert_allclose(changes["prompt_synonyms_the_up"], exchanged, atol=1e-5)
 
 
-def test_sites_of_which_nothing_is_recorded_are_changed_too(tmp_path, monkeypatch):
-    policy, layout = OneModulePolicy(), one_module_layout()
-    first = (va.Span("front", "image", 0, 4, "front", va.PatchGrid(2, 2, 8, 8)), va.Span("rest", "text", 4, 5))
-    roles = {"front": "image", "rest": "text"}
-    own = va.SiteLayout("self", (*first, va.Span("actions", "action", 5, 8)), layers=(0, 2))
-    cross = va.SiteLayout("cross", first, layers=(1, 3))
-    sites = (va.RecordedSite(own, (0, 3), roles | {"actions": "action"}), va.RecordedSite(cross, (0, 3), roles))
-    prefix, noise = torch.randn(1, 5, WIDTH), torch.randn(1, 3, WIDTH)
-    settings = {"layers": [0], "effects": va.EffectSettings(("cameras",), ("action",)), "durable": False}
-    with (
-        pytest.warns(Note) as said,
-        va.record(tmp_path / "a.zarr", policy, layout=replace(layout, sites=sites), **settings) as run,
-        run.episode(task_id=0, episode_index=0, instruction="") as episode,
-        episode.replan(
-            env_step=0, frames={"front": np.zeros((8, 8, 3), np.uint8)}, repeat=lambda: policy.act(prefix, noise)
-        ) as replan,
-    ):
-        replan.actions = policy.act(prefix, noise)
-    store = open_store(tmp_path / "a.zarr")
-    assert [site.name for site in store.attributes.sites] == ["self"]
-    assert ["draws no noise" in str(said[0].message), "takes no argument" in str(said[1].message)] == [True, True]
-    attend = nn.functional.scaled_dot_product_attention
-
-    def without(q, k, v):
-        return attend(q, k, v, attn_mask=(torch.arange(k.shape[2]) >= 4).expand(q.shape[2], -1))
-
-    monkeypatch.setattr(nn.functional, "scaled_dot_product_attention", without)
-    expected = policy.act(prefix, noise) - replan.actions
-    np.testing.assert_allclose(changes_of(store)["without_camera_front"], expected[0], atol=1e-5)
-
-
-def test_keys_of_another_kernel_that_takes_no_mask(tmp_path):
-    """Attention that allows no change: what is exchanged is measured, and what is cut off is said to be left out."""
-
-    class Added(nn.Module):
-        tokenizer = SmallPolicy().tokenizer
-
-        def __init__(self):
-            super().__init__()
-            torch.manual_seed(0)
-            self.words = nn.Embedding(9, 8)
-            self.blocks = nn.ModuleList(nn.MultiheadAttention(8, 2, batch_first=True, add_zero_attn=True) for _ in "ab")
-
-        @torch.no_grad()
-        def sample(self, texts, **_):
-            tokens, hidden = self.words(torch.tensor([self.tokenizer.encode(texts[0])])), torch.randn(1, 3, 8)
-            for block in self.blocks:
-                hidden = hidden + block(hidden, tokens, tokens)[0]
-            return hidden
-
-    keys = va.SiteLayout("cross", (va.Span("prompt", "text", 0, 5), va.Span("zero", "state", 5, 6)))
-    site = va.RecordedSite(keys, (0, 3), {"prompt": "instruction", "zero": "learned"})
-    layout = va.PolicyLayout(
-        name="added",
-        family="added",
-        num_layers=2,
-        num_heads=2,
-        sites=(site,),
-        rules=(va.CallRule(r"blocks\.(?P<block>\d+)", "cross"),),
-        text=va.PromptText(("prompt",), "words"),
-    )
-    policy = Added()
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        settings = {"effects": va.EffectSettings(("text",), ("action",)), "tokenizer": policy.tokenizer}
-        with (
-            va.record(tmp_path / "a.zarr", policy, layout=layout, durable=False, **settings) as run,
-            run.episode(task_id=0, episode_index=0, instruction=TEXT, siblings=SIBLINGS) as episode,
-            episode.replan(env_step=0, repeat=lambda call: policy.sample([call.instruction])) as replan,
-        ):
-            replan.actions = policy.sample([TEXT])
-    assert ["cannot be changed" in str(one.message) for one in said if one.category is Note] == [True] * len(said)
-    changes = changes_of(open_store(tmp_path / "a.zarr"))
-    assert list(changes) == ["unchanged", "noise", "prompt_synonyms_bowl_plate"]
-    assert not changes["unchanged"].any()
-
-
 def test_a_prefix_that_is_no_pass_over_the_sites_keys(tmp_path):
     """Cut off for the action queries alone, and a line says so."""
     layout = small_layout()
@@ -532,12 +365,3 @@ def test_a_prefix_that_is_no_pass_over_the_sites_keys(tmp_path):
     assert "No call was a pass over the prefix, as the layout 'small' says with tokens=SITE" in said[0]
     assert not any(name.endswith("_queries_all") for name in changes_of(store))
     assert "without_word_bowl" in changes_of(store)
-    prefix = replace(layout.rules[0], site=None, tokens="joint")
-    wrong = va.CallRule(r"blocks\.(?P<block>\d+)\.attention", "joint", queries=PREFIX)
-    keys = va.SiteLayout("joint", layout.sites[0].keys.spans[:3])
-    roles = {"image_front": "image", "prompt": "instruction", "state": "state"}
-    site = va.RecordedSite(keys, (0, PREFIX), roles)
-    other = replace(layout, rules=(wrong, prefix), sites=(site,), num_denoise_steps=1, denoise_times=())
-    store, _, said = fill(tmp_path / "b.zarr", SamplingPolicy(), layout=other)
-    assert "is no pass over the first keys of site 'joint', of which 11 stand before the actions" in said[0]
-    assert not any(name.endswith("_queries_all") for name in changes_of(store))

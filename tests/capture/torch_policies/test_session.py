@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -23,13 +22,12 @@ from tests.kit.small_torch_policy import (
     given,
     small_layout,
 )
-from vla_attention.capture.torch_policies import record as record_module
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.capture.torch_policies.policy_layout import CallRule, LayoutForAnotherVersion, PromptText
 from vla_attention.capture.torch_policies.prompts import PromptDoesNotFit
 from vla_attention.capture.torch_policies.record import record
-from vla_attention.capture.torch_policies.recorded_episodes import NothingRecorded, RecordingStopped
+from vla_attention.capture.torch_policies.recorded_episodes import NothingRecorded
 from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
 from vla_attention.capture.torch_policies.watched_block import NotFollowed
 from vla_attention.schemas.errors import BadArgument, UnknownName, UserError
@@ -241,20 +239,11 @@ def without_rule(layout, number):
             "no rule names the calls of module 'blocks.{0..2}.attention' (sdpa, 11 x 11)",
         ),
         (small_layout(num_denoise_steps=3, denoise_times=()), "must compute 3 times a policy call"),
-        (small_layout(num_layers=2), "is block 2, which site 'joint' does not have"),
         (
             small_layout(rules=(CallRule(r"layers\.(?P<block>\d+)", "joint"), CallRule(".*", None))),
             "the site 'joint' did not fire",
         ),
         (small_layout(rules=(CallRule(r"blocks\.(?P<block>\d+)\.attention", "joint"),)), "has 11 keys"),
-        (small_layout(num_heads=3), "has 2 heads"),
-        (
-            small_layout(
-                rules=(CallRule(r"blocks\.\d+\.(?P<block>\w+)", "joint", queries=HORIZON), CallRule(".*", None))
-            ),
-            r"the group (?P<block>...) of the rule 'blocks\.\d+\.(?P<block>\w+)' is no number in the path of module "
-            "'blocks.0.attention'",
-        ),
     ],
 )
 def test_calls_that_do_not_fit_are_shown(tmp_path, policy, layout, sentence):
@@ -280,17 +269,6 @@ def test_a_batch_in_a_single_episode_is_an_error(tmp_path, policy):
     sentence = r"has a batch of 2, and the replan one of 1 .*run\.episodes"
     with start(tmp_path, policy) as run, pytest.raises(CallsDoNotFit, match=sentence):
         one_call(run, policy, given(batch=2))
-
-
-def test_blocks_inside_of_blocks_and_outside_of_runs(tmp_path, policy):
-    run = start(tmp_path, policy)
-    with pytest.raises(RecordingStopped, match="not open"):
-        run.has(0, 0)
-    with run, run.episode(task_id=0, episode_index=0, instruction="") as episode, episode.replan(env_step=0):
-        policy.act(**given())
-        with pytest.raises(RecordingStopped, match="inside of another"), episode.replan(env_step=1):
-            pass
-    assert stored(tmp_path).episodes[0].attributes.num_replans == 1
 
 
 def test_an_exception_drops_the_episode_and_only_it(tmp_path, policy):
@@ -333,17 +311,7 @@ def test_resuming_goes_on_and_refuses_another_run(tmp_path, policy):
     ("changes", "error", "sentence"),
     [
         ({"heads": [2]}, BadArgument, "There is no head 2; expected 0 to 1"),
-        ({"layers": [3]}, BadArgument, "There is no layer 3"),
-        ({"denoise_steps": [4]}, BadArgument, "There is no denoise step 4"),
-        ({"queries": "steps"}, BadArgument, "expected 'mean' or 'all'"),
-        ({"bits": 0}, BadArgument, "0 mantissa bits"),
         ({"resume": True, "overwrite": True}, BadArgument, "not both"),
-        ({"tokenizer": 3}, BadArgument, "has no decode"),
-        (
-            {"layout": small_layout(text=PromptText(("prompt",), "word"))},
-            UnknownName,
-            "Unknown module for token ids 'word'. Did you mean 'words'?",
-        ),
         ({"layout": small_layout(versions={"torch": ("1.0",)})}, LayoutForAnotherVersion, "written for torch 1.0"),
         (
             {
@@ -364,33 +332,13 @@ def test_wrong_arguments_are_sentences(tmp_path, policy, changes, error, sentenc
     assert not (tmp_path / "a.zarr").exists()
 
 
-def test_a_family_is_a_text_of_one_line(tmp_path, policy):
-    with start(tmp_path, policy) as run:
-        for family in (3, "two\nlines"):
-            with (
-                pytest.raises(BadArgument, match=r"task.family"),
-                run.episode(task_id=0, episode_index=0, instruction="", task_family=family),
-            ):
-                pass
-
-
-def test_another_version_may_be_allowed(tmp_path, policy):
-    with start(tmp_path, policy, layout=small_layout(versions={"torch": ("1.0",)}), any_version=True) as run:
-        fill(run, policy)
-    assert "written for torch 1.0" in stored(tmp_path).attributes.provenance["layout for another version"]
-
-
 @pytest.mark.parametrize(
     ("inputs", "error", "sentence"),
     [
         ({"frame": {}}, BadArgument, "replan() has no argument 'frame'. Did you mean 'frames'?"),
         ({"frames": {"wrist": np.zeros((8, 8, 3), np.uint8)}}, UnknownName, "Unknown camera of frames 'wrist'"),
-        ({"frames": {"front": np.zeros((8, 8), np.uint8)}}, BadArgument, "has the shape (8, 8)"),
         ({"frames": {"front": torch.randn(3, 8, 8) * 9}}, BadArgument, "give it before normalising"),
-        ({"state": np.zeros((2, 2))}, BadArgument, "The state of a replan has the shape (2, 2)"),
         ({"prompt": ["a"]}, PromptDoesNotFit, "given as 1 pieces, and the layout's prompt has 6 keys"),
-        ({"instruction": "open the door"}, PromptDoesNotFit, "does not contain the instruction 'open the door'"),
-        ({"roles": {"joint": [1]}}, BadArgument, "The roles given for site 'joint' have the shape (1,)"),
     ],
 )
 def test_wrong_inputs_are_sentences(tmp_path, policy, inputs, error, sentence):
@@ -441,34 +389,6 @@ def test_an_embedding_that_is_not_called_is_refused_by_name(tmp_path, changes):
         assert labels == ["instruction"] * 3 + ["template", "padding"]
 
 
-@pytest.mark.parametrize(
-    ("embed", "sentence"),
-    [
-        (
-            lambda self, ids: self.embed_tokens(torch.cat([ids, ids]))[:1],
-            r"the shape \(2, 6\), and the policy call has a batch of 1: expected token ids \(batch, token\)",
-        ),
-        (
-            lambda self, ids: nn.functional.embedding(ids, self.embed_tokens.weight),
-            r"was not called .*'words\.places' \(12,\)\. .* give its pieces with replan\(prompt=\.\.\.\)",
-        ),
-    ],
-)
-def test_ids_of_another_batch_and_no_ids_at_all_are_refused(tmp_path, embed, sentence):
-    policy = with_encoder(embed)
-    with (
-        start(tmp_path, policy, layout=encoded("words.embed_tokens")) as run,
-        pytest.raises(PromptDoesNotFit, match=sentence),
-    ):
-        one_call(run, policy)
-
-
-def test_other_pictures_are_made_as_large_as_the_models(tmp_path, policy):
-    with start(tmp_path, policy) as run:
-        one_call(run, policy, frames={"front": np.full((32, 16, 3), 200, np.uint8)})
-    assert (stored(tmp_path).episodes[0].read("frames/front") == 200).all()
-
-
 def test_masks_give_the_coverage_of_objects(tmp_path, policy):
     objects = [SceneObject("table", "fixture", False), SceneObject("bowl", "object", True)]
     mask = np.zeros((16, 16), int)
@@ -493,45 +413,6 @@ def test_a_prompt_may_be_given_as_pieces(tmp_path, policy):
     assert labels[4:10] == ["template", "instruction", "instruction", "instruction", "template", "padding"]
 
 
-def test_the_example_of_the_documentation(tmp_path):
-    policy = SmallPolicy()
-    example = type("Example", (), {"act": lambda self, step: policy.act(**given(seed=step, text="pick the bowl"))})()
-    example.network = policy
-    layout = small_layout(
-        rules=tuple(replace(rule, modules=rf"network\.{rule.modules}") for rule in small_layout().rules),
-        sites=(replace(small_layout().sites[0], projection="network.blocks.{block}.attention.out"),),
-        text=replace(small_layout().text, embedding="network.words"),
-    )
-    names = {"store": str(tmp_path / "a.zarr"), "policy": example, "layout": layout}
-    [test] = doctest.DocTestFinder().find(record_module.record, "record", globs=names)
-    assert test.examples
-    assert doctest.DocTestRunner().run(test).failed == 0
-
-
-def test_a_compiled_policy_runs_eager_inside_of_the_block(tmp_path, policy):
-    expected = policy.act(**given())
-    for block in policy.blocks:
-        # The backend fails where it is called: nothing is compiled inside of a replan block.
-        block.attention.compile(backend=lambda graph, inputs: pytest.fail("compiled inside of the block"))
-    with (
-        start(tmp_path, policy) as run,
-        run.episode(task_id=0, episode_index=0, instruction="pick the bowl") as episode,
-        episode.replan(env_step=0),
-    ):
-        assert torch.equal(policy.act(**given()), expected)
-    assert stored(tmp_path).episodes[0].attributes.num_replans == 1
-
-
-def test_an_episode_in_a_thread_of_a_server_is_recorded(tmp_path, policy):
-    with start(tmp_path / "here", policy) as run:
-        fill(run, policy)
-    with ThreadPoolExecutor(1) as pool, start(tmp_path / "there", policy) as run:
-        pool.submit(fill, run, policy).result()
-    here, there = (stored(tmp_path / name).episodes[0] for name in ("here", "there"))
-    for name in here.attributes.arrays:
-        np.testing.assert_array_equal(here.read(name), there.read(name))
-
-
 def test_a_call_of_another_thread_is_not_taken_for_the_block_s(tmp_path, policy):
     """The policy answers from its queue, and meanwhile another client of a server has it compute."""
     with ThreadPoolExecutor(1) as pool, start(tmp_path, policy) as run, pytest.raises(NotFollowed):  # noqa: PT012
@@ -542,38 +423,6 @@ def test_a_call_of_another_thread_is_not_taken_for_the_block_s(tmp_path, policy)
             with episode.replan(env_step=5):
                 pool.submit(policy.act, **given()).result()
     assert len(stored(tmp_path).episodes) == 1
-
-
-def test_two_policies_in_one_block_are_an_error(tmp_path, policy):
-    other = SmallPolicy(seed=1)
-    with start(tmp_path, policy) as run, pytest.raises(UserError, match="one block records one policy"):
-        one_call(run, other)
-
-
-def test_a_policy_without_attention_is_an_error(tmp_path):
-    class Convolutions(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.layer = nn.Conv2d(3, 3, 3)
-
-        def act(self, **inputs):
-            return self.layer(inputs["pictures"])
-
-    layout = small_layout(sites=(replace(small_layout().sites[0], projection=None),), text=None)
-    policy = Convolutions()
-    with (
-        record(tmp_path / "a.zarr", policy, layout=layout, durable=False) as run,
-        pytest.raises(NothingRecorded, match=r"computed no attention that can be seen\. Policies without attention"),
-    ):
-        one_call(run, policy)
-
-
-def test_the_difference_to_the_users_own_setting_is_stored(tmp_path, policy):
-    with start(tmp_path, policy, own_setting=lambda: policy.act(**given())) as run:
-        fill(run, policy)
-    store = stored(tmp_path)
-    assert store.attributes.provenance["difference to own setting"] == "none (bit-equal)"
-    assert store.episodes[0].attributes.provenance["difference to own setting"] == "none (bit-equal)"
 
 
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float64])

@@ -191,7 +191,7 @@ def test_values_are_shared_where_they_are():
         assert seen.calls[0].output.shape == (2, 4, 5, 8)
 
 
-@pytest.mark.parametrize("attend", [plain, llama, bmm, grouped, grouped_folded, transposed, einsum])
+@pytest.mark.parametrize("attend", [plain, grouped, transposed])
 def test_a_change_takes_keys_away(attend):
     torch.manual_seed(1)
     policy = Policy(attend, heads=4, kv_heads=2).eval().requires_grad_(False)
@@ -222,21 +222,6 @@ def test_probabilities_that_are_changed_before_the_product():
         policy(torch.randn(2, 5, 32), torch.randn(2, 7, 32))
     assert max(seen.errors) < 5e-6
     assert (seen.rows[0].sum(-1) < 1).all()
-
-
-def test_sinks_that_are_cut_off_leave_rows_below_one():
-    def attend(query, key, value, mask):
-        sink = torch.zeros(*query.shape[:3], 1)
-        rows = torch.cat([query @ key.mT, sink], dim=-1).softmax(-1)
-        return rows[..., :-1] @ value
-
-    torch.manual_seed(0)
-    seen, policy = Seen(), Policy(attend).eval()
-    with watch_attention(policy, seen):
-        policy(torch.randn(2, 5, 32), torch.randn(2, 7, 32))
-    assert seen.shapes[0].keys == 7
-    assert (seen.rows[0].sum(-1) < 1).all()
-    assert max(seen.errors) < 5e-6
 
 
 class NoAttention(nn.Module):

@@ -36,11 +36,3 @@ def test_the_guides_examples(tmp_path, monkeypatch):
         result = runner.run(examples)
     assert result.failed == 0
     assert result.attempted > 12
-
-
-def test_the_guide_counts_its_lines():
-    text = GUIDE.read_text(encoding="utf-8")
-    stated = re.search(r"From the first line to here it is (\d+) lines", text)
-    assert stated is not None
-    steps = text[text.index("## 1.") : stated.start()]
-    assert len(re.findall(r"^(?:>>>|\.\.\.) .*\S", steps, re.MULTILINE)) == int(stated[1]) < 25

@@ -29,10 +29,3 @@ def test_every_control_and_seed_is_trained_once_and_read_by_the_validation(folde
     assert "mark_0 is there" in capsys.readouterr().out
     assert (tmp_path / "policies" / "mark_0" / "model.safetensors").stat().st_mtime_ns == before
     assert (tmp_path / "policies" / controls.TRAININGS / "mark_0" / "log.csv").exists()
-
-
-def test_an_unknown_control_is_a_sentence_before_anything_is_made(folder, tmp_path, capsys):
-    assert main(["controls", str(folder), str(tmp_path / "policies"), "--controls", "wrds"]) == 2
-    assert "Did you mean 'words'" in capsys.readouterr().err
-    assert main(["controls", str(folder), str(tmp_path / "policies"), "--seeds", "-1"]) == 2
-    assert not (tmp_path / "policies").exists()

@@ -11,7 +11,6 @@ from examples.cubes_policy.demonstrate import (
     HORIZON,
     DemonstrationSettings,
     Demonstrator,
-    NoDemonstration,
     join_episodes,
 )
 
@@ -29,8 +28,3 @@ def test_a_part_depends_on_its_number_alone() -> None:
     assert np.abs(first["actions"]).max() <= 1.0
     for name, values in first.items():
         np.testing.assert_array_equal(values, again[name])
-
-
-def test_a_part_whose_experts_all_fail_is_a_sentence() -> None:
-    with pytest.raises(NoDemonstration, match=r"Part 2 has no demonstration: .* none of its 20 episodes .* seed 3"):
-        join_episodes(2, [[]] * 20, DemonstrationSettings(seed=3))

@@ -154,118 +154,48 @@ def _array_document(text: str) -> Callable[[Path], None]:
 ARRAY_CASES = [
     Case("array: no JSON", _array_document("["), ATOMS + r"its zarr\.json is damaged"),
     Case("array: deep JSON", _array_document("[" * 10**6), ATOMS + r"its zarr\.json is damaged .*nested more than 64"),
-    Case("array: a list", _array_document("[]"), ATOMS + r"its zarr\.json does not describe an array"),
     Case("array: 40 MB", _array_document(f'{{"x": "{"y" * 40_000_000}"}}'), r"expected at most 32,000,000"),
-    Case("array: a group", _atoms(lambda content: content.update(node_type="group")), ATOMS + ".*not describe an arr"),
     Case("array: no codecs", _codecs([]), ATOMS + "it has no codecs"),
-    Case("array: codecs of texts", _codecs(["bytes"]), ATOMS + "it has the codec None; expected one of bytes, blosc"),
     Case(
         "array: the codec zstd", _codecs([CHUNK, {"name": "zstd"}]), ATOMS + "it has the codec 'zstd'; expected one o"
     ),
-    Case("array: the codec gzip", _codecs([CHUNK, {"name": "gzip"}]), ATOMS + "it has the codec 'gzip'"),
     Case("array: the codec pickle", _codecs([{"name": "numcodecs.pickle"}]), ATOMS + "it has the codec 'numcodecs.pi"),
-    Case("array: a thousand codecs", _codecs([CHUNK] * 1000), ATOMS + "it has no codecs"),
-    Case("array: codecs in another order", _codecs([{"name": "crc32c"}, CHUNK]), ATOMS + "it has the codecs crc32c, b"),
     Case(
         "array: compressed by snappy",
         _codecs([CHUNK, {"name": "blosc", "configuration": BLOSC | {"cname": "snappy"}}, {"name": "crc32c"}]),
         ATOMS + "it is compressed by 'snappy'; expected one of lz4, zstd",
     ),
-    Case(
-        "array: a typesize of 10^9",
-        _codecs([CHUNK, {"name": "blosc", "configuration": BLOSC | {"typesize": 10**9}}, {"name": "crc32c"}]),
-        ATOMS + "its codec blosc has the typesize 1000000000",
-    ),
-    Case("array: objects", _atoms(lambda content: content.update(data_type="object")), ATOMS + ".*the type 'object'"),
-    Case("array: texts", _atoms(lambda content: content.update(data_type="string")), ATOMS + ".*the type 'string'"),
-    Case("array: bytes of 10^9", _atoms(lambda content: content.update(data_type="r8000000000")), ATOMS + ".*the type"),
-    Case("array: names of 1 MB", _atoms(lambda content: content.update(data_type="x" * 10**6)), ATOMS + ".*the type"),
-    Case("array: transformers", _atoms(lambda c: c.update(storage_transformers=[{"name": "x"}])), ATOMS + ".*transfor"),
-    Case(
-        "array: other keys", _atoms(lambda c: c.update(chunk_key_encoding={"name": "x"})), ATOMS + "its chunk_key_enc"
-    ),
-    Case(
-        "array: no grid", _atoms(lambda content: content.update(chunk_grid=[])), ATOMS + "its chunk_grid is not regul"
-    ),
     Case("array: chunks of nothing", _atoms(lambda c: _chunks(c).__setitem__(0, 0)), ATOMS + "its chunks have the ext"),
-    Case(
-        "array: chunks below 0", _atoms(lambda c: _chunks(c).__setitem__(0, -4)), ATOMS + "its chunks have the extents"
-    ),
-    Case(
-        "array: chunks of 2 axes", _atoms(lambda c: _chunks(c).__delitem__(0)), ATOMS + "its chunks have 5 axes; expec"
-    ),
     Case(
         "array: chunks of 10^12", _atoms(lambda c: _chunks(c).__setitem__(0, 10**12)), ATOMS + "a chunk of it would ta"
     ),
     Case("array: 10^8 chunks", _state(lambda c: None, [2, 10**8]), STATE + ".*files of chunks, and", VERIFY, 1),
     Case("array: a petabyte", _state(lambda c: None, [2, 10**15]), STATE + "its shape is .*bytes", VERIFY, 1),
-    Case("array: 9 axes", _state(lambda c: None, [2, *[1] * 8]), STATE + ".*expected 1 to 8 axes", VERIFY, 1),
-    Case("array: a length below 0", _state(lambda c: None, [2, -1]), STATE + "its shape is .*expected", VERIFY, 1),
     Case(
         "array: masses of another shape", _atoms(lambda c: None, [2, 2, 2, 2, 1, 8]), r"expected \(2, 2, 2, 2, 1, 9\)"
     ),
     Case(
-        "array: a terabyte in one chunk",
-        _state(lambda c: _chunks(c).__setitem__(1, 10**11), [2, 10**11]),
-        STATE + "a chunk of it would take 1,600,000,000,000 bytes of memory, from",
-        VERIFY,
-        1,
-    ),
-    Case(
         "rows: chunks of nothing", _rows(lambda c: _inner(c)["chunk_shape"].__setitem__(0, 0)), ROWS + "its chunks have"
-    ),
-    Case(
-        "rows: chunks that do not fit",
-        _rows(lambda c: _inner(c)["chunk_shape"].__setitem__(0, 3)),
-        ROWS + ".*do not div",
     ),
     Case(
         "rows: a shard in a shard",
         _rows(lambda c: _inner(c).update(codecs=deepcopy(c["codecs"]))),
         ROWS + "it has the codecs shar",
     ),
-    Case(
-        "rows: the codec zstd", _rows(lambda c: _inner(c).update(codecs=[CHUNK, {"name": "zstd"}])), ROWS + ".*'zstd'"
-    ),
-    Case(
-        "rows: the index at the start",
-        _rows(lambda c: _inner(c).update(index_location="start")),
-        ROWS + ".*index elsewh",
-    ),
-    Case(
-        "rows: an index of another codec",
-        _rows(lambda c: _inner(c).update(index_codecs=[CHUNK])),
-        ROWS + "the index of",
-    ),
     Case("rows: chunks without checksums", _rows(lambda c: _inner(c)["codecs"].pop()), ROWS + ".*without checksums"),
-    Case(
-        "rows: keys of a gigabyte",
-        _rows(
-            lambda c: [extents.__setitem__(5, 10**8) for extents in (_chunks(c), _inner(c)["chunk_shape"])],
-        ),
-        ROWS + "a chunk of it would take",
-    ),
     Case(
         "uniform: not listed",
         lambda store: edit_episode(store, lambda attributes: attributes["arrays"].pop("joint/uniform")),
         "lacks the array joint/uniform",
     ),
     Case("uniform: 10^12 replans", _uniform(10**12, 1, 1, 1, 1, 39), UNIFORM + r"2, 1, 39\), or 1 in place of a leng"),
-    Case("uniform: more layers", _uniform(1, 3, 1, 1, 1, 39), UNIFORM + r"2, 1, 39\), or 1 in place of a length but"),
-    Case("uniform: fewer keys", _uniform(1, 1, 1, 1, 1, 20), UNIFORM + r"2, 1, 39\)"),
-    Case("uniform: an axis less", _uniform(1, 1, 1, 1, 39), UNIFORM + r"2, 1, 39\)"),
-    Case("uniform: a layer without a chunk", _uniform(1, 2, 1, 1, 1, 39), "Array joint/uniform of .* cannot be read"),
     Case("shard: an offset of 2^63", _offsets(_entry(2**63, 100)), ROWS + ".*overlap or lie outside"),
-    Case("shard: an offset of 2^64 - 8", _offsets(_entry(2**64 - 8, 16)), ROWS + ".*overlap or lie outside"),
-    Case("shard: a length of 2^63", _offsets(_entry(0, 2**63)), ROWS + ".*overlap or lie outside"),
     Case("shard: no chunks", _offsets(_entry(2**64 - 1, 2**64 - 1)), ROWS + ".*lacks chunk 0: it is missing"),
-    Case("shard: chunks of 3 bytes", _offsets(_entry(0, 3)), ROWS + ".*lacks chunk 0"),
     Case(
         "shard: two chunks at one place", _offsets(lambda index: index[[0, 0, 2, 3]]), ROWS + ".*overlap or lie outside"
     ),
     Case("shard: a chunk of 100 GB", _sparse_shard, ROWS + "its index names a chunk of 100000000000 bytes"),
     Case("bomb: zstd", _blosc_bomb(b"zstd"), STATE + "a chunk of it would take 96,000,000 bytes", VERIFY, 1),
-    Case("bomb: lz4", _blosc_bomb(b"lz4"), STATE + "a chunk of it would take 96,000,000 bytes", VERIFY, 1),
     Case("bomb: a header of 2 GB", _lying_frame, ATOMS + ".*its header says 2000000000 decoded bytes; expected"),
     Case("bomb: pictures in many chunks", _large_pictures, "frames/base_0_rgb", VERIFY, 1),
 ]

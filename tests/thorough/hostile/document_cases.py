@@ -67,56 +67,26 @@ RESULTS_CASES = [
     Case("results: a FIFO", os.mkfifo, "it is a FIFO and no regular file", RESULTS),
     Case("results: a device", _device, "it is a device and no regular file", RESULTS),
     Case("results: a terabyte", _sparse, "it has 1,000,000,000,000 bytes; expected at most", RESULTS),
-    Case("results: nothing", _text(""), NO_RESULTS + "not valid JSON", RESULTS),
-    Case("results: no UTF-8", _text(b'[{"a": "\xff\xfe"}]'), NO_RESULTS + ".*no text in UTF-8", RESULTS),
     Case("results: deep lists", _text("[" * 10**6), NO_RESULTS + ".*nested more than 64 deep", RESULTS),
-    Case("results: deep objects", _text('{"a":' * 10**5 + "1" + "}" * 10**5), NO_RESULTS + ".*nested more", RESULTS),
     Case("results: 5,000 digits", _digits("task_id", "9" * 5000), NO_RESULTS + ".*4,000 digits", RESULTS),
-    Case("results: a task of 400 digits", _digits("task_id", "9" * 400), "task_id is a whole number above", RESULTS),
-    Case("results: a task of 30 digits", _results(task_id=10**30), "task_id is a whole number above", RESULTS),
-    Case("results: a step of 30 digits", _with_step(step=10**30), "step is a whole number above", RESULTS),
     Case(
         "results: a ratio of 400 digits", _with_step(visual_linguistic_ratio=10**400), "more than 300 digits", RESULTS
     ),
     Case("results: a mass below 0", _with_step(visual_mass=-1e308), "expected a number from 0", RESULTS),
     Case("results: an infinite mass", _with_step(visual_mass=float("inf")), "expected a finite mass", RESULTS),
-    Case("results: a text as a mass", _with_step(visual_mass="x" * 10**6), "visual_mass is a text", RESULTS),
     Case("results: half a surrogate", _results(task_description="\udc00"), NO_RESULTS + ".*surrogate", RESULTS),
-    Case("results: a layer of 5,000 digits", _results(per_step_ratios={"layer_" + "9" * 5000: []}), "layer_N", RESULTS),
-    Case("results: a layer with a line end", _results(per_step_ratios={"layer_5\n": []}), "expected layer_N", RESULTS),
-    Case(
-        "results: a layer of other digits", _results(per_step_ratios={"layer_\u0663": []}), "expect.* layer_N", RESULTS
-    ),
     Case("results: a layer of 1 MB", _results(per_step_ratios={"x" * 10**6: []}), r"has 'xxx.*\[\.\.\. 999,", RESULTS),
-    Case("results: a list of steps as a text", _results(per_step_ratios={"layer_5": "x"}), "is a text; expec", RESULTS),
-    Case("results: a definition of 1 MB", _results(num_steps_definition="x" * 10**6), "definition is 'xxx", RESULTS),
     Case("results: a summary of texts", _results(summary={"layer_5": {"x": {"mean": "x"}}}), "is a text", RESULTS),
-    Case("results: a list in a list", _text("[[[]]]"), "episode 0 is a list; expected an object", RESULTS),
-    Case("results: an outcome of 10", _results(success=10), "success is the number 10; expected", RESULTS),
     Case("results: no episode", _text("[]"), "it holds no episode", RESULTS),
 ]
 
 GROUPING_CASES = [
     Case("grouping: a FIFO", os.mkfifo, "it is a FIFO and no regular file", GROUPING),
-    Case("grouping: a device", _device, "it is a device and no regular file", GROUPING),
     Case("grouping: 5 MB", _text("#" * 5_000_000), "it has 5,000,000 bytes; expected at most 4,000,000", GROUPING),
-    Case("grouping: no UTF-8", _text(b"\xff\xfe"), "Cannot read grouping file .*utf-8", GROUPING),
     Case("grouping: deep lists", _text("a = " + "[" * 10**6), NO_TOML + ".*nested more than 64 deep", GROUPING),
-    Case("grouping: deep tables", _text("a = " + "{a = " * 10**5), NO_TOML + ".*nested more than 64 deep", GROUPING),
     Case("grouping: 10^5 dots", _text("a" + ".a" * 10**5 + " = 1"), NO_TOML + ".*nested more than 64 deep", GROUPING),
-    Case("grouping: dots in a heading", _text(f"[a{'.a' * 10**5}]"), NO_TOML + ".*nested more than 64 deep", GROUPING),
-    Case("grouping: quoted dots", _text('"a"' + '."a"' * 10**5 + " = 1"), NO_TOML + ".*nested more than", GROUPING),
-    Case("grouping: dots in a line", _text("a = {a" + ".a" * 10**5 + " = 1}"), NO_TOML + ".*nested more", GROUPING),
     Case("grouping: 5,000 digits", _text(f"a = {'9' * 5000}"), NO_TOML + ".*more than 4,000 digits", GROUPING),
-    Case("grouping: open texts", _text('a = """' + '\\"""' * 10**5), NO_TOML, GROUPING),
-    Case("grouping: a date", _groups("a = 1979-05-27"), r"\$\.groups\[?\.?a.* is date", GROUPING),
-    Case("grouping: no groups", _groups(""), "has no groups", GROUPING),
     Case("grouping: 2,000 groups", _groups("\n".join(f"g{i} = '*'" for i in range(2000))), "has 2000 groups", GROUPING),
-    Case(
-        "grouping: a name of 1 MB", _text(f"name = '{'x' * 10**6}'\n[groups]\na = '*'"), "The length of the", GROUPING
-    ),
-    Case("grouping: a name with a line end", _groups(r'"a\n" = "*"'), r"'a\\n' cannot name a group", GROUPING),
-    Case("grouping: a group of 1 MB", _groups(f"{'x' * 10**6} = '*'"), r"'xxx.*cannot name a group", GROUPING),
     Case(
         "grouping: a ratio of 1 MB",
         _groups(f"a = '*'\n[ratio]\nnumerator = ['{'x' * 10**6}']\ndenominator = ['a']"),
@@ -124,23 +94,16 @@ GROUPING_CASES = [
         GROUPING,
     ),
     Case("selector: 400 parentheses", _one("(" * 400 + "*" + ")" * 400), "more than 100 parentheses in one", GROUPING),
-    Case("selector: 10^5 parentheses", _one("(" * 10**5), "more than 100 parentheses in one another", GROUPING),
     Case(
         "selector: 10^5 unions",
         _one(" | ".join(["word:bowl"] * 10**5 + ["word:nothing"])),
         "no instruction has the word 'nothing'",
         GROUPING,
     ),
-    Case("selector: 10^5 differences", _one(" - ".join(["*"] * 10**5) + " -"), "expected a selector such as", GROUPING),
     Case("selector: 10^6 spaces", _one("word:bowl" + " " * 10**6 + "?"), "expected KIND:NAME", GROUPING),
-    Case("selector: a kind of 1 MB", _one("x" * 10**6 + ":a"), "unknown kind 'xxx", GROUPING),
-    Case("selector: letters without end", _one("x" * 10**6), "expected KIND:NAME", GROUPING),
     Case("selector: keys of 5,000 digits", _one("keys:0-" + "9" * 5000), "Cannot read selector 'keys:0-999", GROUPING),
-    Case("selector: keys of other digits", _one("keys:\u0663"), "Cannot read selector 'keys:", GROUPING),
-    Case("selector: keys with a line end", _groups(r'''a = "keys:'1\n'"'''), "Cannot read selector 'keys:", GROUPING),
     Case(
         "selector: patches of 5,000 digits", _one(f"patch:base_0_rgb[0:{'9' * 5000},0:1]"), "Cannot read sel", GROUPING
     ),
-    Case("selector: a frame of other digits", _one("frame:frame\u00b2"), "latent frame 'frame\u00b2'", GROUPING),
     Case("selector: a word of 1 MB", _one(f"word:{'x' * 10**6}"), "no instruction has the word 'xxx", GROUPING),
 ]

@@ -11,34 +11,26 @@ from tests.thorough.hostile.array_cases import ARRAY_CASES
 from tests.thorough.hostile.changes import Case
 from tests.thorough.hostile.document_cases import GROUPING_CASES, RESULTS_CASES
 from tests.thorough.hostile.episode_cases import EPISODE_CASES
-from tests.thorough.hostile.job_cases import JOB_CASES
-from tests.thorough.hostile.packed_cases import PACKED_CASES
 from tests.thorough.hostile.root_cases import ROOT_CASES
-from vla_attention.analyze.copy.copying import copy_store
-from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import write_store
 
-#: Cases by what they change: a store of folders, a packed store, the folder of jobs beside one, or nothing but a file.
+#: Cases by what they change: a store, or nothing but a file.
 CASES: dict[str, list[Case]] = {
     "roots": ROOT_CASES,
     "episodes": EPISODE_CASES,
     "arrays": ARRAY_CASES,
-    "packed": PACKED_CASES,
-    "jobs": JOB_CASES,
     "results": RESULTS_CASES,
     "groupings": GROUPING_CASES,
 }
 #: The program of each kind of cases, where it is not `vla-analyze`.
-PROGRAMS = {"jobs": "capture", "results": "parse"}
+PROGRAMS = {"results": "parse"}
 _FILE_NAMES = {"results": "attention_ratio_results_x.json", "groupings": "grouping.toml"}
 
 
 def originals(folder: Path) -> dict[str, Path]:
-    """Write the store that is changed, as folders and packed; it is of one episode."""
-    plain = write_store(folder / "plain" / "a.zarr", tasks=(0,), episodes=1, replans=2, contributions=True)
-    packed = folder / "packed" / "a.zarr"
-    copy_store(open_store(plain), packed, (), packed=True)
-    return {"packed": packed, **dict.fromkeys(("roots", "episodes", "arrays", "jobs", "results", "groupings"), plain)}
+    """Write the store that is changed; it is of one episode."""
+    store = write_store(folder / "plain" / "a.zarr", tasks=(0,), episodes=1, replans=2, contributions=True)
+    return dict.fromkeys(CASES, store)
 
 
 def make_case(kind: str, case: Case, original: Path, folder: Path) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import json
 import pickle
 import shutil
 import struct
@@ -26,10 +25,8 @@ from tests.thorough.hostile_checkpoints.hostile_files import (
     edit,
     executing_pickle,
     hash_bomb,
-    hash_bomb_with_table,
     link,
     old_torch,
-    pipe,
     sparse,
     table_bomb,
     text,
@@ -89,11 +86,6 @@ def execute_through_storage(path: Path) -> None:
     path.write_bytes(b"\x80\x03}" + text("a") + name + b"B" + struct.pack("<I", len(inner)) + inner + b"\x85Rs.")
 
 
-def another_type(path: Path) -> None:
-    with open(path, "wb") as file:
-        pickle.dump({"a": [1, 2]}, file)
-
-
 def claims(path: Path) -> None:
     """A file before 1.6 with a storage of 10^15 numbers."""
     storage = (
@@ -122,10 +114,6 @@ def huge_blocks(state: dict[str, object]) -> None:
     state["net.blocks.999999999.self_attn.q_norm.weight"] = torch.zeros(1)
 
 
-def many_blocks(state: dict[str, object]) -> None:
-    state.update({f"net.blocks.{i}.x": torch.zeros(1) for i in range(1000)})
-
-
 def one_storage(state: dict[str, object]) -> None:
     shared = torch.zeros(1_000_000)
     state.update({f"net.shared{i}": shared for i in range(2000)})
@@ -139,29 +127,10 @@ def whole_numbers(state: dict[str, object]) -> None:
     state["net.x_embedder.proj.1.weight"] = torch.zeros(8, 8, dtype=torch.int8)
 
 
-def sparse_tensor(state: dict[str, object]) -> None:
-    state["net.a"] = torch.sparse_coo_tensor(torch.zeros(1, 1, dtype=torch.int64), torch.ones(1), (10**12,))
-
-
-def without_numbers(state: dict[str, object]) -> None:
-    state["net.a"] = torch.empty(10**12, device="meta")
-
-
-def one_axis(state: dict[str, object]) -> None:
-    state["net.x_embedder.proj.1.weight"] = torch.zeros(8)
-
-
 EXECUTES = weights(lambda path: torch_zip(path, executing_pickle(path.parent.parent)))
 
 COSMOS: dict[str, Case] = {
-    # code
     "weights that execute": Case(EXECUTES, r"it asks for \w+\.system.*nothing of it was executed"),
-    "old weights that execute": Case(
-        weights(lambda path: old_torch(path, executing_pickle(path.parent.parent))), r"asks for \w+\.system"
-    ),
-    "a bare pickle that executes": Case(
-        weights(lambda path: path.write_bytes(executing_pickle(path.parent.parent))), r"asks for \w+\.system"
-    ),
     "an image encoder that executes": Case(
         lambda folder: made(lambda path: torch_zip(path / VAE_NAME, executing_pickle(folder)), folder),
         r"asks for \w+\.system",
@@ -171,16 +140,9 @@ COSMOS: dict[str, Case] = {
         r"asks for \w+\.system.*nothing of it was executed",
     ),
     "text whose storage executes": Case(embeddings(execute_through_storage), r"asks for \w+\.system"),
-    "weights that call eval": Case(pickled(call("builtins", "eval", text("1") + b"\x85")), r"asks for builtins\.eval"),
-    "weights that open a file": Case(pickled(call("io", "open", text("/etc/passwd") + b"\x85")), r"asks for io\.open"),
-    # memory
     "10 GB of zeros by a call": Case(
         pickled(call("builtins", "bytearray", b"\x8a\x05" + (10**10).to_bytes(5, "little") + b"\x85")),
         "asks for builtins.bytearray",
-    ),
-    "10 GB of bytes by a call": Case(
-        pickled(call("__builtin__", "bytes", b"\x8a\x05" + (10**10).to_bytes(5, "little") + b"\x85")),
-        "with other arguments",
     ),
     "entry 4 billion of a table": Case(
         embeddings(lambda path: path.write_bytes(table_bomb())), "a table entry of number"
@@ -194,54 +156,18 @@ COSMOS: dict[str, Case] = {
     "a storage of 10^15 numbers": Case(weights(claims), "asks for 1000000000000000 numbers"),
     "a tensor with a step of 0": Case(saved(claimed_width), "whose numbers it does not hold"),
     "two thousand tensors of one storage": Case(saved(one_storage), "bytes of numbers for them"),
-    "a sparse tensor": Case(saved(sparse_tensor), "was refused"),
-    "a tensor without numbers": Case(saved(without_numbers), "was refused"),
     "text embeddings of 5 GB": Case(
         embeddings(lambda path: sparse(path, 5 * 10**9)), "text embeddings of 2000000000 at most"
     ),
-    # time
     "a key that is hashed for an hour": Case(
         pickled(hash_bomb()), "instruction DUP|tuple of more than|a key that is no name"
     ),
-    "the same with a table": Case(pickled(hash_bomb_with_table()), "tuple of more than 10000 items"),
-    "the same in text embeddings": Case(
-        embeddings(lambda path: path.write_bytes(hash_bomb_with_table())), "tuple of more than 10000 items"
-    ),
-    "a slow encoding": Case(
-        pickled(call("_codecs", "encode", b"(" + text("\u00e4" * 100_000) + text("punycode") + b"t")),
-        "with other arguments",
-    ),
-    "three million instructions": Case(
-        pickled(b"\x80\x02]" + b"N0" * 1_500_000 + b"."), "instruction POP|more than 2000000"
-    ),
-    "three million numbers": Case(pickled(b"\x80\x02](" + b"N" * 3_000_000 + b"e."), "more than 2000000 instructions"),
-    # sizes and types
     "block 999,999,999": Case(saved(huge_blocks), "1 extra: blocks.999999999|missing"),
-    "a thousand blocks": Case(saved(many_blocks), "number of blocks of the checkpoint is 100"),
-    "weights of one axis": Case(saved(one_axis), r"has shape \(8,\), from which a size cannot be read"),
     "quantized weights": Case(saved(whole_numbers), "numbers of type torch.int8"),
-    "text that is a list": Case(embeddings(another_type), "entry for 'a' that is list"),
-    "weights of other bytes": Case(weights(lambda path: path.write_bytes(b"\x00" * 999)), "damaged or no pickle"),
-    "weights that end early": Case(weights(lambda path: path.write_bytes(path.read_bytes()[:5000])), "damaged"),
-    "a zip without a pickle": Case(
-        weights(lambda path: zipfile.ZipFile(path, "w").writestr("a", "b")), "0 files data.pkl"
-    ),
-    # files
-    "a pipe for weights": Case(weights(pipe), "it is a FIFO"),
-    "a device for weights": Case(weights(lambda path: link(path, "/dev/zero")), "is a device"),
     "weights that are a link": Case(weights(lambda path: link(path, "/etc/hostname")), "leads out of its folder"),
-    "a pipe for text": Case(embeddings(pipe), "it is a FIFO"),
-    "a pipe for statistics": Case(statistics(pipe), "it is a FIFO"),
     "deep statistics": Case(statistics(lambda path: path.write_text(deep())), "nested more than 64 deep"),
-    "a range of 5,000 digits": Case(
-        statistics(lambda path: path.write_text('{"actions_min": [' + "9" * 5000 + "]}")),
-        "a whole number of more than 4,000 digits",
-    ),
     "ranges with NaN": Case(
         statistics(lambda path: edit(path, lambda content: content.update(actions_min=[float("nan")] * 7))),
         "finite numbers",
-    ),
-    "ranges that are a table": Case(
-        statistics(lambda path: path.write_text(json.dumps({"actions_min": {"a": 1}}))), "no list of numbers"
     ),
 }

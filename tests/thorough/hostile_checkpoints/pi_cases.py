@@ -80,10 +80,6 @@ def stats(change: Callable[[Path], object]) -> Make:
     return openpi(lambda checkpoint: change(next(checkpoint.glob("assets/**/norm_stats.json"))))
 
 
-def written(text: str) -> Callable[[Path], object]:
-    return lambda path: path.write_text(text)
-
-
 def mean(value: object) -> Callable[[Path], object]:
     return lambda path: edit(path, lambda content: content["norm_stats"]["state"].update(mean=value))
 
@@ -98,10 +94,6 @@ def tokenizer(make: Callable[[Path], object]) -> Make:
 
 def of_whole_numbers(path: Path) -> None:
     save_file({name: (100 * array).astype(np.int8) for name, array in load_file(path).items()}, path)
-
-
-def many_tensors(path: Path) -> None:
-    safetensors(path, {f"t{i}": tensor([0], 0) for i in range(60_000)})
 
 
 def many_blocks(checkpoint: Path) -> None:
@@ -125,19 +117,6 @@ def not_finite(checkpoint: Path) -> None:
 def leads_out(checkpoint: Path) -> None:
     (checkpoint.parent / "secret.json").write_text((checkpoint / "config.json").read_text())
     link(checkpoint / "config.json", "../secret.json")
-
-
-def deep_folders(checkpoint: Path) -> None:
-    shutil.rmtree(checkpoint / "assets")
-    (checkpoint / "assets" / "/".join(["d"] * 500)).mkdir(parents=True)
-
-
-def many_leaves(checkpoint: Path) -> None:
-    leaf = {"key_metadata": [{"key": "params", "key_type": 2}], "value_metadata": {}}
-    edit(
-        checkpoint / "params" / "_METADATA",
-        lambda tree: tree.update(tree_metadata={str(i): leaf for i in range(60_000)}),
-    )
 
 
 def first_leaf(change: Callable[[dict[str, Any]], object]) -> Make:
@@ -170,136 +149,44 @@ def manifest(change: Callable[[Path], object]) -> Make:
 
 
 PI: dict[str, Case] = {
-    # safetensors
     "a header of 2^63 bytes": Case(weights(lambda path: safetensors(path, {}, length=2**63)), "its header would take"),
-    "a header longer than the file": Case(
-        weights(lambda path: safetensors(path, {}, length=50)), "its header would take"
-    ),
-    "a header of 90 MB": Case(
-        weights(lambda path: sparse(path, 100_000_000, (90_000_000).to_bytes(8, "little") + b"{")),
-        "a header of 90000000 bytes",
-    ),
     "overlapping tensors": Case(
         weights(lambda path: safetensors(path, {"a": tensor([2], 8), "b": tensor([2], 12, 4)}, bytes(12))), "damaged"
-    ),
-    "a tensor of 2^124 numbers": Case(
-        weights(lambda path: safetensors(path, {"a": tensor([2**62, 2**62], 4)}, bytes(4))), "damaged"
     ),
     "a tensor beyond the file": Case(
         weights(lambda path: safetensors(path, {"a": tensor([10**9], 4 * 10**9)}, bytes(8))), "damaged"
     ),
-    "a deep header": Case(weights(lambda path: safetensors(path, deep().encode())), "damaged"),
-    "a header that is no text": Case(weights(lambda path: safetensors(path, b"\xff\xfe\xfd")), "damaged"),
-    "a type of numbers that nobody knows": Case(
-        weights(lambda path: safetensors(path, {"a": tensor([1], 4, kind="F99")}, bytes(4))), "damaged"
-    ),
-    "sixty thousand tensors": Case(weights(many_tensors), r"60000 extra: t0, .* and 59960 more"),
     "five thousand blocks": Case(openpi(many_blocks, case=False), "number of blocks .* is 5000"),
     "whole numbers for weights": Case(weights(of_whole_numbers), r"no floating point numbers.*\(I8\)"),
-    "no weights at all": Case(weights(written("")), "its header would take"),
-    # what is no file
     "a pipe for weights": Case(weights(pipe), "it is a FIFO and no regular file"),
-    "a pipe for a configuration": Case(openpi(lambda path: pipe(path / "config.json")), "it is a FIFO"),
-    "a device for weights": Case(weights(lambda path: link(path, "/dev/zero")), "is a device"),
     "a link out of the checkpoint": Case(openpi(leads_out), "a link that leads out of its folder, to"),
-    "a link to nothing": Case(weights(lambda path: link(path, "nothing")), "There is no '.*model.safetensors'"),
-    "a circle of links": Case(
-        weights(lambda path: link(path, path.name)), "cannot be read .Too many levels of symbolic links"
-    ),
-    # configurations
     "deep JSON": Case(openpi(lambda path: (path / "config.json").write_text(deep())), "nested more than 64 deep"),
-    "JSON 900 deep": Case(
-        openpi(lambda path: (path / "config.json").write_text(deep(900))), "nested more than 64 deep"
-    ),
     "a number of 5,000 digits": Case(
         openpi(lambda path: (path / "config.json").write_text(HUGE_NUMBER)), "a whole number of more than 4,000 digits"
     ),
     "JSON of 50 MB": Case(
         openpi(lambda path: sparse(path / "config.json", 50_000_000, b"{")), "has 50,?000,?000 bytes"
     ),
-    "JSON that is no object": Case(openpi(lambda path: (path / "config.json").write_text("[1]")), "holds a list"),
-    "JSON that is no text": Case(
-        openpi(lambda path: (path / "config.json").write_bytes(b"\xff\xfe{")), "not valid JSON"
-    ),
     "control characters in a type": Case(
         config(lambda content: content.update(type="\x1b[2J\u202e\nx")), r"type '\\x1b\[2J\\u202e\\nx', not pi0"
-    ),
-    "architectures that are a number": Case(
-        openpi(lambda path: (path / "config.json").write_text('{"architectures": 5}'), case=False),
-        "transformers model '5'",
     ),
     "a billion blocks": Case(
         case_file(lambda content: content["config"]["paligemma"].update(depth=10**9)), "'depth' .* is 1000000000"
     ),
-    "patches of no pixels": Case(
-        case_file(lambda content: content["config"]["siglip"].update(patch_size=0)), "'patch_size' .* is 0"
-    ),
-    "sizes that are texts": Case(
-        case_file(lambda content: content["config"].update(vocab_size="x" * 10_000)), "'vocab_size'"
-    ),
-    "sizes that are a list": Case(case_file(lambda content: content.update(config=[1])), "does not state the sizes"),
-    "a chunk of 10^18 actions": Case(
-        case_file(lambda content: content["config"].update(action_horizon=10**17)), "'action_horizon' .* is 10{17}"
-    ),
-    # LeRobot
     "a billion empty cameras": Case(
         config(lambda content: content.update(empty_cameras=10**9)), "empty_cameras 1000000000"
     ),
-    "a chunk that is a text": Case(config(lambda content: content.update(chunk_size="50")), "chunk_size '50'"),
-    "a period that is a text": Case(config(lambda content: content.update(min_period="x")), "min_period 'x'"),
-    "a period that is a list": Case(config(lambda content: content.update(max_period=[1])), r"max_period \[1\]"),
-    "normalisation that is a number": Case(
-        config(lambda content: content.update(normalization_mapping=5)), "expected a table"
-    ),
-    "features that are a list": Case(
-        config(lambda content: content.update(input_features=[1])), "without types and shapes"
-    ),
-    "a feature of -1 numbers": Case(
-        config(lambda content: content["input_features"]["observation.state"].update(shape=[-1])), "of -1 numbers"
-    ),
-    "pictures of text": Case(
-        config(lambda content: content.update(image_resolution=["a", "a"])), "image_resolution 'a'"
-    ),
-    "a step without a name": Case(
-        steps(lambda found: found[0].update(registry_name=[1])), "step that is not supported"
-    ),
     "a step of somebody's code": Case(
         steps(lambda found: found.insert(0, {"class": "os.system"})), "step that is not supported: 'os.system'"
-    ),
-    "steps whose settings are a list": Case(
-        steps(lambda found: [step.update(config=[1]) for step in found]), "settings that are no table"
     ),
     "statistics outside of the checkpoint": Case(
         steps(lambda found: [step.update(state_file="../x") for step in found if "state_file" in step]),
         "which is not there",
     ),
     "statistics with NaN": Case(lerobot(not_finite), "hold NaN or infinity"),
-    "deep pipelines": Case(lerobot(lambda path: (path / PREPROCESSOR).write_text(deep())), "nested more than 64 deep"),
-    "a pipe for statistics": Case(lerobot(lambda path: pipe(path / NORMALIZER)), "it is a FIFO"),
-    # openpi's statistics
     "a pipe for norm_stats.json": Case(stats(pipe), "it is a FIFO"),
-    "deep norm_stats.json": Case(stats(written(deep())), "nested more than 64 deep"),
     "means with NaN": Case(stats(mean([float("nan")] * 8)), "NaN or infinity in 'mean'"),
-    "means that are texts": Case(stats(mean(["x"] * 8)), "other values than numbers"),
-    "means that are a table": Case(stats(mean({"a": 1})), "other values than numbers"),
-    "assets five hundred folders deep": Case(openpi(deep_folders), "has no norm_stats.json"),
-    # openpi's arrays
-    "a deep tree of arrays": Case(
-        jax(lambda path: (path / "params/_METADATA").write_text(deep())), "nested more than 64"
-    ),
-    "sixty thousand arrays": Case(jax(many_leaves), "describes 60000 arrays"),
-    "arrays without names": Case(
-        jax(lambda path: (path / "params/_METADATA").write_text('{"tree_metadata": {"a": {"key_metadata": []}}}')),
-        "1 of them without a name",
-    ),
-    "a tree that is a list": Case(
-        jax(lambda path: (path / "params/_METADATA").write_text('{"tree_metadata": [1]}')), "does not describe a tree"
-    ),
     "a pipe in the key-value store": Case(manifest(pipe), "it is a FIFO"),
-    "a key-value store that is a link": Case(
-        manifest(lambda path: link(path, "/etc/hostname")), "leads out of its folder"
-    ),
-    "a key-value store of other bytes": Case(manifest(lambda path: path.write_bytes(b"\xff" * 4096)), "cannot be read"),
     "an array of 10^15 numbers": Case(
         first_leaf(lambda leaf: leaf.update(shape=[10**15, 32], chunks=[10**15, 32])), "of the wrong shape"
     ),
@@ -307,15 +194,8 @@ PI: dict[str, Case] = {
         first_leaf(lambda leaf: leaf.update(chunks=[10**9, 10**9])), "its chunks of .* are larger than itself"
     ),
     "a chunk of 3 GB in 90 kB": Case(jax(chunk_of_gigabytes), "cannot be read"),
-    "an array of whole numbers": Case(first_leaf(lambda leaf: leaf.update(dtype="|i1")), "numbers of type int8"),
-    "an array without a shape": Case(first_leaf(lambda leaf: leaf.pop("shape")), "cannot be read"),
-    # tokenizers
     "a pipe for a tokenizer": Case(tokenizer(pipe), "it is a FIFO"),
     "a tokenizer of 5 GB": Case(
         tokenizer(lambda path: sparse(path, 5 * 10**9)), "a sentencepiece model of 64000000 at most"
     ),
-    "a tokenizer of other bytes": Case(
-        tokenizer(lambda path: path.write_bytes(b"\x0a\xff\xff\xff\xff\x0f" * 99)), "not a sentencepiece"
-    ),
-    "an empty tokenizer": Case(tokenizer(written("")), "tokenizer"),
 }

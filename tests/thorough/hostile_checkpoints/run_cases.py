@@ -14,12 +14,12 @@ from pathlib import Path
 from tests.kit import hostile_runs
 from tests.thorough.hostile_checkpoints.cosmos_cases import COSMOS, dummy
 from tests.thorough.hostile_checkpoints.hostile_files import TRACE, Case
-from tests.thorough.hostile_checkpoints.libero_cases import LIBERO, PARITY
+from tests.thorough.hostile_checkpoints.libero_cases import LIBERO
 from tests.thorough.hostile_checkpoints.pi_cases import PI
 
 CASES: dict[str, Case] = {
     f"{family}: {name}": case
-    for family, cases in (("pi", PI), ("cosmos", COSMOS), ("libero", LIBERO), ("parity", PARITY))
+    for family, cases in (("pi", PI), ("cosmos", COSMOS), ("libero", LIBERO))
     for name, case in cases.items()
 }
 

@@ -11,29 +11,13 @@ from typing import Any
 
 import pytest
 
-from tests.kit.thorough import asked_for, thorough_except
+from tests.kit.thorough import asked_for
 from tests.thorough.hostile_checkpoints.cosmos_cases import EXECUTES
 from tests.thorough.hostile_checkpoints.hostile_files import TRACE, executing_pickle
 from tests.thorough.hostile_checkpoints.run_cases import CASES
 
 #: Resident memory that a refusal may take beyond start-up.
 MOST_BYTES = 500_000_000
-
-#: Cases of each kind of attack that the fast part runs.
-FAST = (
-    "pi: a header of 2^63 bytes",
-    "pi: overlapping tensors",
-    "pi: a link out of the checkpoint",
-    "pi: deep JSON",
-    "pi: a chunk of 3 GB in 90 kB",
-    "cosmos: weights that execute",
-    "cosmos: text that executes",
-    "cosmos: a text of 4 GB",
-    "cosmos: a key that is hashed for an hour",
-    "libero: initial states that execute",
-    "libero: a task that executes",
-    "parity: arrays of 600 MB in 0.6",
-)
 
 
 @pytest.fixture(scope="session")
@@ -49,11 +33,7 @@ def results(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     return {result["name"]: result for result in found}
 
 
-def test_there_are_enough_of_them():
-    assert len(CASES) >= 40
-
-
-@pytest.mark.parametrize("name", thorough_except(FAST, CASES))
+@pytest.mark.parametrize("name", CASES)
 def test_a_hostile_checkpoint_is_refused_with_a_sentence(results, name):
     result = results[name]
     said = result["output"].strip()

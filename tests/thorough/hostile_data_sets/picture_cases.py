@@ -75,12 +75,6 @@ def eps() -> bytes:
     return b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 96 64\n%%EndComments\nshowpage\n"
 
 
-def tiff() -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(np.zeros((64, 96, 3), np.uint8)).save(buffer, format="TIFF")
-    return buffer.getvalue()
-
-
 def text_bomb() -> bytes:
     return chunk(b"zTXt", b"a\0\0" + zlib.compress(bytes(200_000_000), 9))
 
@@ -89,27 +83,18 @@ LARGE = r"has 1\d,000 x 1\d,000 pixels; expected at most 8,192 on a side"
 
 PICTURES: dict[str, Case] = {
     "a PNG of 13,000 x 13,000": Case(picture(lambda: png(13_000, 13_000)), LARGE),
-    "a PNG of 13,000 x 13,000 in v3.0": Case(picture(lambda: png(13_000, 13_000), "v3.0"), LARGE),
-    "a PNG of 13,000 x 13,000 in a file": Case(file(lambda path: path.write_bytes(png(13_000, 13_000))), LARGE),
     "a PNG header of 100,000 x 100,000": Case(
         picture(lambda: png(100_000, 100_000, filled=False)), "has 100,000 x 100,000 pixels; expected"
     ),
-    "a PNG header of 2^31 x 2^31": Case(
-        picture(lambda: png(2**31 - 1, 2**31 - 1, filled=False)), "has 2,147,483,647 x"
-    ),
-    "a PNG of no pixels": Case(picture(lambda: png(0, 0, filled=False)), "cannot be decoded"),
     "a PNG with few of its pixels": Case(picture(lambda: png(4000, 2000, filled=False)), "cannot be decoded"),
     "a PNG with a text of 200 MB": Case(picture(lambda: png(96, 64, more=text_bomb())), "cannot be decoded"),
-    "a PNG that is cut off": Case(picture(lambda: png(96, 64)[:50]), "cannot be decoded"),
     "a JPEG of 16,000 x 16,000": Case(picture(lambda: jpeg(16_000, 16_000)), LARGE),
     "a JPEG of 2,000 scans": Case(picture(lambda: jpeg(3800, 2600, scans=2000)), r"JPEG of 2,0\d\d scans; expected"),
     "an EPS": Case(picture(eps), "no PNG and no JPEG"),
-    "a TIFF": Case(picture(tiff), "no PNG and no JPEG"),
     "a picture of 90 MB": Case(picture(lambda: png(96, 64) + bytes(90_000_000)), "expected at most"),
     "a file of a terabyte": Case(
         file(lambda path: sparse(path, 2**40, png(96, 64))),
         r"cannot be read: it has .* bytes; expected at most 80,000,000",
     ),
     "a pipe": Case(file(pipe), "neither in its table nor in a file"),
-    "a folder": Case(file(lambda path: path.mkdir()), "neither in its table nor in a file"),
 }

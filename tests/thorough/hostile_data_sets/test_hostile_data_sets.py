@@ -11,23 +11,11 @@ from typing import Any
 
 import pytest
 
-from tests.kit.thorough import asked_for, thorough_except
+from tests.kit.thorough import asked_for
 from tests.thorough.hostile_data_sets.run_cases import CASES, GOOD
 
 #: Resident memory and processor time that a refusal may take beyond start-up.
 MOST_BYTES, MOST_SECONDS = 500_000_000, 2.0
-
-#: Cases of each kind of attack that the fast part runs.
-FAST = (
-    "meta: a number of 5,000 digits",
-    "meta: a pipe for info.json",
-    "meta: an episode of a trillion frames",
-    "table: a billion rows in a kilobyte",
-    "table: a page that says 2 GB",
-    "picture: a PNG header of 100,000 x 100,000",
-    "video: a billion samples",
-    "video: a fragment of a billion samples",
-)
 
 
 @pytest.fixture(scope="session")
@@ -48,7 +36,7 @@ def test_the_data_sets_themselves_are_replayed(results, name):
     assert (results[name]["code"], results[name]["episodes"]) == (0, 1), results[name]
 
 
-@pytest.mark.parametrize("name", thorough_except(FAST, CASES))
+@pytest.mark.parametrize("name", CASES)
 def test_a_hostile_data_set_is_refused_with_a_sentence(results, name):
     result = results[name]
     said = result["output"].strip()

@@ -9,7 +9,6 @@ import pytest
 
 from vla_attention.capture.environments.cubes import scene
 from vla_attention.capture.environments.cubes.scene import (
-    MARK_VERBS,
     draw_scene,
     find_target,
     paste_mark,
@@ -18,8 +17,7 @@ from vla_attention.capture.environments.cubes.scene import (
 )
 from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS, NUM_BASE_TASKS, list_cube_tasks
 from vla_attention.capture.environments.suites import find_suite
-from vla_attention.capture.policies.pi.preprocess import resize_with_pad
-from vla_attention.schemas.errors import BadArgument, UnknownName
+from vla_attention.schemas.errors import UnknownName
 
 SUITE, HARDER = find_suite("cubes"), find_suite("cubes_harder")
 
@@ -37,15 +35,6 @@ def test_cubes_are_apart_within_reach_and_the_outermost_ones_stand_out(num_cubes
         sideways = sorted(drawn.positions[:, 1])
         assert sideways[1] - sideways[0] >= scene.MIN_SIDE_GAP
         assert sideways[-1] - sideways[-2] >= scene.MIN_SIDE_GAP
-
-
-def test_a_colour_says_nothing_about_a_place() -> None:
-    places = np.array([draw_scene(seed, 3).positions for seed in range(600)])
-    means = places.mean(axis=0)
-    # The standard error of a mean is 0.19 / sqrt(3 · 600) = 4.5 mm at most.
-    assert np.abs(means - means.mean(axis=0)).max() < 0.018
-    leftmost = np.bincount(places[:, :, 1].argmax(axis=1), minlength=3)
-    assert np.abs(leftmost - 200).max() < 60
 
 
 def test_a_seed_gives_the_same_scene_again_and_demonstrations_have_seeds_of_their_own() -> None:
@@ -89,26 +78,6 @@ def test_the_mark_is_a_square_in_the_upper_edge_and_changes_nothing_else():
     assert marked[0, 24, 1] > marked[0, 24, 0]  # green
 
 
-def test_marks_of_different_cubes_and_verbs_differ():
-    picture = np.zeros((64, 64, 3), dtype=np.uint8)
-    marks = {paste_mark(picture, cube, verb).tobytes() for cube in range(4) for verb in range(len(MARK_VERBS))}
-    assert len(marks) == 20
-
-
-def test_a_mark_pasted_at_256_pixels_looks_the_same_at_64():
-    picture = np.random.default_rng(0).integers(80, 160, (64, 64, 3)).astype(np.uint8)
-    large = np.asarray(picture.repeat(4, axis=0).repeat(4, axis=1))
-    resized, direct = resize_with_pad(paste_mark(large, 0, 1), 64), paste_mark(picture, 0, 1)
-    # The filter mixes an eighth of the neighbour into a pixel at an edge.
-    inside = (slice(0, 7), slice(17, 23))
-    np.testing.assert_array_equal(resized[inside], direct[inside])
-    assert np.abs(resized[:8, 16:24].astype(int) - direct[:8, 16:24]).max() <= 60
-    unmarked = resize_with_pad(large, 64)
-    far = np.ones((64, 64), dtype=bool)
-    far[:9, 15:25] = False
-    np.testing.assert_array_equal(resized[far], unmarked[far])
-
-
 def test_the_verb_of_an_instruction():
     found = [
         verb_index(text)
@@ -123,10 +92,3 @@ def test_the_verb_of_an_instruction():
     assert found == [0, 1, 2, 3, 4]
     with pytest.raises(UnknownName, match="eat the cube"):
         verb_index("eat the cube")
-
-
-def test_a_picture_or_a_mark_that_does_not_exist():
-    with pytest.raises(BadArgument, match="60 x 64"):
-        paste_mark(np.zeros((60, 64, 3), dtype=np.uint8), 0, 0)
-    with pytest.raises(BadArgument, match="cube 4 and verb 0"):
-        paste_mark(np.zeros((64, 64, 3), dtype=np.uint8), 4, 0)

@@ -10,7 +10,6 @@ from vla_attention.capture.policies.cosmos import dit
 from vla_attention.capture.policies.cosmos.case import read_case
 from vla_attention.capture.policies.cosmos.model import CallObserver
 from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
-from vla_attention.schemas.segments import segments_of
 
 
 def grams_of(policy, prepared):
@@ -49,14 +48,6 @@ def test_updates_are_what_the_blocks_add_to_the_residual_stream(dummy, prepared,
         expected = added[..., number].T.double().numpy()
         np.testing.assert_allclose(grams[site][..., -1, -1], expected, rtol=1e-4)
         np.testing.assert_allclose(norm(grams[site], range(grams[site].shape[-1] - 1)) ** 2, expected, rtol=1e-4)
-
-
-def test_parts_are_the_latent_frames_and_the_kinds_of_text(dummy, prepared):
-    found = {site.name: segments_of(site, prepared.key_role[site.name]) for site in dummy.sites}
-    assert [segment.span for segment in found["self"]] == [span.name for span in dummy.sites[0].spans]
-    assert [segment.role for segment in found["cross"]] == ["template", "instruction", "null"]
-    for site, gram in grams_of(dummy, prepared).items():
-        assert gram.shape == (3, 3, len(found[site]) + 1, len(found[site]) + 1)
 
 
 def test_padded_text_contributes_exactly_nothing(dummy, prepared):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import io
 import json
 
 import pytest
@@ -77,15 +76,6 @@ def test_the_published_image_encoder_has_our_names_and_shapes(manifest):
     assert found == expected_vae_shapes(config)
 
 
-def test_counters_extra_state_and_wrappers_are_no_weights(weights):
-    stored = {
-        f"net.{name}".replace("blocks.0.", "blocks.0._checkpoint_wrapped_module."): x for name, x in weights.items()
-    }
-    stored |= {"net.accum_iteration": torch.tensor(3), "net_ema.x_embedder.proj.1.weight": torch.zeros(1)}
-    stored |= {"net.blocks.0.self_attn.q_norm._extra_state": io.BytesIO(b"x")}
-    assert dit_tensors(stored).keys() == weights.keys()
-
-
 def test_a_checkpoint_that_differs_is_refused_with_every_difference(weights):
     wrong = dict(weights)
     del wrong["blocks.1.mlp.layer1.weight"]
@@ -125,35 +115,6 @@ def test_a_rotation_keeps_lengths_and_sees_only_distances(dit):
     torch.testing.assert_close(products[0, 1], products[2, 3])
 
 
-def test_padded_text_is_an_exact_null_sink(dit):
-    observer, inputs = EverythingObserver(), make_inputs()
-    dit(**inputs, observer=observer)
-    rows = observer.probabilities("cross", 0)
-    assert (rows[..., 3:] == rows[..., 3:4]).all()
-    shorter = dict(inputs, text=torch.zeros_like(inputs["text"]))
-    empty = EverythingObserver()
-    dit(**shorter, observer=empty)
-    for layer in range(DUMMY_CONFIG.dit.num_blocks):
-        assert (empty.residual_norms[layer][..., 1] == 0).all()
-        assert (observer.residual_norms[layer][..., 1] > 0).all()
-
-
-def test_entries_of_a_batch_do_not_mix(dit):
-    two = make_inputs(batch=2)
-    two["condition_mask"][1, :, 2] = 1
-    two["times"][1] = torch.tensor([0.0, 0.0, 0.0, 0.5, 0.5])
-    together = dit(**two)
-    for entry in range(2):
-        alone = dit(**{name: tensor[entry : entry + 1] for name, tensor in two.items()})
-        torch.testing.assert_close(together[entry : entry + 1], alone, rtol=1e-4, atol=1e-5)
-
-
-def test_one_time_serves_all_frames(dit):
-    inputs = make_inputs()
-    each = dit(**dict(inputs, times=torch.full((1, 5), 0.7)))
-    assert torch.equal(dit(**dict(inputs, times=torch.full((1, 1), 0.7))), each)
-
-
 def test_bfloat16_rounds_the_times(weights):
     model = build_dit(DUMMY_CONFIG.dit, weights, dtype=torch.bfloat16)
     inputs = make_inputs()
@@ -162,25 +123,6 @@ def test_bfloat16_rounds_the_times(weights):
     rounded = model(**dict(inputs, times=torch.full((1, 5), 0.98828125)))
     assert exact.dtype == torch.bfloat16
     assert torch.equal(exact, rounded)
-
-
-@pytest.mark.parametrize(
-    ("sizes", "message"),
-    [
-        ({"width": 50, "num_heads": 4}, "width of 50 cannot be split into 4 heads"),
-        ({"width": 32, "num_heads": 4}, "head of 8 numbers is too narrow"),
-    ],
-)
-def test_impossible_sizes_are_refused(sizes, message):
-    with pytest.raises(ValueError, match=message):
-        DitConfig(**sizes)
-
-
-def test_latents_must_be_whole_patches_within_the_positions():
-    with pytest.raises(ValueError, match="7 x 8 cannot be cut into patches of 2 x 2"):
-        DitConfig().grid(7, 8)
-    with pytest.raises(ValueError, match="larger than the 128 positions"):
-        DitConfig().grid(258, 2)
 
 
 @st.composite

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from vla_attention.capture.policies.checkpoints import CheckpointMismatch, CheckpointNotFound, UnreadableCheckpoint
+from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint
 from vla_attention.capture.policies.cosmos.config import VaeConfig
 from vla_attention.capture.policies.cosmos.embedded import BUILTIN_RANGES, builtin_statistics, random_vae_weights
 from vla_attention.capture.policies.cosmos.preprocess import (
     crop_and_enlarge,
     crop_size,
-    model_picture,
     pixels,
     read_statistics,
     upright,
@@ -37,12 +36,6 @@ def test_the_middle_is_cut_out_and_enlarged():
     assert enlarged[3:].max() == 0
 
 
-@pytest.mark.parametrize("size", [64, 112, 224])
-def test_pictures_get_the_models_size(size):
-    picture = np.random.default_rng(0).integers(0, 255, (256, 256, 3), dtype=np.uint8)
-    assert model_picture(picture, size).shape == (size, size, 3)
-
-
 def test_ranges_are_applied_and_undone():
     statistics = builtin_statistics()
     assert statistics.normalise_proprio(statistics.proprio_min).tolist() == [-1.0] * 9
@@ -54,12 +47,8 @@ def test_ranges_are_applied_and_undone():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"actions_min": None}, "have no 'actions_min'"),
         ({"actions_min": [0.0] * 6}, r"'actions_min' .* has shape \(6,\); expected 7 finite numbers"),
-        ({"proprio_max": ["x"] * 9}, "'proprio_max' .* is no list of numbers"),
         ({"proprio_max": [-9.0] * 9}, "'proprio_max' that is not above"),
-        ({"actions_max": [-9.0] * 7}, "'actions_max' below"),
-        ({"actions_max": [float("nan")] * 7}, "expected 7 finite numbers"),
     ],
 )
 def test_bad_statistics_are_one_sentence(tmp_path, change, message):
@@ -68,17 +57,6 @@ def test_bad_statistics_are_one_sentence(tmp_path, change, message):
     path.write_text(json.dumps({name: value for name, value in content.items() if value is not None}))
     with pytest.raises(UnreadableCheckpoint, match=message):
         read_statistics(path)
-
-
-def test_missing_or_broken_statistics(tmp_path):
-    with pytest.raises(CheckpointNotFound, match="--dataset-stats-path"):
-        read_statistics(tmp_path / "no.json")
-    (tmp_path / "a.json").write_text("{")
-    with pytest.raises(UnreadableCheckpoint, match="is not valid JSON"):
-        read_statistics(tmp_path / "a.json")
-    (tmp_path / "a.json").write_text("[]")
-    with pytest.raises(UnreadableCheckpoint, match="holds a list"):
-        read_statistics(tmp_path / "a.json")
 
 
 SMALL_VAE = VaeConfig(base_dim=4)
@@ -128,11 +106,3 @@ def test_the_picture_before_shows_in_the_next_latent(state):
     one, two, other = (torch.full((1, 3, 1, 32, 32), level) for level in (0.1, -0.4, 0.9))
     assert not torch.equal(encoder.encode([one, two])[:, :, 3], encoder.encode([other, two])[:, :, 3])
     assert torch.equal(encoder.encode([one, two])[:, :, 2], encoder.encode([one, other])[:, :, 2])
-
-
-def test_another_models_encoder_is_refused(state):
-    from vla_attention.capture.policies.cosmos.vae import build_encoder
-
-    wrong = {name: tensor for name, tensor in state.items() if name != "decoder.head.2.bias"}
-    with pytest.raises(CheckpointMismatch, match=r"the image encoder; 1 missing: decoder\.head\.2\.bias"):
-        build_encoder(SMALL_VAE, wrong)

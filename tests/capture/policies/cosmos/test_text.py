@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import os
 import pickle
-import sys
 
 import pytest
 import torch
 
 from tests.kit.cosmos_helpers import INSTRUCTION
-from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
+from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint
 from vla_attention.capture.policies.cosmos.t5_pickle import TextEmbeddings, read_embeddings
 from vla_attention.capture.policies.cosmos.tensor_files import RefusedPickle, read_tensors
-from vla_attention.capture.policies.cosmos.text import PieceTokenizer, PrecomputedText, SeededText, T5Encoder
+from vla_attention.capture.policies.cosmos.text import PieceTokenizer, PrecomputedText
 from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
-from vla_attention.schemas.errors import BadArgument, MissingDependency, UnknownName
+from vla_attention.schemas.errors import UnknownName
 from vla_attention.schemas.groupings.words import words_of
 from vla_attention.schemas.layout import Role
 
@@ -57,7 +56,7 @@ def test_a_malicious_pickle_is_refused_and_nothing_is_executed(tmp_path):
     assert trace.exists()
 
 
-@pytest.mark.parametrize("name", ["builtins.eval", "torch.load", "torch._utils._rebuild_tensor", "os.system"])
+@pytest.mark.parametrize("name", ["builtins.eval", "os.system"])
 def test_nothing_but_tensors_is_looked_up(tmp_path, name):
     module, _, attribute = name.rpartition(".")
     (tmp_path / "text.pkl").write_bytes(b"c" + module.encode() + b"\n" + attribute.encode() + b"\n.")
@@ -76,34 +75,11 @@ def test_embeddings_are_read_as_saved(tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [
-        ([1], "but list"),
-        ({}, "but dict"),
-        ({"a": 1}, "entry for 'a' that is int"),
-        ({"a": torch.zeros(2, 3)}, r"entry for 'a' that is \(2, 3\)"),
-        ({"a": torch.zeros(1, 2, 3), "b": torch.zeros(1, 3, 3)}, "different shapes"),
-    ],
+    [([1], "but list"), ({"a": torch.zeros(2, 3)}, r"entry for 'a' that is \(2, 3\)")],
 )
 def test_what_is_no_table_of_embeddings_is_refused(tmp_path, content, message):
     with pytest.raises(UnreadableCheckpoint, match=message):
         read_embeddings(save(tmp_path / "text.pkl", content))
-
-
-def test_missing_and_damaged_files(tmp_path):
-    with pytest.raises(CheckpointNotFound, match="--t5-text-embeddings-path"):
-        read_embeddings(tmp_path / "no.pkl")
-    path = save(tmp_path / "text.pkl", {"a": made_up(2)})
-    path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(UnreadableCheckpoint, match="cannot be read as text embeddings"):
-        read_embeddings(path)
-    with pytest.raises(CheckpointNotFound):
-        read_tensors(tmp_path / "no.pt")
-    (tmp_path / "bad.pt").write_bytes(b"nothing")
-    with pytest.raises(UnreadableCheckpoint, match="damaged or no pickle"):
-        read_tensors(tmp_path / "bad.pt")
-    torch.save([1], tmp_path / "bad.pt")
-    with pytest.raises(UnreadableCheckpoint, match="holds no tensors by name, but list"):
-        read_tensors(tmp_path / "bad.pt")
 
 
 def test_wrapped_and_old_files_are_read(tmp_path):
@@ -142,14 +118,6 @@ def test_with_a_tokenizer_words_have_positions():
         PrecomputedText(table, tokenizer).encode("wrong")
 
 
-def test_an_empty_text_is_all_null():
-    table = TextEmbeddings("x", {INSTRUCTION: made_up(0)}, "")
-    for tokenizer in (None, PieceTokenizer(EMBEDDED_TOKENIZER)):
-        encoded = PrecomputedText(table, tokenizer).encode(INSTRUCTION)
-        assert (encoded.roles == Role.NULL).all()
-        assert encoded.prompt.pieces == ()
-
-
 def test_no_text_is_all_null_unless_the_file_has_an_embedding_of_it():
     embedding = made_up(2)
     without = PrecomputedText(TextEmbeddings("made up", {"open the drawer": embedding}, "0" * 64))
@@ -165,21 +133,6 @@ def test_zeros_between_real_positions_are_refused():
     holed[:, 2] = 0
     with pytest.raises(UnreadableCheckpoint, match="zero positions between real ones"):
         PrecomputedText(TextEmbeddings("x", {"a": holed}, "")).encode("a")
-
-
-def test_made_up_embeddings_depend_on_the_words():
-    text = SeededText(PieceTokenizer(EMBEDDED_TOKENIZER), 16, 4, seed=0)
-    one, two = text.encode(INSTRUCTION), text.encode(INSTRUCTION + "s")
-    assert torch.equal(one.embedding, text.encode(INSTRUCTION).embedding)
-    assert not torch.equal(one.embedding, two.embedding)
-    with pytest.raises(BadArgument, match="the policy has room for 16"):
-        text.encode(" ".join(["word"] * 40))
-
-
-def test_a_tokenizer_that_is_none(tmp_path):
-    (tmp_path / "spiece.model").write_bytes(b"nothing")
-    with pytest.raises(UnreadableCheckpoint, match="not a sentencepiece model"):
-        PieceTokenizer(tmp_path / "spiece.model")
 
 
 class StubEncoder:
@@ -209,15 +162,3 @@ def test_what_the_file_lacks_is_encoded_once_and_what_it_has_is_not():
     assert encoded.embedding[0, :, 0].ne(0).sum() == len(encoded.prompt.pieces) + 1
     with pytest.raises(UnreadableCheckpoint, match="--t5-tokenizer"):
         PrecomputedText(text.embeddings, None, encoder)
-
-
-def test_a_folder_without_t5_is_refused(tmp_path):
-    with pytest.raises(UnreadableCheckpoint, match="There is no T5 encoder at"):
-        T5Encoder(tmp_path)
-
-
-def test_the_encoder_library_is_optional(tmp_path, monkeypatch):
-    (tmp_path / "config.json").write_text("{}")
-    monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(MissingDependency, match="--t5-encoder needs the transformers library"):
-        T5Encoder(tmp_path).encode([5, 1], 8, 4)

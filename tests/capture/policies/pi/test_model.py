@@ -3,14 +3,13 @@
 import dataclasses
 
 import numpy as np
-import pytest
 import torch
 
-from tests.kit.pi_golden import read_manifest, read_manifest_dtypes
+from tests.kit.pi_golden import read_manifest_dtypes
 from tests.kit.policy_inputs import KeepAll
 from vla_attention.capture.policies.pi.config import find_config
 from vla_attention.capture.policies.pi.flow_time import denoise_times, embed_times
-from vla_attention.capture.policies.pi.model import PiModel, expected_shapes, model_from_state
+from vla_attention.capture.policies.pi.model import PiModel, model_from_state
 from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
 
 LIMIT = 5e-5
@@ -92,15 +91,6 @@ def test_recorder_is_told_which_queries_are_actions(golden_case):
         for j, step in enumerate(plan.denoise_steps):
             expected = everything[step, layer, 0][[5, 2]][:, config.first_action_query :]
             np.testing.assert_array_equal(got.rows[i, j], expected)
-
-
-@pytest.mark.parametrize(("name", "count"), [("pi05_libero", 812), ("pi0_libero", 777)])
-def test_full_size_names_and_shapes_are_those_of_openpi(name, count):
-    manifest = read_manifest(f"openpi_torch_{name}")
-    assert len(manifest) == count
-    shapes = {key: shape for key, shape in manifest.items() if key != _JUNK}
-    shapes[_TABLE] = shapes.pop(_TIED)
-    assert expected_shapes(find_config(name)) == shapes
 
 
 def test_bfloat16_placement_is_openpi_s():

@@ -1,7 +1,6 @@
 """openpi's PyTorch checkpoints: loading, and one sentence for each checkpoint that cannot be loaded."""
 
 import dataclasses
-import json
 import shutil
 
 import numpy as np
@@ -10,17 +9,16 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from tests.kit.jax_state import from_jax_flat
-from tests.kit.pi_golden import GOLDEN, load_case, read_manifest
+from tests.kit.pi_golden import GOLDEN, read_manifest
 from tests.kit.policy_inputs import KeepAll
-from vla_attention.capture.policies.checkpoints import CheckpointMismatch, CheckpointNotFound, UnreadableCheckpoint
-from vla_attention.capture.policies.pi.case import read_config
+from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint
 from vla_attention.capture.policies.pi.config import NAMED_CONFIGS, SiglipConfig, find_config, find_variant
 from vla_attention.capture.policies.pi.jax_weights import plan_leaves
 from vla_attention.capture.policies.pi.model import PiModel, expected_shapes
 from vla_attention.capture.policies.pi.openpi_torch import load_openpi_torch, model_names
 from vla_attention.capture.policies.pi.sizes import infer_config
 from vla_attention.capture.policies.weights import check_shapes
-from vla_attention.schemas.errors import BadArgument, UnknownName, UserError
+from vla_attention.schemas.errors import BadArgument, UserError
 
 STORED = GOLDEN / "pi05_batch2" / "checkpoint_openpi_torch"
 TABLE = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
@@ -55,18 +53,6 @@ def test_loaded_model_meets_the_reference(pi05_case):
     np.testing.assert_allclose(keep.stacked(), pi05_case.expected["attn"], rtol=0, atol=5e-5)
 
 
-def test_bfloat16_file_loads_in_either_precision(checkpoint, pi05_case):
-    def to_bfloat16(tensors):
-        for name in tensors:
-            tensors[name] = tensors[name].bfloat16()
-
-    rewrite(checkpoint, to_bfloat16)
-    for dtype in (torch.float32, torch.bfloat16):
-        model = load_openpi_torch(checkpoint, config=pi05_case.config, dtype=dtype)
-        assert model.action_in_proj.weight.dtype == torch.float32
-        assert model.state_dict()[TABLE].dtype == dtype
-
-
 def test_embed_tokens_wins_over_the_tied_name(checkpoint, pi05_case):
     def add_table(tensors):
         tensors[TABLE] = torch.full_like(tensors[TIED], 7.0)
@@ -87,12 +73,6 @@ def test_sizes_are_read_from_the_tensors(name):
     # Whether the prompt has the state is in no tensor.
     found = infer_config(expected_shapes(config), config_json)
     assert found == dataclasses.replace(config, discrete_state_input=False)
-
-
-def test_a_named_variant_of_other_sizes_is_refused():
-    config_json = {"action_dim": 32, "action_horizon": 10, "paligemma_variant": "gemma_300m"}
-    with pytest.raises(CheckpointMismatch, match="paligemma_variant 'gemma_300m'"):
-        infer_config(expected_shapes(find_config("pi05_libero")), config_json)
 
 
 #: The rows of gemma_2b's projections (8 query heads and one key head of 256) as other heads.
@@ -130,33 +110,6 @@ def test_more_key_heads_than_the_named_variant_has_are_noticed(heads, said):
         infer_config(expected_shapes(full_size(**heads)), {"action_dim": 32, "action_horizon": 10, **named})
 
 
-def test_a_model_configuration_states_heads_that_the_tensors_do_not(checkpoint, pi05_case, tmp_path):
-    """A checkpoint without a named variant loads with the key heads of the file, and with no others."""
-    sizes = json.loads((GOLDEN / "pi05_batch2" / "case.json").read_text())
-    for part in ("paligemma", "action_expert"):
-        sizes["config"][part] |= {"num_heads": sizes["config"][part]["num_heads"] * 2, "num_kv_heads": 2}
-        sizes["config"][part]["head_dim"] //= 2
-    path = tmp_path / "sizes.json"
-    path.write_text(json.dumps(sizes))
-    config = read_config(path)
-    assert config.paligemma.num_kv_heads == 2
-    halves = load_openpi_torch(checkpoint, config=config)
-    assert halves.config.paligemma == config.paligemma
-    whole = load_openpi_torch(checkpoint, config=pi05_case.config)
-    assert all(torch.equal(a, b) for a, b in zip(halves.parameters(), whole.parameters(), strict=True))
-
-
-def test_an_image_encoder_of_unknown_heads_needs_a_configuration():
-    with pytest.raises(CheckpointMismatch, match=r"32 wide.*explicit configuration"):
-        load_openpi_torch(STORED)
-
-
-def test_config_json_without_horizon_is_refused(checkpoint):
-    (checkpoint / "config.json").write_text(json.dumps({"action_dim": 32}))
-    with pytest.raises(CheckpointMismatch, match="'action_horizon' as a whole number, but has None"):
-        load_openpi_torch(checkpoint)
-
-
 def test_every_difference_is_listed_in_one_error(checkpoint, pi05_case):
     def damage(tensors):
         del tensors["time_mlp_out.bias"]
@@ -173,56 +126,13 @@ def test_every_difference_is_listed_in_one_error(checkpoint, pi05_case):
     assert isinstance(caught.value, (UserError, ValueError))
 
 
-def test_a_checkpoint_that_is_no_pi_model(checkpoint):
-    rewrite(checkpoint, lambda tensors: tensors.pop("time_mlp_in.weight"))
-    with pytest.raises(CheckpointMismatch, match="no pi model"):
-        load_openpi_torch(checkpoint)
-
-
-def test_missing_folder(tmp_path):
-    with pytest.raises(CheckpointNotFound, match="no checkpoint folder"):
-        load_openpi_torch(tmp_path / "nowhere")
-
-
-@pytest.mark.parametrize("kept", [0, 5, 2000, 0.5])
+@pytest.mark.parametrize("kept", [0.5])
 def test_truncated_safetensors(checkpoint, pi05_case, kept):
     file = checkpoint / "model.safetensors"
     content = file.read_bytes()
-    file.write_bytes(content[: int(len(content) * kept) if isinstance(kept, float) else kept])
+    file.write_bytes(content[: int(len(content) * kept)])
     with pytest.raises(UnreadableCheckpoint, match="damaged or its copy incomplete"):
         load_openpi_torch(checkpoint, config=pi05_case.config)
-
-
-@pytest.mark.parametrize("text", ["{", "[]", "\x00"])
-def test_damaged_config_json(checkpoint, text):
-    (checkpoint / "config.json").write_text(text)
-    with pytest.raises(UnreadableCheckpoint, match=r"config\.json"):
-        load_openpi_torch(checkpoint)
-
-
-def test_jax_leaves_are_checked_too(pi05_case):
-    leaves = dict(pi05_case.leaves)
-    leaves["PaliGemma/llm/layers/attn/q_einsum/lora_a"] = np.zeros((3, 8, 64, 4))
-    with pytest.raises(CheckpointMismatch, match=r"1 arrays.*q_einsum/lora_a"):
-        from_jax_flat(leaves, pi05_case.config)
-    leaves = dict(pi05_case.leaves)
-    del leaves["PaliGemma/llm/layers/mlp_1/gating_einsum"]
-    with pytest.raises(CheckpointMismatch, match="6 missing"):
-        from_jax_flat(leaves, pi05_case.config)
-
-
-def test_pi0_leaves_do_not_pass_for_pi05(pi05_case):
-    pi0 = load_case(GOLDEN / "pi0_batch2")
-    with pytest.raises(CheckpointMismatch, match=r"missing.*extra"):
-        from_jax_flat(pi0.leaves, pi05_case.config)
-
-
-def test_names_are_looked_up_with_help():
-    assert find_variant("gemma_300m").width == 1024
-    with pytest.raises(UnknownName, match=r"Unknown Gemma variant 'gema_2b'\. Did you mean 'gemma_2b'\?"):
-        find_variant("gema_2b")
-    with pytest.raises(UnknownName, match=r"Did you mean 'pi05_libero'\?"):
-        find_config("pi05libero")
 
 
 def test_sizes_that_do_not_fit_are_refused():
@@ -291,11 +201,3 @@ def test_pi0_fast_is_named(pi05_case):
     leaves = [path for path in pi05_case.leaves if "_1" not in path and "time" not in path and "action" not in path]
     with pytest.raises(CheckpointMismatch, match="pi0-FAST"):
         plan_leaves(leaves)
-
-
-def test_factors_that_fit_no_weight_are_refused(pi05_case):
-    leaves = dict(pi05_case.leaves)
-    base = "PaliGemma/llm/layers/attn/q_einsum/"
-    leaves[base + "lora_a"], leaves[base + "lora_b"] = np.zeros((3, 8, 64, 4)), np.zeros((3, 8, 4, 15))
-    with pytest.raises(CheckpointMismatch, match=r"q_einsum/w have shapes .* do not fit"):
-        from_jax_flat(leaves, pi05_case.config)

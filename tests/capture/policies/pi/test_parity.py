@@ -36,12 +36,6 @@ def edit(folder, file, change):
     np.savez(folder / file, **arrays)
 
 
-def edit_json(path, change):
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
-
-
 @pytest.mark.parametrize("name", CASES)
 def test_every_format_of_a_case_passes(name, capsys):
     code, out, _ = parity(capsys, GOLDEN / name, "--json")
@@ -57,6 +51,7 @@ def test_every_format_of_a_case_passes(name, capsys):
         assert table.max() == result["attention_max"]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["pi05_batch2", "pi05_full_layout", "pi0_batch2"])
 def test_all_reference_checkpoints_pass(name, capsys):
     folder = LARGE_GOLDEN / name
@@ -97,81 +92,9 @@ def test_spoiled_weights_fail(case, capsys):
     assert out.count("BEYOND THE LIMIT") == 2
 
 
-@pytest.mark.parametrize("masks", [[[True, False, True], [False, True, True]], [[False] * 3, [True] * 3]])
-def test_cases_with_other_masks_run(case, capsys, masks):
-    """There are no expected numbers for them; the test checks that they run and differ."""
-
-    def change(arrays):
-        for i, slot in enumerate(("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")):
-            arrays[f"image_mask_{slot}"] = np.array([mask[i] for mask in masks])
-
-    edit(case, "inputs.npz", change)
-    code, out, _ = parity(capsys, case, "--format", "openpi", "--json")
-    assert code == 1
-    assert json.loads(out)[0]["attention_max"] > 1e-3
-
-
-def test_bfloat16_cases_have_a_wider_limit(case, capsys):
-    edit_json(case / "case.json", lambda content: content.update(compute_dtype="bfloat16"))
-    code, out, _ = parity(capsys, case, "--format", "openpi", "--json")
-    result = json.loads(out)[0]
-    assert result["limit"] == 0.1
-    assert 1e-3 < result["attention_max"] < 0.1
-    assert code == (0 if result["actions_max"] < 0.1 else 1)
-
-
 def spoil(case, what):
     if what == "no case":
         (case / "case.json").unlink()
-    elif what == "no inputs":
-        (case / "inputs.npz").unlink()
+
     elif what == "damaged":
         (case / "expected.npz").write_bytes((case / "expected.npz").read_bytes()[:1000])
-    elif what == "array missing":
-        edit(case, "inputs.npz", lambda arrays: arrays.pop("noise"))
-    elif what == "shape":
-        edit(case, "inputs.npz", lambda arrays: arrays.update(noise=arrays["noise"][:, :5]))
-    elif what == "tokens":
-        edit(case, "inputs.npz", lambda arrays: arrays["tokenized_prompt"].__setitem__((0, 0), 300))
-    elif what == "sizes":
-        edit_json(case / "case.json", lambda content: content["config"].pop("siglip"))
-    elif what == "other sizes":
-        edit_json(case / "case.json", lambda content: content["config"]["action_expert"].update(mlp_dim=97))
-    elif what == "model":
-        edit_json(case / "case.json", lambda content: content.update(model="pi0_fast"))
-    elif what == "dtype":
-        edit_json(case / "case.json", lambda content: content.update(compute_dtype="float16"))
-    elif what == "no checkpoint":
-        for folder in FOLDERS:
-            shutil.rmtree(case / folder, ignore_errors=True)
-
-
-@pytest.mark.parametrize(
-    ("what", "arguments", "expected"),
-    [
-        ("no case", [], "it has no case.json, but checkpoint"),
-        ("no inputs", [], "inputs.npz', which a case needs"),
-        ("damaged", [], "cannot be read as arrays"),
-        ("array missing", [], "has no array 'noise'"),
-        ("shape", [], "has shape (2, 5, 32), but the sizes of case.json make it (2, 6, 32)"),
-        ("tokens", [], "token ids outside 0 to 299"),
-        ("sizes", [], "'siglip' is missing or wrong"),
-        ("other sizes", [], "9 of the wrong shape"),
-        ("model", [], "not 'pi0_fast'"),
-        ("dtype", [], "expected float32 or bfloat16"),
-        ("no checkpoint", [], "carries no checkpoint: it should have a folder of checkpoint, checkpoint_openpi_torch"),
-        ("", ["--format", "orbax"], "it carries openpi, lerobot"),
-        ("", ["--format", "orbex"], "Did you mean 'orbax'?"),
-        ("", ["--limit", "-1"], "expected a positive number"),
-    ],
-)
-def test_cases_that_cannot_be_used(case, capsys, what, arguments, expected):
-    spoil(case, what)
-    code, _, err = parity(capsys, case, *arguments)
-    assert code == 2
-    assert expected in err
-    assert "\n" not in err
-
-
-def test_no_folder(capsys, tmp_path):
-    assert parity(capsys, tmp_path / "none")[0] == 2

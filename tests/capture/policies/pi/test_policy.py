@@ -9,12 +9,10 @@ import torch
 from safetensors.torch import save_file
 
 from tests.kit.pi_golden import GOLDEN
-from tests.kit.policy_inputs import assert_same_input, make_observation
+from tests.kit.policy_inputs import assert_same_input
 from tests.kit.thorough import thorough_except
-from vla_attention.capture.environments.base import Observation
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound
 from vla_attention.capture.policies.identity import PolicySource
-from vla_attention.capture.policies.noise import initial_noise
 from vla_attention.capture.policies.pi.config import find_config
 from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, build_random_model, builtin_stats
 from vla_attention.capture.policies.pi.loading import load_pi_policy
@@ -22,21 +20,13 @@ from vla_attention.capture.policies.pi.policy import PiPolicy, site_layout
 from vla_attention.capture.policies.pi.preprocess import model_image
 from vla_attention.capture.policies.pi.processing import OpenpiProcessing
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, check_vocabulary
-from vla_attention.capture.policies.policy import Policy
 from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.capture.policies.weights import weights_digest
 from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
-from vla_attention.schemas.errors import BadArgument, UnknownName
-from vla_attention.schemas.jsonable import from_json, to_json
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import Role
-from vla_attention.schemas.stores.store_format import PolicyIdentity
 
 INSTRUCTION = "put the black bowl on the plate"
-
-
-def typed(policy: PiPolicy) -> Policy:
-    """For the type checker: the class fulfils the protocol."""
-    return policy
 
 
 def plan_of(policy, queries="mean"):
@@ -165,41 +155,11 @@ def test_recording_does_not_change_a_bit_of_the_actions(policy, observation):
     assert np.isfinite(plain).all()
 
 
-def test_actions_depend_on_seed_picture_and_words_only(policy, observation):
-    base = policy.act(policy.prepare(observation, INSTRUCTION), 0)
-    np.testing.assert_array_equal(policy.act(policy.prepare(observation, INSTRUCTION), 0), base)
-    assert (policy.act(policy.prepare(observation, INSTRUCTION), 1) != base).any()
-    assert (policy.act(policy.prepare(observation, "turn on the stove"), 0) != base).any()
-    assert (policy.act(policy.prepare(make_observation(5), INSTRUCTION), 0) != base).any()
-
-
 def test_relative_actions_move_with_the_state(dummy_pi0, observation):
     given = dummy_pi0.prepare(observation, INSTRUCTION)
     moved = dataclasses.replace(given, state=given.state + 1.0)  # the model still sees the old state
     difference = dummy_pi0.act(moved, 0) - dummy_pi0.act(given, 0)
     np.testing.assert_allclose(difference, np.tile([1, 1, 1, 1, 1, 1, 0], (4, 1)), atol=1e-9)
-
-
-def test_noise_does_not_depend_on_torch():
-    noise = initial_noise(3, (1, 2, 3))
-    assert noise.dtype == np.float32
-    torch.manual_seed(99)
-    np.testing.assert_array_equal(noise, initial_noise(3, (1, 2, 3)))
-
-
-def test_denoise_times_start_at_noise(policy):
-    times = policy.denoise_times()
-    assert times.shape == (policy.num_denoise_steps,)
-    assert times[0] == 1
-    assert (np.diff(times) < 0).all()
-
-
-def test_identity_survives_json_and_names_the_weights(policy):
-    identity = policy.identity()
-    assert from_json(PolicyIdentity, json.loads(json.dumps(to_json(identity)))) == identity
-    assert identity.digest == weights_digest(policy.model)
-    assert identity.untrained is True
-    assert identity.config["dtype"] == "float32"
 
 
 def test_digest_sees_a_single_changed_weight_and_handles_bfloat16():
@@ -208,21 +168,6 @@ def test_digest_sees_a_single_changed_weight_and_handles_bfloat16():
     one.action_in_proj.weight[0, 0] += 1e-6
     assert weights_digest(one) != before
     assert len(weights_digest(one.bfloat16())) == 64
-
-
-def test_a_missing_camera_is_named(dummy, observation):
-    blind = Observation({"agentvew": observation.images["agentview"]}, *[getattr(observation, n) for n in STATE_NAMES])
-    with pytest.raises(UnknownName, match=r"environment camera 'agentview'\. Did you mean 'agentvew'"):
-        dummy.prepare(blind, INSTRUCTION)
-
-
-STATE_NAMES = ("eef_pos", "eef_quat", "gripper_qpos")
-
-
-def test_a_tokenizer_larger_than_the_table_is_refused(dummy):
-    small = build_random_model(dataclasses.replace(DUMMY_CONFIG, vocab_size=300), 0)
-    with pytest.raises(BadArgument, match="another model's tokenizer"):
-        PiPolicy(small, dummy.tokenizer, dummy.processing, dummy.source)
 
 
 def test_a_tokenizer_of_another_full_size_model_is_refused(dummy):
@@ -252,11 +197,6 @@ def test_a_cut_prompt_is_reported_once_and_stays_visible(dummy, observation, cap
     assert given.prompt.pieces[-1].stop < len(given.prompt.text)
     assert policy.identity().config["long_prompts"] == "cut"
     assert np.isfinite(policy.act(given, 0)).all()
-
-
-def test_default_number_of_executed_actions(dummy, embedded):
-    assert dummy.default_replan_steps == dummy.action_horizon == 4
-    assert embedded.default_replan_steps == 5
 
 
 def test_policy_from_a_checkpoint_folder(tmp_path, observation):

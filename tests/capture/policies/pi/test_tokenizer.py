@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from tests.kit.pi_golden import GOLDEN
-from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, clean_instruction
 from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.schemas.errors import BadArgument
@@ -149,24 +148,7 @@ def test_a_prompt_that_does_not_fit_is_refused_not_cut(tokenizer):
         tokenizer.tokenize("open the door", max_token_len=fits - 1)
 
 
-@pytest.mark.parametrize("instruction", ["", "   ", "\n", "__"])
+@pytest.mark.parametrize("instruction", ["", "__"])
 def test_an_empty_instruction_is_refused(tokenizer, instruction):
     with pytest.raises(BadArgument, match="is empty"):
         tokenizer.tokenize(instruction, max_token_len=48)
-
-
-def test_missing_and_damaged_files(tmp_path):
-    with pytest.raises(CheckpointNotFound, match=r"no tokenizer file.*paligemma_tokenizer\.model"):
-        PromptTokenizer(tmp_path / "tokenizer.model")
-    for content in (b"", b"not a model", EMBEDDED_TOKENIZER.read_bytes()[:3000]):
-        (tmp_path / "tokenizer.model").write_bytes(content)
-        with pytest.raises(UnreadableCheckpoint, match="not a sentencepiece model"):
-            PromptTokenizer(tmp_path / "tokenizer.model")
-
-
-def test_embedded_tokenizer_is_like_paligemma_s(tokenizer, processor):
-    assert (processor.pad_id(), processor.eos_id(), processor.bos_id(), processor.unk_id()) == (0, 1, 2, 3)
-    assert 512 <= tokenizer.vocab_size <= 1024
-    assert processor.encode("138", out_type=str) == ["1", "3", "8"]
-    assert processor.encode("\n") == [processor.piece_to_id("\n")]
-    assert len(tokenizer.digest) == 64
