@@ -11,19 +11,10 @@ from tests.kit.lazy_imports import HEAVY, help_without_libraries
 from vla_attention.analyze.commands import COMMANDS
 
 
-@pytest.mark.parametrize(
-    ("module", "words"),
-    [
-        ("vla_attention.analyze.parse.command", ["--help"]),
-        ("vla_attention.analyze", ["--help"]),
-        *(("vla_attention.analyze", [command, "--help"]) for command in COMMANDS),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else value,
-)
-def test_help_imports_no_library(module, words):
-    printed = help_without_libraries(module, words)
-    assert printed.startswith("usage:")
-    assert "examples:" in printed
+@pytest.mark.thorough
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_imports_no_library(command):
+    assert help_without_libraries("vla_attention.analyze", [command, "--help"]).startswith("usage:")
 
 
 def test_importing_the_package_imports_no_library():
