@@ -76,7 +76,7 @@ WORKERS = "vla_attention.analyze.stores.worker_processes"
     ("moment", "words"),
     [
         (at_import("numpy"), []),
-        (after_call(WORKERS, "WorkerProcesses", "_submit"), ["--workers", "2"]),
+        pytest.param(after_call(WORKERS, "WorkerProcesses", "_submit"), ["--workers", "2"], marks=pytest.mark.thorough),
         (after_call("os", "", "replace"), ["--no-plots"]),
     ],
     ids=["numpy", "workers", "first file"],
@@ -104,7 +104,7 @@ STOPPED = "complete episodes are kept, continue with --resume."
 @pytest.mark.parametrize(
     ("moment", "times"),
     [
-        (at_import("torch.nn"), 2),
+        pytest.param(at_import("torch.nn"), 2, marks=pytest.mark.thorough),
         (after_call("vla_attention.capture.machine.device", "", "load_torch"), 1),
     ],
     ids=["twice", "loading"],
