@@ -1,4 +1,4 @@
-"""`--help` waits for no library: what it imports is looked at, no time is measured."""
+"""Neither `--help` nor an import waits for a library: what is imported is looked at, no time is measured."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stores that come along are whole, small, and what `scripts/make_example_stores.py` says."""
+"""The stores that come along are whole and small, and differ in what they should."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Workflows, templates, citation and paper: they parse, and name what exists."""
+"""Workflows and citation: they parse, and name what exists."""
 
 from __future__ import annotations
 

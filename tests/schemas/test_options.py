@@ -1,4 +1,4 @@
-"""Options of both command lines: former and published names, ranges, tasks by their words."""
+"""Options of both command lines: published names, ranges, tasks by their words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The number of threads from faked machines, and that it is in place before a library reads it."""
+"""The number of threads from faked machines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`scripts/site_hooks.py`: links between docs/ and the rest of the checkout, and what is put in at build time."""
+"""`scripts/site_hooks.py`: links between docs/ and the rest of the checkout, and the help texts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The shipped kit: what it says a store holds is what any reader finds, and it imports neither torch nor hypothesis."""
+"""The shipped kit: what it says a store holds is what plain Zarr finds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Entropy, effective keys and top-k mass: random stores and groupings against scipy and sorting, and known rows."""
+"""Entropy and effective keys of known rows."""
 
 from __future__ import annotations
 

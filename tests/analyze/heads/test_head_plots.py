@@ -1,4 +1,4 @@
-"""Head grid, layers over time, profiles of layers and of steps: drawn for all kinds of data, from the right numbers."""
+"""Head grid, layers over time, profiles of layers and of steps: drawn for all kinds of data."""
 
 from __future__ import annotations
 

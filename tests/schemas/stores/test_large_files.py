@@ -1,4 +1,4 @@
-"""Large files are never in memory whole where a part would do: in `verify`, `copy`, packing and merging."""
+"""Large files that are read in parts: a damage in any part is found."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stores at an address: only what a question needs is sent, once, and what a server sends wrongly is never a number."""
+"""Stores at an address: what a server sends wrongly is never a number."""
 
 from __future__ import annotations
 
