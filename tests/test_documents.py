@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 import shlex
-import subprocess
-import sys
 from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import find_spec
@@ -14,12 +12,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-import vla_attention as va
 from scripts.site_hooks import OUTSIDE
 from vla_attention.__main__ import COMMANDS as PROGRAM_COMMANDS
 from vla_attention.analyze.commands import COMMANDS, DEFAULT_COMMAND
 from vla_attention.capture.commands.arguments import build_parser
-from vla_attention.capture.policies.families import policy_families
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [path for path in (*ROOT.glob("*.md"), *sorted((ROOT / "docs").rglob("*.md"))) if path.is_file()]
@@ -76,15 +72,6 @@ def test_make_targets_exist(document):
             assert target in targets, target
 
 
-def test_the_guides_name_every_command_and_family():
-    commands = text_of(ROOT / "docs" / "commands.md")
-    for command in COMMANDS:
-        assert re.search(rf"^\| .*`{command}( A B)?`", commands, re.MULTILINE), command
-    for family in policy_families():
-        assert f"`vla-attention capture {family.name}`" in commands, family.name
-        assert f"`vla-attention capture {family.name}`" in text_of(ROOT / "docs" / "policies.md"), family.name
-
-
 def command_lines(document: Path) -> Iterator[list[str]]:
     """The words of every line of a shell block that calls one of the programs.
 
@@ -128,50 +115,3 @@ def test_the_site_has_every_page_once():
     listed = list(pages(yaml.safe_load(text_of(ROOT / "mkdocs.yml"))["nav"]))
     written = [path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")]
     assert sorted(listed) == sorted([*written, *(page for page in OUTSIDE.values() if page.endswith(".md"))])
-
-
-def test_the_reference_shows_every_public_name():
-    """`va.record` is shown under the module that defines it."""
-    shown = re.findall(r"^<!-- docstring: (\S+) -->$", text_of(ROOT / "docs" / "api.md"), re.MULTILINE)
-    assert all(exists(name) for name in shown)
-    names = {name.rpartition(".")[2] for name in shown}
-    assert {*dir(va), *va.layouts.__all__} - names == {"__version__", "datasets", "layouts"}
-
-
-def test_the_readme_is_short_and_shows_pictures():
-    readme = text_of(ROOT / "README.md")
-    assert len(readme.splitlines()) <= 130
-    assert readme.index("docs/pictures/overlay.png") < readme.index("## ")
-
-
-@pytest.mark.parametrize("document", DOCUMENTS, ids=page_name)
-def test_pictures_have_a_text_and_are_small(document):
-    for text, target in re.findall(r"!\[(.*?)\]\((.*?)\)", text_of(document)):
-        assert len(text) > 15, target
-        assert (document.parent / target).stat().st_size < 300_000, target
-
-
-def test_samples_are_found_and_cut_as_their_comments_say(tmp_path):
-    page = tmp_path / "a.md"
-    comment = "<!-- sample: vla-attention heads --help :: 1 3-4 -->\n\n```\nold\n```\n"
-    page.write_text(f"before\n\n{comment}after\n")
-    program = [sys.executable, ROOT / "docs" / "make_samples.py", page]
-    assert subprocess.run(program, check=True, capture_output=True, text=True).stdout == f"{page}: 1 samples\n"
-    lines = page.read_text().split("\n")
-    assert (lines[0], lines[2], lines[-3:]) == ("before", comment.split("\n")[0], ["```", "after", ""])
-    assert lines[6] == "..."
-    assert len(lines[5:-3]) == 4
-    page.write_text(page.read_text().replace("--help", "--lost"))
-    assert subprocess.run(program, check=False, capture_output=True).returncode == 2
-
-
-def test_every_sample_is_of_this_programs_commands():
-    found = [
-        found for page in DOCUMENTS for found in re.findall(r"^<!-- sample: (.*) -->$", text_of(page), re.MULTILINE)
-    ]
-    assert found
-    for line in found:
-        assert all(
-            command.split()[0] in ("vla-analyze", "vla-capture", "vla-attention")
-            for command in line.split(" :: ")[0].split(" && ")
-        )

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.thorough
+
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted((ROOT / "docs" / "errors").glob("*.md"))
 #: What a value in a text of the sources becomes; no text has it.
@@ -61,15 +63,3 @@ def test_every_quoted_sentence_is_in_the_sources(page):
     for quote in found:
         assert len(quote.replace("…", "").strip()) >= FEWEST_CHARACTERS, quote
         assert is_printed(quote), quote
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_every_sentence_has_its_reason_and_what_to_do(page):
-    for section in page.read_text(encoding="utf-8").split("\n## ")[1:]:
-        assert re.findall(r"^(?:> |\*\*(.*?)\*\*)", section, re.MULTILINE) == ["", "Why.", "What to do."], section
-
-
-def test_a_sentence_that_nobody_prints_is_found():
-    assert is_printed("There is no checkpoint folder at '…'.")
-    assert not is_printed("There is no checkpoint folder near '…'.")
-    assert not is_printed("checkpoint folder at … There is no")

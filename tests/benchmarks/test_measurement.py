@@ -8,7 +8,7 @@ from itertools import count
 
 import pytest
 
-from benchmarks.measurement import Table, in_turn, measured, ratios, read_rows, run_process, take_turns, write_rows
+from benchmarks.measurement import Table, in_turn, measured, ratios, run_process, take_turns, write_rows
 
 
 def test_every_round_calls_all_and_every_second_one_backwards():
@@ -28,20 +28,6 @@ def test_seconds_are_the_mean_of_the_repeats():
 def test_median_and_range_of_ratios_of_the_same_round():
     value = measured(ratios([2.0, 6.0, 3.0], [1.0, 2.0, 3.0]), factor=10)
     assert (value.median, value.lowest, value.highest, value.times) == (20, 10, 30, 3)
-
-
-def test_tables_of_another_run_stay_in_the_file(tmp_path):
-    columns = {"what": "what", "s": "seconds"}
-    write_rows("x", {"one": Table(columns, [{"what": "a", "s": measured([1.0])}])}, command="first", folder=tmp_path)
-    path = write_rows(
-        "x", {"two": Table(columns, [{"what": "b", "s": 2}], "A note.")}, command="second", folder=tmp_path
-    )
-    tables = read_rows(path)
-    assert [(name, table["command"]) for name, table in tables.items()] == [("one", "first"), ("two", "second")]
-    assert tables["one"]["rows"][0]["s"] == {"median": 1.0, "lowest": 1.0, "highest": 1.0, "times": 1}
-    assert tables["two"]["note"] == "A note."
-    assert {"processor", "cores", "memory_gb", "threads", "load"} <= set(tables["one"]["machine"])
-    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_rows_that_are_no_numbers_are_refused_and_the_file_stays(tmp_path):

@@ -6,12 +6,9 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import pytest
-
-from tests.kit.viewer import served
 
 #: Debian's; playwright brings one of its own only where it is asked to download it.
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -81,18 +78,6 @@ def watched_page(browser: Any, width: int = 1280, height: int = 900, **options: 
         yield watched
     finally:
         context.close()
-
-
-@contextmanager
-def shown_page(*stores: Path, query: str = "", **options: Any) -> Iterator[Any]:
-    """The page of stores, drawn, in a browser of its own. At the end a test fails on what it complained of.
-
-    `query`: of the page's link, with its question mark. `options`: of playwright's `new_context`.
-    """
-    with served(*stores) as server, chromium() as browser, watched_page(browser, 1300, 1400, **options) as watched:
-        watched.open(f"{server.link}{query}")
-        yield watched.page
-        assert not watched.complaints, watched.complaints
 
 
 def wait_until_ready(page: Any) -> None:

@@ -4,32 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from importlib.metadata import version
 
 import pytest
 
-from tests.kit.lazy_imports import help_without_libraries
-from vla_attention.__main__ import COMMANDS, main
+from vla_attention.__main__ import main
 from vla_attention.example_stores import CUBES
-
-
-@pytest.mark.parametrize(
-    "words", [[], ["--help"], ["analyze", "--help"], ["capture", "--help"], ["completion", "--help"]]
-)
-def test_help_imports_no_library(words):
-    assert help_without_libraries("vla_attention", words).startswith("usage:")
-
-
-def test_without_arguments_it_lists_every_command(capsys):
-    assert main([]) == 0
-    printed = capsys.readouterr().out
-    for command in COMMANDS:
-        assert f"\n  {command} " in printed
-
-
-def test_the_version_is_the_package_s(capsys):
-    assert main(["--version"]) == 0
-    assert capsys.readouterr().out == f"vla-attention {version('vla-attention')}\n"
 
 
 def test_analyze_is_vla_analyze(capsys):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from vla_attention.__main__ import main
-from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.testing.stores import write_store
 
 
@@ -35,10 +34,6 @@ def test_the_sentence_says_what_to_type(capsys, words, sentence):
     assert sentence in said(capsys, *words)
 
 
-def test_a_folder_of_stores_is_listed(store, capsys):
-    assert "The folder holds the stores a.zarr: name one, or several." in said(capsys, "analyze", store.parent)
-
-
 def test_the_store_may_stand_first(store, tmp_path, capsys):
     words = ["--no-plots", "--output", tmp_path]
     turned = said(capsys, store, "words", *words, code=0)
@@ -61,33 +56,3 @@ def test_a_ratio_may_name_a_default_group_beside_ones_own(store, tmp_path, capsy
         said(capsys, "analyze", store, "--ratio", "visual/bowl", *words, code=0).split()
     )
     assert "nouns" in said(capsys, "analyze", store, "--ratio", "visual/nouns", *words)
-
-
-def test_the_program_that_was_called_is_named(store, capsys):
-    assert said(capsys, "words", store, "--layers", 99).startswith("vla-attention words: ")
-    assert said(capsys, "analyze", store, "--layers", 99).startswith("vla-attention analyze: ")
-    assert analyze(["words", str(store), "--layers", "99"]) == 2
-    assert capsys.readouterr().err.startswith("vla-analyze words: ")
-
-
-@pytest.mark.parametrize(
-    "command", ["analyze", "words", "objects", "time", "compare", "view", "copy", "verify", "cache"]
-)
-def test_a_help_fits_a_screen_and_help_all_has_every_option(capsys, command):
-    with pytest.raises(SystemExit):
-        main([command, "--help"])
-    short = capsys.readouterr().out
-    with pytest.raises(SystemExit):
-        main([command, "--help-all"])
-    whole = capsys.readouterr().out
-    assert short.count("\n") <= 30
-    assert "--threads" in whole
-    assert all(len(line) <= 120 for line in short.splitlines())
-
-
-def test_the_programs_help_has_every_command_in_some_thirty_lines(capsys):
-    from vla_attention.analyze.commands import COMMANDS
-
-    shown = said(capsys, "help", code=0)
-    assert shown.count("\n") <= 32
-    assert all(f"  {name} " in shown for name in COMMANDS if name != "ratios")

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.thorough
+
 pytest.importorskip("mypy", reason="a part of the extra dev")
 
 ROOT = Path(__file__).parents[2]

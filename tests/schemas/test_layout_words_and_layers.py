@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.words import find_phrase, split_words, words_of
 from vla_attention.schemas.layers import select_layers
 from vla_attention.schemas.layout import PatchGrid, Piece, Prompt, Role, SiteLayout, Span, find_role
@@ -99,14 +99,6 @@ def test_layer_numbers_of_the_published_scripts():
         select_layers([28], 28, "cosmos")
 
 
-def test_half_a_name_and_a_near_name_are_recognised():
-    assert did_you_mean("base", ["wrist", "base_0_rgb"]) == " Did you mean 'base_0_rgb'?"
-    assert did_you_mean("LIBERO_10", ["libero_10"]) == " Did you mean 'libero_10'?"
-    assert did_you_mean("zzz", ["libero_10"]) == ""
-    assert listing(range(5), limit=3) == "0, 1, 2 and 2 more"
-    assert listing([]) == "none"
-
-
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
@@ -121,13 +113,6 @@ def test_half_a_name_and_a_near_name_are_recognised():
 def test_a_site_has_a_name_of_its_own_and_numbers_that_can_be(changes, said):
     with pytest.raises(BadArgument, match=said):
         SiteLayout(**{"name": "even", "spans": (span("a", 0, 2),), **changes})
-
-
-def test_only_growing_spans_have_an_offset():
-    assert span("a", 0, 2, growing=True, growing_offset=1).growing_offset == 1
-    for more in ({"growing_offset": 1}, {"growing": True, "growing_offset": -1}):
-        with pytest.raises(BadArgument, match="growing offset"):
-            span("a", 0, 2, **more)
 
 
 def test_what_is_recorded_of_a_site():

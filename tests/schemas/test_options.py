@@ -1,4 +1,4 @@
-"""Options of both command lines: former and published names, ranges, tasks by their words."""
+"""Options of both command lines: published names, ranges, tasks by their words."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import warnings
 import pytest
 
 from vla_attention.schemas.errors import BadArgument, Note, UnknownName
-from vla_attention.schemas.former_commands import as_of_today
 from vla_attention.schemas.layers import select_layers
 from vla_attention.schemas.options import Numbers, add_capture_output, add_option, add_task, number_range, resolve_tasks
 
@@ -24,15 +23,6 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def test_former_names_do_the_same_and_say_the_new_one():
-    with pytest.warns(Note, match=r"^--tasks is called --task now\.$"):
-        assert parser().parse_args(["--tasks", "3"]).task_id == [3]
-    with pytest.warns(Note, match=r"^--denoise-steps is called --denoise now\.$"):
-        assert parser().parse_args(["--denoise-steps", "first", "9"]).denoise == ["first", "9"]
-    with pytest.warns(Note, match=r"^--store is called --output now\.$"):
-        assert str(parser().parse_args(["--store", "a"]).store) == "a"
-
-
 def test_published_names_are_silent_and_no_help_shows_either():
     with warnings.catch_warnings():
         warnings.simplefilter("error", Note)
@@ -42,11 +32,6 @@ def test_published_names_are_silent_and_no_help_shows_either():
     assert "--task " in shown
     for name in ("--task-id", "--tasks", "--denoise-steps", "--store", "--output-dir"):
         assert name not in shown
-
-
-def test_nothing_given_is_nothing():
-    given = parser().parse_args([])
-    assert (given.task_id, given.denoise, given.layers, given.store, given.output_dir) == (None,) * 5
 
 
 def test_an_output_is_a_store_or_a_folder():
@@ -78,23 +63,3 @@ def test_tasks_are_chosen_by_number_or_by_their_words():
         assert resolve_tasks(["lift the red cube"], INSTRUCTIONS, "the suite") == (0, 4)
     with pytest.raises(UnknownName, match="Did you mean 'lift the green cube'"):
         resolve_tasks(["lift the gren cube"], INSTRUCTIONS, "the suite")
-
-
-@pytest.mark.parametrize(
-    ("given", "today"),
-    [
-        (["merge", "a", "b", "-o", "c"], ["copy", "a", "b", "-o", "c"]),
-        (["repair", "a"], ["verify", "--repair", "--quick", "a"]),
-        (["repair", "a", "--verify", "--dry-run"], ["verify", "--repair", "a", "--dry-run"]),
-    ],
-)
-def test_former_commands_are_parts_of_others(given, today):
-    with pytest.warns(Note, match="is called"):
-        assert as_of_today(given) == today
-
-
-def test_other_words_stay_as_they_are():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", Note)
-        assert as_of_today(["verify", "repair"]) == ["verify", "repair"]
-        assert as_of_today([]) == []

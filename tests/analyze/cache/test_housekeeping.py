@@ -1,4 +1,4 @@
-"""The size of the cache: bounded, shown, removed when asked; and the commands that use it."""
+"""The size of the cache: bounded, and what a killed process left is removed."""
 
 from __future__ import annotations
 

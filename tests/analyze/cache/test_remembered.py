@@ -160,7 +160,6 @@ def test_masses_without_some_keys_are_kept_apart(cache, originals, measured):
 FAST = (
     "files of joint/atoms exchanged",
     "joint/rows exchanged",
-    "seals and attributes exchanged",
     "an episode copied under another name",
     "the root of another run",
 )

@@ -1,4 +1,4 @@
-"""Recorded effects of two runs side by side: a planted difference in one word, and runs without effects."""
+"""Recorded effects of two runs side by side: the differences of the two commands, and a planted word."""
 
 from __future__ import annotations
 

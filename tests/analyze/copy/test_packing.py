@@ -1,4 +1,4 @@
-"""Packed stores: commands give what they give of the folder, other readers open a zip, copies go on."""
+"""Packed stores: the same numbers, the captured store again, copies that go on."""
 
 from __future__ import annotations
 

@@ -61,6 +61,7 @@ def test_replans_dimensions_and_phases_are_those_of_the_raw_arrays(store):
     np.testing.assert_allclose(thirds["chunk"].to_numpy(), expected["chunk"].to_numpy())
 
 
+@pytest.mark.thorough
 def test_a_policy_of_the_mean_action_is_one_spread_away(tmp_path):
     path = write_site_store(tmp_path / "a.zarr", dataset_actions=1.0, episodes=8)
     study = study_deviation(question_about(path))

@@ -1,4 +1,4 @@
-"""What a condition is about, and which others are its control and its reverse."""
+"""What a condition is about, and which other is its reverse."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recorded effects with planted sizes: means by hand, who reads an item, floors, and what the first lines say."""
+"""Recorded effects with planted sizes: means by hand, who reads an item, and floors."""
 
 from __future__ import annotations
 

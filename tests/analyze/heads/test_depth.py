@@ -1,4 +1,4 @@
-"""Depth, layers over time, denoise steps: planted centres, centres of contributions, parts of an episode's time."""
+"""Parts of an episode's time, and denoise steps."""
 
 from __future__ import annotations
 

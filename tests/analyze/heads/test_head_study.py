@@ -1,4 +1,4 @@
-"""Heads, layers, denoise steps, rows and sinks of random stores against independent arithmetic on raw Zarr arrays."""
+"""Heads and sinks of random and planted stores against independent arithmetic on raw Zarr arrays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Entropy, top-k mass, sinks' counts, dispersion and depth on arrays, against scipy and plain loops."""
+"""Sinks' counts on arrays, against a loop."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The control for attention that is fixed to a place: loops over raw arrays, null stores, followers, still objects."""
+"""The control for attention that is fixed to a place: null stores and followers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The summary's sections on contribution norms: a line per layer, intervals, and a note on groups without a norm."""
+"""A block that is named twice counts once in the average of contributions over layers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report without a browser: well-formed, self-contained, escaped, small, and with the numbers of the tables."""
+"""The report without a browser: well-formed, self-contained, escaped, and with the numbers of the tables."""
 
 from __future__ import annotations
 

@@ -195,7 +195,7 @@ def test_a_small_task_beside_large_ones_does_not_narrow_the_interval(sizes):
 
 @pytest.mark.parametrize(
     ("sizes", "between", "within"),
-    [([5] * 10, 0.3, 0.6), ([5] * 5, 0.3, 0.25), ([5] * 10, 0.0, 0.25), ([2, 3, 5, 10, 30], 0.3, 0.6), ([6], 0.0, 0.6)],
+    [([5] * 5, 0.3, 0.25), ([2, 3, 5, 10, 30], 0.3, 0.6), ([6], 0.0, 0.6)],
 )
 def test_ninety_five_per_cent_cover_ninety_five_per_cent(sizes, between, within):
     """The geometric mean of log-normal ratios with a known truth; two standard errors of 1500 stores are 1.1 %."""

@@ -93,9 +93,7 @@ def all_bytes(store: Path) -> dict[str, bytes]:
 
 
 FAST = (
-    "files of joint/atoms exchanged",
     "files of joint/rows exchanged",
-    "index of rows: layers exchanged",
     "chunks of rows: other bits of the same crc32c",
     "an episode copied under another name",
 )

@@ -1,4 +1,4 @@
-"""Rows as the analysis gets them: against the raw arrays and row sums, whole, no more bytes than are needed."""
+"""Rows as the analysis gets them: against the raw arrays and row sums, whole."""
 
 import re
 import warnings

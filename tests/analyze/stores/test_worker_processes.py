@@ -115,9 +115,8 @@ def test_the_command_line_takes_a_number_of_workers(store, tmp_path, capsys):
         assert (tmp_path / "a" / file).read_bytes().replace(OWN, OTHERS) == (tmp_path / "b" / file).read_bytes(), file
 
 
-@pytest.mark.parametrize("number", ["0", "-2"])
-def test_no_workers_are_refused(store, tmp_path, capsys, number):
-    assert main([str(store), "--no-plots", "--output", str(tmp_path), "--workers", number]) == 2
-    assert f"Cannot use --workers {number}; expected at least 1." in capsys.readouterr().err
-    with pytest.raises(BadArgument), workers(int(number)):
+def test_no_workers_are_refused(store, tmp_path, capsys):
+    assert main([str(store), "--no-plots", "--output", str(tmp_path), "--workers", "0"]) == 2
+    assert "Cannot use --workers 0; expected at least 1." in capsys.readouterr().err
+    with pytest.raises(BadArgument), workers(0):
         pass

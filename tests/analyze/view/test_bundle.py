@@ -1,4 +1,4 @@
-"""The viewer's page as it ships: it is what its sources build, it is small, and it names no other place."""
+"""The page as it ships: it is what its sources build, and it names no other place."""
 
 from __future__ import annotations
 

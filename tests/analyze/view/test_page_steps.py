@@ -1,4 +1,4 @@
-"""What the page says of an episode's steps: what was touched first, whose goal was reached. Wrong ones: a sentence."""
+"""What the page says of an episode's steps: what was touched first, whose goal was reached."""
 
 from __future__ import annotations
 

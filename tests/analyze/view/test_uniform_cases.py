@@ -1,4 +1,4 @@
-"""The page's baselines are those of the table that Python is tested with, in stores of version 2 and of version 1."""
+"""The page's baselines are those of the table that Python is tested with."""
 
 from __future__ import annotations
 

@@ -117,6 +117,7 @@ def test_a_site_publishes_nothing_but_the_store(store, tmp_path, capsys, name):
     assert not (tmp_path / "site").exists()
 
 
+@pytest.mark.thorough
 def test_what_an_upload_takes_along(store, tmp_path, capsys):
     """Of a second site in the same place, too: the links of the first are gone, and others are refused."""
     other = write_store(tmp_path / "b.zarr", spec=SPEC, suite="other")
@@ -154,7 +155,8 @@ def test_what_is_no_store_is_refused_with_a_sentence(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("signal", "code", "word"), [("SIGINT", 130, "stopped"), ("SIGTERM", 143, "stopped by SIGTERM")]
+    ("signal", "code", "word"),
+    [("SIGINT", 130, "stopped"), pytest.param("SIGTERM", 143, "stopped by SIGTERM", marks=pytest.mark.thorough)],
 )
 def test_it_ends_with_one_sentence(store, signal, code, word, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

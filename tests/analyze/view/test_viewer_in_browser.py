@@ -1,4 +1,4 @@
-"""The viewer in a real headless Chromium: numbers are Python's, controls and links work, nothing else is asked for."""
+"""The page in a real headless Chromium: a walk with Python's numbers, hostile texts, damage, a site."""
 
 from __future__ import annotations
 

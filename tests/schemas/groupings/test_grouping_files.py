@@ -10,7 +10,6 @@ from vla_attention.schemas.groupings.grouping import (
     GroupingError,
     GroupingNotFound,
     Ratio,
-    conventional_ratio,
     parse_group_argument,
     parse_ratio_argument,
     read_grouping_file,
@@ -39,13 +38,6 @@ def test_a_file_keeps_order_lists_and_ratio(tmp_path):
     assert grouping.names == ("b", "a", "rest")
     assert grouping.groups["a"] == ("word:bowl", "word:plate")
     assert grouping.ratio == Ratio(("b",), ("a",))
-
-
-def test_a_file_without_name_is_called_by_its_stem_and_may_follow_convention(tmp_path):
-    grouping = read(tmp_path, '[groups]\nvisual = "camera:base"\nlinguistic = "word:bowl"\n')
-    assert grouping.name == "mine"
-    assert grouping.ratio == Ratio(("visual",), ("linguistic",))
-    assert conventional_ratio(["visual"]) is None
 
 
 @pytest.mark.parametrize(

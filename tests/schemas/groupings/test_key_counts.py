@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.kit.uniform_cases import LENGTHS, TABLE, attention, layout_of, tokens_of_case
-from vla_attention.schemas.groupings.key_counts import uniform_of_roles, uniform_of_version_1, uniform_rows
+from tests.kit.uniform_cases import LENGTHS, TABLE, attention, tokens_of_case
+from vla_attention.schemas.groupings.key_counts import uniform_of_roles, uniform_rows
 from vla_attention.schemas.layout import INVALID_ROLES, Role
 
 #: The table has 10 digits.
 CLOSE = 1e-9
-VERSION_1 = pytest.mark.parametrize("case", TABLE["version_1"], ids=lambda case: case["name"])
 STORED = pytest.mark.parametrize("case", TABLE["stored"], ids=lambda case: case["name"])
 #: The groups of `default`, as roles.
 GROUPS = {
@@ -26,35 +25,6 @@ GROUPS = {
     "padding": (Role.PADDING,),
     "masked": (Role.MASKED_IMAGE,),
 }
-
-
-def of_version_1(case: dict[str, Any], roles: list[int]) -> list[float]:
-    """Mean share (key,) of each key at a replan, from its roles, query by query."""
-    growing = layout_of(case).growing_span
-    queries = case["num_queries"]
-    if growing is not None:
-        queries = max(1, queries - sum(roles[key] == Role.ABSENT for key in range(growing.start, growing.stop)))
-    shares = [0.0] * len(roles)
-    for query in range(queries):
-        seen = [
-            key
-            for key, role in enumerate(roles)
-            if role != Role.ABSENT
-            and not (growing and key in range(growing.start + query + growing.growing_offset, growing.stop))
-        ]
-        valid = [key for key in seen if roles[key] not in INVALID_ROLES]
-        for key in seen if valid else ():
-            shares[key] += 1 / len(valid) / queries
-    return shares
-
-
-@VERSION_1
-def test_what_version_1_gives_is_uniform_at_every_query(case):
-    roles = np.array(case["key_role"], dtype=np.uint8)
-    given = uniform_of_version_1(layout_of(case), roles, ~np.isin(roles, INVALID_ROLES), case["num_queries"])
-    np.testing.assert_allclose(given, case["uniform"], rtol=CLOSE)
-    by_query = [of_version_1(case, of_replan) for of_replan in case["key_role"]]
-    np.testing.assert_allclose(case["uniform"], by_query, rtol=CLOSE)
 
 
 def rows_of(case: dict[str, Any], replan: int, of: dict[str, int], weights: list[float]) -> list[list[float]]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vla_attention.schemas.groupings.builtin_groupings import BUILTIN_GROUPINGS, find_grouping
-from vla_attention.schemas.groupings.grouping import Grouping, GroupingError, Ratio, with_groups
+from vla_attention.schemas.groupings.grouping import Grouping, Ratio, with_groups
 from vla_attention.schemas.groupings.resolve import check_names, resolve
 from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vocabulary
@@ -65,12 +65,6 @@ def test_words_with_known_places_are_found():
     grouping = Grouping("g", {"noun": ("word:bowl",)})
     check_names(grouping, collect_vocabulary([SPELT]), CROSS)
     assert resolve(grouping, SPELT).weights[0, :, 0].tolist() == [0, 0, 1, 0, 0, 0, 0, 0, 0, 0]
-
-
-def test_the_words_of_the_instruction_cannot_be_a_group_when_nobody_knows_where_they_are():
-    with pytest.raises(GroupingError, match=r"Grouping 'instruction': .*--t5-tokenizer"):
-        find_grouping("instruction", collect_vocabulary([UNSPELT]))
-    assert "linguistic" in find_grouping("instruction", collect_vocabulary([SPELT])).names
 
 
 def test_a_text_left_out_on_purpose_is_no_error():

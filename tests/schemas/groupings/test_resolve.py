@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from itertools import combinations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -246,16 +244,3 @@ def test_reference_on_latent_frames_and_where_it_makes_no_sense():
         BUILTIN_GROUPINGS["reference"](collect_vocabulary([text]))
     with pytest.raises(GroupingError, match="compare latent frames; expected 'reference'"):
         find_grouping("reference:200", collect_vocabulary([latent]))
-
-
-def test_names_of_groups_and_ratios_are_checked():
-    for groups, said in [
-        ({}, "no groups"),
-        ({"a b": ("*",)}, "cannot name a group"),
-        ({"numerator": ("*",)}, "cannot name"),
-    ]:
-        with pytest.raises(GroupingError, match=said):
-            Grouping("g", groups)
-    for first, second in combinations(("x", "y"), 2):
-        with pytest.raises(GroupingError, match="only one group can take the rest"):
-            Grouping("g", {first: ("*",), second: ("*",)})

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from vla_attention.schemas.groupings.selector_parser import Atom, Everything, Operation, atoms_of, parse_selector
+from vla_attention.schemas.groupings.selector_parser import Atom, Everything, Operation, parse_selector
 from vla_attention.schemas.groupings.selectors import SelectorError
 
 
@@ -25,14 +25,6 @@ def test_parentheses_quotes_and_hyphens_in_names():
     assert parse_selector('(word:"black bowl")&object:salad-dressing') == Operation(
         "&", Atom("word", "black bowl"), Atom("object", "salad-dressing")
     )
-
-
-def test_patch_region_may_contain_spaces():
-    assert parse_selector("patch:cam[0:4, 2:16]") == Atom("patch", "cam[0:4, 2:16]")
-
-
-def test_atoms_are_listed_left_to_right():
-    assert [atom.kind for atom in atoms_of(parse_selector("(role:bos | word:x) - span:y"))] == ["role", "word", "span"]
 
 
 @pytest.mark.parametrize(

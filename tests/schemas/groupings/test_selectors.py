@@ -33,7 +33,3 @@ def test_a_new_kind_is_one_entry_of_the_table(monkeypatch):
         check_names(Grouping("g", {"some": ("every:99",)}), vocabulary, tokens.layout)
     with pytest.raises(SelectorError, match="did you mean 'every'"):
         Grouping("g", {"some": ("evry:3",)})
-
-
-def test_every_kind_says_what_it_takes():
-    assert all(kind.takes for kind in SELECTOR_KINDS.values())

@@ -13,8 +13,6 @@ from vla_attention.schemas.groupings.resolve import check_names, memberships, re
 from vla_attention.schemas.groupings.selector_parser import Atom, parse_selector
 from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vocabulary
-from vla_attention.schemas.groupings.words import split_words, stop_words, word_class
-from vla_attention.schemas.layout import SiteLayout, Span
 from vla_attention.testing.strategies import episode_tokens as random_tokens
 from vla_attention.testing.strategies import groupings
 
@@ -22,31 +20,6 @@ from vla_attention.testing.strategies import groupings
 def keys(tokens: EpisodeTokens, selector: str, replan: int) -> list[int]:
     weights = resolve(Grouping("g", {"g": (selector,)}), tokens).weights[:, :, 0]
     return np.flatnonzero(weights[replan if len(weights) > 1 else 0]).tolist()
-
-
-def test_the_stop_list_has_closed_classes_and_not_the_words_it_says_it_lacks():
-    words = stop_words()
-    assert 120 < len(words) < 220
-    assert all(word == word.casefold() and [word[a:b] for a, b in split_words(word)] == [word] for word in words)
-    assert {"the", "a", "of", "on", "up", "and", "it", "them", "is", "which"} <= words
-    assert not words & {
-        "can",
-        "left",
-        "right",
-        "top",
-        "front",
-        "back",
-        "both",
-        "one",
-        "two",
-        "not",
-        "pick",
-        "bowl",
-        "red",
-    }
-    assert word_class("THE") == "stop"
-    assert word_class("Bowl") == "content"
-    assert word_class("it\u2019s") == "stop"
 
 
 def test_word_classes_take_every_piece_at_every_replan():
@@ -100,27 +73,6 @@ def test_what_exists_nowhere_is_said(selector, said):
     with pytest.raises(SelectorError) as caught:
         check_names(Grouping("g", {"g": (selector,)}), collect_vocabulary([tokens]), tokens.layout)
     assert said in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("selector", "said"),
-    [
-        ("words:all", "spell no words; choose a site with text"),
-        ("word:bowl", "spell no words"),
-        ("object:@interest", "no selected episode has object coverage"),
-        ("object:plate_1", "no selected episode has object coverage"),
-    ],
-)
-def test_a_site_without_words_or_coverage_says_what_to_do(selector, said):
-    layout = SiteLayout("self", (Span("blank", "latent", 0, 2),))
-    tokens = EpisodeTokens(layout, np.full((1, 2), 10, dtype=np.uint8))
-    with pytest.raises(SelectorError, match=said):
-        check_names(Grouping("g", {"g": (selector,)}), collect_vocabulary([tokens]), layout)
-
-
-def test_a_word_class_that_is_resolved_unchecked_is_an_error_too():
-    with pytest.raises(SelectorError, match="There is no word class 'Verbs'"):
-        resolve(Grouping("g", {"g": ("words:Verbs",)}), bowl_tokens(replans=1))
 
 
 def test_single_quotes_and_apostrophes():

@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from vla_attention.schemas.stores.claims import Claims, Holder, holders, jobs_folder
-from vla_attention.schemas.stores.partial_folders import partial_of, remove_dead_partials
-from vla_attention.schemas.stores.store_format import StoreError
+from vla_attention.schemas.stores.partial_folders import partial_of
 from vla_attention.schemas.stores.worker import Worker, is_known_dead, this_worker
 
 NAME = "task000_episode003"
@@ -110,50 +109,6 @@ def test_what_a_running_process_of_this_machine_writes_stays(tmp_path):
         assert folder.is_dir()
 
 
-@pytest.mark.parametrize(
-    "name", ["7", "x.7", f"{NAME}", f"{NAME}.", f"{NAME}.01", f"{NAME}.\u00b2", f"{NAME}.-1", ".0"]
-)
-def test_what_has_another_name_is_no_claim(tmp_path, name):
-    (jobs_folder(tmp_path / "a.zarr") / "claims" / name).mkdir(parents=True)
-    assert holders(tmp_path / "a.zarr") == []
-    first = claims(tmp_path, worker(1))
-    assert first.acquire(NAME) is None
-    assert [holder.episode for holder in holders(tmp_path / "a.zarr")] == [NAME]
-    first.release(NAME)
-    assert listed(tmp_path) == [name]
-
-
-@pytest.mark.parametrize("name", ["a.zarr.jobs", "a.zarr.jobs/claims", "a.zarr.partial"])
-def test_folders_of_this_program_that_are_links_are_refused(tmp_path, name):
-    for folder in ("a.zarr.jobs", "elsewhere"):
-        (tmp_path / folder).mkdir()
-    link = tmp_path / name
-    if link.exists():
-        link.rmdir()
-    link.symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(StoreError, match=f"{name} is a link, and nothing is written, moved or removed"):
-        holders(tmp_path / "a.zarr") if "jobs" in name else remove_dead_partials(tmp_path / "a.zarr")
-
-
-def test_a_process_starts_again_if_the_dead_claim_has_been_replaced_and_released(tmp_path, monkeypatch):
-    """Two processes find the same holder dead; the first replaces it, finishes and cleans up before the second acts."""
-    dead, quick, late = (claims(tmp_path, worker(number)) for number in (1, 2, 3))
-    assert dead.acquire(NAME) is None
-    age(tmp_path, 1000)
-    rename = Claims._rename
-
-    def after_the_quick_one(self: Claims, building: Path, target: Path) -> bool:
-        monkeypatch.setattr(Claims, "_rename", rename)
-        assert quick.acquire(NAME) is None
-        quick.release(NAME)
-        return rename(self, building, target)
-
-    monkeypatch.setattr(Claims, "_rename", after_the_quick_one)
-    assert late.acquire(NAME) is None
-    assert listed(tmp_path) == [f"{NAME}.0"]
-    assert [holder.worker for holder in holders(tmp_path / "a.zarr")] == [late.worker]
-
-
 @pytest.mark.parametrize("silent", [False, True])
 def test_of_several_processes_one_gets_the_claim(tmp_path, silent):
     if silent:
@@ -207,33 +162,9 @@ def test_a_process_of_this_machine_that_has_ended_is_known_to_be_dead(tmp_path):
     assert claims(tmp_path, me).acquire(NAME) is None
 
 
-def test_a_process_of_another_node_with_the_same_host_name_is_not_known_to_be_dead():
-    """Nodes that start from one image may share the host name, and all machines have the same first namespace."""
-    me, namespace = this_worker(), os.readlink("/proc/self/ns/pid")
-    boot, _, rest = me.process_space.partition(" ")
-    assert rest == namespace
-    for space in (namespace, f"{boot[::-1]} {namespace}", ""):
-        other = replace(me, tag="x", process=2**22, process_start="1", process_space=space)
-        assert not is_known_dead(other, me)
-        assert not is_known_dead(other, replace(me, process_space=""))
-    assert is_known_dead(replace(me, tag="x", process=2**22, process_start="1"), me)
-
-
 def test_a_requeued_job_replaces_its_own_claim_at_once(tmp_path):
     before = worker(1, slurm_job="7")
     assert claims(tmp_path, before).acquire(NAME) is None
     assert claims(tmp_path, worker(2, slurm_job="8")).acquire(NAME) is not None
     assert claims(tmp_path, worker(3, slurm_job="7")).acquire(NAME) is not None
     assert claims(tmp_path, worker(3, slurm_job="7", restarts=1)).acquire(NAME) is None
-
-
-def test_an_unreadable_claim_expires_like_any_other(tmp_path):
-    claim = jobs_folder(tmp_path / "a.zarr") / "claims" / f"{NAME}.0"
-    claim.mkdir(parents=True)
-    (claim / "owner.json").write_text("")
-    first = claims(tmp_path, worker(1))
-    assert first.acquire(NAME) is not None
-    age(tmp_path, 1000)
-    assert first.acquire(NAME) is None
-    first.release(NAME)
-    assert listed(tmp_path) == []

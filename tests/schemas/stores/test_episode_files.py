@@ -50,13 +50,6 @@ def test_every_file_is_missed(episode):
     assert problems(episode) == []
 
 
-def test_an_emptied_folder_and_one_that_is_gone(episode):
-    shutil.rmtree(episode)
-    assert "it has lost its seal" in " ".join(problems(episode))
-    episode.mkdir()
-    assert "it has lost its seal" in " ".join(problems(episode))
-
-
 def test_cut_off_grown_and_edited_files(episode):
     rows = episode / ROWS
     content = rows.read_bytes()

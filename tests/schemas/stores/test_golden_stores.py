@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.kit.golden_stores import GOLDEN_STORES, NAMES, STORES, differences, flat, folder_of, numbers_of, read_table
+from tests.kit.golden_stores import GOLDEN_STORES, differences, flat, folder_of, numbers_of, read_table
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 
@@ -20,15 +20,3 @@ def test_a_golden_store_gives_its_numbers(version, name):
     assert {f"{table}.csv" for table in found} == {file.name for file in (folder / name).iterdir()}
     for table, values in found.items():
         assert differences(flat(values), read_table(folder / name / f"{table}.csv", values)) == [], table
-
-
-@pytest.mark.parametrize("version", STORES)
-def test_what_the_golden_stores_are(version):
-    stores = {name: open_store(folder_of(version) / f"{name}.zarr") for name in NAMES}
-    assert [site.name for site in stores["joint"].attributes.sites] == ["joint"]
-    assert {site.name for site in stores["cosmos"].attributes.sites} == {"self", "cross"}
-    assert stores["library"].attributes.protocol.name == "recorded"
-    assert stores["packed"].run == stores["joint"].run
-    assert all(episode.place is not None for episode in stores["packed"].episodes)
-    assert stores["rerun"].attributes.rerun_of is not None
-    assert stores["rerun"].attributes.rerun_of.run == stores["joint"].run

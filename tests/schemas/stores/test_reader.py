@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
-from numcodecs import blosc
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from tests.kit.attacks import exchange, files_of, with_checksum
+from tests.kit.attacks import exchange, files_of
 from vla_attention.schemas.errors import Note
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import (
@@ -138,46 +137,12 @@ def test_an_array_of_any_layout_is_bound_to_its_episode(path, layout):
         open_store(path).episodes[0].read("joint/rows")
 
 
-@pytest.mark.parametrize("array", ["joint/atoms", "joint/key_role", "actions", "frames/base_0_rgb", "state"])
-def test_a_single_chunk_that_decodes_to_another_size_is_refused(path, array):
-    """Its checksum and its seal are right: the rest of the array would be what was in memory before."""
-    folder = path / "episodes" / "task001_episode000"
-    values = zarr.open_array(folder / array)[...]
-    (file,) = files_of(folder, array)
-    for other in (values[:1], np.concatenate([values, values])):
-        frame = blosc.compress(np.ascontiguousarray(other), b"zstd", 3, blosc.SHUFFLE, typesize=values.itemsize)
-        file.write_bytes(with_checksum(frame))
-        reseal(folder)
-        for index in (..., 0):
-            with pytest.raises(
-                CorruptEpisode, match=rf"{array} of episode task001_episode000.*header says \d+ decoded"
-            ):
-                open_store(path).episodes[0].read(array, index)
-
-
-def test_an_index_that_does_not_exist_is_the_callers_mistake(original):
-    with pytest.raises(IndexError):
-        open_store(original).episodes[0].read("joint/rows", (0, 99))
-
-
-def test_an_array_that_does_not_exist(original):
-    with pytest.raises(CorruptEpisode, match="task001_episode000 lacks the array joint/colour"):
-        open_store(original).episodes[0].array("joint/colour")
-
-
 def test_a_missing_store_names_its_neighbours(path):
     with pytest.raises(StoreNotFound, match=r"Did you mean '.*libero_10\.zarr'") as caught:
         open_store(path.with_name("libero10.zarr"))
     assert isinstance(caught.value, FileNotFoundError)
     with pytest.raises(StoreNotFound, match=r"Stores in .*: none"):
         open_store(path.parent / "nowhere" / "a.zarr")
-
-
-def test_a_missing_store_names_five_neighbours_at_most(tmp_path):
-    for number in range(7):
-        (tmp_path / f"run{number}.zarr").mkdir()
-    with pytest.raises(StoreNotFound, match=r"run0\.zarr, .*run4\.zarr and 2 more\. Make one"):
-        open_store(tmp_path / "none.zarr")
 
 
 def test_a_folder_or_file_that_is_no_store(tmp_path):
@@ -199,7 +164,6 @@ def change_root(path: Path, **changes: object) -> None:
     ("changes", "message"),
     [
         ({"format": "something else"}, "not a store of this tool"),
-        ({"format": None}, "not a store of this tool"),
         ({"policy": "pi0.5"}, r"\$\.policy is str; expected dict"),
         ({"protocol": {}}, r"\$\.protocol lacks the field 'name'"),
         (
@@ -207,13 +171,11 @@ def change_root(path: Path, **changes: object) -> None:
             "gap or overlap",
         ),
         ({"sites": [{"name": "../up", "spans": []}]}, "'../up' cannot be the name of a site"),
-        ({"sites": [{"name": "frames", "spans": []}]}, "A site cannot be called 'frames'"),
         ({"sites": [{"name": "self", "spans": [ONE_KEY]}] * 2}, "do not have different names"),
         (
             {"sites": [{"name": "self", "spans": [ONE_KEY], "layers": [1, 3]}]},
             "in none of the recorded layers 0, 2; it is in",
         ),
-        ({"sites": [{"name": "self", "spans": [], "layers": [3, 1]}]}, "in ascending order"),
         ({"surprise": 1}, "unknown field 'surprise'"),
     ],
 )
@@ -227,21 +189,13 @@ def test_root_attributes_of_the_wrong_kind(path, changes, message):
 
 @pytest.mark.parametrize(
     "content",
-    [b"", b"{", b"\xff\xfe\xfd", b"[]", b"null", b"3", b'{"node_type": "array", "zarr_format": 3}', b"\x00" * 50],
+    [b"", b"{", b"\xff\xfe\xfd", b'{"node_type": "array", "zarr_format": 3}'],
 )
 def test_an_unreadable_root(path, content):
     (path / "zarr.json").write_bytes(content)
     with pytest.raises(StoreError, match="cannot be read") as caught:
         open_store(path)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
-def test_a_truncated_root(path, share):
-    content = (path / "zarr.json").read_bytes().rstrip()
-    (path / "zarr.json").write_bytes(content[: int(share * len(content))])
-    with pytest.raises(StoreError, match="cannot be read"):
-        open_store(path)
 
 
 def test_a_folder_that_is_no_episode_is_named_and_ignored(path):
@@ -254,9 +208,3 @@ def test_a_store_without_its_episodes_group(path):
     shutil.rmtree(path / "episodes")
     with pytest.raises(StoreError, match="cannot be read"):
         open_store(path)
-
-
-def test_files_beside_the_episodes_are_named_and_ignored(path):
-    (path / "episodes" / "README").write_text("mine")
-    with pytest.warns(Note, match="among its episodes: README"):
-        assert len(open_store(path).episodes) == 4

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,10 +14,11 @@ from tests.kit.http_ranges import Served, serve
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.schemas.stores import remote_source
-from vla_attention.schemas.stores.digest import seal_digest
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 from vla_attention.testing.stores import StoreSpec, write_store
+
+pytestmark = pytest.mark.thorough
 
 pytest.importorskip("aiohttp", reason="needs the extra remote: pip install 'vla-attention[remote]'")
 
@@ -148,80 +147,6 @@ def test_a_store_on_the_hub_is_read_by_ranges(hub, stores, tmp_path, capsys):
         assert said.count("\n") == 1
 
 
-def test_a_branch_is_asked_for_once_and_everything_is_read_at_its_commit(hub, stores, tmp_path, capsys):
-    """While the store is read, somebody moves `main` to a commit that has nothing of it."""
-
-    def move(path: str, content: bytes) -> bytes:
-        if path.endswith("a.zarr/zarr.json"):
-            point_main_at(tmp_path / "hub", "b" * 40)
-        return content
-
-    hub.change = move
-    assert analyze(["copy", "hf://datasets/org/name/runs/a.zarr", str(tmp_path / "here.zarr")]) == 0
-    assert sum(path.endswith("/revision/main") for path, _ in hub.requests) == 1
-    assert all(f"/resolve/{COMMIT}/" in path for path, _ in hub.requests if "/resolve/" in path)
-    assert any(f"/tree/{COMMIT}/" in path for path, _ in hub.requests)
-    copied = open_store(tmp_path / "here.zarr")
-    assert copied.attributes.provenance["fetched_from"] == f"hf://datasets/org/name@{COMMIT}/runs/a.zarr"
-    assert copied.run == open_store(stores[0]).run
-    assert verify_store(copied) == []
-    # A copy is of one commit. With it the same command goes on.
-    capsys.readouterr()
-    shutil.copytree(hub_commit(tmp_path, COMMIT), hub_commit(tmp_path, "b" * 40))
-    list_commit(tmp_path / "hub", "b" * 40)
-    assert analyze(["copy", "hf://datasets/org/name/runs/a.zarr", str(tmp_path / "here.zarr")]) == 2
-    said = capsys.readouterr().err
-    assert f"it is of hf://datasets/org/name@{COMMIT}/runs/a.zarr" in said
-    assert said.count("\n") == 1
-    assert analyze(["copy", f"hf://datasets/org/name@{COMMIT}/runs/a.zarr", str(tmp_path / "here.zarr")]) == 0
-    assert "2 were there already" in capsys.readouterr().out
-
-
-def lacking(index: Path) -> bytes:
-    """An index without the second episode, whose zip is there, and with its right digest."""
-    document = json.loads(index.read_text())
-    del document["episodes"]["task000_episode001"]
-    return json.dumps(document | {"digest": seal_digest(document)}).encode()
-
-
-def check_one_is_lacking(url: str, capsys: pytest.CaptureFixture[str]) -> None:
-    lost = "episodes/task000_000/task000_episode001.zip"
-    assert analyze(["verify", url]) == 1
-    assert f"{lost}: index.json does not list it" in capsys.readouterr().out
-    assert analyze([url, "--list"]) == 0
-    assert f"what its index.json does not list, {lost}" in capsys.readouterr().err
-
-
-def test_a_zip_that_the_index_lacks_is_found_on_the_hub(hub, tmp_path, capsys):
-    index = hub_commit(tmp_path, COMMIT) / "runs/a.zarr/index.json"
-    index.write_bytes(lacking(index))
-    check_one_is_lacking("hf://datasets/org/name/runs/a.zarr", capsys)
-
-
-def test_a_zip_that_the_index_lacks_is_found_in_s3(bucket, stores, capsys):
-    import boto3
-
-    body = lacking(stores[1] / "index.json")
-    boto3.client("s3").put_object(Bucket="stores", Key="packed.zarr/index.json", Body=body)
-    check_one_is_lacking(f"{bucket}/packed.zarr", capsys)
-
-
-def test_a_merged_store_names_the_commit(hub, tmp_path):
-    more = write_store(tmp_path / "more.zarr", spec=StoreSpec(tasks=(1,), episodes=1, replans=2))
-    url = "hf://datasets/org/name/runs/a.zarr"
-    assert analyze(["copy", url, str(more), "-o", str(tmp_path / "all.zarr")]) == 0
-    assert open_store(tmp_path / "all.zarr").attributes.provenance["merged_from"] == (
-        f"hf://datasets/org/name@{COMMIT}/runs/a.zarr (2 episodes), more.zarr (1 episode)"
-    )
-
-
-@pytest.mark.parametrize("answer", ["{}", "no JSON", '{"sha": "main"}', "[]", '{"sha": 5}'])
-def test_a_hub_that_states_no_commit(hub, tmp_path, capsys, answer):
-    (tmp_path / "hub/api/datasets/org/name/revision/main").write_text(answer)
-    assert analyze(["hf://datasets/org/name/runs/a.zarr", "--list"]) == 2
-    assert "did not say which commit main is" in capsys.readouterr().err
-
-
 def test_the_token_goes_to_the_hub_and_not_where_it_sends_readers(hub, stores, tmp_path):
     """The hub keeps large files at another address, and answers with that."""
     with serve(tmp_path / "hub") as elsewhere:
@@ -231,28 +156,3 @@ def test_the_token_goes_to_the_hub_and_not_where_it_sends_readers(hub, stores, t
         assert hub.authorizations == {"Bearer made-up"}
         assert elsewhere.authorizations == {""}
         assert elsewhere.of_episodes() > 0 == hub.of_episodes()
-
-
-@pytest.mark.parametrize("missing", ["fsspec", "aiohttp"])
-def test_a_missing_package_is_named(missing, monkeypatch, capsys):
-    from fsspec.registry import _registry
-
-    remote_source._file_system_of.cache_clear()
-    real = __import__
-
-    def refuse(name: str, *arguments: Any, **options: Any) -> Any:
-        if name.partition(".")[0] == missing:
-            raise ImportError(f"No module named '{missing}'", name=missing)
-        return real(name, *arguments, **options)
-
-    for name in list(sys.modules):
-        if name.partition(".")[0] == missing or name == "fsspec.implementations.http":
-            monkeypatch.delitem(sys.modules, name)
-    monkeypatch.delitem(_registry, "https", raising=False)  # classes that fsspec has imported already
-    monkeypatch.setattr("builtins.__import__", refuse)
-    assert analyze(["https://127.0.0.1:9/x.zarr", "--no-plots"]) == 2
-    monkeypatch.undo()
-    remote_source._file_system_of.cache_clear()
-    said = capsys.readouterr().err
-    assert "vla-attention[remote]" in said
-    assert said.count("\n") == 1

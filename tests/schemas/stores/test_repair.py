@@ -7,9 +7,8 @@ import os
 import shutil
 import signal
 import subprocess
-import zipfile
 from collections.abc import Callable
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -21,12 +20,8 @@ from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main
 from vla_attention.capture.jobs.status import store_status
-from vla_attention.capture.published.evaluate import evaluate_attention_ratio
 from vla_attention.schemas.errors import plural
-from vla_attention.schemas.stores import repair
 from vla_attention.schemas.stores.claims import Claims, holders
-from vla_attention.schemas.stores.damaged_episodes import DamagedEpisodesLeft
-from vla_attention.schemas.stores.durable_files import lock_for_writing
 from vla_attention.schemas.stores.partial_folders import process_tag
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.repair import damaged_folder, repair_store
@@ -152,22 +147,6 @@ def test_damage_that_only_reading_shows_needs_verify(store, episode, capsys):
     assert "(every byte was read)" in capsys.readouterr().out
 
 
-def test_the_same_episode_moved_twice_within_a_second(store, episode, monkeypatch):
-    class Clock(datetime):
-        @classmethod
-        def now(cls, tz=None):
-            return datetime(2026, 3, 2, 11, 40, tzinfo=UTC)
-
-    monkeypatch.setattr(repair, "datetime", Clock)
-    shutil.rmtree(episode)
-    for _ in range(3):
-        episode.mkdir()
-        (finding,) = repair_store(store)
-        assert finding.moved_to is not None
-    entries = sorted(entry.name for entry in damaged_folder(store).iterdir())
-    assert entries == [f"{DAMAGED}-20260302T114000Z{suffix}" for suffix in ("", "-2", "-3")]
-
-
 def test_a_claimed_episode_is_left_alone(store, episode, capsys):
     empty(episode)
     claims = Claims(store, NODE)
@@ -260,21 +239,6 @@ def test_a_killed_repair_harms_nothing(store, episode, original, kind, number):
     claims.release(DAMAGED)
 
 
-def test_a_link_to_a_store_and_several_stores(store, episode, tmp_path, capsys):
-    (tmp_path / "elsewhere").mkdir()
-    link = tmp_path / "elsewhere" / "b.zarr"
-    link.symlink_to(store)
-    empty(episode)
-    assert main(["repair", str(link), str(store)]) == 0
-    printed = capsys.readouterr().out
-    assert f"{link}: 1 of 4 episodes is damaged." in printed
-    assert f"{store}: none of 3 episodes is damaged" in printed
-    assert len(list(damaged_folder(store).iterdir())) == 1
-    assert list(link.parent.iterdir()) == [link]
-    assert main(["repair", str(tmp_path / "none.zarr")]) == 2
-    assert "There is no store at" in capsys.readouterr().err
-
-
 def test_resuming_records_what_is_missing_and_says_what_is_damaged(tmp_path, monkeypatch, capsys):
     capture_without_simulator(monkeypatch)
     store = tmp_path / "a.zarr"
@@ -327,30 +291,6 @@ def test_resuming_records_what_is_missing_and_says_what_is_damaged(tmp_path, mon
     assert analyze(["verify", str(store)]) == 0
 
 
-def test_the_other_suites_do_not_wait_for_a_repair(tmp_path, monkeypatch, capsys):
-    captured: list[str] = []
-
-    def run_capture(settings, policy, device, termination):
-        captured.append(settings.suite.name)
-        if settings.suite.name in ("libero_spatial", "libero_goal"):
-            raise DamagedEpisodesLeft(f"damage in {settings.suite.name}.")
-
-    monkeypatch.setattr("vla_attention.capture.run.capture_run.run_capture", run_capture)
-    arguments = [
-        "--checkpoint",
-        "untrained-tiny",
-        "--task-suite",
-        "all",
-        "--stage",
-        "capture",
-        "--output-dir",
-        str(tmp_path),
-    ]
-    assert evaluate_attention_ratio(arguments) == 2
-    assert captured == ["libero_spatial", "libero_object", "libero_goal", "libero_10"]
-    assert "damage in libero_spatial. damage in libero_goal." in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("program", [main, analyze], ids=["vla-capture", "vla-analyze"])
 def test_leftovers_of_dead_processes_are_removed(store, capsys, program):
     folder = store.with_name("a.zarr.partial")
@@ -379,39 +319,6 @@ def test_leftovers_of_dead_processes_are_removed(store, capsys, program):
     assert all(f"  removed: {folder / name}" in said for name in dead)
     assert sorted(entry.name for entry in folder.iterdir()) == sorted([*others, *living])
     assert verify_store(open_store(store)) == []
-
-
-@pytest.mark.parametrize("damage", [Path.unlink, lambda file: file.write_text("{")])
-def test_a_lost_group_of_episodes_is_written_again(store, original, capsys, damage):
-    damage(store / "episodes/zarr.json")
-    assert analyze(["verify", str(store), "--quick"]) == 1
-    assert analyze(["repair", str(store), "--dry-run"]) == 0
-    assert "would be written again: episodes/zarr.json, it is " in capsys.readouterr().out
-    assert analyze(["repair", str(store)]) == 0
-    assert "written again: episodes/zarr.json, it is " in capsys.readouterr().out
-    assert json.loads((store / "episodes/zarr.json").read_text()) == json.loads(
-        (original / "episodes/zarr.json").read_text()
-    )
-    assert verify_store(open_store(store)) == []
-    assert not list((store / "episodes").glob(".*"))
-
-
-def test_a_changed_record_of_the_root_is_named_and_left(store, capsys):
-    document = json.loads((store / "zarr.json").read_text())
-    document["attributes"]["provenance"]["numpy"] = "1.0"
-    (store / "zarr.json").write_text(json.dumps(document))
-    assert analyze(["repair", str(store)]) == 0
-    assert "left as it is: zarr.json, it was changed: its own digest does not fit" in capsys.readouterr().out
-
-
-def test_a_linked_episode_is_damaged(store, episode, tmp_path, capsys):
-    episode.rename(tmp_path / "elsewhere")
-    episode.symlink_to(tmp_path / "elsewhere")
-    assert analyze(["verify", str(store), "--quick"]) == 1
-    assert "it is a link that leads out of the store" in capsys.readouterr().out
-    assert analyze(["repair", str(store)]) == 0
-    assert names(store) == WHOLE
-    assert (tmp_path / "elsewhere/zarr.json").is_file()
 
 
 def test_a_claim_of_somebody_else_makes_repair_delete_nothing(store, episode, tmp_path):
@@ -443,77 +350,3 @@ def test_episodes_of_another_store_are_not_moved(store, tmp_path, capsys):
     shutil.copyfile(other / "zarr.json", store / "zarr.json")
     assert main(["repair", str(store)]) == 2
     assert files(other) == before
-
-
-@pytest.mark.parametrize("link", ["episodes", "episodes/task000_000"])
-def test_zips_of_another_store_are_not_moved(store, tmp_path, capsys, link):
-    packed, other = tmp_path / "packed.zarr", tmp_path / "other.zarr"
-    for target in (packed, other):
-        assert analyze(["copy", str(store), str(target), "--packed"]) == 0
-    (other / "episodes/zarr.json").write_text("{}")
-    before = files(other)
-    shutil.rmtree(packed / link)
-    (packed / link).symlink_to(other / link)
-    assert main(["repair", str(packed)]) == 2
-    assert "is a link, and what " in capsys.readouterr().err
-    (packed / "index.json").unlink()  # the copy begins again
-    assert analyze(["copy", str(store), str(packed), "--packed"]) == 2
-    assert "is a link, and " in capsys.readouterr().err
-    assert files(other) == before
-
-
-def zip_of(packed: Path) -> Path:
-    (found,) = packed.rglob(f"{DAMAGED}.zip")
-    return found
-
-
-def flipped(file: Path) -> None:
-    with zipfile.ZipFile(file) as found:
-        rows = next(one for one in found.infolist() if "joint/rows/c" in one.filename)
-    content = bytearray(file.read_bytes())
-    content[rows.header_offset + 30 + len(rows.filename) + 20] ^= 1
-    file.write_bytes(content)
-
-
-@pytest.mark.parametrize(
-    ("damage", "options"),
-    [
-        (lambda file: os.truncate(file, 100), []),
-        (Path.unlink, []),
-        (lambda file: shutil.copy(file.with_name(f"{WHOLE[0]}.zip"), file), []),
-        (flipped, ["--verify"]),
-    ],
-)
-def test_damaged_zips_are_moved_aside_and_packed_again(store, tmp_path, capsys, damage, options):
-    packed, words = tmp_path / "packed.zarr", ["copy", str(store), str(tmp_path / "packed.zarr"), "--packed"]
-    assert analyze(words) == 0
-    whole = files(packed)
-    damage(zip_of(packed))
-    assert main(["repair", str(packed), *options, "--dry-run"]) == 1
-    assert names(packed) == sorted([*WHOLE, DAMAGED])
-    capsys.readouterr()
-    assert main(["repair", str(packed), *options]) == 0
-    said = capsys.readouterr().out
-    assert f"{packed}: 1 of 4 episodes is damaged." in said
-    assert "Run the same vla-attention copy --packed to pack what was moved aside again." in said
-    (entry,) = damaged_folder(packed).iterdir()
-    assert json.loads((entry / "reason.json").read_text())["episode"] == DAMAGED
-    assert names(packed) == WHOLE
-    assert verify_store(open_store(packed)) == []
-    assert main(["repair", str(packed), "--verify"]) == 0
-    assert analyze(words) == 0
-    assert files(packed) == whole
-
-
-def test_nothing_is_repaired_while_a_copy_packs(store, tmp_path, capsys):
-    packed = tmp_path / "packed.zarr"
-    assert analyze(["copy", str(store), str(packed), "--packed"]) == 0
-    zip_of(packed).unlink()
-    before = files(packed)
-    lock = lock_for_writing(packed, packing=True)
-    try:
-        assert main(["repair", str(packed)]) == 2
-    finally:
-        os.close(lock)
-    assert "another copy is writing into it" in capsys.readouterr().err
-    assert files(packed) == before

@@ -14,11 +14,8 @@ import polars as pl
 import pytest
 
 import vla_attention as va
-from tests.kit.attacks import FIRST, files_of, forge_chunk
-from tests.kit.http_ranges import serve
-from tests.kit.paths import GOLDEN
+from tests.kit.attacks import FIRST, forge_chunk
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.schemas.stores import shards
 from vla_attention.schemas.stores.digest import seal_digest
 from vla_attention.schemas.stores.reader import open_store
@@ -69,18 +66,6 @@ def test_a_seal_has_the_first_bytes_of_the_sha256_of_every_chunk(original):
         assert record["chunks"] == "".join(chunk[-4:].hex() for chunk in stored)
 
 
-def test_a_copy_of_version_1_without_pictures_has_a_seal_that_older_programs_read(tmp_path):
-    """They refuse a field that they do not know."""
-    old = GOLDEN / "stores" / "version1" / "joint.zarr"
-    copy_store(open_store(old), tmp_path / "c.zarr", ("frames",))
-    for episode in open_store(old).episodes:
-        ours, theirs = records(tmp_path / "c.zarr", episode.name), records(old, episode.name)
-        assert len(ours) < len(theirs)
-        for file in set(ours) - {"zarr.json"}:
-            assert ours[file] == theirs[file]
-        assert ours["zarr.json"].keys() == theirs["zarr.json"].keys() == {"size", "sha256", "index", "chunks"}
-
-
 def masses(path: Path) -> pl.DataFrame:
     return va.open(path).masses("tasks", groups=dict([CORNER.split("=")]))
 
@@ -118,46 +103,6 @@ def test_bits_that_keep_the_checksum_are_refused_by_every_reading(forged, origin
     assert not masses(forged).equals(expected)
 
 
-def test_bits_that_keep_the_checksum_are_refused_in_a_zip_and_at_an_address(path, tmp_path, capsys, monkeypatch):
-    pytest.importorskip("aiohttp", reason="needs the extra remote: pip install 'vla-attention[remote]'")
-    monkeypatch.setenv("VLA_CACHE", "off")
-    monkeypatch.setenv("VLA_REMOTE_CACHE", str(tmp_path / "kept"))
-    packed = tmp_path / "served" / "packed.zarr"
-    copy_store(open_store(path), packed, (), packed=True)
-    shard = (path / "episodes" / FIRST / ROWS).read_bytes()
-    (zip_file,) = packed.rglob(f"{FIRST}.zip")
-    content = zip_file.read_bytes()
-    assert content.count(shard) == 1
-    zip_file.write_bytes(content.replace(shard, forge_chunk(shard, 2, 4, 39)))
-    with serve(tmp_path / "served") as served:
-        for place in (str(packed), f"{served.url}/packed.zarr"):
-            asked = [place, "--group", CORNER, "--no-plots", "--output", str(tmp_path / "out")]
-            assert SENTENCE in refused_by(asked, capsys)
-            assert FIRST in refused_by(["verify", place], capsys)
-            assert ROWS in refused_by(["copy", place, str(tmp_path / "c.zarr")], capsys)
-
-
-@pytest.mark.parametrize("packed", [False, True])
-def test_version_1_finds_such_bits_by_the_row_sums(tmp_path, capsys, monkeypatch, packed):
-    """It has no digests of chunks: bits that keep the sums of the rows, too, are found by `verify` and copies alone."""
-    monkeypatch.setenv("VLA_CACHE", "off")
-    old = Path(shutil.copytree(GOLDEN / "stores" / "version1" / "joint.zarr", tmp_path / "a.zarr"))
-    episode = open_store(old).episodes[0]
-    (file,) = files_of(old / "episodes" / episode.name, "joint/rows")
-    shard = file.read_bytes()
-    count = len(records(old, episode.name)[f"joint/rows/{file.name}"]["chunks"]) // 8
-    forged = forge_chunk(shard, count - 1, count, episode.shape_of("joint/rows")[-1])
-    if packed:
-        copy_store(open_store(old), tmp_path / "b.zarr", (), packed=True)
-        old = tmp_path / "b.zarr"
-        (file,) = old.rglob(f"{episode.name}.zip")
-    file.write_bytes(file.read_bytes().replace(shard, forged))
-    asked = ["--group", CORNER, "--no-plots"]
-    said = refused_by([str(old), *asked, "--output", str(tmp_path / "out")], capsys)
-    assert f"Episode {episode.name} is damaged: joint/rows does not add up to the row sums" in said
-    assert "joint/rows" in refused_by(["verify", str(old)], capsys)
-
-
 def seal_with(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
     """Change the record of the rows in a seal, which gets its right digest."""
     file = path / "episodes" / FIRST / "seal/zarr.json"
@@ -171,13 +116,8 @@ def seal_with(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
     ("change", "sentence"),
     [
         (lambda record: record.pop("digests"), f"no digests of the chunks of its {ROWS}, which version 2 has"),
-        (lambda record: record.update(digests=""), f"no digests of the chunks of its {ROWS}, which version 2 has"),
         (lambda record: record.update(digests=record["digests"][:48]), "3 digests of chunks and 4 checksums; expected"),
-        (lambda record: record.update(digests=record["digests"] * 2), "8 digests of chunks and 4 checksums; expected"),
-        (lambda record: record.update(digests=record["digests"][1:]), "are not 16 hexadecimal digits each"),
         (lambda record: record.update(digests="x" * 64), "are not 16 hexadecimal digits each"),
-        (lambda record: record.update(digests=" " + record["digests"][1:]), "are not 16 hexadecimal digits each"),
-        (lambda record: record.update(digests=4), "digests is int; expected str"),
         (lambda record: record.update(chunks=""), "4 digests of chunks and 0 checksums; expected"),
         (lambda record: record.update(digests="0" * 64), "does not agree with its seal, although its checksum fits"),
     ],
@@ -188,25 +128,3 @@ def test_a_seal_with_other_digests_is_refused(path, capsys, change, sentence):
         open_store(path).episodes[0].read_layer("joint/rows", 1, 0)
     assert FIRST in refused_by(["verify", str(path)], capsys)
     assert FIRST in refused_by(["copy", str(path), str(path.parent / "c.zarr")], capsys)
-
-
-def test_digests_in_upper_case_are_the_same(path):
-    seal_with(path, lambda record: record.update(digests=record["digests"].upper()))
-    open_store(path).episodes[0].read_layer("joint/rows", 1, 0)
-
-
-def test_version_1_has_no_digests(tmp_path):
-    old = Path(shutil.copytree(GOLDEN / "stores" / "version1" / "joint.zarr", tmp_path / "a.zarr"))
-    name = open_store(old).episodes[0].name
-    file = old / "episodes" / name / "seal/zarr.json"
-    document = json.loads(file.read_text())
-    of_rows = next(
-        record for path, record in document["attributes"]["files"].items() if path.startswith("joint/rows/c")
-    )
-    of_rows["digests"] = "0" * 2 * len(of_rows["chunks"])
-    document["attributes"]["digest"] = seal_digest(document["attributes"])
-    file.write_text(json.dumps(document))
-    with pytest.raises(
-        CorruptEpisode, match=r"digests of the chunks of its joint/rows/.*, which version 1 does not have"
-    ):
-        _ = open_store(old).episodes[0].seal

@@ -87,32 +87,6 @@ def test_equals_zarr_python(tmp_path_factory, shape, block, blocks, separator, s
             np.testing.assert_array_equal(read, array[:, layer, denoise])
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"compressors": (BloscCodec(typesize=4),)},
-        {"shards": None},
-        {"chunks": (4, 2, 1, 2, 1, 8)},
-        {"shards": (4, 1, 2, 2, 1, 8)},
-        {"chunk_key_encoding": {"name": "v2", "separator": "."}},
-        {"compressors": None},
-    ],
-    ids=["no checksum", "no shards", "two layers a chunk", "a shard for each layer", "other names", "plain"],
-)
-def test_other_layouts_are_not_claimed(tmp_path, changes):
-    values = np.random.default_rng(0).random((8, 2, 2, 2, 1, 8), dtype=np.float32)
-    write_array(tmp_path / "rows", values, 4, **changes)
-    assert reader_of(tmp_path / "rows") is None
-
-
-@pytest.mark.parametrize("keys", [None, "default", {"name": "default", "configuration": None}, {"name": "other"}])
-def test_chunk_keys_that_nobody_writes_are_refused(tmp_path, keys):
-    write_array(tmp_path / "rows", np.zeros((4, 2, 1, 2, 1, 8), dtype=np.float32), 4)
-    document = json.loads((tmp_path / "rows" / "zarr.json").read_bytes()) | {"chunk_key_encoding": keys}
-    with pytest.raises(CorruptEpisode, match="chunk_key_encoding"):
-        describe_array(json.dumps(document).encode())
-
-
 def fail(file: str) -> SealedShard:
     raise AssertionError(file)
 
@@ -220,10 +194,8 @@ def test_a_frame_that_decodes_to_fewer_bytes_leaves_nothing_of_the_memory(tmp_pa
     [
         ({0: (10**6, 100)}, "outside"),
         ({0: (2**64 - 8, 16)}, "outside"),
-        ({0: (0, 2**64 - 1)}, "outside"),
         ({1: None}, "overlap"),
         ({0: (0, 4)}, "missing"),
-        ({0: (2**64 - 1, 2**64 - 1)}, "missing"),
     ],
 )
 def test_positions_that_cannot_be_are_refused(tmp_path, entries, problem):
@@ -284,6 +256,7 @@ def crafted(tmp_path_factory) -> Path:
     return store / "episodes/task000_episode000"
 
 
+@pytest.mark.thorough
 @settings(max_examples=examples(15), deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_a_changed_frame_with_right_checksums_gives_the_exact_values_or_an_error(crafted, data):

@@ -5,9 +5,8 @@ from __future__ import annotations
 import functools
 import os
 import shutil
-import zipfile
 from collections.abc import Callable
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -58,24 +57,6 @@ def flip(store: Path, episode: int) -> None:
     file.write_bytes(content)
 
 
-def flip_in_zip(store: Path, episode: int) -> None:
-    file = zip_of(store, episode)
-    with zipfile.ZipFile(file) as found:
-        rows = next(one for one in found.infolist() if "joint/rows/c" in one.filename)
-    content = bytearray(file.read_bytes())
-    content[rows.header_offset + 30 + len(rows.filename) + rows.file_size // 3] ^= 4
-    file.write_bytes(content)
-
-
-def zips_of(store: Path, episode: int) -> list[Path]:
-    return list(store.rglob(f"{episode_name(0, episode)}.zip"))
-
-
-def zip_of(store: Path, episode: int) -> Path:
-    (file,) = zips_of(store, episode)
-    return file
-
-
 def edit(store: Path, episode: int) -> None:
     file = store / "episodes" / episode_name(0, episode) / "zarr.json"
     file.write_text(file.read_text().replace("bowl", "bowk"))
@@ -89,16 +70,6 @@ DAMAGE: dict[str, tuple[Callable[[Path, int], object], bool]] = {
     "lose": (lambda store, episode: rows_of(store, episode).unlink(), True),
 }
 
-#: The same for zips. A copy packs again what has another size than its index says.
-DAMAGE_OF_ZIPS: dict[str, tuple[Callable[[Path, int], object], bool]] = {
-    "flip": (flip_in_zip, False),
-    "cut": (lambda store, episode: os.truncate(zip_of(store, episode), 100), True),
-}
-
-
-def kinds_of(store: str) -> dict[str, tuple[Callable[[Path, int], object], bool]]:
-    return DAMAGE_OF_ZIPS if store.startswith("packed") else DAMAGE
-
 
 def write(path: Path, episode: int) -> None:
     write_episode(open_run(path, root_attributes(SPEC), "resume", durable=False), SPEC, 0, episode)
@@ -108,8 +79,8 @@ def repair(path: Path, verify: bool) -> None:
     repair_store(path, verify=verify)
 
 
-def copy(path: Path, target: Path, packed: bool) -> None:
-    copy_store(open_store(path), target, (), packed=packed)
+def copy(path: Path, target: Path) -> None:
+    copy_store(open_store(path), target, ())
 
 
 def merge(one: Path, other: Path, target: Path) -> None:
@@ -168,9 +139,8 @@ class StoreLife(RuleBasedStateMachine):
     @rule(data=st.data())
     def damage(self, data: st.DataObject) -> None:
         store, episode = data.draw(st.sampled_from(self.undamaged()))
-        kinds = kinds_of(store)
-        damage = data.draw(st.sampled_from(sorted(kinds)))
-        kinds[damage][0](self.folder / store, episode)
+        damage = data.draw(st.sampled_from(sorted(DAMAGE)))
+        DAMAGE[damage][0](self.folder / store, episode)
         self.model[store][episode] = damage
 
     @rule(data=st.data(), quick=st.booleans())
@@ -179,11 +149,7 @@ class StoreLife(RuleBasedStateMachine):
         opened = open_store(self.folder / store)
         found = {episode.name for episode in opened.episodes if episode_report(opened, episode, quick=quick).problems}
         assert found == {episode_name(0, number) for number in self.damaged(store, quick)}
-        # A copy that died between a zip and its index left one that no index lists.
-        zips = {path.relative_to(self.folder / store).as_posix() for path in (self.folder / store).rglob("*.zip")}
-        listed = {episode_name(0, number) for number in self.model[store]}
-        unlisted = {path for path in zips if PurePosixPath(path).stem not in listed}
-        assert {fault.where for fault in store_faults(opened)} == unlisted
+        assert not list(store_faults(opened))
 
     @rule(data=st.data(), verify=st.booleans())
     def repair(self, data: st.DataObject, verify: bool) -> None:
@@ -204,38 +170,31 @@ class StoreLife(RuleBasedStateMachine):
         run_child(act_and_die, kind, number, repair, self.folder / store, verify)
         listed = self.listed(store)
         gone = set(before) - listed
-        if store.startswith("packed"):  # the index is written when all zips have been moved
-            lost = {
-                number for number in listed if not list((self.folder / store).rglob(f"{episode_name(0, number)}.zip"))
-            }
-            gone |= lost
-            before |= dict.fromkeys(lost, "cut")
         assert listed <= set(before)
         assert gone <= set(self.damaged(store, not verify))
         assert self.kept_aside(store) == kept + len(gone)
         self.model[store] = {number: damage for number, damage in before.items() if number in listed}
 
-    @rule(store=stores, packed=st.booleans())
-    def copy(self, store: str, packed: bool) -> None:
-        target = self.copy_of(store, packed)
+    @rule(store=stores)
+    def copy(self, store: str) -> None:
+        target = f"copy_{store}"
         there = {number: damage for number, damage in self.model.get(target, {}).items() if damage != "cut"}
         damaged = [number for number in self.damaged(store, False) if number not in there]
         if damaged:
             with pytest.raises(CorruptEpisode, match=episode_name(0, damaged[0])):
-                copy(self.folder / store, self.folder / target, packed)
+                copy(self.folder / store, self.folder / target)
         else:
-            copy(self.folder / store, self.folder / target, packed)
+            copy(self.folder / store, self.folder / target)
         until = damaged[0] if damaged else len(EPISODES)
         self.model[target] = there | {number: None for number in self.model[store] if number < until}
         assert not partial_folder(self.folder / target).exists()
 
-    @rule(store=stores, packed=st.booleans(), kind=kinds, number=numbers)
-    def die_copying(self, store: str, packed: bool, kind: str, number: int) -> None:
-        target = self.copy_of(store, packed)
+    @rule(store=stores, kind=kinds, number=numbers)
+    def die_copying(self, store: str, kind: str, number: int) -> None:
+        target = f"copy_{store}"
         if self.damaged(store, False) or any(self.model.get(target, {}).values()):
             return
-        kind = {"rename": "replace", "renamed": "replaced"}[kind] if packed else kind
-        run_child(act_and_die, kind, number, copy, self.folder / store, self.folder / target, packed)
+        run_child(act_and_die, kind, number, copy, self.folder / store, self.folder / target)
         if (self.folder / target).exists():
             listed = self.listed(target)
             assert set(self.model.get(target, ())) <= listed <= {*self.model.get(target, ()), *self.model[store]}
@@ -291,16 +250,13 @@ class StoreLife(RuleBasedStateMachine):
 
     def damaged(self, store: str, quick: bool) -> list[int]:
         found = {number: damage for number, damage in self.model[store].items() if damage is not None}
-        return sorted(number for number, damage in found.items() if kinds_of(store)[damage][1] or not quick)
+        return sorted(number for number, damage in found.items() if DAMAGE[damage][1] or not quick)
 
     def undamaged(self) -> list[tuple[str, int]]:
         return [(store, number) for store, held in self.model.items() for number, damage in held.items() if not damage]
 
     def kept_aside(self, store: str) -> int:
         return len(list(damaged_folder(self.folder / store).glob("*/task*")))
-
-    def copy_of(self, store: str, packed: bool) -> str:
-        return f"{'packed' if packed else 'copy'}_{store}"
 
 
 def test_the_life_of_stores(tmp_path, monkeypatch):
