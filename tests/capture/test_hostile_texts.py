@@ -15,9 +15,7 @@ from typing import Any
 
 import pytest
 
-from tests.kit.paths import GOLDEN
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.schemas.command_line import run_command
 from vla_attention.schemas.errors import BadArgument
@@ -105,21 +103,6 @@ def test_what_looks_at_a_store(
         assert r"a\x1b[2J\nFORGED" in said
     if command[0] == "status":
         assert r"x\x1b[2J\u202e" in said
-
-
-@pytest.mark.thorough
-@pytest.mark.parametrize("command", ["pi", "doctor"])
-def test_a_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str):
-    checkpoint = tmp_path / f"c\x1b[2J\n{FORGED}"
-    shutil.copytree(GOLDEN / "pi" / "pi05_batch2" / "checkpoint_lerobot", checkpoint)
-    config = checkpoint / "config.json"
-    config.write_text(json.dumps(json.loads(config.read_text()) | {HOSTILE: HOSTILE}))
-    words = ("pi",) if command == "doctor" else ()
-    model = ("--checkpoint", checkpoint, "--tokenizer", EMBEDDED_TOKENIZER, "--device", "cpu")
-    model += ("--output", tmp_path / "a.zarr")
-    code = run(command, *words, *model, "--task-suite", "cubes")
-    assert code == (1 if command == "doctor" else 2)
-    assert r"\x1b[2J\u202e" in check_output(capsys)
 
 
 def test_errors_of_the_library():

@@ -5,16 +5,13 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
 import time
-from random import Random
 
 import pytest
 
-from tests.kit.attacks import files_of
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.jobs.status import store_status
@@ -73,42 +70,6 @@ def test_sigterm_drops_the_episode_in_flight_and_resuming_completes_the_store(tm
     assert capture([*arguments, "--resume"]) == 0
     assert analyze(["verify", str(store)]) == 0
     assert store_status(store).complete
-
-
-@pytest.mark.thorough
-def test_kills_and_damage_end_in_a_whole_store_after_repair_and_resuming(tmp_path, capsys):
-    """SIGKILL three times at moments that nobody chose, then lost files."""
-    store, random = tmp_path / "a.zarr", Random(int.from_bytes(os.urandom(4)))
-    arguments = [*DUMMY, "--num-episodes", "4", "--max-steps", "8", "--output", str(store), "--resume"]
-    command = [sys.executable, "-m", "vla_attention.capture", *arguments]
-    environment = os.environ | {"MUJOCO_GL": os.environ.get("MUJOCO_GL", "egl")}
-    for _ in range(3):
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment)
-        until = time.monotonic() + 120
-        while not list((tmp_path / "a.zarr.partial").glob("task*")) and process.poll() is None:
-            assert time.monotonic() < until, "no episode begins"
-            time.sleep(0.02)
-        time.sleep(random.uniform(0, 1.5))  # while the episode runs, is written, or the next one begins
-        process.kill()
-        process.wait()
-        if store.exists():
-            assert all(not task.damaged for task in store_status(store).tasks)  # a kill damages nothing
-    assert capture(arguments) == 0
-    assert analyze(["verify", str(store)]) == 0
-
-    shutil.rmtree(store / "episodes/task000_episode001")
-    (store / "episodes/task000_episode001").mkdir()
-    for file in files_of(store / "episodes/task000_episode002", "joint/rows"):
-        file.unlink()
-    shutil.rmtree(store / "episodes/task000_episode003")
-    capsys.readouterr()
-    assert capture(arguments) == 2
-    assert "2 of the episodes asked for are damaged" in capsys.readouterr().err
-    assert capture(["repair", str(store)]) == 0
-    assert capture(arguments) == 0
-    assert analyze(["verify", str(store)]) == 0
-    assert store_status(store).complete
-    assert not (tmp_path / "a.zarr.partial").exists()
 
 
 def test_array_tasks_fill_one_store_and_the_analysis_comes_last(tmp_path, monkeypatch, capsys):

@@ -12,8 +12,6 @@ from vla_attention.capture.doctor.acceptance import (
     exact_interval,
     find_published_rate,
     judge,
-    most_that_is_too_few,
-    rate_found_in_nine_of_ten,
 )
 from vla_attention.capture.policies.families import default_family
 from vla_attention.capture.policies.family import PublishedRate
@@ -47,16 +45,3 @@ def test_intervals_are_those_of_clopper_and_pearson(count, share):
     successes = round(share * count)
     expected = stats.binomtest(successes, count).proportion_ci(0.95, method="exact")
     assert exact_interval(successes, count) == pytest.approx((expected.low, expected.high), abs=1e-9)
-
-
-@given(count=st.integers(1, 40), rate=st.floats(0.05, 1))
-def test_too_few_is_what_lies_below(count, rate):
-    too_few = most_that_is_too_few(count, rate)
-    assert too_few < 0 or exact_interval(too_few, count)[1] < rate
-    assert too_few + 1 == count or exact_interval(too_few + 1, count)[1] >= rate
-    if too_few >= 0:
-        found = rate_found_in_nine_of_ten(count, too_few)
-        assert stats.binom.cdf(too_few, count, found) == pytest.approx(0.9, abs=1e-6)
-        assert found < rate
-    else:
-        assert rate_found_in_nine_of_ten(count, too_few) == 0

@@ -5,17 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import zarr
 
 from tests.capture.rerun.conftest import pi_store as pi_store
-from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.capture.__main__ import main
 from vla_attention.capture.effects.arguments import EffectSettings
 from vla_attention.capture.effects.mean_pictures import pictures_of
 from vla_attention.capture.policies.pi.embedded import dummy_policy
 from vla_attention.capture.rerun.stored_calls import read_calls
-from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.reader import open_store
 
 SETTINGS = EffectSettings(("cameras",))
@@ -59,14 +56,3 @@ def test_a_rerun_measures_what_the_policy_does_with_it(pi_store, tmp_path):
             expected = policy.act(changed, int(calls.noise_seed[replan])) - calls.actions[replan]
             found = episode.read("effects/change")[entry] * np.array(effects.units)
             np.testing.assert_allclose(found, expected, atol=1e-5)
-
-
-def test_stores_without_fitting_pictures_are_refused(pi_store, tmp_path):
-    policy, settings = dummy_policy(), replace(SETTINGS, pictures=pi_store)
-    with pytest.raises(BadArgument, match="whose tasks are of 'robosuite'"):
-        pictures_of(settings, policy, "cubes")
-    copy_store(open_store(pi_store), tmp_path / "bare.zarr", without=("frames",))
-    with pytest.raises(BadArgument, match="in every episode, and there are none"):
-        pictures_of(replace(SETTINGS, pictures=tmp_path / "bare.zarr"), policy, "robosuite")
-    assert pictures_of(None, policy, "cubes") is None
-    assert pictures_of(EffectSettings(("text",)), policy, "cubes", open_store(pi_store)) is None

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from tests.capture.interventions.test_interventions_on_policies import policy_named
 from tests.kit.cosmos_helpers import INSTRUCTION
@@ -194,28 +193,6 @@ def test_a_call_among_the_others_that_differs_is_refused(monkeypatch):
     assert [effects.conditions[number] for number in effects.measured] == [UNCHANGED]
     np.testing.assert_allclose(effects.change, -1e-3, rtol=0.02)
     assert any("refused" in line for line in run.lines)
-
-
-def test_memory_that_does_not_suffice_makes_batches_smaller(monkeypatch):
-    policy = policy_named("pi05")
-    given, context, actions = call_of(policy)
-    make, sizes = type(policy).act_variants, []
-
-    def as_if_small(self, variants, num_steps, batch):
-        sizes.append(batch)
-        if batch > most:
-            raise torch.OutOfMemoryError("out of memory")
-        return make(self, variants, num_steps, batch)
-
-    monkeypatch.setattr(type(policy), "act_variants", as_if_small)
-    most, run = 8, measurement(policy)
-    assert len(run.begin().measure(given, 11, actions, context).measured) > 1
-    assert sizes == [64, 32, 16, 8]
-    run.begin().measure(given, 11, actions, context)
-    assert sizes == [64, 32, 16, 8, 8]
-    most, run = 0, measurement(policy)
-    assert run.begin().measure(given, 11, actions, context).measured == ()
-    assert "The memory does not suffice for the effects of a single call: they are left out." in run.lines
 
 
 def test_numbers_that_are_not_finite_are_left_out(monkeypatch):

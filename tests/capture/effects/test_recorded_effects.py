@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +11,7 @@ import pytest
 
 from tests.capture.rerun.conftest import capture
 from tests.capture.rerun.conftest import pi_store as pi_store
-from vla_attention.analyze.effects.effect_study import study_effects
-from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.capture.__main__ import main
-from vla_attention.capture.store.disk_estimate import estimate_disk
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.verify import verify_store
 from vla_attention.testing.stores import reseal
@@ -71,53 +67,6 @@ def test_a_rerun_of_one_condition_gives_the_same(with_effects, tmp_path, conditi
     for episode in rerun.episodes:
         expected = episode.read("actions") - episode.read("base_actions")
         np.testing.assert_allclose(recorded[episode.name], expected, atol=1e-5)
-
-
-@pytest.mark.thorough
-def test_effects_of_the_store_are_those_of_its_reruns(with_effects, tmp_path):
-    """The command's numbers: from what was recorded, and from reruns of some of its conditions."""
-    folder = tmp_path / "reruns"
-    for queries in ("all", "action"):
-        for word in ("cube", "red"):
-            target = folder / f"{word}_{queries}.zarr"
-            options = ["--knockout", f'word:"{word}"', "--knockout-queries", queries, "--task-id", "0"]
-            assert main(["rerun", str(with_effects), "--output", str(target), "--check", "0", *options]) == 0
-    seed = str(open_store(with_effects).attributes.recording.effects.seed)
-    noise = ["rerun", str(with_effects), "--output", str(folder / "n.zarr"), "--check", "0", "--noise-seed", seed]
-    assert main(noise) == 0
-    settings = AnalysisSettings(tasks=(0,))
-    recorded = study_effects(with_effects, [], settings, dimensions=range(7)).summary
-    rerun = study_effects(with_effects, [folder], settings, dimensions=range(7)).summary
-    columns = ["effect", "effect_chunk", "angle", "mass", "lift", "keys", "noise", "minus_noise", "num_episodes"]
-    for suffix in ("", "_queries_all"):
-        for word in ("cube", "red"):
-            pair = [
-                table.filter(scope="all", condition=name).select("phase", *columns)
-                for table, name in (
-                    (recorded, f"without_word_{word}{suffix}"),
-                    (rerun, f"without_word_{word}{suffix}"),
-                )
-            ]
-            assert pair[0].height == 4
-            assert pair[0]["phase"].to_list() == pair[1]["phase"].to_list()
-            for column in columns:
-                mine, theirs = (part[column].to_numpy() for part in pair)
-                np.testing.assert_allclose(mine, theirs, rtol=1e-3, atol=1e-5, err_msg=column)
-
-
-def test_the_disk_estimate_knows_them(with_effects):
-    store = open_store(with_effects)
-    root, pictures = store.attributes, [64 * 64 * 3] * 2
-    with_them = estimate_disk(root.recording, root.sites, pictures, 3, 4)
-    without = estimate_disk(replace(root.recording, effects=None), root.sites, pictures, 3, 4)
-    names = ("effects/change", "joint/cut")
-    written = sum(
-        record.size
-        for episode in store.episodes
-        for file, record in episode.files.records.items()
-        if file.startswith(names)
-    )
-    assert written < with_them.total_bytes - without.total_bytes < 10 * written
 
 
 def test_a_rerun_adds_effects_to_stored_calls(pi_store, with_effects, tmp_path, capsys):

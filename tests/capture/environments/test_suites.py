@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from vla_attention.capture.environments.base import EnvironmentSettings, check_initial_state_index, check_task_id
+from vla_attention.capture.environments.base import EnvironmentSettings, check_task_id
 from vla_attention.capture.environments.episode_protocol import LEROBOT, OPENPI
-from vla_attention.capture.environments.suites import SUITES, find_suite, list_tasks, make_environment
+from vla_attention.capture.environments.suites import SUITES, find_suite, make_environment
 from vla_attention.schemas.errors import BadArgument, UnknownName
 
 SETTINGS = EnvironmentSettings()
@@ -39,11 +39,3 @@ def test_task_id_out_of_range_states_the_range() -> None:
             check_task_id(suite, task_id)
     with pytest.raises(BadArgument, match="Task 8"):
         make_environment(find_suite("robosuite"), 8, SETTINGS)
-
-
-def test_initial_state_out_of_range_states_the_range() -> None:
-    task = list_tasks(find_suite("robosuite"))[1]
-    check_initial_state_index(task, 49)
-    for index in (-1, 50):
-        with pytest.raises(BadArgument, match=f"Initial state {index} does not exist .* are 0 to 49"):
-            check_initial_state_index(task, index)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import av
 import pytest
 
 from tests.kit.lerobot_data_sets import H264, Encoding, numbered_picture, write_video
@@ -17,18 +16,6 @@ def test_videos_are_taken(tmp_path, encoding):
     assert check_mp4(path, 20) == path.stat().st_size
     with pytest.raises(Mp4Refused, match="20 pictures; expected at most 19"):
         check_mp4(path, 19)
-
-
-@pytest.mark.parametrize("flags", ["frag_keyframe+empty_moov"])
-def test_other_orders_of_boxes_are_taken(tmp_path, flags):
-    path = tmp_path / "video.mp4"
-    with av.open(str(path), "w", options={"movflags": flags}) as output:
-        stream = output.add_stream("libx264", rate=10)
-        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuv420p"
-        for number in range(20):
-            output.mux(stream.encode(av.VideoFrame.from_ndarray(numbered_picture(number), format="rgb24")))
-        output.mux(stream.encode())
-    assert check_mp4(path, 20) == path.stat().st_size
 
 
 def test_sizes_of_samples_are_compared_with_that_of_the_file(tmp_path):

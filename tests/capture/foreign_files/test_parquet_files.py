@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tests.kit.parquet_writer import Stored, constant, page, run, write_parquet
+from tests.kit.parquet_writer import constant, write_parquet
 from vla_attention.capture.foreign_files.parquet_files import ParquetFile, ParquetRefused
 
 
@@ -57,11 +57,3 @@ def test_memory_is_compared_with_what_is_stored(tmp_path):
     numbers = np.random.default_rng(1).normal(size=10_000_000)
     pl.DataFrame({"a": [0] * len(numbers), "b": numbers}).write_parquet(tmp_path / "real.parquet")
     ParquetFile(tmp_path / "real.parquet").check(["b", "a"])
-
-
-@pytest.mark.parametrize("values", [3, 5])
-def test_pages_have_the_values_of_the_footer(tmp_path, values):
-    column = Stored("a", 2, page(b"\x01" + run(0, values), values), 4, has_dictionary=False)
-    write_parquet(tmp_path / "a.parquet", [column], 4)
-    with pytest.raises(ParquetRefused, match="footer"):
-        ParquetFile(tmp_path / "a.parquet").check(["a"])

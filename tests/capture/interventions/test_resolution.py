@@ -8,7 +8,6 @@ import pytest
 from vla_attention.capture.interventions.resolution import (
     ReplanPlace,
     TooFewKeys,
-    check_selectors,
     empty_replans,
     has_empty_group,
     make_editors,
@@ -17,7 +16,6 @@ from vla_attention.capture.interventions.resolution import (
     site_tokens,
 )
 from vla_attention.schemas.groupings.resolve import EmptyGroup
-from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, SceneObject
 from vla_attention.schemas.interventions import AttentionScale, AttentionUniform, Interventions, KeyKnockout
 from vla_attention.schemas.layout import PatchGrid, Piece, Prompt, Role, SiteLayout, Span
@@ -111,22 +109,6 @@ def test_the_random_control():
     assert (values(control, sliver)["joint"] == 0).sum() == 1
     with pytest.raises(TooFewKeys, match=r"needs 5 keys outside .* replan 7 of task000_episode002, and there are 3"):
         values(KeyKnockout("camera:base | word:the", random_seed=0), joint())
-
-
-@pytest.mark.parametrize(
-    ("selector", "message"),
-    [
-        (
-            "object:bowl_2",
-            r"'object:bowl_2': there is no object 'bowl_2'. Did you mean 'bowl_1'\? Existing: bowl_1, pl",
-        ),
-        ("camera:wrist", r"there is no camera 'wrist'"),
-    ],
-)
-def test_names_that_no_site_has(selector, message):
-    for tokens in (joint(), two_sites()):
-        with pytest.raises(SelectorError, match=message):
-            check_selectors(Interventions(keys=(KeyKnockout(selector),)), vocabularies(tokens))
 
 
 def test_empty_groups():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -80,24 +79,6 @@ def test_plans_of_several_processes_add_up(store, capsys):
     assert store_status(store).tasks[0].last_by == "node7 (job 98_2)"
     assert main(["status", str(store)]) == 0
     assert "node7 (job 98_2)" in capsys.readouterr().out
-
-
-def test_dropped_episodes_are_shown_with_the_reason_until_they_are_recorded(store, capsys):
-    for at, sentence in enumerate(("The simulator stopped.", "The picture of wrist is black.\x1b[2J")):
-        record = RecordWriter(store, replace(NODE, tag=f"node7-1{at}-ab"), (planned(2, 4),))
-        record.add_drop("task002_episode003", sentence)
-        record.add_drop("task002_episode001", "It was recorded later.")
-        record.end("failed")
-    assert main(["status", str(store), "--check"]) == 1
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("dropped: ")]
-    at = read_records(store)[-1].dropped[0].at.removesuffix("+00:00").replace("T", " ")
-    (line,) = lines
-    assert line.startswith(f"dropped: task002_episode003 by node7 (job 98_2), {at}: The picture of wrist is black.")
-    assert "\x1b" not in line
-    assert main(["status", str(store), "--json"]) == 0
-    (status,) = json.loads(capsys.readouterr().out)
-    (dropped,) = next(task["dropped"] for task in status["tasks"] if task["task_id"] == 2)
-    assert (dropped["name"], dropped["by"]) == ("task002_episode003", "node7 (job 98_2)")
 
 
 def test_records_of_an_earlier_store_with_the_same_name_are_ignored(store):

@@ -29,35 +29,3 @@ def test_during_an_episode_a_signal_takes_effect_at_the_next_check() -> None:
 def test_between_episodes_a_signal_takes_effect_at_once() -> None:
     with pytest.raises(Terminated):
         Termination().on_signal(signal.SIGTERM, None)
-
-
-def test_a_second_signal_takes_effect_at_once() -> None:
-    termination = Termination()
-    second = []
-
-    def episode() -> None:
-        with termination.only_at_checks():
-            termination.on_signal(signal.SIGTERM, None)
-            try:
-                termination.on_signal(signal.SIGTERM, None)
-            except Terminated:
-                second.append("at once")
-                raise
-
-    with pytest.raises(Terminated):
-        episode()
-    assert second == ["at once"]
-
-
-def test_a_signal_without_a_check_takes_effect_at_the_end_of_the_episode() -> None:
-    termination = Termination()
-    steps = []
-
-    def episode() -> None:
-        with termination.only_at_checks():
-            termination.on_signal(signal.SIGTERM, None)
-            steps.append("committed")
-
-    with pytest.raises(Terminated):
-        episode()
-    assert steps == ["committed"]

@@ -32,19 +32,6 @@ def left(root: Path) -> list[tuple[float, str]]:
     return [(limit.bytes / GB, limit.by) for limit in memory_limits(root)]
 
 
-@pytest.mark.parametrize("group", ["/", "/jobs/job_7/step_0"])
-def test_a_control_group_or_one_above_it_has_less(root, group):
-    write(root, "proc/self/cgroup", f"0::{group}\n")
-    write(root, "sys/fs/cgroup/memory.max", "max\n")
-    write(root, "sys/fs/cgroup/jobs/memory.max", f"{8 * GB}\n")
-    write(root, "sys/fs/cgroup/jobs/memory.current", f"{5 * GB}\n")
-    write(root, "sys/fs/cgroup/jobs/memory.stat", f"file 9\nactive_file 5\ninactive_file {2 * GB}\n")
-    expected = [(16, "the machine")]
-    if group != "/":
-        expected.append((8 - 5 + 2, "its control group"))
-    assert left(root) == expected
-
-
 @pytest.mark.parametrize(
     ("given", "expected"),
     [

@@ -86,16 +86,6 @@ def test_episodes_are_in_the_order_of_their_numbers_and_the_last_of_several_coun
     assert 2 not in data.info.episodes
 
 
-def test_a_line_ends_only_where_json_lines_end(tmp_path):
-    """Python's `splitlines` also ends one at characters that a text may have."""
-    folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3,)))
-    task = "put it\u2028there"
-    (folder / "meta" / "tasks.jsonl").write_text(
-        json.dumps({"task_index": 0, "task": task}, ensure_ascii=False) + "\r\n"
-    )
-    assert open_dataset(folder).tasks == {0: task}
-
-
 def test_whole_numbers_of_tables_may_be_stored_as_floats(tmp_path):
     """pandas makes floats of a column of whole numbers when it joins tables."""
     folder = write_data_set(tmp_path / "robot", "v3.0", made_up_episodes((3, 4)), video=H264)
@@ -204,18 +194,6 @@ def test_numbers_of_episodes_that_cannot_be_are_refused(tmp_path, index, length)
         open_dataset(folder).episode(0)
 
 
-def test_times_and_pictures_that_are_none_are_refused(tmp_path):
-    folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3,)))
-    table = next(folder.glob("data/**/*.parquet"))
-    rows = pl.read_parquet(table)
-    rows.with_columns(pl.lit(3).alias(CAMERAS[0])).write_parquet(table)
-    with pytest.raises(DamagedDataSet, match="expected the bytes of a picture"):
-        list(open_dataset(folder).episode(0).frames())
-    rows.with_columns(pl.lit(None, dtype=pl.Float32).alias("timestamp")).write_parquet(table)
-    with pytest.raises(DamagedDataSet, match=r"'timestamp' of episode 0 .* NaN"):
-        open_dataset(folder).episode(0)
-
-
 def test_a_video_that_is_shorter_than_its_table_is_refused(tmp_path):
     from tests.kit.lerobot_data_sets import write_video
 
@@ -265,32 +243,3 @@ def test_names_of_the_hub(tmp_path, monkeypatch):
     monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path))
     write_data_set(tmp_path / "lerobot" / "pusht", "v3.0", made_up_episodes((3,)))
     assert open_dataset("lerobot/pusht").name == "lerobot/pusht"
-
-
-def test_only_the_files_of_the_wanted_episodes_are_fetched(tmp_path, monkeypatch):
-    import huggingface_hub
-
-    commit = "c" * 40
-    snapshot = tmp_path / "hub" / "datasets--org--name" / "snapshots" / commit
-    folder = write_data_set(snapshot, "v2.1", made_up_episodes((3, 3), CAMERAS), video=H264)
-    asked, revisions = [], []
-
-    def snapshot_download(name, repo_type, revision, allow_patterns):
-        asked.append((name, repo_type, allow_patterns))
-        revisions.append(revision)
-        return str(folder)
-
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
-    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path / "none"))
-    data = open_dataset("org/name")
-    list(data.episode(1).frames(cameras=CAMERAS[1:]))
-    assert [(name, kind) for name, kind, _ in asked] == [("org/name", "dataset")] * 3
-    # Whatever is uploaded meanwhile, the files of episodes are of the commit of the meta files.
-    assert revisions == [None, commit, commit]
-    assert data.downloads == {"hub org/name": commit}
-    assert open_dataset("org/name@v1").name == "org/name"
-    assert revisions[3:] == ["v1"]
-    assert [path for _, _, paths in asked[1:3] for path in paths] == [
-        "data/chunk-000/episode_000001.parquet",
-        f"videos/chunk-000/{CAMERAS[1]}/episode_000001.mp4",
-    ]

@@ -90,17 +90,6 @@ def test_another_result_is_measured_and_the_machines_are_compared(pi_store):
     assert "NOT bit-equal. Actions differ by at most 0.5 of the environment's units" in result.describe()
 
 
-def test_rows_of_other_noise_are_measured(pi_store):
-    base = open_store(pi_store)
-    calls, policy = read_calls(base.episodes[0]), dummy_policy()
-    other = replace(calls, noise_seed=calls.noise_seed + 1)
-    result = check_fidelity(Repeater(policy, base.attributes.recording), base.attributes.recording, other, 9, {})
-    assert result.replans == 3
-    assert 0 < result.rows < 1
-    assert 0 < result.rows_changed <= 1
-    assert "differ: nothing that the store knows of." in result.describe()
-
-
 def test_another_state_than_the_prompts_is_an_error(pi_store):
     """The tiny policy writes its state into the prompt."""
     base = open_store(pi_store)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import pytest
@@ -24,20 +23,6 @@ def status(store: Path, capsys: pytest.CaptureFixture[str]) -> dict:
     main(["status", str(store), "--json"])
     [found] = json.loads(capsys.readouterr().out)
     return found
-
-
-def test_status_counts_what_a_rerun_was_asked_for(pi_store, tmp_path, capsys):
-    store = tmp_path / "again.zarr"
-    words = ["rerun", str(pi_store), "--output", str(store), "--check", "0", "--task-id", "1"]
-    assert main(words) == 0
-    found = status(store, capsys)
-    assert found["complete"] is True
-    assert [(task["task_id"], task["expected"], task["committed"]) for task in found["tasks"]] == [(1, 2, 2)]
-    shutil.rmtree(store / "episodes" / EPISODES[3])
-    found = status(store, capsys)
-    assert (found["complete"], found["tasks"][0]["missing"]) == (False, [1])
-    assert main([*words, "--resume"]) == 0
-    assert status(store, capsys)["complete"] is True
 
 
 def test_sigterm_drops_the_episode_in_progress(pi_store, tmp_path, monkeypatch, capsys):

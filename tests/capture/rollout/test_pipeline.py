@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
-import struct
 import subprocess
 import sys
 import time
-from multiprocessing.connection import Connection
-from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -25,9 +22,8 @@ from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.jobs.status import store_status
 from vla_attention.capture.jobs.termination import EXIT_TERMINATED
 from vla_attention.capture.rerun.base_store import machine_differences
-from vla_attention.capture.rollout import pipeline, simulator_process
+from vla_attention.capture.rollout import pipeline
 from vla_attention.capture.rollout.policy_call import record_calls
-from vla_attention.capture.rollout.simulation import Advanced
 from vla_attention.schemas.stores.claims import Claims, holders
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.worker import Worker
@@ -85,44 +81,6 @@ def test_an_episode_whose_simulator_died_begins_again(scene, tmp_path, capsys):
     assert capsys.readouterr().out.count(again) == 2
     assert_same_episodes(tmp_path / "one.zarr", tmp_path / "a.zarr")
     assert not (tmp_path / "a.zarr.partial").exists()
-
-
-@pytest.mark.thorough
-def test_a_simulator_may_end_inside_of_an_answer(scene, tmp_path, monkeypatch, capsys):
-    """A killed process leaves the beginning of what it was sending."""
-    left = [1]
-
-    class Cut(Connection):
-        def send(self, answer: Any) -> None:
-            if left[0] and isinstance(answer, Advanced) and answer.steps:
-                left[0] -= 1
-                data = bytes(ForkingPickler.dumps(answer))
-                os.write(self.fileno(), struct.pack("!i", len(data)) + data[: len(data) // 2])
-                raise EOFError
-            super().send(answer)
-
-    monkeypatch.setattr(simulator_process, "Connection", Cut)
-    words = ["--task-id", "0", "--num-episodes", "2"]
-    assert record(tmp_path / "a.zarr", 2, *words) == 0
-    assert left == [0]
-    assert capsys.readouterr().out.count("its simulator ended (killed by signal 9); the episode begins again.") == 1
-
-
-def test_an_episode_begins_again_at_most_twice(scene, tmp_path, capsys):
-    Deadly.lives = [3]
-    scene.make = Deadly
-    assert record(tmp_path / "a.zarr", 2, "--task-id", "0", "--num-episodes", "3") == 2
-    said = capsys.readouterr().err
-    assert (
-        f"The simulator of episode task000_episode001 of {tmp_path}/a.zarr ended 3 times, the last time killed" in said
-    )
-    assert "a smaller --num-envs" in said
-    assert "is missing: task000_episode001. " in said
-    assert said.count("\n") == 1
-    assert len(open_store(tmp_path / "a.zarr").episodes) == 2
-    assert not (tmp_path / "a.zarr.partial").exists()
-    assert holders(tmp_path / "a.zarr") == []
-    assert analyze(["verify", str(tmp_path / "a.zarr")]) == 0
 
 
 class Broken(StillScene):
@@ -228,19 +186,6 @@ def test_the_first_replan_of_a_batch_is_that_of_single_calls_but_for_rounding(
         for name in ("noise_seed", "env_step"):
             assert four.attrs[name] == one.attrs[name]
     assert analyze(["verify", str(tmp_path / "four.zarr")]) == 0
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--num-envs", "0"], "Cannot use --num-envs 0; expected at least 1."),
-        (["--policy-batch", "2", "--knockout", "camera:base_0_rgb"], "with interventions on attention, whose"),
-    ],
-)
-def test_what_does_not_work_is_refused(scene, tmp_path, capsys, words, said):
-    assert record(tmp_path / "a.zarr", 2, "--task-id", "0", "--num-episodes", "2", *words) == 2
-    assert said in capsys.readouterr().err
-    assert not (tmp_path / "a.zarr/episodes").exists() or not any((tmp_path / "a.zarr/episodes").glob("task*"))
 
 
 # --------------------------------------------------------------------------------------------- real simulators

@@ -65,14 +65,6 @@ def test_pi_its_reruns_and_replays(tmp_path):
     check_few(tmp_path / "replay.zarr")
 
 
-@pytest.mark.thorough
-@pytest.mark.usefixtures("still_scene")
-def test_cosmos_with_two_sites(tmp_path):
-    run("cosmos", *WHERE, "--ckpt-path", "untrained-tiny", "--contributions", "--output", tmp_path / "run.zarr")
-    assert [site.name for site in open_store(tmp_path / "run.zarr").attributes.sites] == ["self", "cross"]
-    check_few(tmp_path / "run.zarr")
-
-
 def test_an_episode_of_any_length_has_the_same_files(tmp_path, monkeypatch):
     monkeypatch.setattr(store_codecs, "TARGET_CHUNK_BYTES", 1)
     counts = {replans: check_few(write_store(tmp_path / f"{replans}.zarr", replans=replans)) for replans in (1, 60)}

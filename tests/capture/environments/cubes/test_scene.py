@@ -13,11 +13,9 @@ from vla_attention.capture.environments.cubes.scene import (
     find_target,
     paste_mark,
     scene_seed,
-    verb_index,
 )
 from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS, NUM_BASE_TASKS, list_cube_tasks
 from vla_attention.capture.environments.suites import find_suite
-from vla_attention.schemas.errors import UnknownName
 
 SUITE, HARDER = find_suite("cubes"), find_suite("cubes_harder")
 
@@ -76,19 +74,3 @@ def test_the_mark_is_a_square_in_the_upper_edge_and_changes_nothing_else():
     assert changed.sum() == 64
     assert (picture == 100).all()
     assert marked[0, 24, 1] > marked[0, 24, 0]  # green
-
-
-def test_the_verb_of_an_instruction():
-    found = [
-        verb_index(text)
-        for text in (
-            "touch the red cube",
-            "lift the cube on the left",
-            "push the red cube to the left",
-            "push the red cube to the right",
-            "put the red cube on the green cube",
-        )
-    ]
-    assert found == [0, 1, 2, 3, 4]
-    with pytest.raises(UnknownName, match="eat the cube"):
-        verb_index("eat the cube")

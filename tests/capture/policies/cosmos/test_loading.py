@@ -96,17 +96,6 @@ def test_files_may_lie_elsewhere(folder, tmp_path):
     assert policy.num_layers == 3
 
 
-def test_the_image_encoder_is_found_beside_the_checkpoint_and_in_the_cache(folder, tmp_path):
-    beside = tmp_path / "Cosmos-Predict2-2B-Video2World"
-    beside.mkdir()
-    shutil.move(folder / "tokenizer", beside / "tokenizer")
-    assert load_cosmos_policy(str(folder), options=SMALL).num_layers == 3
-    cached = tmp_path / "hub" / "models--nvidia--Cosmos-Predict2-2B-Video2World" / "snapshots" / "abc"
-    cached.parent.mkdir(parents=True)
-    shutil.move(beside, cached)
-    assert load_cosmos_policy(str(folder), options=SMALL).num_layers == 3
-
-
 def test_embeddings_of_another_model_are_refused(folder, tmp_path):
     import pickle
 

@@ -73,15 +73,6 @@ def test_embeddings_are_read_as_saved(tmp_path):
         assert found.find(name).dtype == torch.bfloat16
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [([1], "but list"), ({"a": torch.zeros(2, 3)}, r"entry for 'a' that is \(2, 3\)")],
-)
-def test_what_is_no_table_of_embeddings_is_refused(tmp_path, content, message):
-    with pytest.raises(UnreadableCheckpoint, match=message):
-        read_embeddings(save(tmp_path / "text.pkl", content))
-
-
 def test_wrapped_and_old_files_are_read(tmp_path):
     torch.save({"model": {"net.a": torch.ones(2)}}, tmp_path / "a.pt")
     assert torch.equal(read_tensors(tmp_path / "a.pt")["net.a"], torch.ones(2))

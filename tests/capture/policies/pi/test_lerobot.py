@@ -170,28 +170,6 @@ def test_the_files_decide_everything(checkpoint, tokenizer_path):
     assert np.isfinite(actions).all()
 
 
-def test_another_order_of_cameras_steps_and_precision(checkpoint, tokenizer_path):
-    def change(config):
-        features = config["input_features"]
-        order = ["observation.images.empty_camera_0", "observation.images.image2", "observation.images.image"]
-        config["input_features"] = {"observation.state": features["observation.state"]} | {
-            n: features[n] for n in order
-        }
-        config.update(n_action_steps=3, num_inference_steps=4, dtype="bfloat16", min_period=5e-3)
-
-    edit(checkpoint / "config.json", change)
-    policy = load_pi_policy(checkpoint, tokenizer_path)
-    assert policy.model.config.cameras == ("image2", "image", "empty_camera_0")
-    assert policy.model.dtype == torch.bfloat16
-    assert policy.default_replan_steps == 3
-    assert policy.denoise_times().tolist() == [1.0, 0.75, 0.5, 0.25]
-    assert policy.model.config.min_period == 5e-3
-    assert policy.model.paligemma_with_expert.paligemma.model.multi_modal_projector.linear.weight.dtype == torch.float32
-    assert np.isfinite(policy.act(policy.prepare(make_observation(1), INSTRUCTION), 0)).all()
-    float32 = load_pi_policy(checkpoint, tokenizer_path, options=CheckpointOptions(dtype=torch.float32))
-    assert float32.model.dtype == torch.float32
-
-
 def test_the_cameras_own_pictures_give_the_same_input_again(checkpoint, tokenizer_path):
     """Pictures that were rounded for the store would not: the model's image was resized in floating point."""
     policy = load_pi_policy(checkpoint, tokenizer_path)

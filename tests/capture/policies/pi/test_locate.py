@@ -4,7 +4,6 @@ import json
 import shutil
 import sys
 import types
-from pathlib import Path
 
 import pytest
 
@@ -13,10 +12,7 @@ from tests.kit.small_tokenizer import train_small_tokenizer
 from tests.kit.still_scene import capture_without_simulator
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.policies.hub import (
-    downloads,
     hub_cache,
-    hub_version,
-    in_hub_cache,
 )
 from vla_attention.capture.policies.identity import downloads_of
 from vla_attention.capture.policies.pi.loading import build_pi_policy
@@ -59,24 +55,6 @@ def test_a_hub_name_is_downloaded_by_the_hub_s_client(monkeypatch, tmp_path):
 
 
 COMMIT, OTHER = "a" * 40, "b" * 40
-
-
-def test_the_commit_of_a_file_is_read_from_the_cache():
-    snapshots = hub_cache() / "models--org--name" / "snapshots"
-    for commit in (COMMIT, OTHER):
-        (snapshots / commit / "tokenizer").mkdir(parents=True)
-        (snapshots / commit / "tokenizer" / "tokenizer.model").touch()
-    path = snapshots / COMMIT / "tokenizer" / "tokenizer.model"
-    assert str(hub_version(path)) == f"org/name@{COMMIT}"
-    assert downloads(path, None, Path("/elsewhere/snapshots/x")) == {"hub org/name": COMMIT}
-    assert hub_version(snapshots) is None
-    # Of two versions that are there, the one that `main` was at the last download, not the last by its letters.
-    assert in_hub_cache("org/name", "tokenizer/tokenizer.model") == path
-    (snapshots.parent / "refs").mkdir()
-    for commit in (OTHER, COMMIT):
-        (snapshots.parent / "refs" / "main").write_text(commit)
-        assert hub_version(in_hub_cache("org/name", "tokenizer/tokenizer.model")).commit == commit
-    assert in_hub_cache("org/name", "other") is None
 
 
 @pytest.fixture
