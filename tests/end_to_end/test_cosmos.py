@@ -98,6 +98,7 @@ def test_the_published_frame_proxy_is_named_by_its_frames(tmp_path):
     assert (tmp_path / "attention_ratio_results_robosuite.json").is_file()
 
 
+@pytest.mark.thorough
 def test_queries_can_be_pooled_by_action_step(tmp_path):
     store = tmp_path / "a.zarr"
     assert capture([*ONE_LAYER, "--queries", "steps", "--output", str(store)]) == 0

@@ -80,6 +80,7 @@ def rows_of(store: Path, site: str) -> np.ndarray:
     return zarr.open_group(store / "episodes/task000_episode000", mode="r")[f"{site}/rows"][:].astype(np.float64)
 
 
+@pytest.mark.thorough
 @pytest.mark.libero
 @pytest.mark.simulator
 def test_the_store_has_the_published_sizes_and_both_sites(libero_store):
@@ -89,6 +90,7 @@ def test_the_store_has_the_published_sizes_and_both_sites(libero_store):
     assert rows_of(libero_store, "cross").shape == (2, 3, 2, 2, 1, 512)
 
 
+@pytest.mark.thorough
 @pytest.mark.libero
 @pytest.mark.simulator
 def test_the_results_of_the_command_have_the_published_fields_and_sums(libero_run, libero_store):
@@ -155,6 +157,7 @@ def test_an_instruction_without_embedding_names_the_near_ones(folder, capsys):
     assert "nearest: 'stack the red cube'" in said
 
 
+@pytest.mark.thorough
 @pytest.mark.simulator
 def test_without_t5s_tokenizer_words_cannot_be_selected_and_the_text_as_a_whole_can(tmp_path, capsys):
     task = list_tasks(find_suite("robosuite"))[1]

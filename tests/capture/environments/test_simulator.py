@@ -11,7 +11,6 @@ pytest.importorskip("robosuite")
 
 import mujoco
 
-from tests.kit.thorough import thorough_except
 from vla_attention.capture.environments import simulator
 from vla_attention.capture.environments.base import EnvironmentSettings
 from vla_attention.capture.environments.episode_protocol import CAMERAS
@@ -88,9 +87,7 @@ def test_pictures_in_a_kept_context_are_those_of_a_new_one() -> None:
 
 @pytest.mark.simulator
 @pytest.mark.libero
-@pytest.mark.parametrize(
-    ("suite", "task"),
-    thorough_except([("libero_goal", 0)], [("libero_goal", 0), ("libero_90", 20)], several=True),
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize(("suite", "task"), [("libero_goal", 0), ("libero_90", 20)])
 def test_pictures_of_libero_in_a_kept_context_are_those_of_a_new_one(libero_assets, suite, task) -> None:
     hold_that_the_context_is_kept(suite, task, EnvironmentSettings(libero_assets=libero_assets))

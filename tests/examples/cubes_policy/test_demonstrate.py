@@ -15,6 +15,7 @@ from examples.cubes_policy.demonstrate import (
 )
 
 
+@pytest.mark.thorough
 @pytest.mark.simulator
 def test_a_part_depends_on_its_number_alone() -> None:
     settings = DemonstrationSettings(episodes_per_part=1)
