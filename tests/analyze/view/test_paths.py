@@ -34,6 +34,7 @@ def test_the_page_its_documents_and_the_files_of_stores_are_named():
         "stores/0/episodes/..",
         "stores/0/episodes/../../x",
         "stores/0/episodes/..%2f..%2fx",
+        "stores/0/episodes%2fa",
         "stores/0/episodes/a\\..\\x",
         "stores/0//etc/passwd",
         "stores/0/episodes//x",

@@ -109,6 +109,20 @@ def test_what_a_running_process_of_this_machine_writes_stays(tmp_path):
         assert folder.is_dir()
 
 
+def test_of_two_that_saw_no_holder_one_gets_the_claim(tmp_path, monkeypatch):
+    first, second = claims(tmp_path, worker(1)), claims(tmp_path, worker(2))
+
+    def after_the_other(building: Path, target: Path, rename=Path.rename) -> Path:
+        monkeypatch.undo()
+        assert first.acquire(NAME) is None
+        return rename(building, target)
+
+    monkeypatch.setattr(Path, "rename", after_the_other)
+    held = second.acquire(NAME)
+    assert held is not None
+    assert held.worker == first.worker
+
+
 @pytest.mark.parametrize("silent", [False, True])
 def test_of_several_processes_one_gets_the_claim(tmp_path, silent):
     if silent:
