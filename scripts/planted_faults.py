@@ -213,7 +213,7 @@ def plant(fault: Fault, copy: Path) -> str:
         for words in (fault.tests, ()):
             code, printed = run_tests(copy, ["-x", *words])
             if code == 1:
-                failed = re.findall(r"^(?:FAILED|ERROR) (\S+)", printed, re.MULTILINE)
+                failed = re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", printed, re.MULTILINE)
                 return failed[0] if failed else "(no name)"
             if code != 0:
                 raise RuntimeError(f"pytest ended with {code} for {fault.name}:\n{printed[-2000:]}")
