@@ -155,7 +155,7 @@ FAULTS = (
         "capture/policies/noise.py",
         "[run_seed, task_id, episode_index, replan]",
         "[run_seed, task_id, episode_index, 0]",
-        ("tests/capture/policies",),
+        ("tests/capture/policies/test_noise.py",),
     ),
     Fault(
         "effect of the wrong reader: all queries for the action queries",
@@ -176,7 +176,7 @@ FAULTS = (
         "capture/policies/pi/policy.py",
         "torch.cat([each.tensors[name] for each in policy_inputs])",
         'torch.cat([each.tensors[name] for each in policy_inputs]).roll(int(name == "tokens"), 0)',
-        ("tests/capture/policies/pi",),
+        ("tests/capture/rollout/test_pipeline.py",),
     ),
     Fault(
         "resumed twice: a committed episode is recorded again",

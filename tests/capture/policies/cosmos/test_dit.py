@@ -115,6 +115,19 @@ def test_a_rotation_keeps_lengths_and_sees_only_distances(dit):
     torch.testing.assert_close(products[0, 1], products[2, 3])
 
 
+def test_padded_text_is_an_exact_null_sink(dit):
+    observer, inputs = EverythingObserver(), make_inputs()
+    dit(**inputs, observer=observer)
+    rows = observer.probabilities("cross", 0)
+    assert (rows[..., 3:] == rows[..., 3:4]).all()
+    shorter = dict(inputs, text=torch.zeros_like(inputs["text"]))
+    empty = EverythingObserver()
+    dit(**shorter, observer=empty)
+    for layer in range(DUMMY_CONFIG.dit.num_blocks):
+        assert (empty.residual_norms[layer][..., 1] == 0).all()
+        assert (observer.residual_norms[layer][..., 1] > 0).all()
+
+
 def test_bfloat16_rounds_the_times(weights):
     model = build_dit(DUMMY_CONFIG.dit, weights, dtype=torch.bfloat16)
     inputs = make_inputs()
