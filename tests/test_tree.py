@@ -8,11 +8,12 @@ import pytest
 
 from tests.kit.paths import ROOT
 
-TOP = """
-    .ci .github .gitignore .pre-commit-config.yaml CHANGELOG.md CITATION.cff CONTRIBUTING.md LICENSE MANIFEST.in Makefile
-    README.md analyze benchmarks capture constraints.txt docs examples mkdocs.yml paper.bib paper.md pyproject.toml
-    requirements-libero.txt schemas scripts tests vla_attention
-""".split()
+TOP = {
+    ".ci", ".github", ".gitignore", ".pre-commit-config.yaml", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md",
+    "LICENSE", "MANIFEST.in", "Makefile", "README.md", "analyze", "benchmarks", "capture", "constraints.txt",
+    "docs", "examples", "mkdocs.yml", "paper.bib", "paper.md", "pyproject.toml", "requirements-libero.txt",
+    "schemas", "scripts", "tests", "vla_attention",
+}  # fmt: skip
 #: Below these, folders NAME.zarr are tracked.
 STORES = ("tests/golden/stores/", "tests/golden/tables/stores/", "vla_attention/example_stores/")
 
