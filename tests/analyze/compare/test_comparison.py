@@ -135,6 +135,7 @@ def test_nothing_that_pairs_is_compared_unpaired_and_said(stores):
     first, other = ([log_ratio(run, t, e) / np.log(2) for t in TASKS for e in range(EPISODES)] for run in (0, 1))
     assert row["paired"] is False
     assert row["difference"] == pytest.approx(np.mean(other) - np.mean(first), rel=1e-4)
+    assert (row["mean_first"], row["mean_other"]) == pytest.approx((np.mean(first), np.mean(other)), rel=1e-4)
     assert row["low"] < row["difference"] < row["high"]
     assert row["high"] - row["low"] > 1.0  # scenes are in it
     assert found.pairs.is_empty()
