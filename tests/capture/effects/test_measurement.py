@@ -11,7 +11,7 @@ from tests.capture.interventions.test_interventions_on_policies import policy_na
 from tests.kit.cosmos_helpers import INSTRUCTION
 from tests.kit.policy_inputs import make_observation
 from vla_attention.capture.effects.arguments import EffectSettings
-from vla_attention.capture.effects.conditions import UNCHANGED, exchanges, planned_effects, refuse_both
+from vla_attention.capture.effects.conditions import UNCHANGED, planned_effects, refuse_both
 from vla_attention.capture.effects.measurement import EffectMeasurement
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
 from vla_attention.capture.interventions.resolution import (
@@ -213,16 +213,6 @@ def test_numbers_that_are_not_finite_are_left_out(monkeypatch):
     monkeypatch.undo()
     assert {*effects.measured, 3} == set(whole.begin().measure(given, 11, actions, context).measured)
     assert any(effects.conditions[3].name in line for line in run.lines)
-
-
-def test_words_are_exchanged_for_those_in_their_places():
-    prompt = policy_named("pi05").prepare(make_observation(0), TEXT).prompt
-    found = exchanges(words_of(prompt), SIBLINGS[0])
-    assert found == [
-        PromptChange("synonyms", synonyms={"bowl": "cup"}),
-        PromptChange("synonyms", synonyms={"plate": "stove"}),
-        PromptChange("synonyms", synonyms={"red": "blue"}),
-    ]
 
 
 def test_what_a_policy_has_not_is_refused():

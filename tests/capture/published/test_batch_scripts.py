@@ -68,22 +68,6 @@ def test_the_helper_prints_what_it_would_submit(tmp_path):
     assert all(line.strip().endswith("run_attention_ratio_cosmos.sh") for line in (array, analysis))
 
 
-@pytest.mark.parametrize(
-    ("words", "variables", "expected"),
-    [(["--array=0-2"], {"TASK_ID": "2"}, "give --array=2 instead"), (["--array=0-2"], {}, "there is no sbatch here")],
-)
-def test_mistakes_of_the_helper(tmp_path, words, variables, expected):
-    # Without folders that may contain an sbatch.
-    (tmp_path / "bin").mkdir()
-    for tool in ("bash", "dirname", "env"):
-        (tmp_path / "bin" / tool).symlink_to(f"/usr/bin/{tool}")
-    path = f"{tmp_path / 'bin'}:{Path(sys.executable).parent}"
-    done = run("submit_attention_ratio.sh", tmp_path, *words, **variables, PATH=path)
-    assert done.returncode == 2, done.stderr
-    assert expected in done.stderr
-    assert done.stderr.count("\n") == 1
-
-
 def arguments(family: PolicyFamily = PI, **variables: str) -> list[str]:
     return arguments_from_environment(variables, family)
 

@@ -182,27 +182,6 @@ def test_black_pictures_again_and_again_end_the_run(scene, tmp_path, capsys, num
     check_nothing_is_left(tmp_path / "a.zarr")
 
 
-@pytest.mark.parametrize(("num_envs", "kind", "shown"), [(1, AlwaysBlack, "black")])
-def test_pictures_without_content_from_the_beginning_are_said_once_and_no_fault(
-    scene, whole, tmp_path, capsys, monkeypatch, num_envs, kind, shown
-):
-    """A camera may look at nothing: the task's first picture decides."""
-    spoil(scene, kind, 100)
-    monkeypatch.setattr(kind, "at", 0)
-    assert record(tmp_path / "a.zarr", num_envs, *WORDS) == 0
-    said = capsys.readouterr().err
-    assert said.startswith(
-        "vla-capture: The picture of agentview at replan 0 (environment step 10) of episode task000_"
-    )
-    assert f", the first of its task, is {shown}: the camera shows nothing." in said
-    assert said.count("\n") == 1
-    facts = [
-        episode.attributes.provenance.get("constant_cameras") for episode in open_store(tmp_path / "a.zarr").episodes
-    ]
-    assert facts == ["agentview"] * 3
-    assert not any("constant_cameras" in one.attributes.provenance for one in open_store(whole).episodes)
-
-
 @both
 def test_numbers_that_turn_nan_cost_their_episode_only(scene, tmp_path, monkeypatch, capsys, num_envs):
     store = tmp_path / "a.zarr"

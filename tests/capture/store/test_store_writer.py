@@ -39,8 +39,6 @@ from vla_attention.testing.stores import (
 )
 from vla_attention.testing.strategies import episode_tokens
 
-CORE_CODECS = {"bytes", "blosc", "crc32c", "sharding_indexed"}
-
 
 def check_equals_spec(path: Path, spec: StoreSpec) -> None:
     """Every array and attribute of every episode against what the spec says."""
@@ -144,37 +142,6 @@ def test_episodes_around_the_size_of_a_block(tmp_path, monkeypatch, replans):
 def written(tmp_path_factory) -> tuple[Path, StoreSpec]:
     spec = StoreSpec(replans=9)
     return write_store(tmp_path_factory.mktemp("written") / "a.zarr", spec=spec), spec
-
-
-def array_documents(path: Path) -> dict[str, dict]:
-    documents = {str(file.parent): json.loads(file.read_text()) for file in path.rglob("zarr.json")}
-    return {name: document for name, document in documents.items() if document["node_type"] == "array"}
-
-
-def codec_chains(codecs: list[dict]) -> list[list[dict]]:
-    """The codec chain of chunks and, inside a shard, those of the inner chunks and of the index."""
-    if codecs[0]["name"] != "sharding_indexed":
-        return [codecs]
-    inner = codecs[0]["configuration"]
-    return [*codec_chains(inner["codecs"]), inner["index_codecs"]]
-
-
-def test_core_codecs_only_and_a_checksum_on_every_chunk(written):
-    documents = array_documents(written[0])
-    assert len(documents) == 4 * 11
-    for name, document in documents.items():
-        assert document["zarr_format"] == 3
-        assert document["storage_transformers"] == []
-        names = {codec["name"] for codec in document["codecs"]}
-        for chain in codec_chains(document["codecs"]):
-            names |= {codec["name"] for codec in chain}
-            assert chain[-1]["name"] == "crc32c", name
-        assert names <= CORE_CODECS, name
-        assert document["fill_value"] == (
-            "NaN" if document["data_type"].startswith("float") else document["fill_value"]
-        )
-        assert document["data_type"] in ("uint8", "float32", "float64")
-        assert len(document["dimension_names"]) == len(document["shape"])
 
 
 def test_chunks_that_hold_only_the_fill_value_are_written(tmp_path):

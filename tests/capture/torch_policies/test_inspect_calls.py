@@ -9,7 +9,7 @@ from torch.nn.functional import scaled_dot_product_attention as sdpa
 
 import vla_attention as va
 from tests.kit.attention_modules import Policy
-from vla_attention.capture.torch_policies.inspect_calls import NoAttention, folded_paths
+from vla_attention.capture.torch_policies.inspect_calls import NoAttention
 
 
 class Decoder(nn.Module):
@@ -37,17 +37,6 @@ def test_the_table():
     assert (first.times, second.times) == ((1, 1), (5, 5))
     assert (first.heads, second.heads, second.kv_heads, second.batch) == (4, 4, 2, 2)
     assert max(table.errors) < 3e-6
-
-
-@pytest.mark.parametrize(
-    ("paths", "folded"),
-    [
-        ([f"layers.{n}.attn" for n in range(0, 17, 2)], "layers.{0,2..16}.attn"),
-        ([f"t{m}.l.{n}" for m in (0, 1) for n in range(4)], "t{0,1}.l.{0..3}"),
-    ],
-)
-def test_paths_are_folded(paths, folded):
-    assert folded_paths(paths) == folded
 
 
 def test_a_policy_without_attention():

@@ -18,7 +18,6 @@ from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.session import WeightsChanged
 from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
 from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
-from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
@@ -375,24 +374,3 @@ def test_attention_inside_of_vmap_is_refused(tmp_path):
     policy = OddPolicy(lambda block, q, k, v: torch.vmap(nn.functional.scaled_dot_product_attention)(q, k, v))
     with pytest.raises(UnseenAttention, match=r"inside of torch\.vmap"):
         rows_of(tmp_path, policy)
-
-
-@pytest.mark.parametrize(
-    ("given", "sentence"),
-    [
-        ({"actions": np.zeros((ACTIONS, 2))}, "actions has 3 entries; expected one for each of 2 episodes"),
-        ({"active": [True]}, "active has 1 entries"),
-    ],
-)
-def test_what_a_batch_is_given_has_an_entry_for_each_episode(tmp_path, given, sentence):
-    policy, given = OddPolicy(sdpa), dict(given)
-    actions = given.pop("actions", None)
-    facts = [{"task_id": 0, "episode_index": row, "instruction": ""} for row in range(2)]
-    with record(tmp_path / "a.zarr", policy, layout=layout(), durable=False) as run:
-        with (
-            pytest.raises(BadArgument, match=sentence),
-            run.episodes(facts) as episodes,
-            episodes.replan(env_step=0, **given) as replan,
-        ):
-            replan.actions = (policy.act(batch=2), actions)[1]
-        assert not run.has(0, 0)

@@ -233,16 +233,6 @@ def test_a_repeat_that_raises_is_said_once_and_its_entries_are_absent(tmp_path):
         assert {"front_blank", "without_word_bowl_queries_all"} <= set(changes_of(store, replan))
 
 
-def test_a_repeat_that_never_works_leaves_a_whole_episode_without_entries(tmp_path):
-    store, _, said = fill(tmp_path / "a.zarr", SamplingPolicy(), lambda *_: lambda call: np.zeros((3, 2)))
-    (sentence,) = said
-    assert "made no attention call: a policy that answers from a queue must be reset in it" in sentence
-    assert "(policy.reset(), policy.select_action(batch))[1]" in sentence
-    assert store.episodes[0].attributes.num_replans == 2
-    assert changes_of(store) == {}
-    assert "effects/change" not in store.episodes[0].attributes.arrays
-
-
 def test_a_repeat_of_another_call_is_refused(tmp_path):
     def other(policy, replan):
         return lambda call: repeat_of(policy, replan)(call) + 1e-3

@@ -14,7 +14,7 @@ from tests.kit.cosmos_checkpoint import WEIGHTS_NAME
 from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION
 from tests.kit.policy_inputs import make_observation
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound
-from vla_attention.capture.policies.cosmos.loading import CosmosOptions, build_cosmos_policy, load_cosmos_policy
+from vla_attention.capture.policies.cosmos.loading import CosmosOptions, load_cosmos_policy
 from vla_attention.capture.policies.cosmos.locate import (
     EMBEDDINGS_NAME,
     POLICY_REPOSITORY,
@@ -80,20 +80,6 @@ def test_missing_files_are_named(folder, missing, error, message):
     (folder / missing).unlink()
     with pytest.raises(error, match=message):
         load_cosmos_policy(str(folder), options=SMALL)
-
-
-def test_files_may_lie_elsewhere(folder, tmp_path):
-    for name in (STATISTICS_NAME, EMBEDDINGS_NAME):
-        shutil.move(folder / name, tmp_path / name)
-    shutil.move(folder / "tokenizer", tmp_path / "vae")
-    policy = build_cosmos_policy(
-        str(folder),
-        device="cpu",
-        dataset_stats_path=str(tmp_path / STATISTICS_NAME),
-        t5_text_embeddings_path=str(tmp_path / EMBEDDINGS_NAME),
-        vae_path=str(tmp_path / "vae"),
-    )
-    assert policy.num_layers == 3
 
 
 def test_embeddings_of_another_model_are_refused(folder, tmp_path):

@@ -19,11 +19,8 @@ from vla_attention.capture.policies.pi.loading import build_pi_policy
 from vla_attention.capture.policies.pi.locate import (
     HUB_FILES,
     find_checkpoint,
-    find_tokenizer,
     openpi_cache,
 )
-from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
-from vla_attention.schemas.errors import BadArgument
 
 URL = "gs://openpi-assets/checkpoints/pi05_libero"
 
@@ -112,21 +109,3 @@ def test_openpi_s_cache_is_used_when_the_checkpoint_is_there():
     target.mkdir(parents=True)
     assert find_checkpoint(URL) == target
     assert find_checkpoint(URL + "/") == target
-
-
-def test_tokenizers_are_looked_for_in_the_checkpoint_and_the_caches(tmp_path):
-    checkpoint = tmp_path / "checkpoint"
-    places = [
-        hub_cache() / "models--google--paligemma-3b-pt-224" / "snapshots" / "abc" / "tokenizer.model",
-        openpi_cache() / "big_vision" / "paligemma_tokenizer.model",
-        checkpoint / "paligemma_tokenizer.model",
-        checkpoint / "tokenizer.model",
-        checkpoint / "tokenizer" / "tokenizer.model",
-    ]
-    with pytest.raises(BadArgument, match=r"gs://big_vision/paligemma_tokenizer\.model.*give --tokenizer PATH"):
-        find_tokenizer(checkpoint, None)
-    for place in places:  # each later one takes precedence over the earlier ones
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.touch()
-        assert find_tokenizer(checkpoint, None) == place
-    assert find_tokenizer(checkpoint, str(EMBEDDED_TOKENIZER)) == EMBEDDED_TOKENIZER

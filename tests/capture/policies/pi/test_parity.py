@@ -5,7 +5,6 @@ import shutil
 
 import numpy as np
 import pytest
-from safetensors.torch import load_file, save_file
 
 from tests.kit.pi_golden import GOLDEN, LARGE_GOLDEN
 from vla_attention.capture.__main__ import main
@@ -28,12 +27,6 @@ def case(tmp_path):
     folder = tmp_path / "case"
     shutil.copytree(GOLDEN / "pi05_batch2", folder)
     return folder
-
-
-def edit(folder, file, change):
-    arrays = dict(np.load(folder / file))
-    change(arrays)
-    np.savez(folder / file, **arrays)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -63,33 +56,6 @@ def test_all_reference_checkpoints_pass(name, capsys):
 
 
 FOLDERS = ("checkpoint", "checkpoint_openpi_torch", "checkpoint_lerobot")
-
-
-def test_a_difference_fails_and_its_place_is_printed(case, capsys):
-    def change(arrays):
-        arrays["attn"][7, 2, 1, 4, 3, 20] += 1e-3
-
-    edit(case, "expected.npz", change)
-    code, out, _ = parity(capsys, case, "--format", "openpi")
-    assert code == 1
-    assert "attention  1.0e-03  BEYOND THE LIMIT" in out
-    row = next(line for line in out.splitlines() if line.strip().startswith("2 "))
-    assert row.split()[1 + 7] == "1.0e-03"
-    assert parity(capsys, case, "--format", "openpi", "--limit", "2e-3")[0] == 0
-    edit(case, "expected.npz", lambda arrays: arrays["attn"].fill(np.nan))
-    code, out, _ = parity(capsys, case, "--format", "lerobot", "--json")
-    assert code == 1
-    assert json.loads(out)[0]["attention_max"] is None
-
-
-def test_spoiled_weights_fail(case, capsys):
-    file = case / "checkpoint_openpi_torch" / "model.safetensors"
-    tensors = load_file(file)
-    tensors["paligemma_with_expert.gemma_expert.model.layers.1.self_attn.q_proj.weight"] *= 1.01
-    save_file(tensors, file)
-    code, out, _ = parity(capsys, case)
-    assert code == 1
-    assert out.count("BEYOND THE LIMIT") == 2
 
 
 def spoil(case, what):
