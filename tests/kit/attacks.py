@@ -34,16 +34,6 @@ def exchange(one: Path, other: Path) -> None:
     aside.rename(other)
 
 
-def arrays_of(episode: Path) -> list[str]:
-    """Names of the arrays in an episode's folder."""
-    documents = sorted(episode.rglob("zarr.json"))
-    return [
-        file.parent.relative_to(episode).as_posix()
-        for file in documents
-        if json.loads(file.read_text())["node_type"] == "array"
-    ]
-
-
 def files_of(episode: Path, array: str) -> list[Path]:
     """The files of an array's chunks."""
     return sorted(file for file in (episode / array).rglob("*") if file.is_file() and file.name != "zarr.json")
