@@ -1,7 +1,6 @@
 """The table of cases of what uniform attention gives, which Python and the viewer's page share, and stores of them.
 
-`version_1`: a layout, roles (replan, key) and a number of queries, and what a store of version 1 has as its baseline
-(replan, key). `stored`: who sees what (`seen`: replan, layer, denoise step, head, query, key; one entry stands for
+`stored`: who sees what (`seen`: replan, layer, denoise step, head, query, key; one entry stands for
 all), what uniform attention then gives over selections (replan, key), and lifts of the groups of `default` for
 attention that is shared out by `weights` among the keys that a query sees.
 """

@@ -119,36 +119,7 @@ function measured(one) {
   };
 }
 
-function tomlFile({ text, path }) {
-  const grouping = engine.readGroupingFile(text, path);
-  return {
-    name: grouping.name,
-    description: grouping.description,
-    groups: [...grouping.groups],
-    ratio: grouping.ratio,
-    overlap: grouping.overlap,
-    allow_empty: grouping.allowEmpty,
-    written: engine.writeGroupingFile(grouping),
-  };
-}
-
-const answers = {
-  cases: measured,
-  files: tomlFile,
-  near: ([word, names]) => engine.didYouMean(word, names),
-  shown: (text) => [engine.visible(text), engine.quoted(text), engine.shortened(text, 20), engine.casefold(text)],
-  words: (text) => engine.splitWords(text),
-  rectangles: ({ mask, rows, columns }) => engine.coveringRectangles(Uint8Array.from(mask), rows, columns),
-  rewritten: (text) => engine.selectorText(engine.parseSelector(text)),
-  painted: ({ text, layout, camera, patches, erase }) => engine.paintedPatches(text, layout, camera, patches, erase),
-  toggled: ({ text, atom }) => engine.toggledPart(text, atom),
-  ranks: ({ row, valid }) => numbers(engine.keyRanks(Float64Array.from(row), Uint8Array.from(valid))),
-  lifts: ({ row, valid, uniform }) =>
-    numbers(engine.keyLifts(Float64Array.from(row), Uint8Array.from(valid), Float64Array.from(uniform))),
-  version_1: (episode) => tokensOf(episode).uniformOfVersion1.map(numbers),
-  drafts: (text) => engine.textOfDraft(engine.draftOfText(text)),
-  shell: (text) => engine.shellWord(text),
-};
+const answers = { cases: measured };
 const results = {};
 for (const [kind, answer] of Object.entries(answers)) {
   results[kind] = (given[kind] ?? []).map((one) => {
