@@ -19,6 +19,7 @@ EPISODE = "episodes/task000_episode002"
 SHORT = ("pi", "--checkpoint", "untrained-tiny", "--task-suite", "libero_goal", "--task-id", "0", "--max-steps", "4")
 
 
+@pytest.mark.thorough
 @pytest.mark.simulator
 @pytest.mark.libero
 def test_a_resumed_episode_is_the_one_of_a_run_in_order(tmp_path: Path, libero_assets: Path, capfd) -> None:

@@ -96,6 +96,7 @@ def test_regions_belong_to_what_they_are_part_of() -> None:
     assert parent_of_region("main_table_stove_front_region", known) is None
 
 
+@pytest.mark.thorough
 @pytest.mark.simulator
 @pytest.mark.libero
 def test_pictures_are_those_of_the_untouched_protocol(
@@ -111,6 +112,7 @@ def test_pictures_are_those_of_the_untouched_protocol(
         np.testing.assert_array_equal(ours.gripper_qpos, theirs["robot0_gripper_qpos"])
 
 
+@pytest.mark.thorough
 @pytest.mark.simulator
 @pytest.mark.libero
 def test_the_segmentation_shows_the_moment_of_the_picture(
@@ -131,6 +133,7 @@ def test_the_segmentation_shows_the_moment_of_the_picture(
     np.testing.assert_array_equal(environment.segmentation("agentview"), segmented)
 
 
+@pytest.mark.thorough
 @pytest.mark.simulator
 @pytest.mark.libero
 def test_episodes_do_not_depend_on_what_ran_before(environment: LiberoEnvironment, episode: list[Observation]) -> None:
@@ -144,6 +147,7 @@ def test_episodes_do_not_depend_on_what_ran_before(environment: LiberoEnvironmen
     np.testing.assert_array_equal(state, caller_state)
 
 
+@pytest.mark.thorough
 @pytest.mark.simulator
 @pytest.mark.libero
 def test_objects_and_their_pixels(environment: LiberoEnvironment, episode: list[Observation]) -> None:
