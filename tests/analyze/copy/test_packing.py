@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import signal
 import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.kit.crashes import before_call, die, run_child
 from vla_attention.analyze.copy import packing
 from vla_attention.analyze.copy.copying import copy_store
-from vla_attention.schemas.errors import Note
 from vla_attention.schemas.stores.packed_index import INDEX_FILE
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
@@ -94,26 +91,3 @@ def test_an_interrupted_copy_goes_on(original, packed, tmp_path, monkeypatch):
     again = copy_store(open_store(original), target, (), packed=True)
     assert (again.present, again.added) == (2, 2)
     assert all_bytes(target) == all_bytes(packed)
-
-
-def killed_in_the_third(original: Path, target: Path) -> None:
-    with before_call("replaced", 2, die):
-        copy_store(open_store(original), target, (), packed=True)
-
-
-def test_a_killed_copy_leaves_nothing_behind_for_long(original, packed, tmp_path):
-    target = tmp_path / "b.zarr"
-    assert run_child(killed_in_the_third, original, target) == -signal.SIGKILL
-    assert {file.suffix for file in target.rglob("*") if file.is_file()} == {".json", ".zip"}
-    (left,) = (tmp_path / "b.zarr.partial").iterdir()
-    assert left.name.startswith("copy-")
-    with pytest.warns(Note, match="Left out of .*b.zarr"):
-        faults = verify_store(open_store(target))
-    # What it has packed is on the disk, and in no index yet.
-    assert [fault.where for fault in faults] == [
-        str(file.relative_to(target)) for file in sorted(target.rglob("*.zip"))
-    ]
-    pack(original, target)
-    assert verify_store(open_store(target)) == []
-    assert all_bytes(target) == all_bytes(packed)
-    assert list(tmp_path.iterdir()) == [target]

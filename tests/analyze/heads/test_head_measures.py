@@ -10,7 +10,6 @@ import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from polars.testing import assert_frame_equal
 
 from tests.kit.made_up_steps import flat
 from tests.kit.questions import question_about
@@ -18,7 +17,6 @@ from tests.kit.raw_rows import FEW, leaky, raw_episodes, weights_of
 from vla_attention.analyze.heads.head_measures import ranked_heads
 from vla_attention.analyze.heads.head_study import HeadStudy, study_heads
 from vla_attention.analyze.heads.row_metrics import RowOptions
-from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.testing.stores import StoreSpec, every_key_seen, write_store
 from vla_attention.testing.strategies import episode_tokens, groupings
@@ -130,27 +128,6 @@ def test_numbers_of_heads_equal_loops_over_raw_rows(data):
             assert row["fraction_std"] == pytest.approx(np.mean(np.std(of_heads, axis=0)), abs=1e-5)
 
 
-@pytest.mark.thorough
-@FEW
-@given(data=st.data())
-def test_layers_of_a_study_equal_those_of_the_whole_analysis(data):
-    """With and without reading rows, and whether or not a group cuts a segment."""
-    tokens = data.draw(episode_tokens())
-    grouping = data.draw(groupings(tokens))
-    with tempfile.TemporaryDirectory() as folder:
-        path = write_store(
-            Path(folder) / "a.zarr", tokens=tokens, tasks=(0, 1), episodes=1, mantissa_bits=23, layer_labels=(0, 2, 4)
-        )
-        question = question_about(path, grouping)
-        whole = analyse(question)
-        for options in (None, RowOptions()):
-            study = study_heads(question, options)
-            for part in ("cells", "groups"):
-                replans, tasks = getattr(study.replans, part), getattr(study.tasks, part)
-                assert_frame_equal(replans, getattr(whole.replans, part), rel_tol=1e-5, abs_tol=1e-7)
-                assert_frame_equal(tasks, getattr(whole.tasks, part), rel_tol=1e-4, abs_tol=1e-6)
-
-
 def planted(where: dict[tuple[int, int], tuple[slice, float]]):
     """Rows even over the valid keys; some (layer position, head) give the keys of a slice so many times as much."""
 
@@ -177,14 +154,6 @@ def test_planted_specialists_are_at_the_two_ends(tmp_path):
     assert len(order) == 9
     widest = study.dispersion.sort("log2_ratio_std", descending=True)["block"].to_list()
     assert set(widest[:2]) == {1, 3}
-
-
-def test_a_block_that_is_named_twice_is_ranked_once(tmp_path):
-    study = study_of(tmp_path, layer_labels=(0, 2, 4))
-    ranked = ranked_heads(study.heads, study.question.grouping)
-    assert study.heads.cells.height == 6
-    assert ranked.height == 4
-    assert set(ranked["layer"]) == {0, 2}
 
 
 def test_heads_without_a_finite_ratio_are_ranked_at_the_ends_and_heads_without_mass_are_left_out(tmp_path):

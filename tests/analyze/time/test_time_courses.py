@@ -8,12 +8,10 @@ import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import stats
 
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.measures.alignment import (
-    closing_replan,
     on_episode_time,
     replan_starts,
 )
@@ -109,13 +107,6 @@ def test_bins_agree_with_a_finely_sampled_step_function(data):
     assert on_episode_time(values, starts, num_steps, bins) == pytest.approx(expected, abs=1e-9)
 
 
-def test_values_that_are_not_finite_take_no_part_in_a_bin():
-    values = np.array([[np.inf], [2.0], [np.nan], [np.nan]])
-    found = on_episode_time(values, np.array([0, 1, 2, 3]), 4, 2)[:, 0]
-    assert found[0] == 2.0
-    assert np.isnan(found[1])
-
-
 def expected_logs():
     """Straight from the arrays of the store's recipe: log ratio (replan,) by (task, episode)."""
     return {name: log_ratio(*name) for name in NAMES}
@@ -140,17 +131,6 @@ def test_the_course_is_that_of_plain_numpy(courses):
         assert found["value"].to_numpy() == pytest.approx(np.exp(means), rel=1e-5)
         assert (found["low"] < found["value"]).all()
         assert (found["value"] < found["high"]).all()
-
-
-def test_the_planted_effect_of_success_is_found(courses):
-    logs = expected_logs()
-    means = {name: values.mean() / np.log(2) for name, values in logs.items()}
-    first, second = ([means[name] for name in NAMES if solved(*name) is flag] for flag in (True, False))
-    row = courses.outcomes.filter(quantity="log2_ratio").row(0, named=True)
-    assert row["difference"] == pytest.approx(np.mean(first) - np.mean(second), rel=1e-4)
-    assert row["cliffs_delta"] == pytest.approx(2 * stats.mannwhitneyu(first, second).statistic / 64 - 1)
-    assert row["within_tasks_low"] < 0.8 / np.log(2) < row["within_tasks_high"]
-    assert row["within_tasks_low"] > 0.3
 
 
 @pytest.mark.drawn
@@ -185,16 +165,3 @@ def test_replans_that_do_not_fit_their_episode_are_refused():
     for steps, wait, length in (([10, 15], 5, 20), ([10, 10], 10, 20), ([10, 15], 10, 5), ([], 10, 5)):
         with pytest.raises(StoreError, match="do not fit"):
             replan_starts(np.array(steps, dtype=np.int64), wait, length, "it")
-
-
-def test_only_executed_actions_close_the_gripper():
-    planned = np.full((3, 8, 7), -1.0)
-    planned[0, 5:, -1] = 1.0  # planned, and replaced by the next replan
-    planned[1, 4, -1] = 0.2
-    starts = np.array([0, 5, 10])
-    assert closing_replan(planned, starts, 12) == 1
-    planned[1, 4, -1] = 0.0  # leaves the fingers where they are
-    assert closing_replan(planned, starts, 12) is None
-    planned[2, 3, -1] = 1.0  # after the episode's end
-    assert closing_replan(planned, starts, 12) is None
-    assert closing_replan(planned, starts, 14) == 2
