@@ -74,7 +74,7 @@ def fuzz(folder: Path, results: Results, seconds: float) -> None:
     """Made-up bytes for every parser; every run adds to the earlier ones."""
     from reliability_fuzz import run
 
-    from tests.kit.fuzz_targets import TARGETS
+    from tests.thorough.fuzz_targets import TARGETS
 
     run(folder, results, seconds, TARGETS)
 

@@ -1,4 +1,4 @@
-"""The part `fuzz` of `reliability.py`: atheris gives made-up bytes to every parser of `tests/kit/fuzz_targets.py`.
+"""The part `fuzz` of `reliability.py`: atheris gives made-up bytes to every parser of `tests/thorough/fuzz_targets.py`.
 
 Usage: .venv-fuzz/bin/python benchmarks/reliability_fuzz.py TARGET --seconds 300 --folder FOLDER
 `make fuzz` makes that environment and runs all targets.
@@ -61,7 +61,7 @@ def main() -> None:
     import atheris
 
     with atheris.instrument_imports(include=["vla_attention"]):
-        from tests.kit import fuzz_targets
+        from tests.thorough import fuzz_targets
     if arguments.target not in fuzz_targets.TARGETS:
         parser.error(f"unknown target '{arguments.target}'; existing: {', '.join(fuzz_targets.TARGETS)}")
     corpus = arguments.folder / "corpus" / arguments.target

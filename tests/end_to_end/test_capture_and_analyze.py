@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 import zarr
 
-from tests.kit.written_tables import written_steps
+from tests.end_to_end.written_tables import written_steps
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 

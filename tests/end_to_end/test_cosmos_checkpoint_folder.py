@@ -14,8 +14,8 @@ import pytest
 import torch
 import zarr
 
+from tests.end_to_end.written_tables import written_steps
 from tests.kit.cosmos_checkpoint import write_dummy_folder
-from tests.kit.written_tables import written_steps
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.environments.suites import find_suite, list_tasks

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from tests.kit.jax_leaves import to_jax_leaves
+from tests.capture.policies.pi.jax_leaves import to_jax_leaves
 from tests.kit.paths import GOLDEN as ALL_GOLDEN
 from tests.kit.paths import SHARED
 from vla_attention.capture.policies.pi.case import Case, read_case

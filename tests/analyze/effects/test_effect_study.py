@@ -272,74 +272,6 @@ def test_replans_without_the_word_are_in_no_effect(folder, tmp_path):
         assert study.notes == ()
 
 
-def test_dimensions_that_are_mostly_noise_are_named(folder, tmp_path):
-    def plant(task, episode, replans):
-        actions = changed_actions(PLANTED["noise"])(task, episode, replans)
-        generator = np.random.default_rng([task, episode])
-        actions[..., 4] += generator.normal(0, 1.5 * 0.05, actions.shape[:2])
-        return actions
-
-    spec = replace(
-        BASE,
-        plant_actions=plant,
-        interventions=PLANTED["noise"].interventions,
-        rerun_of=rerun_source(folder / "base.zarr"),
-    )
-    noisy = write_store(tmp_path / "noise.zarr", spec=spec)
-    study = study_effects(folder / "base.zarr", [noisy], AnalysisSettings())
-    assert study.spread.left_out == (4,)
-    assert "not compared: dimensions 4 (mostly noise) of the action." in text_of(effects_sections(study))
-    assert row_of(study, "noise")["effect"] < 0.15
-    all_of_them = study_effects(folder / "base.zarr", [noisy], AnalysisSettings(), dimensions=tuple(range(7)))
-    assert all_of_them.spread.left_out == ()
-    assert row_of(all_of_them, "noise")["effect"] > 0.4
-
-
-def test_a_word_that_no_selected_task_has_leaves_its_rerun_out(folder, tmp_path):
-    """With --allow-empty all episodes are there, unchanged where the word is not; in a series they are not."""
-    planted = PlantedRerun(knockout("without_bowl", "word:bowl"), 0.0)
-    write_rerun(tmp_path / "all.zarr", folder / "base.zarr", planted)
-    write_rerun(tmp_path / "own.zarr", folder / "base.zarr", planted, tasks=(0,))
-    for name, reason in (("all", "the group has no key in the base"), ("own", "none of the selected episodes")):
-        given = [tmp_path / f"{name}.zarr", folder / "series" / "noise.zarr"]
-        study = study_effects(folder / "base.zarr", given, AnalysisSettings(tasks=(1, 2)))
-        assert [condition.name for condition in study.conditions] == ["noise"]
-        assert study.episodes["condition"].unique().to_list() == ["noise"]
-        text = " ".join(text_of(effects_sections(study)).split())
-        assert "note: without_bowl is left out" in text
-        assert reason in text
-        assert "no attention beside" not in text
-        with pytest.raises(BadArgument, match=r"No rerun of .*base.zarr can be compared: without_bowl is left out"):
-            study_effects(folder / "base.zarr", given[:1], AnalysisSettings(tasks=(1, 2)))
-
-
-def test_dimensions_that_are_left_out_do_not_change_with_the_selected_tasks(folder, tmp_path):
-    """Dimension 4 is noise in tasks 0 and 2 only: whoever looks at task 1 has the same units."""
-
-    def plant(task, episode, replans):
-        actions = changed_actions(PLANTED["noise"])(task, episode, replans)
-        if task != 1:
-            actions[..., 4] += np.random.default_rng([task, episode]).normal(0, 2 * 0.05, actions.shape[:2])
-        return actions
-
-    spec = replace(
-        BASE,
-        plant_actions=plant,
-        interventions=PLANTED["noise"].interventions,
-        rerun_of=rerun_source(folder / "base.zarr"),
-    )
-    given = [write_store(tmp_path / "noise.zarr", spec=spec)]
-    whole = study_effects(folder / "base.zarr", given, AnalysisSettings())
-    one = study_effects(folder / "base.zarr", given, AnalysisSettings(tasks=(1,)))
-    assert one.spread.left_out == whole.spread.left_out == (4,)
-    assert one.spread.noise is not None
-    assert whole.spread.noise is not None
-    np.testing.assert_array_equal(one.spread.noise.change, whole.spread.noise.change)
-    np.testing.assert_array_equal(one.spread.noise.low, whole.spread.noise.low)
-    of_task = whole.episodes.filter(task_id=1)["effect"].to_list()
-    assert one.episodes["effect"].to_list() == of_task
-
-
 def test_only_executed_steps_count_where_the_base_stores_how_many(folder):
     [item, *_] = study_effects(
         folder / "base.zarr", [folder / "series" / "noise.zarr"], AnalysisSettings()
@@ -356,15 +288,6 @@ def test_only_executed_steps_count_where_the_base_stores_how_many(folder):
     # The frames between the calls of a replayed data set are no executed steps; nor is a number known that is 0.
     assert executed(name="dataset", replan_steps=2) == [5] * REPLANS
     assert executed(name="recorded", replan_steps=0) == [5] * REPLANS
-
-
-def test_an_effect_within_the_noise_is_called_so(folder, tmp_path):
-    """The grouping's own state group, planted as large as the noise."""
-    settings = AnalysisSettings(groups=("state=role:state", "rest=*"), ratio="state/rest")
-    series = [folder / "series" / f"{name}.zarr" for name in ("noise", "without_state")]
-    text = " ".join(text_of(effects_sections(study_effects(folder / "base.zarr", series, settings))).split())
-    assert "Without state the action changes by 0.091" in text
-    assert "not shown to exceed the noise" in text
 
 
 def test_a_control_of_less_than_half_a_key_is_none(folder, tmp_path):

@@ -10,8 +10,8 @@ import numpy as np
 import polars as pl
 import pytest
 
+from tests.analyze.published.published_results import cosmos_episodes, pi_episodes, write_published
 from tests.analyze.published.test_results_reader import ours
-from tests.kit.published_results import cosmos_episodes, pi_episodes, write_published
 from vla_attention.analyze.parse.command import main
 from vla_attention.analyze.show.numbers import format_number
 

@@ -13,9 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.kit.examples import examples
-from tests.kit.made_up_steps import default_grouping, flat, make_steps, replans_of
-from tests.kit.published_results import (
+from tests.analyze.published.published_results import (
     cosmos_episodes,
     pi_episodes,
     pi_step,
@@ -23,6 +21,8 @@ from tests.kit.published_results import (
     published_episode,
     write_published,
 )
+from tests.kit.examples import examples
+from tests.kit.made_up_steps import default_grouping, flat, make_steps, replans_of
 from vla_attention.analyze.published.results_reader import find_results, read_results_file
 from vla_attention.analyze.published.results_tables import (
     NO_FINITE_AS_ZERO,

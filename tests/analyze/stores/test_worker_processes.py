@@ -11,7 +11,7 @@ import pytest
 from polars.testing import assert_frame_equal
 
 import vla_attention as va
-from tests.kit.episode_work import damaged, defect, process_of, square
+from tests.analyze.stores.episode_work import damaged, defect, process_of, square
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.measures.steps import measure_episodes

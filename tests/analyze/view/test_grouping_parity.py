@@ -1,6 +1,6 @@
 """The page's grouping language and measures are Python's: the same cases in both, the shipped script run by node.
 
-Cases are made when the test runs, from a seed (`tests/kit/grouping_cases.py`). Weights, masses and what follows from
+Cases are made when the test runs, from a seed (`grouping_cases.py`). Weights, masses and what follows from
 them are within 1e-12 of each other; what is an error is the same sentence in both.
 """
 
@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.kit.grouping_cases import grouping_cases
-from tests.kit.viewer_in_node import needs_node, run_in_node
+from tests.analyze.view.grouping_cases import grouping_cases
+from tests.analyze.view.viewer_in_node import needs_node, run_in_node
 
 NUM_CASES = 300
 #: The measures of a group that the page computes; those of the tables may be more.

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from tests.analyze.view.page_answers import PageQuestion, page_answers
+from tests.analyze.view.viewer_in_node import needs_node
 from tests.kit.http_ranges import serve
 from tests.kit.uniform_cases import TABLE, write_case
-from tests.kit.viewer_in_node import needs_node
 from vla_attention.schemas.layout import INVALID_ROLES
 
 pytestmark = needs_node

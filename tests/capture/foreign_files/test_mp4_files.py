@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.kit.lerobot_data_sets import H264, Encoding, numbered_picture, write_video
-from tests.kit.mp4_boxes import box, samples_of_a_video
+from tests.thorough.hostile_data_sets.mp4_boxes import box, samples_of_a_video
 from vla_attention.capture.foreign_files.mp4_files import Mp4Refused, check_mp4
 
 

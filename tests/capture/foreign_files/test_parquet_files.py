@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tests.kit.parquet_writer import constant, write_parquet
+from tests.thorough.hostile_data_sets.parquet_writer import constant, write_parquet
 from vla_attention.capture.foreign_files.parquet_files import ParquetFile, ParquetRefused
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.kit.simulators_in_threads import assert_same_episodes, record
+from tests.capture.rollout.simulators_in_threads import assert_same_episodes, record
 from tests.kit.spoiled_policy import spoil_actions
 from tests.kit.still_scene import StillScene
 from vla_attention.analyze.__main__ import main as analyze
@@ -30,7 +30,7 @@ both = pytest.mark.parametrize("num_envs", [1, 2], ids=["serial", "pipelined"])
 def whole(tmp_path_factory) -> Iterator[Path]:
     """The store of three episodes without a fault."""
     with pytest.MonkeyPatch.context() as patch:
-        from tests.kit.simulators_in_threads import simulators_in_threads
+        from tests.capture.rollout.simulators_in_threads import simulators_in_threads
 
         simulators_in_threads(patch)
         store = tmp_path_factory.mktemp("whole") / "a.zarr"

@@ -15,9 +15,8 @@ import numpy as np
 import pytest
 import zarr
 
-from tests.kit.simulators_in_threads import TINY, ThreadOfTests, assert_same_episodes, record
+from tests.capture.rollout.simulators_in_threads import TINY, ThreadOfTests, assert_same_episodes, record
 from tests.kit.still_scene import StillScene
-from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.jobs.status import store_status
@@ -193,7 +192,8 @@ def test_the_first_replan_of_a_batch_is_that_of_single_calls_but_for_rounding(
 
 
 @pytest.mark.simulator
-@pytest.mark.parametrize("suite", thorough_except(["cubes"], ["cubes", "robosuite"]))
+@pytest.mark.thorough
+@pytest.mark.parametrize("suite", ["cubes", "robosuite"])
 def test_two_simulators_give_the_episodes_of_one_to_the_bit(suite, tmp_path, monkeypatch):
     # One renders with the threads of this process, the other two with one each.
     words = ["--task-suite", suite, "--task-id", "0", "3", "--num-episodes", "2"]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 import vla_attention as va
-from tests.kit.residual_policies import (
+from tests.capture.torch_policies.residual_policies import (
     ACTIONS,
     BLOCKS,
     DIM,

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 import vla_attention as va
-from tests.kit.openpi_pi05 import PI05Pytorch
+from tests.capture.torch_policies.openpi_pi05 import PI05Pytorch
 from tests.kit.policy_inputs import make_observation
 from vla_attention.capture.policies.noise import initial_noise
 from vla_attention.capture.policies.pi.embedded import dummy_policy

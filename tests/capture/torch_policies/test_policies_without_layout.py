@@ -11,8 +11,7 @@ import pytest
 import torch
 
 import vla_attention as va
-from tests.capture.torch_policies.test_odd_policies import HEAD_ORDER, HEADS, OddPolicy, by_hand, logits
-from tests.kit.cached_torch_policies import (
+from tests.capture.torch_policies.cached_torch_policies import (
     LoopedPolicy,
     SlidingAttention,
     StaticAttention,
@@ -20,6 +19,7 @@ from tests.kit.cached_torch_policies import (
     fixed_layout,
     looped_layout,
 )
+from tests.capture.torch_policies.test_odd_policies import HEAD_ORDER, HEADS, OddPolicy, by_hand, logits
 from tests.kit.small_torch_policy import HORIZON, WIDTH, SmallPolicy, given, small_layout
 from tests.kit.small_torch_variants import token_layout
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit

@@ -12,15 +12,15 @@ import torch
 from torch import nn
 
 import vla_attention as va
-from tests.kit.small_torch_policy import HORIZON, PROMPT, given, small_layout
-from tests.kit.small_torch_variants import PATCHES, TokenPolicy, token_layout
-from tests.kit.stateful_policies import (
+from tests.capture.torch_policies.stateful_policies import (
     BufferPolicy,
     GeneratorPolicy,
     QueuePolicy,
     SamplingPolicy,
     layout_with_prefix,
 )
+from tests.kit.small_torch_policy import HORIZON, PROMPT, given, small_layout
+from tests.kit.small_torch_variants import PATCHES, TokenPolicy, token_layout
 from vla_attention.capture.policies.noise import noise_seed
 from vla_attention.schemas.errors import BadArgument, Note
 from vla_attention.schemas.groupings.vocabulary import SceneObject

@@ -227,38 +227,6 @@ def test_an_episode_without_attention_is_an_error(tmp_path, policy):
         assert not run.has(0, 0)
 
 
-def without_rule(layout, number):
-    return replace(layout, rules=tuple(rule for i, rule in enumerate(layout.rules) if i != number))
-
-
-@pytest.mark.parametrize(
-    ("layout", "sentence"),
-    [
-        (
-            without_rule(small_layout(), 1),
-            "no rule names the calls of module 'blocks.{0..2}.attention' (sdpa, 11 x 11)",
-        ),
-        (small_layout(num_denoise_steps=3, denoise_times=()), "must compute 3 times a policy call"),
-        (
-            small_layout(rules=(CallRule(r"layers\.(?P<block>\d+)", "joint"), CallRule(".*", None))),
-            "the site 'joint' did not fire",
-        ),
-        (small_layout(rules=(CallRule(r"blocks\.(?P<block>\d+)\.attention", "joint"),)), "has 11 keys"),
-    ],
-)
-def test_calls_that_do_not_fit_are_shown(tmp_path, policy, layout, sentence):
-    with (
-        start(tmp_path, policy, layout=layout, contributions=False, denoise_steps="first") as run,
-        pytest.raises(CallsDoNotFit) as error,
-    ):
-        one_call(run, policy)
-    message = str(error.value)
-    assert sentence in message
-    assert "replan 0 (environment step 0) of task000_episode000" in message
-    assert "3 x 14" in message  # the table
-    assert not list((tmp_path / "a.zarr" / "episodes").glob("task*"))
-
-
 def test_two_policy_calls_in_one_block_are_an_error(tmp_path, policy):
     sentence = r"must compute 4 times a policy call.*block 0: 8"
     with start(tmp_path, policy) as run, pytest.raises(CallsDoNotFit, match=sentence):

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.kit.examples import examples
-from tests.kit.fuzz_targets import run, seeds
+from tests.thorough.fuzz_targets import run, seeds
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.testing.strategies import layouts
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.kit.fuzz_targets import TARGETS, run, seeds
+from tests.thorough.fuzz_targets import TARGETS, run, seeds
 
 # A number that overflows is no reason for a line of numpy's on the terminal.
 pytestmark = pytest.mark.filterwarnings("error")

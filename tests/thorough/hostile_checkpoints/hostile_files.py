@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.kit.hostile_runs import Make
+from tests.thorough.hostile_runs import Make
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from tests.kit.hostile_runs import PACKAGES, Make
 from tests.thorough.hostile_checkpoints.hostile_files import (
     TRACE,
     Case,
@@ -20,6 +19,7 @@ from tests.thorough.hostile_checkpoints.hostile_files import (
     sparse,
     torch_zip,
 )
+from tests.thorough.hostile_runs import PACKAGES, Make
 from vla_attention.capture.environments.libero_installation import ASSET_SUBFOLDERS
 
 #: The first task of the suite.

@@ -2,7 +2,7 @@
 
     python -m tests.thorough.hostile_checkpoints.run_cases FOLDER [NAME ...]
 
-Libraries are imported once, and each case is a fork; see `tests.kit.hostile_runs`.
+Libraries are imported once, and each case is a fork; see `tests.thorough.hostile_runs`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import json
 import sys
 from pathlib import Path
 
-from tests.kit import hostile_runs
+from tests.thorough import hostile_runs
 from tests.thorough.hostile_checkpoints.cosmos_cases import COSMOS, dummy
 from tests.thorough.hostile_checkpoints.hostile_files import TRACE, Case
 from tests.thorough.hostile_checkpoints.libero_cases import LIBERO

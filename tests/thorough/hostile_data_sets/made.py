@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tests.kit.hostile_runs import Make
 from tests.kit.lerobot_data_sets import H264, made_up_episodes, write_data_set
+from tests.thorough.hostile_runs import Make
 
 CAMERA = "observation.images.front"
 #: Frames of the only episode.

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from tests.kit.parquet_writer import constant, counting, texts, write_parquet
 from tests.thorough.hostile_checkpoints.hostile_files import pipe, sparse
 from tests.thorough.hostile_data_sets.made import CAMERA, Case, hostile, info, written
+from tests.thorough.hostile_data_sets.parquet_writer import constant, counting, texts, write_parquet
 
 LINES, TASKS = "meta/episodes.jsonl", "meta/tasks.jsonl"
 TASK_TABLE, EPISODE_TABLE = "meta/tasks.parquet", "meta/episodes/chunk-000/file-000.parquet"

@@ -12,9 +12,9 @@ import numpy as np
 import polars as pl
 from PIL import Image
 
-from tests.kit.hostile_runs import Make
 from tests.thorough.hostile_checkpoints.hostile_files import pipe, sparse
 from tests.thorough.hostile_data_sets.made import CAMERA, TABLE, Case, hostile
+from tests.thorough.hostile_runs import Make
 
 CELLS = pl.Struct({"bytes": pl.Binary, "path": pl.String})
 

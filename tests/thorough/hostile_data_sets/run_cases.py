@@ -10,13 +10,13 @@ import shutil
 import sys
 from pathlib import Path
 
-from tests.kit import hostile_runs
-from tests.kit.hostile_runs import Make
+from tests.thorough import hostile_runs
 from tests.thorough.hostile_data_sets.made import Case, good
 from tests.thorough.hostile_data_sets.meta_cases import META
 from tests.thorough.hostile_data_sets.picture_cases import PICTURES
 from tests.thorough.hostile_data_sets.table_cases import TABLES
 from tests.thorough.hostile_data_sets.video_cases import VIDEOS
+from tests.thorough.hostile_runs import Make
 
 CASES: dict[str, Case] = {
     f"{kind}: {name}": case

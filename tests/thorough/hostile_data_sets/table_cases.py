@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from tests.kit.hostile_runs import Make
-from tests.kit.parquet_writer import (
+from tests.thorough.hostile_data_sets.made import FRAMES, TABLE, Case, hostile
+from tests.thorough.hostile_data_sets.parquet_writer import (
     FLOAT,
     GZIP,
     I32,
@@ -34,7 +34,7 @@ from tests.kit.parquet_writer import (
     write_parquet,
     zeros,
 )
-from tests.thorough.hostile_data_sets.made import FRAMES, TABLE, Case, hostile
+from tests.thorough.hostile_runs import Make
 
 PATH = TABLE["v2.1"]
 

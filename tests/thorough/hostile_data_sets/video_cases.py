@@ -6,10 +6,10 @@ import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from tests.kit.hostile_runs import Make
-from tests.kit.mp4_boxes import LISTS, box, exchange, find
 from tests.thorough.hostile_checkpoints.hostile_files import sparse
 from tests.thorough.hostile_data_sets.made import VIDEO, Case, hostile
+from tests.thorough.hostile_data_sets.mp4_boxes import LISTS, box, exchange, find
+from tests.thorough.hostile_runs import Make
 
 
 def changed(change: Callable[[bytes], bytes]) -> Make:

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from benchmarks.orbax_writer import write_leaves
-from tests.kit.jax_leaves import to_jax_leaves
-from tests.kit.jax_state import from_jax_flat
+from tests.capture.policies.pi.jax_leaves import to_jax_leaves
+from tests.capture.policies.pi.jax_state import from_jax_flat
 from tests.kit.pi_golden import GOLDEN, LARGE_GOLDEN, load_case
 from tests.kit.thorough import thorough_except
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint

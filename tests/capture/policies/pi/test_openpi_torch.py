@@ -8,7 +8,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from tests.kit.jax_state import from_jax_flat
+from tests.capture.policies.pi.jax_state import from_jax_flat
 from tests.kit.pi_golden import GOLDEN, read_manifest
 from tests.kit.policy_inputs import KeepAll
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint

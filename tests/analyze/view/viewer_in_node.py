@@ -10,10 +10,11 @@ from typing import Any
 
 import pytest
 
-from tests.kit.grouping_cases import AXES
+from tests.analyze.view.grouping_cases import AXES
+from tests.kit.paths import ROOT
 
 HERE = Path(__file__).resolve().parent
-SCRIPT = HERE.parents[1] / "analyze/view/bundle/viewer.js"
+SCRIPT = ROOT / "analyze/view/bundle/viewer.js"
 NODE = shutil.which("node")
 needs_node = pytest.mark.skipif(NODE is None, reason="the page's script is run by node, which is not installed")
 

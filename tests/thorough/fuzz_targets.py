@@ -21,7 +21,7 @@ import numpy as np
 
 from tests.kit.attacks import with_checksum
 from tests.kit.lerobot_data_sets import encoded, made_up_episodes, numbered_picture, write_data_set
-from tests.kit.mp4_boxes import samples_of_a_video
+from tests.thorough.hostile_data_sets.mp4_boxes import samples_of_a_video
 from vla_attention.analyze.published.results_reader import read_results_file
 from vla_attention.capture.foreign_files.mp4_files import Mp4Refused, check_mp4
 from vla_attention.capture.foreign_files.pictures import PictureRefused, decode_picture

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.kit.grouping_episodes import NUM_EPISODES, made_up_episode
+from tests.analyze.view.grouping_episodes import NUM_EPISODES, made_up_episode
 from vla_attention.analyze.measures.baselines import uniform_masses
 from vla_attention.analyze.measures.episodes import replan_values
 from vla_attention.analyze.measures.masses import masses
