@@ -7,10 +7,12 @@ import shutil
 
 import pytest
 
+from tests.kit.paths import GOLDEN
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.stores.store_format import STORE_VERSION
 
+STORED = GOLDEN / "stores/version2/joint.zarr"
 DUMMY = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--replan-steps", "4"]
 
 
@@ -41,7 +43,6 @@ def test_capture(arguments, expected, capsys, tmp_path):
     assert expected in run(capture, [*DUMMY, "--output", store, *arguments], capsys)
 
 
-@pytest.mark.simulator
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
@@ -51,19 +52,18 @@ def test_capture(arguments, expected, capsys, tmp_path):
         (["--layers", "6"], "expected block indices 0 to 2"),
     ],
 )
-def test_analyze(arguments, expected, captured_store, tmp_path, capsys):
-    assert expected in run(analyze, [captured_store, "--output", tmp_path / "out", *arguments], capsys)
+def test_analyze(arguments, expected, tmp_path, capsys):
+    assert expected in run(analyze, [STORED, "--output", tmp_path / "out", *arguments], capsys)
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.simulator
-def test_stores_that_cannot_be_read(captured_store, tmp_path, capsys):
-    assert "There is no store at" in run(analyze, [captured_store.with_name("robosite.zarr")], capsys)
+def test_stores_that_cannot_be_read(tmp_path, capsys):
+    assert "There is no store at" in run(analyze, [STORED.with_name("robosite.zarr")], capsys)
 
     assert "is not a store" in run(analyze, [tmp_path], capsys)
 
     newer = tmp_path / "newer.zarr"
-    shutil.copytree(captured_store, newer)
+    shutil.copytree(STORED, newer)
     document = json.loads((newer / "zarr.json").read_text())
     document["attributes"]["store_version"] = STORE_VERSION + 1
     (newer / "zarr.json").write_text(json.dumps(document))
@@ -71,8 +71,7 @@ def test_stores_that_cannot_be_read(captured_store, tmp_path, capsys):
     assert expected in run(analyze, [newer], capsys)
 
 
-@pytest.mark.simulator
-def test_output_folder_that_cannot_be_written(captured_store, tmp_path, capsys):
+def test_output_folder_that_cannot_be_written(tmp_path, capsys):
     (tmp_path / "file").write_text("")
-    said = run(analyze, [captured_store, "--output", tmp_path / "file" / "results", "--no-plots"], capsys)
+    said = run(analyze, [STORED, "--output", tmp_path / "file" / "results", "--no-plots"], capsys)
     assert "Cannot write results to" in said

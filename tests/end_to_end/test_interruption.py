@@ -19,13 +19,12 @@ from vla_attention.capture.jobs.termination import EXIT_TERMINATED
 from vla_attention.capture.published.evaluate import evaluate_attention_ratio
 from vla_attention.schemas.stores.claims import holders
 
-pytestmark = pytest.mark.simulator
+pytestmark = [pytest.mark.simulator, pytest.mark.thorough]
 
 DUMMY = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--replan-steps", "4", "--task-id", "0"]
 DUMMY += ["--num-envs", "1"]  # several simulators: tests/capture/rollout/test_pipeline.py
 
 
-@pytest.mark.thorough
 def test_sigterm_drops_the_episode_in_flight_and_resuming_completes_the_store(tmp_path):
     store = tmp_path / "a.zarr"
     arguments = [*DUMMY, "--num-episodes", "3", "--max-steps", "32", "--output", str(store)]
