@@ -13,7 +13,9 @@ import pytest
 import yaml
 
 from scripts.site_hooks import OUTSIDE
+from tests.kit.golden_tables import STORES
 from vla_attention.__main__ import COMMANDS as PROGRAM_COMMANDS
+from vla_attention.__main__ import main as vla_attention
 from vla_attention.analyze.commands import COMMANDS, DEFAULT_COMMAND
 from vla_attention.capture.commands.arguments import build_parser
 
@@ -102,6 +104,20 @@ def test_the_parsers_take_every_command_line(document):
             for option in ("--threads", "--no-cache"):  # which all commands get when they run
                 given = [word for word in given if word != option]
         parser.parse_args(given)  # a mistake ends it with a sentence and 2
+
+
+def test_the_questions_of_the_readme_run(tmp_path, monkeypatch):
+    """On stores of the suite `cubes`: the one that comes along, and one with effects."""
+    monkeypatch.chdir(tmp_path)
+    Path("runs").mkdir()
+    lines = re.findall(r"(vla-attention (?:\w+) runs/cubes\.zarr[^`:]*)", " ".join(text_of(ROOT / "README.md").split()))
+    questions = [shlex.split(line)[1:] for line in lines if " view " not in line]
+    assert {words[0] for words in questions} == {"analyze", "objects", "effects"}
+    for words in questions:
+        store = STORES["effects" if words[0] == "effects" else "cubes"]
+        Path("runs/cubes.zarr").unlink(missing_ok=True)
+        Path("runs/cubes.zarr").symlink_to(store, target_is_directory=True)
+        assert vla_attention([word for word in words if word != "-->"]) == 0
 
 
 def test_the_site_has_every_page_once():
