@@ -33,6 +33,7 @@ def test_resuming_a_complete_store_changes_nothing(captured_store, run_capture, 
     assert {path: path.read_bytes() for path in captured_store.rglob("*") if path.is_file()} == before
 
 
+@pytest.mark.thorough
 def test_two_runs_give_the_same_bytes_whatever_ran_before(captured_store, run_capture, tmp_path):
     again = tmp_path / "again.zarr"
     run_capture("--task-id", 1, "--num-episodes", 2, "--output", again)

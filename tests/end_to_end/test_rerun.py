@@ -21,6 +21,7 @@ FAMILIES = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("family", thorough_except(["pi"], FAMILIES))
 def test_a_libero_store_is_made_again_and_without_an_object_and_a_word(
     family: str, libero_assets: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -117,6 +117,7 @@ def test_a_run_and_its_rerun_stand_side_by_side(view, server, store, rerun):
     view.page.locator(f"{pair} canvas").first.wait_for(state="hidden")
 
 
+@pytest.mark.thorough
 def test_texts_of_a_store_are_text(browser, tmp_path):
     from tests.analyze.test_hostile_stores import INSTRUCTION, hostile_texts
 

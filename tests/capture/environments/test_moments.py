@@ -195,6 +195,7 @@ STATES: dict[str, tuple[Any, int]] = {
 }
 
 
+@pytest.mark.thorough
 @pytest.mark.libero
 @pytest.mark.parametrize("name", STATES)
 def test_each_goal_of_libero_goal_holds_in_its_state_and_none_of_the_others(goal_suite, name):

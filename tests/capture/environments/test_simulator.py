@@ -80,6 +80,7 @@ def hold_that_the_context_is_kept(suite: str, task: int, settings: EnvironmentSe
     assert other._kept_context._kept is None
 
 
+@pytest.mark.thorough
 @pytest.mark.simulator
 def test_pictures_in_a_kept_context_are_those_of_a_new_one() -> None:
     hold_that_the_context_is_kept("robosuite", 2, EnvironmentSettings())

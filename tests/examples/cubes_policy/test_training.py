@@ -107,6 +107,7 @@ def test_the_loss_falls(demonstrations, tmp_path):
     assert (tmp_path / "loss.png").stat().st_size > 10_000
 
 
+@pytest.mark.thorough
 def test_a_training_that_was_stopped_goes_on_the_same(demonstrations, whole, tmp_path):
     expected, folder = whole
     said: list[str] = []

@@ -114,6 +114,7 @@ def test_touching_another_cube_first_is_no_success(environment: CubesEnvironment
         assert not environment.step(right, observe=False).success
 
 
+@pytest.mark.thorough
 def test_a_mark_is_in_the_picture_and_in_the_segmentation() -> None:
     suite = find_suite("cubes_mark_only")
     task = list_tasks(suite)[_number("push_left", "blue")]
