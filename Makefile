@@ -86,7 +86,7 @@ test-policies: .venv-transformers/installed .venv-lerobot/installed
 
 # moto brings fifty packages, and nothing else needs them.
 test-remote: .venv-remote/installed
-	.venv-remote/bin/pytest tests/schemas/stores/test_remote.py tests/schemas/stores/test_remote_services.py $(ARGS)
+	.venv-remote/bin/pytest --thorough tests/schemas/stores/test_remote.py tests/schemas/stores/test_remote_services.py $(ARGS)
 
 # Executed, with their pictures, in results/notebooks.
 notebooks: .venv-notebooks/installed
