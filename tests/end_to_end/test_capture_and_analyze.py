@@ -87,6 +87,7 @@ def test_results_file_has_the_published_structure(captured_store, tmp_path):
     assert summary["median"] == pytest.approx(np.median(ratios))
 
 
+@pytest.mark.thorough
 def test_a_block_named_both_ways_is_stored_once_and_reported_twice(run_capture, tmp_path):
     """As in the published example, whose layers 8 and 26 are one block of a model with 18."""
     run_capture("--task-id", 0, "--num-episodes", 1, "--layers", 2, 0, 5, "--output-dir", tmp_path)

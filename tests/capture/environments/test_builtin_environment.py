@@ -66,6 +66,7 @@ def test_pictures_are_those_of_the_untouched_simulator(environment: Environment)
         np.testing.assert_array_equal(observation.gripper_qpos, value["robot0_gripper_qpos"])
 
 
+@pytest.mark.thorough
 @pytest.mark.simulator
 def test_initial_states_are_fixed_by_their_index_alone(environment: Environment) -> None:
     first = act(environment, 0, seed=7)
