@@ -70,7 +70,7 @@ test-thorough: .venv/capture-installed
 	$(PYTEST) --thorough --hypothesis-profile thorough $(ARGS)
 	$(MAKE) docs notebooks
 
-# In copies of the checkout, two at a time; half an hour. ARGS=NAME plants one.
+# In copies of the checkout, two at a time; a quarter of an hour. ARGS=NAME plants one.
 faults: .venv/capture-installed
 	$(BIN)/python scripts/planted_faults.py $(ARGS)
 
