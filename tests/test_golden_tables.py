@@ -5,7 +5,8 @@ from __future__ import annotations
 import polars as pl
 import pytest
 
-from tests.kit.golden_tables import CASES, FOLDER, differences, link_stores, published_arguments, tables_of
+from tests.kit.golden_stores import differences
+from tests.kit.golden_tables import CASES, FOLDER, alike, link_stores, published_arguments, tables_of
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +20,9 @@ def hold(case: str, tables: dict[str, pl.DataFrame]) -> None:
     kept = {file.stem: pl.read_parquet(file) for file in sorted((FOLDER / case).glob("*.parquet"))}
     assert kept
     wrong = [f"no table {name}" for name in kept if name not in tables]
-    wrong += [f"{name}: {line}" for name in kept if name in tables for line in differences(tables[name], kept[name])]
+    wrong += [
+        f"{name}: {line}" for name in kept if name in tables for line in differences(tables[name], kept[name], alike)
+    ]
     assert not wrong, "\n".join(wrong[:20])
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import polars as pl
@@ -62,10 +63,19 @@ def _arrays(path: Path) -> pl.DataFrame:
     return pl.DataFrame(rows, schema=["episode", "array", "shape", "type", "sha256"], orient="row")
 
 
-def differences(found: pl.DataFrame, expected: pl.DataFrame) -> list[str]:
-    """Where a table differs from the one that was kept as CSV: its columns have to be there and the same.
+def same(one: object, other: object) -> bool:
+    """Whether two values are: floats to a millionth, everything else exactly."""
+    if isinstance(one, float) and isinstance(other, float):
+        return (math.isnan(one) and math.isnan(other)) or math.isclose(one, other, rel_tol=_RELATIVE, abs_tol=0)
+    return one == other
 
-    Floats to a millionth. Columns that were added since are left out.
+
+def differences(
+    found: pl.DataFrame, expected: pl.DataFrame, alike: Callable[[object, object], bool] = same
+) -> list[str]:
+    """Where a table differs from the one that was kept: its columns have to be there, with values that are alike.
+
+    Columns that were added since are left out.
     """
     found = found.select(name for name in found.columns if name in expected.columns)
     if found.columns != expected.columns or found.height != expected.height:
@@ -74,14 +84,8 @@ def differences(found: pl.DataFrame, expected: pl.DataFrame) -> list[str]:
         f"row {row}, {name}: {one!r}; expected {other!r}"
         for name in found.columns
         for row, (one, other) in enumerate(zip(found[name].to_list(), expected[name].to_list(), strict=True))
-        if not _same(one, other)
+        if not alike(one, other)
     ]
-
-
-def _same(one: object, other: object) -> bool:
-    if isinstance(one, float) and isinstance(other, float):
-        return (math.isnan(one) and math.isnan(other)) or math.isclose(one, other, rel_tol=_RELATIVE, abs_tol=0)
-    return one == other
 
 
 def write_tables(path: Path, folder: Path) -> None:

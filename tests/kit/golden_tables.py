@@ -7,6 +7,7 @@ tables stay as they are.
 
 from __future__ import annotations
 
+import argparse
 import io
 import json
 import math
@@ -25,6 +26,7 @@ from PIL import Image
 
 from tests.kit.paths import GOLDEN, ROOT
 from vla_attention.__main__ import main as vla_attention
+from vla_attention.analyze.parse.command import build_parser as parser_of_results
 from vla_attention.analyze.parse.command import main as parse_attention_ratio_results
 from vla_attention.analyze.show import plot_style
 from vla_attention.capture.commands.arguments import build_evaluate_parser, build_parser
@@ -32,6 +34,9 @@ from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.published.evaluate import arguments_from_environment
 
 FOLDER = GOLDEN / "tables"
+PUBLISHED_LINES = [
+    shlex.split(line) for line in (GOLDEN / "published_lines.txt").read_text(encoding="utf-8").splitlines()
+]
 #: Name below which a question sees a store -> where it lies. effects: pi05_cubes with recorded effects of words and
 #: cameras, for all four readers. libero, cosmos, replay: policies of test size.
 STORES = {
@@ -167,16 +172,14 @@ def _values(document: object, name: str = "") -> Iterator[tuple[str, str]]:
 def published_arguments() -> pl.DataFrame:
     """A row for each option that a published line, or the variables of a batch script, set: given, option, value."""
     rows = []
-    for line in (GOLDEN / "published_lines.txt").read_text(encoding="utf-8").splitlines():
-        program, *words = shlex.split(line)
-        if program.startswith("evaluate"):
-            rows += [(line, *value) for value in _parsed(program, words)]
-        elif program == "make":
-            rows += [(line, *value) for value in _made(words)]
+    for words in PUBLISHED_LINES:
+        if words[0] != "parse-attention-ratio-results":
+            rows += [(" ".join(words), *value) for value in _options(parsed(words))]
     for program, settings in VARIABLES.items():
         for name, variables in settings.items():
             words = arguments_from_environment(variables, _family(program))
-            rows += [(f"{program} with variables: {name}", *value) for value in _parsed(program, words)]
+            options = _options(parsed([program, *words]))
+            rows += [(f"{program} with variables: {name}", *value) for value in options]
     return pl.DataFrame(rows, schema={"given": str, "option": str, "value": str}, orient="row")
 
 
@@ -185,49 +188,40 @@ def _family(program: str) -> Any:
     return family
 
 
-def _parsed(program: str, words: list[str]) -> Iterator[tuple[str, str]]:
-    family = _family(program)
-    yield from _options(build_evaluate_parser(family, family.published).parse_args(words))
-
-
-def _made(words: list[str]) -> Iterator[tuple[str, str]]:
+def parsed(words: list[str]) -> argparse.Namespace:
+    """The arguments of a published line; of `make`, those of the capture that it starts."""
+    program, *given = words
+    if program == "parse-attention-ratio-results":
+        return parser_of_results().parse_args(given)
+    if program != "make":
+        family = _family(program)
+        return build_evaluate_parser(family, family.published).parse_args(given)
     # A make that runs the tests hands its own variables, ARGS for instance, to what it starts.
-    done = subprocess.run(
-        ["make", "--dry-run", *words], cwd=ROOT, env={"PATH": os.environ["PATH"]}, capture_output=True, check=True
+    outside = {"PATH": os.environ["PATH"]}
+    made = subprocess.run(
+        ["make", "--dry-run", *given], cwd=ROOT, env=outside, capture_output=True, text=True, check=True, timeout=60
     )
-    lines = done.stdout.decode().replace("\\\n", " ").splitlines()
-    (line,) = [line for line in lines if "vla-capture" in line and "--task-suite" in line]
+    printed = made.stdout.replace("\\\n", " ").splitlines()
+    (line,) = [line for line in printed if "vla-capture" in line and "--task-suite" in line]
     _, *given = shlex.split(line)
-    yield from _options(build_parser(given).parse_args(given))
+    return build_parser(given).parse_args(given)
 
 
-def _options(arguments: Any) -> Iterator[tuple[str, str]]:
+def _options(arguments: argparse.Namespace) -> Iterator[tuple[str, str]]:
     for name, value in sorted(vars(arguments).items()):
         if not callable(value) and name != "family" and value not in (None, False, []):
             yield name, str(value)
 
 
-def differences(found: pl.DataFrame, kept: pl.DataFrame, relative: float = 1e-5) -> list[str]:
-    """Where a table differs from the kept one; its further columns are left out.
+def alike(one: object, other: object) -> bool:
+    """Whether two values are: numbers, also in text, to a hundred-thousandth; everything else exactly.
 
-    Floats to a hundred-thousandth: matrix products of other processors move effective numbers of keys by 2e-6.
+    Matrix products of other processors move effective numbers of keys by 2e-6.
     """
-    lacking = [name for name in kept.columns if name not in found.columns]
-    if lacking or found.height != kept.height:
-        return [f"{found.height} rows for {kept.height}; without the columns {lacking}"]
-    return [
-        f"row {row}, {name}: {one!r}; kept is {other!r}"
-        for name in kept.columns
-        for row, (one, other) in enumerate(zip(found[name].to_list(), kept[name].to_list(), strict=True))
-        if not _same(one, other, relative)
-    ]
-
-
-def _same(one: object, other: object, relative: float) -> bool:
     if isinstance(one, list) and isinstance(other, list):
-        return len(one) == len(other) and all(map(_same, one, other, [relative] * len(one)))
+        return len(one) == len(other) and all(map(alike, one, other))
     try:
         first, second = (float(value) for value in (one, other))  # type: ignore[arg-type]
     except (TypeError, ValueError):
         return one == other
-    return (math.isnan(first) and math.isnan(second)) or math.isclose(first, second, rel_tol=relative, abs_tol=1e-8)
+    return (math.isnan(first) and math.isnan(second)) or math.isclose(first, second, rel_tol=1e-5, abs_tol=1e-8)

@@ -2,40 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import shlex
-import subprocess
 import warnings
 
 import pytest
 
-from tests.kit.paths import GOLDEN, ROOT
-from vla_attention.analyze.parse.command import build_parser as parser_of_results
-from vla_attention.capture.commands.arguments import build_evaluate_parser, build_parser
-from vla_attention.capture.policies.families import policy_families
+from tests.kit.golden_tables import PUBLISHED_LINES as LINES
+from tests.kit.golden_tables import parsed
 from vla_attention.schemas.errors import Note
-
-LINES = [shlex.split(line) for line in (GOLDEN / "published_lines.txt").read_text(encoding="utf-8").splitlines()]
-
-
-def parsed(words: list[str]):
-    """The arguments of a published line."""
-    program, *rest = words
-    if program == "parse-attention-ratio-results":
-        return parser_of_results().parse_args(rest)
-    for family in policy_families():
-        if family.published is not None and family.published.program == program:
-            return build_evaluate_parser(family, family.published).parse_args(rest)
-    assert program == "make"
-    # A make that runs the tests hands its own variables, ARGS for instance, to what it starts.
-    outside = {"PATH": os.environ["PATH"]}
-    made = subprocess.run(
-        ["make", "--dry-run", *rest], cwd=ROOT, env=outside, capture_output=True, text=True, check=True, timeout=60
-    )
-    printed = made.stdout.replace("\\\n", " ")
-    (line,) = [line for line in printed.splitlines() if "vla-capture" in line and "--task-suite" in line]
-    words = shlex.split(line)
-    return build_parser(words[1:]).parse_args(words[1:])
 
 
 @pytest.mark.parametrize("words", LINES, ids=lambda words: " ".join(words)[:60])
