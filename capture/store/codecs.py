@@ -24,7 +24,9 @@ TARGET_CHUNK_BYTES = 2 << 20
 #: Chunks are named `c.0.0`: with the separator `/`, every axis would be a folder of its own.
 CHUNK_KEYS: dict[str, Any] = {"name": "default", "configuration": {"separator": "."}}
 
+#: The codec of rows, for zarr, which keeps it in the array's metadata, and for numcodecs, which encodes the chunks.
 _ROWS = BloscCodec(cname="lz4", clevel=5, shuffle="bitshuffle", typesize=4)
+_ROW_ENCODER = Blosc(cname="lz4", clevel=5, shuffle=Blosc.BITSHUFFLE)
 
 #: Fill values, which zarr gives for a missing chunk, by kind of number. No stored float has this value. A stored byte
 #: may, so readers of pictures must check that the chunk's file exists.
@@ -67,7 +69,7 @@ def create_rows(
 
 def encode_row_chunk(values: NDArray[np.float32]) -> bytes:
     """A chunk of rows as the Blosc codec of `create_rows` encodes it, without the checksum that follows it."""
-    encoded: bytes = Blosc(_ROWS.cname.value, _ROWS.clevel, Blosc.BITSHUFFLE).encode(values)
+    encoded: bytes = _ROW_ENCODER.encode(values)
     return encoded
 
 

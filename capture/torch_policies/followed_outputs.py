@@ -9,6 +9,9 @@ It is added to the residual stream where the other summand is older than the att
 by copies, factors and sums. The sum with a younger tensor, that of a parallel feed-forward layer, is followed too, but
 may only be added to the stream as it is. What is multiplied with a gate and then added to another older tensor was not
 the stream, but the sum of two branches.
+
+The output must pass no other way: where a tensor that is made of it (by an adapter beside the projection, say) meets it
+on its way, or the stream until the next attention call, the block adds more than the projection gave.
 """
 
 from __future__ import annotations
@@ -44,6 +47,8 @@ _AGELESS = {
 }  # fmt: skip
 #: Numbers that are all smaller are taken for zeros.
 _TINY = 1e-30
+#: For sentences: a tensor that is made of an output, and is none of the steps of its way.
+_ANOTHER_WAY = "something else that is computed of what the attention gave"
 
 
 @dataclass(frozen=True)
@@ -91,10 +96,14 @@ class _Place:
 
 @dataclass(frozen=True)
 class _Stream:
-    """A tensor that is taken for the residual stream after the output of `way` was added; scaled: it was multiplied."""
+    """A tensor that is taken for the residual stream after the output of `way` was added.
+
+    scaled: it was multiplied. summed: something else was added to it since.
+    """
 
     way: OutputWay
     scaled: bool = False
+    summed: bool = False
 
 
 class OutputFollower:
@@ -104,6 +113,8 @@ class OutputFollower:
         self._block = block
         self._places: TensorTable[_Place] = TensorTable()
         self._streams: TensorTable[_Stream] = TensorTable()
+        #: Of tensors that were made of outputs in any way: of which.
+        self._derived: TensorTable[frozenset[OutputWay]] = TensorTable()
         #: The outputs that were not added yet.
         self._ways: list[OutputWay] = []
         #: When tensors were made, of those that were since outputs are followed.
@@ -116,6 +127,8 @@ class OutputFollower:
     def begin(self, way: OutputWay, result: Tensor) -> None:
         """Follow the output of a call that has just run; result: what the policy got of it."""
         self._streams.keep(lambda stream: False)
+        self._derived.keep(lambda ways: not ways.isdisjoint(self._ways))
+        self._derived.drop(result)
         if not self._ways:
             self._made.keep(lambda age: False)
         self._clock += 1
@@ -184,7 +197,7 @@ class OutputFollower:
         if not followed and self._streams:
             return self._follow_stream(function, given, run)
         if len(followed) != 1:
-            result = run()
+            result = self._derive(function, given, run)
             self._left(function, given, [place for _, place in followed], result)
             return result
         tensor, place = followed[0]
@@ -192,15 +205,31 @@ class OutputFollower:
         if place.behind and function in SUMS:
             with self._block.computing():  # before the tensor is written over
                 addition = self._addition(args, kwargs, tensor, place)
-        result = run()
+        result = self._derive(function, given, run)
         if addition is None:
             if not self._moved(function, args, kwargs, tensor, place, result):
                 self._left(function, given, [place], result)
+            if any(place.way in self._ways_of(other) for other in given if other is not tensor):
+                place.way.computed = f"{self._block.running_module} adds {_ANOTHER_WAY} to"
         elif addition.to_stream:
             self._finish(place.way, addition.added, result)
         else:
             self._put(result, replace(place, joined=addition.added))
         return result
+
+    def _derive(self, function: Any, given: Sequence[Tensor], run: Callable[[], Any]) -> Any:
+        """Run a function, and note of which outputs its result is made; given: its tensors."""
+        ways = frozenset[OutputWay]().union(*map(self._ways_of, given))  # before one of them is written over
+        result = run()
+        if ways:
+            for tensor in _written(function, given, result):
+                self._derived.put(tensor, ways)
+        return result
+
+    def _ways_of(self, tensor: Tensor) -> frozenset[OutputWay]:
+        """Return the outputs of which a tensor is made."""
+        place, ways = self._places.get(tensor), self._derived.get(tensor) or frozenset()
+        return ways if place is None else ways | {place.way}
 
     def _moved(
         self,
@@ -246,7 +275,7 @@ class OutputFollower:
         first, second = operands
         other = second if first is tensor else first
         factor = 1 if first is tensor else kwargs.get("alpha", 1)
-        if not isinstance(other, Tensor) or other.numel() != tensor.numel():
+        if not isinstance(other, Tensor) or other.numel() != tensor.numel() or place.way in self._ways_of(other):
             return None
         to_stream = self._may_be_stream(other, tensor, place.way)
         if place.joined is not None:
@@ -268,33 +297,39 @@ class OutputFollower:
         self._ways.remove(way)
         self._places.keep(lambda place: place.way is not way)
         self._streams.put(stream, _Stream(way))
+        self._derived.drop(stream)
         with self._block.computing():
             way.take(added)
 
     def _follow_stream(self, function: Any, given: Sequence[Tensor], run: Callable[[], Any]) -> Any:
-        """Run a function, and see whether what was taken for the residual stream becomes a branch of another sum."""
+        """Run a function, and see whether the block adds more than the output to what was taken for the stream."""
         streams = [(tensor, stream) for tensor in given if (stream := self._streams.get(tensor)) is not None]
-        result = run()
+        again = {stream.way for _, stream in streams} & frozenset().union(*map(self._ways_of, given))
+        result = self._derive(function, given, run)
         self._left(function, given, [], result)
+        for way in again:
+            self._lose(way, f"{self._block.running_module} adds {_ANOTHER_WAY} to a sum with")
         for tensor, stream in streams:
-            if not isinstance(result, Tensor) or result.numel() != tensor.numel():
+            if stream.way in again or not isinstance(result, Tensor) or result.numel() != tensor.numel():
                 continue
             if function in SAME_NUMBERS:
                 self._streams.put(result, stream)
             elif function in PRODUCTS or function in QUOTIENTS:
                 self._streams.put(result, replace(stream, scaled=stream.scaled or len(given) > 1))
             elif function in SUMS:
-                self._end_stream(stream, any(self._may_be_stream(other, tensor, stream.way) for other in given))
+                with_older = any(self._may_be_stream(other, tensor, stream.way) for other in given)
+                if stream.scaled and not stream.summed and with_older:
+                    self._lose(stream.way, f"{self._block.running_module} adds a multiple of a sum with")
+                else:
+                    self._streams.put(result, replace(stream, summed=True))
         return result
 
-    def _end_stream(self, stream: _Stream, with_older: bool) -> None:
-        """End what is known of a stream where it is added to another tensor, older than the attention call or not."""
-        way = stream.way
-        self._streams.keep(lambda other: other.way is not way)
-        if stream.scaled and with_older:
-            way.computed = f"{self._block.running_module} adds a multiple of a sum with"
-            with self._block.computing():
-                way.take(None)
+    def _lose(self, way: OutputWay, computed: str) -> None:
+        """Take back that an output was added to the residual stream; computed: what was instead."""
+        self._streams.keep(lambda stream: stream.way is not way)
+        way.computed = computed
+        with self._block.computing():
+            way.take(None)
 
     def _may_be_stream(self, other: object, tensor: Tensor, way: OutputWay) -> bool:
         """Return whether a summand is as large as a followed tensor, and older than the attention call."""
@@ -311,10 +346,7 @@ class OutputFollower:
 
     def _left(self, function: Any, given: Sequence[Tensor], places: Sequence[_Place], result: Any) -> None:
         """Note that what a function made is not followed; given: its tensors, places: of those that are followed."""
-        made = list(tensors_among((result,)))
-        written = made
-        if getattr(function, "__name__", "") == "__setitem__":
-            written = list(given[:1])
+        made, written = list(tensors_among((result,))), _written(function, given, result)
         for tensor in written:
             self._places.drop(tensor)
         for place in places:
@@ -337,6 +369,13 @@ class OutputFollower:
         if age:
             for tensor in made:
                 self._made.put(tensor, age)
+
+
+def _written(function: Any, given: Sequence[Tensor], result: Any) -> list[Tensor]:
+    """The tensors that a function wrote or made."""
+    if getattr(function, "__name__", "") == "__setitem__":
+        return list(given[:1])
+    return list(tensors_among((result,)))
 
 
 @dataclass(frozen=True)

@@ -91,6 +91,7 @@ class Block(nn.Module):
         self.alpha = nn.Parameter(torch.tensor(0.4))
         self.second = nn.Linear(WIDTH, WIDTH)
         self.mlp = nn.Sequential(nn.Linear(WIDTH, 2 * WIDTH), nn.GELU(), nn.Linear(2 * WIDTH, WIDTH))
+        self.beside = nn.Sequential(nn.Linear(inner, 2, bias=False), nn.Linear(2, WIDTH, bias=False))
         self.kept: list[Call] | None = None
 
     def forward(self, tokens: Tensor, prefix: Tensor, condition: Tensor) -> Tensor:
@@ -274,6 +275,18 @@ WAYS: dict[str, Way] = {
     ),
 }
 
+def added_in_place(block: Block, call: Call) -> Tensor:
+    tokens = call.stream + block.out(call.mixed)
+    tokens += block.beside(call.mixed)
+    return tokens
+
+
+def added_behind_the_feed_forward(block: Block, call: Call) -> Tensor:
+    tokens = call.stream + block.out(call.mixed)
+    tokens = tokens + block.mlp(tokens)
+    return tokens + block.beside(call.mixed)
+
+
 #: Ways of which it cannot be said what each part adds, and a word of the sentence that says why.
 UNKNOWN: dict[str, tuple[Add, str]] = {
     "tanh": (lambda b, c: c.stream + torch.tanh(b.out(c.mixed)), "tanh"),
@@ -292,8 +305,38 @@ UNKNOWN: dict[str, tuple[Add, str]] = {
     ),
     "other tokens": (lambda b, c: c.stream + b.out(c.mixed).flip(1), "flip"),
     "squared": (lambda b, c: c.stream + b.out(c.mixed) ** 2, "pow"),
-    "no residual stream": (lambda b, c: b.out(c.mixed), "layer_norm"),
+    "no residual stream": (lambda b, c: b.out(c.mixed), "adds something else"),
     "mixed heads": (lambda b, c: c.stream + b.out(c.mixed.unflatten(-1, (HEADS, DIM)).mT.flatten(-2)), "out"),
     "value residual": (lambda b, c: c.stream + b.out(c.mixed + b.gate_proj(c.normed)), "add"),
+    "adapter beside the projection": (lambda b, c: c.stream + (b.out(c.mixed) + b.beside(c.mixed)), "adds something else"),
+    "scaled adapter of a copy": (
+        lambda b, c: c.stream + (b.out(c.mixed) + 0.5 * b.beside(c.mixed.double().float())),
+        "adds something else",
+    ),
+    "adapter behind the projection": (
+        lambda b, c: c.stream + (lambda update: update + b.second(update))(b.out(c.mixed)),
+        "adds something else",
+    ),
+    "adapter in a gated branch": (
+        lambda b, c: c.stream + chunk(b, c, 2) * (b.out(c.mixed) + b.beside(c.mixed)),
+        "adds something else",
+    ),
+    "adapter of some heads": (
+        lambda b, c: c.stream + (b.out(c.mixed) + b.second(c.mixed[..., :WIDTH])),
+        "adds something else",
+    ),
+    "feed-forward of the output": (
+        lambda b, c: c.stream + (b.out(c.mixed) + b.mlp(c.normed + b.beside(c.mixed))),
+        "adds something else",
+    ),
+    "projected twice": (lambda b, c: c.stream + (b.out(c.mixed) + b.out(c.mixed.square())), "adds something else"),
+    "another way before": (lambda b, c: (c.stream + b.beside(c.mixed)) + b.out(c.mixed), "adds something else"),
+    "another way behind": (lambda b, c: (c.stream + b.out(c.mixed)) + b.beside(c.mixed), "adds something else"),
+    "another way behind, fused": (
+        lambda b, c: torch.addcmul(c.stream + b.out(c.mixed), b.beside(c.mixed), b.alpha),
+        "adds something else",
+    ),
+    "another way in place": (added_in_place, "adds something else"),
+    "another way behind the feed-forward": (added_behind_the_feed_forward, "adds something else"),
     "added constant": (lambda b, c: c.stream + chunk(b, c, 2) * (b.out(c.mixed) + b.second.bias), "add"),
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -133,6 +134,34 @@ def test_where_it_cannot_be_said_there_are_none_and_a_sentence_says_why(tmp_path
     assert store.attributes.provenance["contributions"].removeprefix("none: ") in sentence
     assert [episode.has("joint/contribution") for episode in store.episodes] == [False, False]
     assert va.open(tmp_path / "a.zarr").masses().height > 0
+
+
+class Adapter(nn.Module):
+    """As an unmerged LoRA of peft."""
+
+    def __init__(self, base_layer: nn.Linear) -> None:
+        super().__init__()
+        self.base_layer = base_layer
+        self.lora_A = nn.Linear(base_layer.in_features, 2, bias=False)
+        self.lora_B = nn.Linear(2, base_layer.out_features, bias=False)
+
+    def forward(self, mixed: Tensor) -> Tensor:
+        return self.base_layer(mixed) + self.lora_B(self.lora_A(mixed)) * 2
+
+
+def test_an_adapter_is_the_projection_and_the_layer_inside_of_it_is_not(tmp_path):
+    policy = ResidualPolicy(WAYS["plain"].add)
+    for block in policy.blocks:
+        block.out = Adapter(block.out)
+    way = Way(WAYS["plain"].add, lambda block, call, share: block.out(share) - block.out(torch.zeros_like(share)))
+    for gram in recorded(tmp_path, policy).episodes[0].read("joint/contribution"):
+        close(gram, expected(policy, way))
+
+    site = replace(residual_layout().sites[0], projection="blocks.{block}.out.base_layer")
+    run = va.record(tmp_path / "inside.zarr", policy, layout=residual_layout(sites=(site,)), durable=False)
+    with run, pytest.warns(Note, match=r"module 'blocks.0.out' adds something else"):
+        fill(run, policy)
+    assert not run.attributes.recording.contributions
 
 
 def test_a_policy_that_begins_to_do_otherwise_is_an_error(tmp_path):
