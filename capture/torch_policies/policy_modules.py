@@ -1,8 +1,7 @@
-"""The modules that a policy holds, by path, their weights, and policies whose attention no Python code computes."""
+"""The modules that a policy holds, by path, and policies whose attention no Python code computes."""
 
 from __future__ import annotations
 
-import hashlib
 import types
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -10,7 +9,6 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from vla_attention.capture.policies.weights import weights_digest
 from vla_attention.capture.torch_policies.attention_calls import CallShape
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
 from vla_attention.capture.torch_policies.tensor_functions import tensors_among
@@ -184,7 +182,7 @@ def find_module(policy: object, path: str, what: str) -> nn.Module:
     return modules[path]
 
 
-def _roots(policy: object) -> dict[str, nn.Module]:
+def root_modules(policy: object) -> dict[str, nn.Module]:
     """The modules of a policy that are in no other one, by path."""
     inside: set[int] = set()
     roots = {}
@@ -193,39 +191,6 @@ def _roots(policy: object) -> dict[str, nn.Module]:
             roots[path] = module
             inside.update(id(part) for part in module.modules())
     return roots
-
-
-def policy_digest(policy: object) -> str:
-    """Return the SHA-256 (hex) over the weights of all modules of a policy."""
-    roots = _roots(policy)
-    if len(roots) == 1:
-        return weights_digest(next(iter(roots.values())))
-    digest = hashlib.sha256()
-    for name, module in sorted(roots.items()):
-        digest.update(f"{name} {weights_digest(module)}\n".encode())
-    return digest.hexdigest()
-
-
-def weights_state(policy: object) -> tuple[tuple[int, int], ...]:
-    """Return what tells quickly that weights may have changed: where they are, and how often torch wrote to them.
-
-    What is written through `.data` is not counted.
-    """
-    return tuple(
-        (weight.data_ptr(), 0 if weight.is_inference() else weight._version)
-        for module in _roots(policy).values()
-        for weight in module.parameters()
-    )
-
-
-def device_and_dtype(policy: object) -> tuple[str, str]:
-    """Return the device and the type of most weights, such as `cuda:0` and `bfloat16`."""
-    counts: dict[tuple[str, str], int] = {}
-    for module in _roots(policy).values():
-        for weight in module.parameters():
-            place = str(weight.device), str(weight.dtype).removeprefix("torch.")
-            counts[place] = counts.get(place, 0) + weight.numel()
-    return max(counts, key=lambda place: counts[place]) if counts else ("cpu", "float32")
 
 
 @dataclass(frozen=True)
@@ -254,11 +219,12 @@ class OutputProjection:
     def _linear(self) -> nn.Linear | None:
         module = self.module
         if isinstance(module, nn.Linear) and type(module).forward is nn.Linear.forward:
-            return module if module.weight.is_floating_point() else None
+            plain = type(module.weight) in (Tensor, nn.Parameter) and not module.weight.is_meta
+            return module if plain and module.weight.is_floating_point() else None
         return None
 
     def _called(self, mixed: Tensor) -> Tensor:
-        # Quantised weights, adapters: the module itself.
+        # Quantised or offloaded weights, adapters: the module itself.
         weights = (weight.dtype for weight in self.module.parameters() if weight.is_floating_point())
         result = self.module(mixed.to(next(weights, mixed.dtype)))
         return next(tensors_among((result,))).float()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib import metadata
@@ -20,11 +21,12 @@ from vla_attention.capture.torch_policies.policy_layout import (
     RecordedSite,
     check_versions,
 )
-from vla_attention.capture.torch_policies.policy_modules import device_and_dtype, policy_digest, projections_of
+from vla_attention.capture.torch_policies.policy_modules import projections_of
+from vla_attention.capture.torch_policies.policy_weights import device_and_dtype, policy_digest
 from vla_attention.capture.torch_policies.prompts import TokenText
 from vla_attention.capture.torch_policies.repeated_calls import effects_of_layout
 from vla_attention.capture.torch_policies.session import RecordedRun
-from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.errors import BadArgument, Note, listing
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import SiteLayout
@@ -162,9 +164,18 @@ def record(
     if own_setting is not None:
         facts["difference to own setting"] = str(difference_to_own_setting(policy, own_setting))
         facts["rows of the batch of own setting"] = rows_apart(policy, layout, own_setting)
+    digest, unread = policy_digest(policy)
+    if unread:
+        facts["not in the digest of weights"] = listing(unread)
+        warnings.warn(
+            f"The digest of the policy's weights is without {listing(unread)}, which cannot be read: offloaded, no "
+            "numbers, or made at the first call (make one before va.record). A change of these is not noticed.",
+            Note,
+            stacklevel=3,
+        )
     facts |= dict(provenance or {})
     attributes = root_attributes(
-        _identity(policy, layout, checkpoint, dtype, untrained=untrained),
+        _identity(policy, layout, checkpoint, digest, dtype, untrained=untrained),
         recorded_sites(layout, recording),
         Protocol(suite=suite, seed=0, wait_steps=0, replan_steps=0, max_steps=0, name="recorded", image_size=0),
         recording,
@@ -219,7 +230,9 @@ def recorded_sites(layout: PolicyLayout, recording: Recording) -> tuple[SiteLayo
     return tuple(stored)
 
 
-def _identity(policy: object, layout: PolicyLayout, checkpoint: str, dtype: str, *, untrained: bool) -> PolicyIdentity:
+def _identity(
+    policy: object, layout: PolicyLayout, checkpoint: str, digest: str, dtype: str, *, untrained: bool
+) -> PolicyIdentity:
     # Pictures are shown as the policy gets them: row 0 on top.
     views = tuple(PolicyCameraView(name, name, upright=True, mirrored=False) for name in layout.camera_names)
     return PolicyIdentity(
@@ -227,7 +240,7 @@ def _identity(policy: object, layout: PolicyLayout, checkpoint: str, dtype: str,
         family=layout.family,
         checkpoint=checkpoint or "not given",
         checkpoint_format=CALLERS_MODULES,
-        digest=policy_digest(policy),
+        digest=digest,
         untrained=untrained,
         num_layers=layout.num_layers,
         num_heads=layout.num_heads,

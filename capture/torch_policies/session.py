@@ -22,12 +22,8 @@ from vla_attention.capture.torch_policies.call_order import CallsDoNotFit, Known
 from vla_attention.capture.torch_policies.call_state import CallState
 from vla_attention.capture.torch_policies.knockouts import ReplanEdits, SessionKnockouts
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
-from vla_attention.capture.torch_policies.policy_modules import (
-    OutputProjection,
-    find_policy,
-    policy_digest,
-    weights_state,
-)
+from vla_attention.capture.torch_policies.policy_modules import OutputProjection, find_policy
+from vla_attention.capture.torch_policies.policy_weights import policy_digest, weights_state
 from vla_attention.capture.torch_policies.prompts import TokenText
 from vla_attention.capture.torch_policies.recorded_episodes import (
     Episode,
@@ -242,7 +238,7 @@ class RecordedRun:
         state = weights_state(self.policy)
         if state == self._weights:
             return
-        if policy_digest(self.policy) != self.attributes.policy.digest:
+        if policy_digest(self.policy)[0] != self.attributes.policy.digest:
             raise WeightsChanged(
                 f"The weights of the policy ({type(self.policy).__name__}) changed since va.record was called, and a "
                 "store is of one policy. Record each of its states into a store of its own."

@@ -275,6 +275,7 @@ WAYS: dict[str, Way] = {
     ),
 }
 
+
 def added_in_place(block: Block, call: Call) -> Tensor:
     tokens = call.stream + block.out(call.mixed)
     tokens += block.beside(call.mixed)
@@ -308,7 +309,10 @@ UNKNOWN: dict[str, tuple[Add, str]] = {
     "no residual stream": (lambda b, c: b.out(c.mixed), "adds something else"),
     "mixed heads": (lambda b, c: c.stream + b.out(c.mixed.unflatten(-1, (HEADS, DIM)).mT.flatten(-2)), "out"),
     "value residual": (lambda b, c: c.stream + b.out(c.mixed + b.gate_proj(c.normed)), "add"),
-    "adapter beside the projection": (lambda b, c: c.stream + (b.out(c.mixed) + b.beside(c.mixed)), "adds something else"),
+    "adapter beside the projection": (
+        lambda b, c: c.stream + (b.out(c.mixed) + b.beside(c.mixed)),
+        "adds something else",
+    ),
     "scaled adapter of a copy": (
         lambda b, c: c.stream + (b.out(c.mixed) + 0.5 * b.beside(c.mixed.double().float())),
         "adds something else",

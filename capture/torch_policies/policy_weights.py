@@ -1,0 +1,137 @@
+"""The weights of a policy of the caller: their digest, whether they changed, and where most of them are.
+
+Policies hold more than plain tensors: packed and quantised weights, weights that a library keeps elsewhere, a state of
+their own. Whatever has bytes is read, and the rest is named: a digest never ends a recording.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from vla_attention.capture.torch_policies.policy_modules import root_modules
+
+
+def policy_digest(policy: object) -> tuple[str, tuple[str, ...]]:
+    """Return the SHA-256 (hex) over the weights and further state of all modules, and the names of what has no bytes.
+
+    Without bytes are weights on torch's meta device (offloaded, or not made yet) and objects that are no numbers.
+    """
+    digest, unread = hashlib.sha256(), []
+    roots = root_modules(policy)
+    for root, module in sorted(roots.items()):
+        for name, value in _state(module):
+            full = f"{root}.{name}" if root and len(roots) > 1 else name
+            try:
+                parts = list(_bytes(value))
+            except Exception:  # of a subclass of tensors, or of what a library made of the attribute
+                parts = []
+            if not parts:
+                unread.append(full)
+            digest.update(f"{full} {type(value).__name__}\n".encode())
+            for part in parts:
+                digest.update(part)
+    return digest.hexdigest(), tuple(unread)
+
+
+def _state(module: nn.Module) -> Iterator[tuple[str, Any]]:
+    """Yield name and value of everything that a module would save, ordered by name; None where it cannot say what."""
+    try:
+        state = module.state_dict()
+    except Exception:  # of one module's own code: then each is asked by itself
+        state = {}
+        for path, part in module.named_modules():
+            prefix = f"{path}." if path else ""
+            try:
+                own: dict[str, Any] = {}
+                part._save_to_state_dict(own, prefix, False)
+            except Exception:
+                own = {prefix + name: value for name, value in (*part._parameters.items(), *part._buffers.items())}
+                own[f"{prefix}(state)"] = None
+            state.update(own)
+    yield from sorted(state.items(), key=lambda item: item[0])
+
+
+def _bytes(value: Any) -> Iterator[bytes | memoryview]:
+    """Yield the bytes of a value of a module's state; nothing, or an error, where it has none."""
+    if isinstance(value, Tensor):
+        yield from _bytes_of_tensor(value)
+    elif isinstance(value, bool | int | float | complex | str | torch.dtype | torch.Size):
+        yield repr(value).encode()
+    elif isinstance(value, bytes | bytearray):
+        yield bytes(value)
+    elif isinstance(value, io.BytesIO):
+        yield value.getvalue()
+    elif isinstance(value, np.ndarray) and not value.dtype.hasobject:
+        yield f"{value.dtype} {value.shape}".encode() + value.tobytes()
+    elif isinstance(value, Mapping):
+        yield from _all([part for key in sorted(value, key=repr) for part in (key, value[key])])
+    elif isinstance(value, list | tuple):
+        yield from _all(list(value))
+    elif isinstance(value, torch.ScriptObject):  # packed weights of torch.ao
+        yield from _bytes(value.__getstate__())
+
+
+def _all(values: list[Any]) -> Iterator[bytes | memoryview]:
+    """Yield the bytes of several values, which all must have some; None stands for what is not there."""
+    yield f"{len(values)} values".encode()
+    for value in values:
+        parts: list[bytes | memoryview] = [b"none"] if value is None else list(_bytes(value))
+        if not parts:
+            raise TypeError(f"a {type(value).__name__} has no bytes")
+        yield from parts
+
+
+def _bytes_of_tensor(tensor: Tensor) -> Iterator[bytes | memoryview]:
+    tensor = tensor.detach()
+    if tensor.is_meta or isinstance(tensor, nn.parameter.UninitializedTensorMixin):
+        return
+    head = f"{tensor.dtype} {tuple(tensor.shape)}".encode()
+    if hasattr(tensor, "__tensor_flatten__"):  # a subclass that holds tensors, such as torchao's
+        names, context = tensor.__tensor_flatten__()
+        yield from _all([head, str(context), *(getattr(tensor, name) for name in names)])
+    elif tensor.is_nested:
+        yield from _all([head, *tensor.unbind()])
+    elif tensor.is_quantized:
+        yield from _all([head, tensor.int_repr(), tensor.dequantize()])
+    else:
+        if tensor.layout is not torch.strided:
+            tensor = tensor.to_dense()
+        plain = tensor.resolve_conj().resolve_neg().cpu().contiguous()
+        yield head
+        # Read as bytes, because numpy knows neither bfloat16 nor numbers of less than 8 bits.
+        if plain.numel():
+            yield plain.reshape(-1).view(torch.uint8).numpy().data
+
+
+def weights_state(policy: object) -> tuple[tuple[int, int], ...]:
+    """Return what tells quickly that weights may have changed: where they are, and how often torch wrote to them.
+
+    What is written through `.data` is not counted, nor is a tensor that has no memory of its own.
+    """
+    return tuple(_place(weight) for module in root_modules(policy).values() for weight in module.parameters())
+
+
+def _place(weight: Tensor) -> tuple[int, int]:
+    try:
+        return weight.data_ptr(), 0 if weight.is_inference() else weight._version
+    except (RuntimeError, ValueError, NotImplementedError):  # not made yet, or a subclass without memory of its own
+        return 0, 0
+
+
+def device_and_dtype(policy: object) -> tuple[str, str]:
+    """Return the device and the type of most weights, such as `cuda:0` and `bfloat16`."""
+    counts: dict[tuple[str, str], int] = {}
+    for module in root_modules(policy).values():
+        for weight in module.parameters():
+            if weight.is_meta or isinstance(weight, nn.parameter.UninitializedTensorMixin):
+                continue
+            place = str(weight.device), str(weight.dtype).removeprefix("torch.")
+            counts[place] = counts.get(place, 0) + weight.numel()
+    return max(counts, key=lambda place: counts[place]) if counts else ("cpu", "float32")
