@@ -6,6 +6,8 @@
 #   make test-thorough   attacks, damages, fuzz, kills, memory, many examples, site and notebooks too (an hour or more)
 #   make faults      twenty faults planted one at a time: the tests of their area have to catch each
 #   make test-policies   policies of transformers 5 and LeRobot, in environments of their own (.venv-transformers, .venv-lerobot)
+#   make package-newest  the wheel with the newest libraries, on each Python that is there (gigabytes; PYTHONS names others)
+#   make test-numpy1 the recorder and its stores with numpy 1.26, in an environment of its own (.venv-numpy1)
 #   make test-remote stores in S3, on moto's server on this machine, in an environment of its own (.venv-remote)
 #   make viewer      the page of `vla-attention view` from its sources in analyze/view/web (needs node and npm)
 #   make notebooks   the notebooks of examples/, run from beginning to end, in an environment of its own (.venv-notebooks)
@@ -44,7 +46,7 @@ WORKERS ?= 2
 # An empty PYTHONDONTWRITEBYTECODE: where it is set, both processes compile all tests anew at every run.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: capture analyze test test-policies test-remote test-slurm notebooks fuzz faults test-thorough check unit package audit setup setup-analyze schemas docs pictures screenshots viewer clean
+.PHONY: capture analyze test test-policies test-remote test-slurm notebooks fuzz faults test-thorough check unit package package-newest test-numpy1 audit setup setup-analyze schemas docs pictures screenshots viewer clean
 
 capture: .venv/capture-installed
 	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --output $(STORE) \
@@ -77,6 +79,14 @@ faults: .venv/capture-installed
 # Source distribution, wheel, and their use from environments outside the checkout.
 package: .venv/capture-installed
 	$(BIN)/python scripts/check_package.py
+
+# As `pip install` finds them today, without constraints.txt; PYTHONS="python3.12 /opt/python3.14/bin/python" names interpreters.
+package-newest: .venv/capture-installed
+	$(BIN)/python scripts/check_package.py --newest $(PYTHONS)
+
+# What openpi, OpenVLA and GR00T pin. zarr 3.1.5 is the last that takes it on Python 3.11.
+test-numpy1: .venv-numpy1/installed
+	.venv-numpy1/bin/pytest tests/schemas tests/capture/torch_policies tests/capture/recording tests/capture/store tests/testing $(ARGS)
 
 # Layouts of policies on small random models of the real classes. Neither environment fits constraints.txt, nor the other:
 # transformers 5 and LeRobot 0.4.4 want different versions of the same libraries.
@@ -164,6 +174,12 @@ setup-analyze: .venv/analyze-installed
 	.venv-lerobot/bin/python -m pip install --quiet --disable-pip-version-check --no-deps lerobot==0.4.4 av==15.0.0 openpi-client==0.1.2 openpi-server==0.1.0
 	@touch $@
 
+.venv-numpy1/installed: pyproject.toml
+	@echo "Installing numpy 1.26, torch and the recorder into .venv-numpy1 ..."
+	$(PYTHON) -m venv .venv-numpy1
+	.venv-numpy1/bin/python -m pip install --quiet --disable-pip-version-check 'numpy<2' torch==2.13.0 safetensors sentencepiece -e '.[dev]'
+	@touch $@
+
 .venv-remote/installed: pyproject.toml constraints.txt
 	@echo "Installing s3fs and moto's server into .venv-remote ..."
 	$(PYTHON) -m venv .venv-remote
@@ -195,4 +211,4 @@ setup-analyze: .venv/analyze-installed
 	@touch $@
 
 clean:
-	rm -rf .venv .venv-transformers .venv-lerobot .venv-remote .venv-audit .venv-notebooks .venv-fuzz .venv-docs build site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-transformers .venv-lerobot .venv-remote .venv-audit .venv-notebooks .venv-fuzz .venv-docs .venv-numpy1 build site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

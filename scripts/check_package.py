@@ -1,11 +1,15 @@
 """Build the source distribution and from it the wheel, install the wheel outside the checkout, and use it there.
 
-Usage: python scripts/check_package.py [--folder FOLDER]
+Usage: python scripts/check_package.py [--folder FOLDER] [--newest [PYTHON ...]]
 
 Two environments are made in a temporary folder, or in FOLDER, which is then kept. "laptop" is clean: the wheel and its
 dependencies. "node" is the wheel on top of the libraries of the environment that runs this script, so that a policy
 can run without a second copy of torch. A store is captured in "node" and analysed in "laptop". Exit code 1: a check
 failed.
+
+With --newest, instead: on each interpreter that is there (python3.11 to python3.13, or those that are named), what
+`pip install 'vla-attention[capture]'` takes today, without constraints.txt, records an episode and analyses it. torch
+may bring CUDA's libraries, several gigabytes for each interpreter.
 """
 
 from __future__ import annotations
@@ -22,6 +26,7 @@ import tempfile
 import tomllib
 import zipfile
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = "vla_attention"
@@ -65,6 +70,17 @@ assert va.open(path).episodes["task_id"].unique().sort().to_list() == [0, 2]
 """
 
 
+#: What `pip install` takes by itself on these is held against the wheel by --newest.
+INTERPRETERS = ("python3.11", "python3.12", "python3.13")
+#: Prints the interpreter's version, and fails where a name on the path is no interpreter (pyenv).
+PRINT_VERSION = "import platform; print(platform.python_version())"
+#: Libraries whose versions are printed.
+LIBRARIES = ("zarr", "numcodecs", "numpy", "polars", "matplotlib", "torch", "mujoco")
+PRINT_LIBRARIES = (
+    "import sys; from importlib.metadata import version as v; print(*(f'{n} {v(n)}' for n in sys.argv[1:]))"
+)
+
+
 class CheckFailed(Exception):
     """A check of the package did not hold."""
 
@@ -73,19 +89,37 @@ def main() -> int:
     """Run all checks; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, help="folder for packages and environments, kept afterwards")
-    given = parser.parse_args().folder
+    parser.add_argument(
+        "--newest", nargs="*", metavar="PYTHON", help="the newest libraries instead, on these interpreters or all"
+    )
+    arguments = parser.parse_args()
+    given = arguments.folder
     with tempfile.TemporaryDirectory(prefix="package_") as temporary:
         folder = Path(temporary) if given is None else given.resolve()
         folder.mkdir(parents=True, exist_ok=True)
         try:
             wheel = build_packages(folder)
-            laptop, node = make_environments(wheel, folder)
-            use_packages(laptop, node, folder)
+            if arguments.newest is None:
+                laptop, node = make_environments(wheel, folder)
+                use_packages(laptop, node, folder)
+            else:
+                use_newest(wheel, arguments.newest, folder)
         except CheckFailed as error:
             print(f"package check failed: {error}", file=sys.stderr)
             return 1
     print("package check passed")
     return 0
+
+
+def project() -> dict[str, Any]:
+    """Return what pyproject.toml says of the package."""
+    with open(ROOT / "pyproject.toml", "rb") as file:
+        return tomllib.load(file)["project"]
+
+
+def version() -> str:
+    """Return the package's version."""
+    return project()["version"]
 
 
 def build_packages(folder: Path) -> Path:
@@ -141,26 +175,30 @@ def make_environments(wheel: Path, folder: Path) -> tuple[Path, Path]:
 
 def use_packages(laptop: Path, node: Path, folder: Path) -> None:
     """Import, ask for help, capture and analyse, with the installed wheel and outside the checkout."""
-    with open(ROOT / "pyproject.toml", "rb") as file:
-        project = tomllib.load(file)["project"]
     for commands in (laptop, node):
         imported = run(commands / "python", "-I", "-c", CHECK_IMPORTS, cwd=folder, quiet=True).split()
-        check(imported[0] == project["version"], f"the version is {imported[0]}, not {project['version']}")
+        check(imported[0] == version(), f"the version is {imported[0]}, not {version()}")
         check(Path(imported[1]).is_relative_to(commands.parent), f"{imported[1]} is not the installed wheel")
-        for script in project["scripts"]:
+        for script in project()["scripts"]:
             run(commands / script, "--help", cwd=folder, quiet=True)
 
     use_examples(laptop, folder)
-    made, store, output = folder / "made.zarr", folder / "store.zarr", folder / "results"
-    for old in (made, store, output):
-        shutil.rmtree(old, ignore_errors=True)
+    made = folder / "made.zarr"
+    shutil.rmtree(made, ignore_errors=True)
     run(laptop / "python", "-c", CHECK_TESTING_KIT, made, cwd=folder, quiet=True)
+    capture_and_analyse(laptop, node, folder)
+
+
+def capture_and_analyse(laptop: Path, node: Path, folder: Path) -> None:
+    """Record an episode with one environment's commands, and analyse it with another's."""
+    store, output = folder / "store.zarr", folder / "results"
+    for old in (store, output):
+        shutil.rmtree(old, ignore_errors=True)
     short = ("--task-id", 0, "--num-episodes", 1, "--replan-steps", 4, "--max-steps", 8)
-    capture = (node / "python", "-m", f"{PACKAGE}.capture", "pi")
     # The default: the trained policy that is part of the package, and its suite.
-    run(*capture, *short, "--output", store, cwd=folder, quiet=True)
+    run(node / "python", "-m", f"{PACKAGE}.capture", "pi", *short, "--output", store, cwd=folder, quiet=True)
     code = json.loads((store / "zarr.json").read_text())["attributes"]["provenance"]["code"]
-    check(code == project["version"], f"the store was made by code version {code}, expected {project['version']}")
+    check(code == version(), f"the store was made by code version {code}, expected {version()}")
     run(laptop / "vla-analyze", store, "--output", output, cwd=folder, quiet=True)
     run(laptop / "python", "-m", f"{PACKAGE}.analyze", "verify", store, cwd=folder, quiet=True)
     run(laptop / "vla-analyze", "report", store, "--output", output / "report.html", cwd=folder, quiet=True)
@@ -170,6 +208,28 @@ def use_packages(laptop: Path, node: Path, folder: Path) -> None:
     check(len(results) == 1, f"expected one results file in {output}, found {results}")
     run(laptop / "parse-attention-ratio-results", "--results", results[0], cwd=folder, quiet=True)
     print("captured a store and analysed it with the installed wheel")
+
+
+def use_newest(wheel: Path, named: list[str], folder: Path) -> None:
+    """On each interpreter, install the wheel without constraints, record an episode and analyse it."""
+    there = {}
+    for python in named or INTERPRETERS:
+        try:
+            there[python] = run(python, "-c", PRINT_VERSION, quiet=True).strip()
+        except (CheckFailed, OSError):
+            check(not named, f"{python} runs no Python.")
+            print(f"{python} is not there")
+    check(bool(there), f"none of {', '.join(INTERPRETERS)} is there; name one: --newest PYTHON")
+    for python, number in there.items():
+        environment = folder / f"newest-{number}"
+        run(python, "-m", "venv", "--clear", environment)
+        pip = (environment / "bin/python", "-m", "pip", "--quiet", "--disable-pip-version-check")
+        run(*pip, "install", f"{wheel}[capture]", quiet=True)
+        print(
+            f"Python {number}:", run(environment / "bin/python", "-c", PRINT_LIBRARIES, *LIBRARIES, quiet=True).strip()
+        )
+        capture_and_analyse(environment / "bin", environment / "bin", folder)
+        shutil.rmtree(environment)
 
 
 def use_examples(laptop: Path, folder: Path) -> None:
