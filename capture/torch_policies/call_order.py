@@ -243,9 +243,11 @@ class CallOrder:
         few_are_fine = self.layout.stops_early and max(counts) <= expected
         if len(counts) > 1 or not (counts == {expected} or few_are_fine):
             given = listing(f"block {block}: {count}" for block, count in times.items())
+            fewer = max(counts) < expected and len(counts) == 1
             yield (
                 f"the blocks of site '{site.name}' must compute {'at most ' if self.layout.stops_early else ''}"
                 f"{expected} times a policy call, once for each generated token, but did otherwise ({given})"
+                f"{'; stops_early=True is for policies that may generate fewer' * fewer}"
             )
 
 

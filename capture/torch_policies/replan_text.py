@@ -23,8 +23,13 @@ from vla_attention.capture.torch_policies.prompts import (
 )
 from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs
 from vla_attention.capture.torch_policies.site_recorder import SiteRows
-from vla_attention.schemas.errors import listing
+from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.layout import Prompt
+
+
+class KeysShifted(BadArgument):
+    """Keys of a row of the batch that are not at the places that the layout gives them."""
+
 
 _Look = Callable[[nn.Module, tuple[Any, ...], dict[str, Any]], None]
 
@@ -140,14 +145,8 @@ class ReplanText:
         sites = self.layout.text_sites
         if self.layout.text is None or not sites:
             return prompt_without_pieces(given.instruction)
-        name = sites[0].name
-        present = (
-            self.present.get(name)
-            if rows_of_sites is None or name not in rows_of_sites
-            else rows_of_sites[name].present
-        )
-        keys = text_keys(sites[0], self.layout.text.spans, present)
         if given.prompt is not None:
+            keys = self._keys(rows_of_sites, len(given.prompt))
             return prompt_from_pieces(given.prompt, keys, given.instruction)
         if self.tokenizer is None:
             return prompt_without_pieces(given.instruction)
@@ -160,7 +159,24 @@ class ReplanText:
             for site in sites:
                 if site.name in rows_of_sites:
                     valid[: site.keys.num_keys] |= rows_of_sites[site.name].valid
-        return prompt_from_ids(self._text_ids(row), keys, self.tokenizer, given.instruction, valid)
+        ids = self._text_ids(row)
+        keys = self._keys(rows_of_sites, len(ids))
+        return prompt_from_ids(ids, keys, self.tokenizer, given.instruction, valid)
+
+    def _keys(self, rows_of_sites: Mapping[str, SiteRows] | None, count: int) -> list[int]:
+        """Return the keys of the prompt's tokens, the same at every site that has them; count: number of tokens."""
+        assert self.layout.text is not None
+        spans, sites = self.layout.text.spans, self.layout.text_sites
+        present = {**self.present, **{name: of.present for name, of in (rows_of_sites or {}).items()}}
+        for site in sites:
+            if site.name in present:
+                return text_keys(site, spans, present[site.name])
+        # None of these calls has run yet. Then the number of tokens says how long a prompt of changing length is.
+        keys = text_keys(sites[0], spans, None)
+        if sites[0].variable_span in spans and count < len(keys):
+            variable = sites[0].keys.span(sites[0].variable_span)
+            keys = [key for key in keys if not variable.stop - (len(keys) - count) <= key < variable.stop]
+        return keys
 
     def roles(
         self,
@@ -181,7 +197,45 @@ class ReplanText:
 
     def early_roles(self, row: int, site: RecordedSite, present: NDArray[np.bool_]) -> NDArray[np.uint8]:
         """Return the roles of a site's keys before the masks are known."""
-        return self.roles(row, site, self.prompt(row, None), present, None)
+        self.check_places(row, site, present, None)
+        # Where none of them is the prompt's, its token ids need not have been seen yet.
+        of_text = site in self.layout.text_sites
+        prompt = self.prompt(row, None) if of_text else prompt_without_pieces(self.inputs[row].instruction)
+        return self.roles(row, site, prompt, present, None)
+
+    def check_places(
+        self, row: int, site: RecordedSite, present: NDArray[np.bool_] | None, valid: NDArray[np.bool_] | None
+    ) -> None:
+        """Raise `KeysShifted` where a row's keys are not at the places of the layout, as padding on the left does.
+
+        Token ids with placeholders for patches tell it for each key. Without them, patches do whose first keys nothing
+        may see while no key of the text is padding: a camera without a picture is masked whole.
+        """
+        given, text = self.inputs[row].roles, self.layout.text if site in self.layout.text_sites else None
+        spans = text.spans if text is not None else [span.name for span in site.keys.spans if span.kind == "text"]
+        if not spans or (given and site.name in given):
+            return
+        keys = np.arange(site.keys.num_keys) if present is None else np.flatnonzero(present)
+        of_text = np.isin(keys, text_keys(site, spans, None))
+        wrong = None
+        if self.seen.ids is not None and text is not None and text.skip_ids:
+            ids = self.seen.ids[row]
+            is_text = ~np.isin(ids, text.skip_ids)
+            is_text[: text.skip_first] = False
+            if of_text.any() and len(ids) == np.flatnonzero(of_text)[-1] + 1:
+                wrong = next(iter(keys[: len(ids)][is_text != of_text[: len(ids)]]), None)
+        if wrong is None and valid is not None and valid[keys[of_text]].all():
+            first = keys[np.argmax(valid[keys])]
+            span = site.keys.spans[site.keys.span_of_key()[first]]
+            wrong = span.start if span.kind == "image" and first > max(span.start, keys[0]) else None
+        if wrong is not None:
+            span = site.keys.spans[site.keys.span_of_key()[wrong]]
+            raise KeysShifted(
+                f"In row {row} of the batch, key {wrong - span.start} of the span '{span.name}' of site '{site.name}' "
+                "is not what the layout says: the row begins with padding. Pad prompts on the right "
+                "(tokenizer.padding_side = 'right'), call the policy for one environment at a time, or give the keys' "
+                "roles with replan(roles=...)."
+            )
 
     def _text_ids(self, row: int) -> list[int]:
         assert self.seen.ids is not None

@@ -455,6 +455,8 @@ class RecordedRun:
         inputs: ReplanInputs,
         actions: NDArray[np.float64] | None,
     ) -> ReplanRecord:
+        for site in self._sites:
+            text.check_places(row, site, rows_of_sites[site.name].present, rows_of_sites[site.name].valid)
         prompt = text.prompt(row, rows_of_sites)
         key_role, stored = {}, {}
         for site in self._sites:

@@ -5,11 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
-from tests.kit.small_torch_policy import SmallPolicy, given, small_layout
+import vla_attention as va
+from tests.kit.small_torch_policy import WORDS, SmallPolicy, WordTokenizer, given, small_layout
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.recorded_episodes import NothingRecorded, RecordingStopped
+from vla_attention.capture.torch_policies.replan_text import KeysShifted
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 
@@ -117,3 +121,82 @@ def record_one(run, policy, alone=False, **inputs):
         block = batch[0].replan(env_step=0) if alone else batch.replan(env_step=0, **inputs)
         with block:
             policy.act(**joined(0))
+
+
+IMAGE = len(WORDS)  # the id of a placeholder for a patch
+
+
+class OneQuery(nn.Module):
+    def forward(self, keys: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        query = torch.ones(len(keys), 1, 1, 8)
+        return nn.functional.scaled_dot_product_attention(query, keys[:, None], keys[:, None], attn_mask=mask)
+
+
+class PaddedPolicy(nn.Module):
+    """Patches and words in one sequence, padded to the longest of the batch, and one action query at its end."""
+
+    def __init__(self, side: str) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.words, self.blocks = nn.Embedding(len(WORDS) + 1, 8), nn.ModuleList([OneQuery()])
+        self.side, self.tokenizer = side, WordTokenizer()
+
+    @torch.no_grad()
+    def act(self, texts: list[str], length: int = 11) -> torch.Tensor:
+        rows = [[IMAGE] * 4 + self.tokenizer.encode(text) for text in texts]
+        pads = [[0] * (length - len(row)) for row in rows]
+        ids = torch.tensor(
+            [pad + row if self.side == "left" else row + pad for pad, row in zip(pads, rows, strict=True)]
+        )
+        keys = self.words(ids)
+        return self.blocks[0](keys, (ids != 0)[:, None, None])
+
+
+def padded_layout(text) -> va.PolicyLayout:
+    spans = (
+        va.Span("image_front", "image", 0, 4, "front", va.PatchGrid(2, 2, 8, 8)),
+        va.Span("prompt", "text", 4, 11),
+    )
+    site = va.RecordedSite(va.SiteLayout("joint", spans), (0, 1), {"image_front": "image", "prompt": "instruction"})
+    return va.PolicyLayout(
+        name="padded",
+        family="padded",
+        sites=(site,),
+        rules=(va.CallRule(r"blocks\.(?P<block>\d+)", "joint"),),
+        num_layers=1,
+        num_heads=1,
+        text=None if text is None else va.PromptText(("prompt",), "words", **text),
+    )
+
+
+@pytest.mark.parametrize("tokenizer", [True, False])
+@pytest.mark.parametrize(
+    ("text", "texts"),
+    [
+        ({"skip_ids": (IMAGE,)}, ["pick the bowl", "pick up the red bowl"]),
+        ({"skip_ids": (IMAGE,)}, ["bowl", "pick up the red bowl"]),  # as many keys as there are patches
+        ({"skip_first": 4}, ["pick the bowl", "pick up the red bowl"]),
+        ({"skip_first": 4}, ["pick up the bowl", "pick the bowl"]),
+        (None, ["pick up the bowl", "pick the bowl"]),
+    ],
+)
+def test_padding_on_the_left_moves_the_keys_and_is_refused(tmp_path, texts, text, tokenizer):
+    policy = PaddedPolicy("left")
+    settings = {"layout": padded_layout(text), "tokenizer": policy.tokenizer if tokenizer else None}
+
+    def act(side):
+        policy.side = side
+        with va.record(tmp_path / f"{side}.zarr", policy, **settings, durable=False) as run:
+            facts = [
+                {"task_id": row, "episode_index": 0, "instruction": row_text} for row, row_text in enumerate(texts)
+            ]
+            with run.episodes(facts) as found, found.replan(env_step=0) as replan:
+                replan.actions = policy.act(texts)[:, 0]
+
+    with pytest.raises(KeysShifted, match=r"the span 'image_front'.*padding_side = 'right'"):
+        act("left")
+    act("right")
+    for row_text, episode in zip(texts, open_store(tmp_path / "right.zarr").episodes, strict=True):
+        roles = [Role(code).label for code in episode.read("joint/key_role")[0]]
+        assert roles[:4] == ["image"] * 4
+        assert roles.count("padding") == 11 - 4 - 2 - len(row_text.split())

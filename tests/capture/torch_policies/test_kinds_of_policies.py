@@ -5,14 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 import vla_attention as va
-from tests.kit.small_torch_policy import HEADS, WIDTH
+from tests.kit.small_torch_policy import HEADS, WIDTH, WORDS, WordTokenizer
 from tests.kit.small_torch_variants import (
     BLOCKS,
     LONGEST,
     PATCHES,
     TOKENS,
+    CausalAttention,
+    Cross,
     OneModulePolicy,
     TokenPolicy,
     TurnsPolicy,
@@ -87,7 +90,7 @@ def test_keys_that_do_not_exist_are_absent_and_not_padding(tmp_path):
 
 def test_fewer_tokens_than_planned(tmp_path):
     policy = TokenPolicy()
-    with pytest.raises(CallsDoNotFit, match="4 times a policy call, once for each generated token"):
+    with pytest.raises(CallsDoNotFit, match=r"4 times a policy call, .*stops_early=True"):
         record_tokens(tmp_path / "strict", policy, tokens=3)
     layout = token_layout(stops_early=True)
     store = record_tokens(tmp_path, policy, tokens=3, layout=layout)
@@ -157,3 +160,74 @@ def test_blocks_that_read_the_text_or_the_pictures_only(tmp_path):
     assert image == ["image"] * PATCHES + ["padding"] * 5
     assert len(episode.attributes.prompts[0].pieces) == 4
     assert set(va.open(tmp_path / "a.zarr").words(site="cross_text")["item"]) >= {"pick", "the", "bowl"}
+
+
+class DecoderBlock(nn.Module):
+    """The actions read each other first, and then the text."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.own, self.cross = CausalAttention(), Cross()
+
+    def forward(self, actions: torch.Tensor, words: torch.Tensor) -> torch.Tensor:
+        self.own.cache = []
+        actions = actions + self.own(actions)
+        return actions + self.cross(actions, words, torch.ones(1, 1, 3, words.shape[1], dtype=torch.bool))
+
+
+class DecoderPolicy(nn.Module):
+    """A decoder over a prompt without padding."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.embed = nn.Embedding(len(WORDS), WIDTH)
+        self.blocks = nn.ModuleList(DecoderBlock() for _ in range(2))
+        self.tokenizer = WordTokenizer()
+
+    @torch.no_grad()
+    def act(self, text: str) -> torch.Tensor:
+        words = self.embed(torch.tensor([self.tokenizer.encode(text)]))
+        actions = torch.ones(1, 3, WIDTH).cumsum(1)
+        for block in self.blocks:
+            actions = block(actions, words)
+        return actions
+
+
+def decoder_layout() -> va.PolicyLayout:
+    own = va.SiteLayout("self", (va.Span("actions", "action", 0, 3),))
+    cross = va.SiteLayout("cross", (va.Span("prompt", "text", 0, LONGEST),))
+    return va.PolicyLayout(
+        name="decoder",
+        family="decoder",
+        sites=(
+            va.RecordedSite(own, (0, 3), {"actions": "action"}, "blocks.{block}.own.o_proj"),
+            va.RecordedSite(cross, (0, 3), {"prompt": "instruction"}, "blocks.{block}.cross.out", "prompt"),
+        ),
+        rules=(
+            va.CallRule(r"blocks\.(?P<block>\d+)\.own", "self"),
+            va.CallRule(r"blocks\.(?P<block>\d+)\.cross", "cross"),
+        ),
+        num_layers=2,
+        num_heads=HEADS,
+        text=va.PromptText(("prompt",), "embed"),
+    )
+
+
+@pytest.mark.parametrize("contributions", [True, False])
+@pytest.mark.parametrize("knockout", [None, "word:bowl"])
+def test_actions_that_read_each_other_before_a_prompt_of_changing_length(tmp_path, contributions, knockout):
+    policy = DecoderPolicy()
+    settings = {"layout": decoder_layout(), "tokenizer": policy.tokenizer, "durable": False, "knockout": knockout}
+    with record(tmp_path / "a.zarr", policy, contributions=contributions, **settings) as run:
+        for number, text in enumerate(TEXTS):
+            with run.episode(task_id=number, episode_index=0, instruction=text) as episode, episode.replan(env_step=0):
+                policy.act(text)
+    for text, episode in zip(TEXTS, open_store(tmp_path / "a.zarr").episodes, strict=True):
+        words = text.split()
+        roles = [Role(code).label for code in episode.read("cross/key_role")[0]]
+        assert roles == ["bos", *["instruction"] * len(words), "template"] + ["absent"] * (LONGEST - len(words) - 2)
+        rows = episode.read("cross/rows")[0]
+        assert (rows[..., words.index("bowl") + 1] == 0).all() == (knockout is not None)
+        assert (rows[..., : len(words) + 2].sum(-1) > 0.999).all()
+        assert episode.has("cross/contribution") == contributions

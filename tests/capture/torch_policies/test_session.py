@@ -416,13 +416,14 @@ def test_rows_that_do_not_reproduce_the_kernel_are_refused(tmp_path, policy, mon
     assert not run.num_dropped
 
 
-def test_numbers_that_are_not_finite_are_refused(tmp_path, policy):
-    with torch.no_grad():
-        policy.state.weight.fill_(torch.inf)
-    with pytest.raises(UserError, match="NaN or infinite"):
-        start(tmp_path, policy)
-    policy = SmallPolicy()
-    inputs = given() | {"states": torch.full((1, 2), torch.nan)}
+@pytest.mark.parametrize("where", ["weights", "input"])
+def test_numbers_that_are_not_finite_are_refused(tmp_path, policy, where):
+    inputs = given()
+    if where == "weights":
+        with torch.no_grad():
+            policy.state.weight.fill_(torch.inf)
+    else:
+        inputs["states"] = torch.full((1, 2), torch.nan)
     with (
         start(tmp_path, policy) as run,
         pytest.raises(UserError, match=r"turned NaN or infinite before or at denoise step 0, block 0"),
