@@ -34,6 +34,8 @@ from vla_attention.schemas.regular_files import read_regular
 #: How far the time of a picture may be from the time of its row, as a part of the time between two frames. LeRobot
 #: itself refuses more than 0.1 ms.
 TIME_TOLERANCE = 0.25
+#: How far the usual time between two frames may be from that of the stated rate, as a share of it: clocks jitter.
+RATE_TOLERANCE = 0.05
 
 #: Makes sure that files of a data set, by their paths inside of it, are on this machine.
 Fetch = Callable[[Sequence[str]], None]
@@ -176,6 +178,7 @@ class DataSetEpisode:
         self._table = table
         self._first = self._find_rows()
         self.seconds = self._index_column("timestamp")
+        self._check_rate()
         self.task_indices = self._index_column("task_index").astype(np.int64)
         unknown = [task for task in np.unique(self.task_indices).tolist() if task not in dataset.tasks]
         if unknown:
@@ -195,6 +198,18 @@ class DataSetEpisode:
             f"Episode {self.index} of '{self.dataset.name}' has {len(rows)} rows in '{table.path}'; the meta files say "
             f"frames 0 to {self.length - 1}, one after the other."
         )
+
+    def _check_rate(self) -> None:
+        """Raise `DamagedDataSet` if the time stamps are of another frame rate than the meta files say."""
+        if self.length < 2:
+            return
+        apart, fps = float(np.median(np.diff(self.seconds))), self.dataset.fps
+        if not abs(apart * fps - 1) <= RATE_TOLERANCE:
+            rate = f" ({1 / apart:.4g} frames per second)" if apart > 0 else ""
+            raise DamagedDataSet(
+                f"The frames of episode {self.index} of '{self.dataset.name}' are {apart:.4g} s apart{rate}, and {INFO} "
+                f"says fps {fps:g}. Correct the one that is wrong: it says when the policy is called."
+            )
 
     def _index_column(self, name: str) -> NDArray[np.float64]:
         values = self._finite(name)

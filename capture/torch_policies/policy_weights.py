@@ -89,9 +89,9 @@ def _all(values: list[Any]) -> Iterator[bytes | memoryview]:
 
 
 def _bytes_of_tensor(tensor: Tensor) -> Iterator[bytes | memoryview]:
-    tensor = tensor.detach()
-    if tensor.is_meta or isinstance(tensor, nn.parameter.UninitializedTensorMixin):
+    if tensor.is_meta or nn.parameter.is_lazy(tensor):
         return
+    tensor = tensor.detach()
     head = f"{tensor.dtype} {tuple(tensor.shape)}".encode()
     if hasattr(tensor, "__tensor_flatten__"):  # a subclass that holds tensors, such as torchao's
         names, context = tensor.__tensor_flatten__()
@@ -130,7 +130,7 @@ def device_and_dtype(policy: object) -> tuple[str, str]:
     counts: dict[tuple[str, str], int] = {}
     for module in root_modules(policy).values():
         for weight in module.parameters():
-            if weight.is_meta or isinstance(weight, nn.parameter.UninitializedTensorMixin):
+            if weight.is_meta or nn.parameter.is_lazy(weight):
                 continue
             place = str(weight.device), str(weight.dtype).removeprefix("torch.")
             counts[place] = counts.get(place, 0) + weight.numel()

@@ -175,6 +175,24 @@ def test_rows_that_contradict_the_meta_files_are_refused(tmp_path):
         open_dataset(folder).episode(0)
 
 
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+@pytest.mark.parametrize("fps", [30, 23, 11, 9, 1, 0.001, 1e300])
+def test_a_frame_rate_that_contradicts_the_time_stamps_is_refused(tmp_path, version, fps):
+    info = write_data_set(tmp_path / "robot", version, made_up_episodes((4, 3)), fps=10) / "meta" / "info.json"
+    info.write_text(json.dumps(json.loads(info.read_text()) | {"fps": fps}))
+    with pytest.raises(DamagedDataSet, match=r"are 0.1 s apart \(10 frames per second\), .* says fps"):
+        open_dataset(tmp_path / "robot").episode(1)
+
+
+def test_time_stamps_of_a_clock_that_jitters_are_taken(tmp_path):
+    folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((40,)), fps=10)
+    table = next(folder.glob("data/**/*.parquet"))
+    jitter = np.random.default_rng(0).uniform(-0.01, 0.01, 40).astype(np.float32)
+    rows = pl.read_parquet(table)
+    rows.with_columns(pl.col("timestamp") + pl.Series(jitter)).write_parquet(table)
+    assert open_dataset(folder).episode(0).length == 40
+
+
 def test_numbers_that_are_not_finite_are_refused(tmp_path):
     episode = made_up_episodes((4,))[0]
     episode.columns["action"][2, 1] = np.nan
