@@ -7,7 +7,7 @@
 #   make faults      twenty faults planted one at a time: the tests of their area have to catch each
 #   make test-policies   policies of transformers 5 and LeRobot, in environments of their own (.venv-transformers, .venv-lerobot)
 #   make package-newest  the wheel with the newest libraries, on each Python that is there (gigabytes; PYTHONS names others)
-#   make test-numpy1 the recorder and its stores with numpy 1.26, in an environment of its own (.venv-numpy1)
+#   make test-numpy1 recorder, stores and analysis with numpy 1.26, in an environment of its own (.venv-numpy1)
 #   make test-remote stores in S3, on moto's server on this machine, in an environment of its own (.venv-remote)
 #   make viewer      the page of `vla-attention view` from its sources in analyze/view/web (needs node and npm)
 #   make notebooks   the notebooks of examples/, run from beginning to end, in an environment of its own (.venv-notebooks)
@@ -86,7 +86,7 @@ package-newest: .venv/capture-installed
 
 # What openpi, OpenVLA and GR00T pin. zarr 3.1.5 is the last that takes it on Python 3.11.
 test-numpy1: .venv-numpy1/installed
-	.venv-numpy1/bin/pytest tests/schemas tests/capture/torch_policies tests/capture/recording tests/capture/store tests/testing $(ARGS)
+	.venv-numpy1/bin/pytest tests/schemas tests/analyze tests/capture/torch_policies tests/capture/recording tests/capture/store tests/testing $(ARGS)
 
 # Layouts of policies on small random models of the real classes. Neither environment fits constraints.txt, nor the other:
 # transformers 5 and LeRobot 0.4.4 want different versions of the same libraries.
@@ -175,9 +175,9 @@ setup-analyze: .venv/analyze-installed
 	@touch $@
 
 .venv-numpy1/installed: pyproject.toml
-	@echo "Installing numpy 1.26, torch and the recorder into .venv-numpy1 ..."
+	@echo "Installing numpy 1.26 and the capture environment into .venv-numpy1 ..."
 	$(PYTHON) -m venv .venv-numpy1
-	.venv-numpy1/bin/python -m pip install --quiet --disable-pip-version-check 'numpy<2' torch==2.13.0 safetensors sentencepiece -e '.[dev]'
+	.venv-numpy1/bin/python -m pip install --quiet --disable-pip-version-check 'numpy<2' torch==2.13.0 -e '.[capture,dev]'
 	@touch $@
 
 .venv-remote/installed: pyproject.toml constraints.txt

@@ -207,8 +207,8 @@ class DataSetEpisode:
         if not abs(apart * fps - 1) <= RATE_TOLERANCE:
             rate = f" ({1 / apart:.4g} frames per second)" if apart > 0 else ""
             raise DamagedDataSet(
-                f"The frames of episode {self.index} of '{self.dataset.name}' are {apart:.4g} s apart{rate}, and {INFO} "
-                f"says fps {fps:g}. Correct the one that is wrong: it says when the policy is called."
+                f"The frames of episode {self.index} of '{self.dataset.name}' are {apart:.4g} s apart{rate}, and "
+                f"{INFO} says fps {fps:g}. Correct the one that is wrong: it says when the policy is called."
             )
 
     def _index_column(self, name: str) -> NDArray[np.float64]:

@@ -257,10 +257,15 @@ class StoredEpisode:
     def _numbers_as_array(self, name: str) -> Any:
         """The numbers of that name in the attributes, None without any."""
         numbers = self._numbers_of(name)
-        try:
-            return np.array(numbers, dtype=NUMBERS[name]) if numbers else None
-        except OverflowError as error:
-            raise CorruptEpisode(f"Episode {self.name} cannot be read: its {name} is damaged ({error}).") from None
+        if not numbers:
+            return None
+        kind = np.dtype(NUMBERS[name])
+        for number in numbers if kind.kind == "i" else ():
+            if not np.iinfo(kind).min <= number <= np.iinfo(kind).max:  # numpy below 2 would wrap it
+                raise CorruptEpisode(
+                    f"Episode {self.name} cannot be read: its {name} is damaged ({number} is no {kind})."
+                )
+        return np.array(numbers, dtype=kind)
 
     def _single_chunk(self, name: str) -> SingleChunk | None:
         from vla_attention.schemas.stores.shards import SingleChunk
