@@ -195,7 +195,9 @@ class Watcher(Protocol):
     It may have an attribute `changes`, False where it changes nothing: it is not asked then. It may have a method
     `passes(shape) -> bool` too, asked when the kernel has run: whether the call is not wanted.
     It is not told of such a call again, and nothing is made of its tensors. It may have
-    `output_modules`, the projections to which it wants outputs to be followed.
+    `output_modules`, the projections to which it wants outputs to be followed, and a method
+    `inside(shape, modules, given)`, told before `saw` which modules run, the innermost last, and what each was given,
+    as (args, kwargs).
     """
 
     def change(self, shape: CallShape) -> Tensor | None:

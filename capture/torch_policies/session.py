@@ -18,6 +18,7 @@ from vla_attention.capture.store.episode_writer import EpisodeWriter
 from vla_attention.capture.store.replan_records import EpisodeStart, ReplanEffects, ReplanRecord
 from vla_attention.capture.store.store_root import read_existing_root
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, make_way, open_run
+from vla_attention.capture.torch_policies.batch_rows import BatchRowsMixed, rows_of_module_apart
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit, KnownCalls
 from vla_attention.capture.torch_policies.call_state import CallState
 from vla_attention.capture.torch_policies.knockouts import ReplanEdits, SessionKnockouts
@@ -117,6 +118,8 @@ class RecordedRun:
         self.every_function = False
         #: Whether it is not known yet that names are enough.
         self._names_unknown = True
+        #: Whether it was asked if the rows of a batch are apart, and what stands in sentences where that is not known.
+        self._asked_of_batch, self._of_batch = False, ""
         self._sites = tuple(layout.site(site.name) for site in attributes.sites)
         self._repeats: RepeatedPolicy | None = None
         if attributes.recording.effects is not None:
@@ -319,6 +322,7 @@ class RecordedRun:
             edits.bias if self.knockouts.any else None,
         )
         edits.recorder = recorder
+        recorder.keeps_module = batch > 1 and not self._asked_of_batch
         text.present = recorder.order.present
         replan = Replan()
         before = self._state_before(episodes[0], given[0])
@@ -359,6 +363,8 @@ class RecordedRun:
             for episode, inputs in list(zip(episodes, given, strict=True))[:2]
         )
         rows_of_sites = recorder.finish(where)
+        if recorder.keeps_module:
+            self._check_batch(recorder)
         self._check_contributions(recorder)
         if self._store is None:
             self._open()
@@ -423,14 +429,35 @@ class RecordedRun:
         finally:
             self._in_block = False
 
+    def _check_batch(self, recorder: ReplanRecorder) -> None:
+        """Raise `BatchRowsMixed` if the rows of a batch are not those of the environments; say where nothing tells."""
+        self._asked_of_batch, call = True, recorder.module_call
+        if self.attributes.recording.contributions and recorder.contributions.unknown() is None:
+            return  # the output projections were given the rows in the order of the batch
+        apart = None if call is None else rows_of_module_apart(self._known_policy, call)
+        if apart is None:
+            self._of_batch = (
+                f"the rows of a batch of {recorder.batch} may be mixed, if heads are folded outside of the batch: "
+                "compare them with a call of one row (va.inspect, first_row=...), or record one environment at a time"
+            )
+            if not self.attributes.recording.contributions:
+                warnings.warn(f"It is not known whether rows are those of their episodes: {self._of_batch}.", Note)
+        elif not apart:
+            assert call is not None
+            raise BatchRowsMixed(
+                f"The rows of a batch of {recorder.batch} are not apart in module '{call.shape.module}': called again "
+                "with another first row, it changes the attention of other rows. It folds heads and batch into one "
+                "axis with the heads outside. Record one environment at a time, with run.episode."
+            )
+
     def _check_contributions(self, recorder: ReplanRecorder) -> None:
         """Raise `ContributionsUnknown` if a call's contributions are not known; at the first one, decide about them."""
-        unknown = recorder.contributions.unknown()
+        unknown, of_batch = recorder.contributions.unknown(), f"; {self._of_batch}" if self._of_batch else ""
         if not self._undecided:
             if unknown is not None:
                 raise ContributionsUnknown(
                     "Contributions cannot be recorded, because it is not known what each part of the keys adds to the "
-                    f"residual stream: {unknown}. Name another projection in the layout, or record with "
+                    f"residual stream: {unknown}{of_batch}. Name another projection in the layout, or record with "
                     "contributions=False. Nothing of this episode was kept."
                 )
             return
@@ -441,8 +468,8 @@ class RecordedRun:
         self._decide(contributions=False, because=f"none: {unknown}")
         warnings.warn(
             "The store has no contributions, because it is not known what each part of the keys adds to the residual "
-            f"stream: {unknown}. The rows are recorded. Name another projection in the layout if this is not the "
-            'output projection (docs/your-policy.md, "Contributions"), or record with contributions=False.',
+            f"stream: {unknown}. The rows are recorded{of_batch}. Name another projection in the layout if this is not "
+            'the output projection (docs/your-policy.md, "Contributions"), or record with contributions=False.',
             Note,
             stacklevel=2,
         )

@@ -9,12 +9,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.store.replan_records import RecordedRows
 from vla_attention.capture.torch_policies.added_updates import OutputWay
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
+from vla_attention.capture.torch_policies.batch_rows import Given, ModuleCall
 from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.key_caches import LOAD_WITH_DYNAMIC_CACHE, first_values, slid
@@ -101,6 +102,9 @@ class ReplanRecorder:
         self.output_modules = tuple(projection.module for projection in projections.values())
         self.bias = bias
         self.largest_error = 0.0
+        #: The first recorded call of a batch, if `keeps_module`.
+        self.module_call: ModuleCall | None = None
+        self.keeps_module = False
         self._changes: dict[tuple[int, ...], Tensor] = {}
         self._collected = {site.name: _Collected() for site in layout.sites}
 
@@ -146,15 +150,23 @@ class ReplanRecorder:
     def passes(self, shape: CallShape) -> bool:
         """Return whether a call that has run is not recorded; it is counted then, and `saw` not called."""
         place = self.order.place(shape)
-        if place is not None and place.site is not None and self._wanted(place):
+        if self._is_recorded(place):
             return False
         self.order.ran(shape, place)
         return True
+
+    def _is_recorded(self, place: CallPlace | None) -> bool:
+        return place is not None and place.site is not None and self._wanted(place)
 
     def _wanted(self, place: CallPlace) -> bool:
         recording = self.recordings.get(place.site or "")
         step = 0 if self.layout.autoregressive else place.step
         return recording is not None and place.block in recording.layers and step in recording.denoise_steps
+
+    def inside(self, shape: CallShape, modules: Sequence[nn.Module], given: Sequence[Given]) -> None:
+        """Keep what the module of the first recorded call was given, if that is wanted."""
+        if self.keeps_module and shape.batch == self.batch and self._is_recorded(self.order.place(shape)):
+            self.module_call = self.module_call or ModuleCall.of(shape, modules, given)
 
     def saw(self, call: AttentionCall) -> OutputWay | None:
         """Keep the rows of a call, if it is recorded; its output is followed for the contributions."""

@@ -58,6 +58,8 @@ class WatchedBlock:
         self._number = 0
         #: The modules whose forward is running, the innermost last.
         self._running: list[nn.Module] = []
+        #: What they were given.
+        self._given: list[tuple[tuple[Any, ...], dict[str, Any]]] = []
         #: Of the call that the watcher saw last, if it wants its output to be followed.
         self._way: OutputWay | None = None
         self._thread = threading.get_ident()
@@ -167,6 +169,9 @@ class WatchedBlock:
             if call.shape.number != self._number:  # another call came between a softmax and its product
                 call = replace(call, shape=replace(call.shape, number=self._number))
             self._number += 1
+            inside = getattr(self.watcher, "inside", None)
+            if inside is not None:
+                inside(call.shape, self._running, self._given)
             self._way = self.watcher.saw(call)
 
     def take_way(self) -> OutputWay | None:
@@ -277,7 +282,7 @@ class WatchedBlock:
     def _followed(
         self, module: nn.Module, forward: Callable[..., Any], at_module: Callable[[], None]
     ) -> Callable[..., Any]:
-        running = self._running
+        running, given = self._running, self._given
 
         def followed(*args: Any, **kwargs: Any) -> Any:
             if not self.in_this_thread:
@@ -285,10 +290,12 @@ class WatchedBlock:
                 return forward(*args, **kwargs)
             at_module()
             running.append(module)
+            given.append((args, kwargs))
             try:
                 return forward(*args, **kwargs)
             finally:
                 running.pop()
+                given.pop()
                 at_module()
 
         return followed

@@ -1,0 +1,149 @@
+"""Rows of a batch are those of its environments, or they are refused: heads can be folded outside of the batch."""
+
+from __future__ import annotations
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import vla_attention as va
+from tests.capture.torch_policies.test_odd_policies import HEADS, OddPolicy, layout, logits
+from vla_attention.capture.torch_policies.batch_rows import BatchRowsMixed
+from vla_attention.capture.torch_policies.record import record
+from vla_attention.schemas.errors import Note
+from vla_attention.schemas.stores.reader import open_store
+
+
+def by_einsum(q, k, v):
+    return torch.einsum("fqk,fkd->fqd", torch.softmax(torch.einsum("fqd,fkd->fqk", q, k) / q.shape[-1] ** 0.5, -1), v)
+
+
+def by_baddbmm(q, k, v):
+    zeros = torch.zeros(len(q), q.shape[1], k.shape[1])
+    return torch.softmax(torch.baddbmm(zeros, q, k.transpose(1, 2), alpha=q.shape[-1] ** -0.5), -1) @ v
+
+
+#: The attention of (batch and head, query, dim).
+FOLDED = {
+    "by hand": lambda q, k, v: torch.bmm(torch.softmax(logits(q, k), dim=-1), v),
+    "baddbmm": by_baddbmm,
+    "einsum": by_einsum,
+    "sdpa": nn.functional.scaled_dot_product_attention,
+}
+
+
+class Core(nn.Module):
+    """Attention of (batch, head, query, dim) that folds two axes into one, heads outside or not."""
+
+    def __init__(self, multiply, outside):
+        super().__init__()
+        self.multiply, self.outside, self.num_heads = multiply, outside, HEADS
+
+    def forward(self, *parts):
+        if self.outside:
+            mixed = self.multiply(*(tensor.transpose(0, 1).flatten(0, 1) for tensor in parts))
+            return mixed.unflatten(0, (HEADS, -1)).transpose(0, 1)
+        return self.multiply(*(tensor.flatten(0, 1) for tensor in parts)).unflatten(0, (-1, HEADS))
+
+
+def folded_policy(outside, multiply, kind=""):
+    core = Core(multiply, outside)
+
+    def attend(block, *parts):
+        if kind == "counts its calls":
+            block.count = getattr(block, "count", 0) + 1
+        if kind == "cannot be called again":
+            if hasattr(block, "was_called"):
+                raise RuntimeError("called again")
+            block.was_called = True
+        return block.core(*parts) if kind == "in a module of its own" else core.forward(*parts)
+
+    policy = OddPolicy(attend)
+    for block in policy.blocks:
+        block.core = Core(multiply, outside)
+    return policy
+
+
+def recorded(path, policy, batch=2, **settings):
+    """Record one call of a batch; how far the rows are from those by hand."""
+    settings = {"bits": 23, "queries": "all", "durable": False, "layout": layout()} | settings
+    facts = [{"task_id": 0, "episode_index": row, "instruction": ""} for row in range(batch)]
+    with record(path, policy, **settings) as run, run.episodes(facts) as episodes, episodes.replan(env_step=0):
+        actions = policy.act(batch)
+    rows = np.stack([episode.read("joint/rows")[0, :, 0] for episode in open_store(path).episodes], axis=1)
+    expected = torch.stack([block.kept for block in policy.blocks]).softmax(-1).numpy()
+    return float(np.abs(rows - expected).max()), actions
+
+
+@pytest.mark.parametrize(
+    ("batch", "kind"),  # as many rows as heads, as tokens, and neither
+    [(2, ""), (3, ""), (5, ""), (2, "in a module of its own"), (2, "counts its calls")],
+)
+@pytest.mark.parametrize("multiply", FOLDED.values(), ids=FOLDED)
+def test_heads_outside_of_the_batch_are_refused_and_inside_they_are_right(tmp_path, multiply, batch, kind):
+    outside = folded_policy(True, multiply, kind)
+    with pytest.raises(BatchRowsMixed, match="one environment at a time"):
+        recorded(tmp_path / "a.zarr", outside, batch)
+    inside = folded_policy(False, multiply, kind)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        off, actions = recorded(tmp_path / "b.zarr", inside, batch)
+    assert off < 2e-6
+    assert torch.equal(actions, folded_policy(False, multiply, kind).act(batch))
+    assert getattr(inside.blocks[0], "count", 1) == 1  # as if the module had not been called again
+
+
+def test_where_nothing_tells_a_sentence_says_that_rows_may_be_mixed(tmp_path):
+    policy = folded_policy(False, FOLDED["sdpa"], "cannot be called again")
+    with pytest.warns(Note, match="rows of a batch of 2 may be mixed"):
+        recorded(tmp_path / "a.zarr", policy)
+
+
+@pytest.mark.parametrize("outside", [True, False])
+def test_contributions_tell_it_where_the_module_cannot_be_called_again(tmp_path, outside):
+    policy = folded_policy(outside, FOLDED["sdpa"], "cannot be called again")
+    (site,) = layout().sites
+    with_projection = layout(
+        sites=(va.RecordedSite(site.keys, site.action_queries, site.role_of_span, "blocks.{block}.out"),)
+    )
+    if outside:
+        with pytest.warns(Note, match="no contributions.*rows of a batch of 2 may be mixed"):
+            recorded(tmp_path / "a.zarr", policy, layout=with_projection)
+    else:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert recorded(tmp_path / "a.zarr", policy, layout=with_projection)[0] < 2e-6
+
+
+@pytest.mark.parametrize("outside", [True, False])
+def test_a_repeatable_call_with_a_batch_tells_where_the_heads_are(tmp_path, outside):
+    policy = folded_policy(outside, FOLDED["by hand"])
+    if outside:
+        sentence = r"rows of a batch of 2 are not apart: .* row 0 changed the actions of other rows by 0\.\d+ .*one env"
+        with pytest.raises(BatchRowsMixed, match=sentence):
+            record(tmp_path / "b.zarr", policy, layout=layout(), own_setting=lambda: policy.act(2))
+    else:
+        run = record(tmp_path / "b.zarr", policy, layout=layout(), own_setting=lambda: policy.act(2))
+        assert run.attributes.provenance["rows of the batch of own setting"] == "apart (2 rows)"
+
+
+@pytest.mark.parametrize("outside", [True, False])
+def test_inspect_holds_the_first_row_against_a_call_of_one_row(outside):
+    policy = folded_policy(outside, FOLDED["sdpa"])
+    # The first row of two is the only row of one: both are drawn from the same numbers.
+    inputs = [torch.randn(2, count, 8, generator=torch.Generator().manual_seed(count)) for count in (3, 6)]
+
+    def act(rows):
+        tokens, prefix = (tensor[:rows] for tensor in inputs)
+        with torch.no_grad():
+            for block in policy.blocks:
+                tokens = block(tokens, prefix)
+
+    table = va.inspect(policy, lambda: act(2), first_row=lambda: act(1))
+    reason = r"blocks\.\{0,1\}, 3 x 9: the first row of its batch differs by 0\.\d+ .* heads are folded outside"
+    assert (re.search(f"Recording refuses {reason}", str(table)) is not None) == outside
+    assert ("refused" in str(table)) == outside
