@@ -44,16 +44,19 @@ def _leftovers(path: Path, dry_run: bool) -> list[str]:
 
     path = path.resolve() if path.is_symlink() else path
     dead, others = dead_partials(path), partials_of_others(path)
+    no_folders = {one for one in dead if one.is_symlink() or not one.is_dir()}  # no process of ours left these
     if not dry_run:
         remove_dead_partials(path)
     would = "would be removed" if dry_run else "removed"
-    return [
-        *(f"  {would}: {visible(str(folder))}, left by a process that has ended" for folder in dead),
-        *(
-            f"  left: {visible(str(folder))}, written by another machine or container; delete it when "
-            "no capture runs there"
-            for folder in others
-        ),
+    lines = []
+    for folder in dead:
+        if folder in no_folders or (not dry_run and folder.exists()):
+            lines.append(f"  left: {visible(str(folder))}, which is no folder or cannot be removed; delete it yourself")
+        else:
+            lines.append(f"  {would}: {visible(str(folder))}, left by a process that has ended")
+    return lines + [
+        f"  left: {visible(str(folder))}, written by another machine or container; delete it when no capture runs there"
+        for folder in others
     ]
 
 

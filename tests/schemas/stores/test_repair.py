@@ -6,6 +6,8 @@ import json
 import os
 import shutil
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
@@ -21,6 +23,7 @@ from vla_attention.capture.__main__ import main
 from vla_attention.capture.jobs.status import store_status
 from vla_attention.schemas.errors import plural
 from vla_attention.schemas.stores.claims import Claims, holders
+from vla_attention.schemas.stores.partial_folders import partial_folder
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.repair import damaged_folder, repair_store
 from vla_attention.schemas.stores.store_format import StoreError
@@ -158,6 +161,28 @@ def test_a_claimed_episode_is_left_alone(store, episode, capsys):
     claims.release(DAMAGED)
     assert main(["repair", str(store)]) == 0
     assert names(store) == WHOLE
+
+
+@pytest.mark.parametrize("dry_run", [True, False])
+@pytest.mark.parametrize("kind", ["folder", "link", "dangling link", "file"])
+def test_what_is_said_to_be_removed_is_gone_and_the_rest_is_there(store, tmp_path, capsys, kind, dry_run):
+    ask = "from vla_attention.schemas.stores.partial_folders import process_tag; print(process_tag())"
+    tag = subprocess.run([sys.executable, "-c", ask], text=True, capture_output=True, check=True).stdout.strip()
+    left, elsewhere = partial_folder(store) / f"{DAMAGED}-{tag}", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "mine").write_text("kept")
+    left.parent.mkdir()
+    if kind == "folder":
+        shutil.copytree(elsewhere, left)
+    elif kind == "file":
+        left.write_text("")
+    else:
+        left.symlink_to(elsewhere if kind == "link" else tmp_path / "nowhere")
+    assert analyze(["verify", str(store), "--repair", *["--dry-run"] * dry_run]) == 0
+    line = next(line for line in capsys.readouterr().out.splitlines() if str(left) in line)
+    assert ("removed: " in line) == (kind == "folder")
+    assert os.path.lexists(left) == (dry_run or kind != "folder")
+    assert (elsewhere / "mine").read_text() == "kept"
 
 
 def test_an_episode_recorded_anew_in_the_meantime_stays(store, episode, original, monkeypatch):
