@@ -129,12 +129,15 @@ def _origin(files: Sequence[ResultsFile]) -> list[str]:
 
 def _dataset(episodes: pl.DataFrame) -> list[str]:
     without = episodes.filter(pl.col("num_replans") == 0)
-    solved = int(episodes["success"].sum())
+    known, solved = episodes["success"].drop_nulls().len(), int(episodes["success"].sum())
+    rate = f"{format_percent(solved / known)} ({solved} of {known})" if known else "not known"
+    if 0 < known < episodes.height:
+        rate += f"; of {episodes.height - known} episodes it is not known"
     lines = [
         "Dataset:",
         f"  Episodes: {episodes.height}",
         f"  Tasks: {episodes.select('file', 'task_id').n_unique()}",
-        f"  Success Rate: {format_percent(solved / episodes.height)} ({solved} of {episodes.height})",
+        f"  Success Rate: {rate}",
     ]
     steps = _float(episodes["num_steps"].mean())
     if steps is not None:

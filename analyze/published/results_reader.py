@@ -106,8 +106,8 @@ class ResultsFile:
         suite: its suite, from the file name.
         kind: the definition of its masses.
         episodes: one row per episode, in the file's order: episode (position), task_id, instruction, episode_index,
-            success, num_steps (the loop's counter, `results.loop_counter`; null where it cannot be known), num_replans
-            (0 for an episode without steps).
+            success (null where it is not known), num_steps (the loop's counter, `results.loop_counter`; null where it
+            cannot be known), num_replans (0 for an episode without steps).
         steps: one row per (episode, replan, layer): episode (position), replan, env_step, layer (the number as a
             string, or "layers_avg"), layer_number, ratio (infinite; null where undefined), visual_mass,
             linguistic_mass, visual_fraction, linguistic_fraction (null where undefined), total_mass, visual_keys,
@@ -231,7 +231,7 @@ class _Reading:
             first = episode.pop("first_step")
             if counts_actions:
                 given = (episode["num_steps"], episode["success"])
-                episode["num_steps"] = None if first is None else loop_counter(first, *given)
+                episode["num_steps"] = None if first is None or given[1] is None else loop_counter(first, *given)
         kind = next(iter(self.kinds))
         floats = ("ratio", "visual_fraction", "linguistic_fraction", *_COUNTS.values())
         schema = dict.fromkeys(floats, pl.Float64)
@@ -239,7 +239,9 @@ class _Reading:
             path=self.path,
             suite=suite_of_results_file(self.path),
             kind=kind,
-            episodes=pl.DataFrame(episodes, schema_overrides={"num_steps": pl.Int64}, infer_schema_length=None),
+            episodes=pl.DataFrame(
+                episodes, schema_overrides={"num_steps": pl.Int64, "success": pl.Boolean}, infer_schema_length=None
+            ),
             steps=pl.DataFrame(
                 self.rows, schema_overrides={**schema, "layer_number": pl.Int64}, infer_schema_length=None
             ),
@@ -264,7 +266,8 @@ class _Reading:
             "task_id": _whole(episode["task_id"], f"{where}, task_id"),
             "instruction": visible(_expect(episode["task_description"], str, f"{where}, task_description")),
             "episode_index": _whole(episode["episode_idx"], f"{where}, episode_idx"),
-            "success": _expect(episode["success"], bool, f"{where}, success"),
+            # Null where a run did not know the outcome.
+            "success": None if episode["success"] is None else _expect(episode["success"], bool, f"{where}, success"),
             "num_steps": _whole(episode["num_steps"], f"{where}, num_steps"),
         }
         where = f"{where} ({_of(identity['task_id'], identity['episode_index'])})"

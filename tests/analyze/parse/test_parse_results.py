@@ -123,6 +123,23 @@ def test_every_picture_has_its_vector_version_and_its_numbers(tmp_path, capsys):
         assert (alone / f"{stem}.png").read_bytes() == (folder / f"{stem}.png").read_bytes()
 
 
+@pytest.mark.parametrize("unknown", [1, 2, 0])
+@pytest.mark.parametrize("episodes", [pi_episodes, cosmos_episodes])
+def test_outcomes_that_are_not_known_are_no_failures(tmp_path, capsys, episodes, unknown):
+    given = episodes()
+    for episode in given[: unknown or None]:
+        episode["success"] = None
+    known = [episode["success"] for episode in given if episode["success"] is not None]
+    path = write_published(tmp_path, "libero_10", given)
+    other = write_published(tmp_path, "libero_90", given)
+    code, out, err = run(
+        capsys, "--results", path, other, "--plot-all", "--plot-comparison", "--output-dir", tmp_path / "plots"
+    )
+    assert (code, err) == (0, "")
+    rate = f"{np.mean(known):.1%} ({sum(known)} of {len(known)}); of {unknown} episodes" if known else "not known"
+    assert f"  Success Rate: {rate}" in out
+
+
 def test_our_files_and_published_ones_are_compared_side_by_side(tmp_path, capsys):
     mine, _ = ours(tmp_path / "mine")
     theirs = write_published(tmp_path / "theirs", "libero_10", pi_episodes())
