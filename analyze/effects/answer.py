@@ -105,7 +105,11 @@ def _deciding(words: Sequence[ItemRow]) -> str:
     # Every word beyond the noise: the largest effect may be one that each task has, and another word may choose.
     large = [word for word in words if (word.strongest["minus_noise"] or 0.0) > 0]
     if not large:
-        return f"{said} Another noise seed changes it as much."
+        effect, beyond_noise = first.strongest["effect"], first.strongest["minus_noise"]
+        if beyond_noise is None:
+            return said
+        more = "more, by" if beyond_noise < -effect / 10 else "as much,"
+        return f"{said} Another noise seed changes it {more} {format_number(effect - beyond_noise)}."
     large = [word for word in large if {"total", "direct"} <= set(word.by_reader)]
     own = [word for word in large if _at_least_half(word.effect("direct"), word.effect("total"))]
     others = [word for word in large if word not in own]

@@ -9,12 +9,13 @@ import polars as pl
 import pytest
 
 from tests.kit.planted_effects import FIRST, ITEMS, RANDOM, READERS, WORDS, planted_effects
-from vla_attention.analyze.effects.answer import mostly_one_dimension
+from vla_attention.analyze.effects.answer import mostly_one_dimension, word_lines
 from vla_attention.analyze.effects.effect_study import study_effects
 from vla_attention.analyze.effects.item_rows import item_rows, ratio_of_effects, ratios_by_family
 from vla_attention.analyze.effects.over_time import shares_of_dimensions
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.show.findings import findings
+from vla_attention.analyze.show.numbers import format_number
 from vla_attention.testing.stores import StoreSpec, write_store
 from vla_attention.testing.tokens import INSTRUCTIONS
 
@@ -39,6 +40,19 @@ def test_the_effect_is_the_planted_size_in_units_of_the_spread(study):
             expected = np.sqrt(np.mean((3.0 * size / spread.spread) ** 2))
             assert row.effect(reader) == pytest.approx(expected, rel=1e-6), (name, reader)
         assert row.direct_share == pytest.approx(sizes["direct"] / sizes["total"], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"), [(0.01, ""), (18.2, "as much,"), (40.0, "more, by"), (14000.0, "more, by")]
+)
+def test_how_much_another_noise_seed_changes_is_said_with_its_size(tmp_path, factor, said):
+    plant = planted_effects(lambda name, *_: factor if name == "noise" else 1.0)
+    spec = StoreSpec(tasks=(0, 1), episodes=2, replans=3, plant_effects=plant)
+    study = study_effects(write_store(tmp_path / "a.zarr", spec=spec), [], AnalysisSettings(intervals="these-tasks"))
+    (row,) = study.summary.filter(scope="all", phase="all", condition="noise").to_dicts()
+    line = word_lines(study, item_rows(study))[0]
+    sentence = f"Another noise seed changes it {said} {format_number(row['effect'])}."
+    assert (sentence in line) if said else ("Another noise seed" not in line)
 
 
 def test_items_are_in_the_order_of_their_total_effects(study):
