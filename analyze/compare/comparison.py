@@ -48,6 +48,7 @@ from vla_attention.analyze.statistics.intervals import (
     mean_over_episodes,
 )
 from vla_attention.analyze.statistics.units import Units
+from vla_attention.analyze.stores.prompt_notes import prompt_notes
 from vla_attention.schemas.groupings.grouping import Grouping
 
 LOG2_RATIO, SUCCESS = "log2_ratio", "success"
@@ -134,7 +135,11 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
     """
     notes = [*check_comparable(runs, allowed), *noted_differences(runs)]
     notes += [line for run in runs[1:] for line in intervention_notes(runs[0], run)]
-    notes += dict.fromkeys(line for run in runs for line in (*run.question.skipped, *run.question.notes))
+    notes += dict.fromkeys(
+        line
+        for run in runs
+        for line in (*run.question.skipped, *prompt_notes(run.question.episodes), *run.question.notes)
+    )
     grouping = runs[0].question.grouping
     selected = [item for run in runs for item in run.question.selected]
     sampling = sampling_of(runs[0].question.settings.intervals, selected)

@@ -1,0 +1,75 @@
+"""A run whose prompts were cut or replaced is told so by every command that answers from it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from tests.kit.planted_effects import planted_effects
+from vla_attention.analyze.__main__ import main
+from vla_attention.schemas.interventions import Interventions, PromptChange
+from vla_attention.testing.stores import StoreSpec, write_store
+from vla_attention.testing.tokens import small_tokens
+
+SPEC = StoreSpec(tasks=(0,), episodes=3, plant_effects=planted_effects())
+#: A store's spec, and what must be said of it.
+KINDS = {
+    "cut": (SPEC, "the policy never read the end of its prompt ('and then the drawer')"),
+    "replaced": (replace(SPEC, interventions=Interventions("shuffled", prompt=PromptChange("shuffled"))), "shuffled"),
+    "neither": (SPEC, ""),
+}
+COMMANDS = {
+    "ratios": (),
+    "words": (),
+    "objects": (),
+    "effects": (),
+    "time": (),
+    "heads": (),
+    "overlay": ("--task", "0", "--episode", "0"),
+    "report": (),
+    "groups": (),
+    "export": ("--csv",),
+    "list": ("--list",),
+    "view": ("--no-open",),
+    "compare": (),
+}
+
+
+def cut(tokens):
+    """The tokens with prompts that go on behind their last piece."""
+    prompts = [replace(prompt, text=f"{prompt.text} and then the drawer") for prompt in tokens.prompts]
+    return replace(tokens, prompts=tuple(prompts))
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stores")
+    made = {"other": write_store(folder / "other.zarr", spec=SPEC)}
+    for name, (spec, _) in KINDS.items():
+        tokens = cut(small_tokens(3, 0, 0)) if name == "cut" else None
+        made[name] = write_store(folder / f"{name}.zarr", spec=replace(spec, tokens=tokens))
+    return made
+
+
+@pytest.mark.parametrize(
+    ("kind", "command"),
+    [
+        *(("cut", command) for command in COMMANDS),
+        *(("replaced", command) for command in ("ratios", "list", "effects", "compare")),
+        *(("neither", command) for command in ("ratios", "list")),
+    ],
+)
+def test_every_command_says_it(stores, tmp_path, monkeypatch, capsys, kind, command):
+    monkeypatch.setattr("vla_attention.analyze.view.server.ViewerServer.serve_forever", lambda self: None)
+    words = [] if command in ("ratios", "list") else [command]
+    words += [str(stores[kind])] + [str(stores["other"])] * (command == "compare") + list(COMMANDS[command])
+    if command not in ("list", "view", "groups"):
+        output = tmp_path / ("a.html" if command == "report" else "results")
+        words += ["--output", str(output)]
+    assert main(words) == 0
+    printed = capsys.readouterr()
+    said = printed.out + printed.err + ((tmp_path / "a.html").read_text() if command == "report" else "")
+    said = " ".join(said.replace("&#39;", "'").split())
+    expected = KINDS[kind][1]
+    assert (expected in said) if expected else ("Prompts were cut" not in said and "another instruction" not in said)
