@@ -261,7 +261,7 @@ class _Reading:
             what = "it is not a results file: " if number == 0 and len(missing) > 3 else ""
             raise _Problem(f"{what}{where} lacks {listing(map(repr, missing))}.")
         self._note_unused(episode, names)
-        identity = {
+        identity: dict[str, Any] = {
             "episode": number,
             "task_id": _whole(episode["task_id"], f"{where}, task_id"),
             "instruction": visible(_expect(episode["task_description"], str, f"{where}, task_description")),
