@@ -23,7 +23,8 @@ from vla_attention.capture.doctor.machine import (
     find_simulator,
     something_missing,
 )
-from vla_attention.capture.environments.suites import check_installed, find_suite
+from vla_attention.capture.environments.drawing import check_simulator
+from vla_attention.capture.environments.suites import find_suite
 from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.rollout.recording_plan import RecordingSettings
@@ -79,10 +80,12 @@ def _findings(arguments: argparse.Namespace, settings: RunSettings, termination:
     yield find_memory()
     gpu = find_gpu(arguments.device, torch)
     yield gpu
-    drawing = find_drawing()
-    yield drawing
     simulator = find_simulator(settings.suite, settings.libero_assets)
     yield from simulator
+    drawing = Finding("drawing", "note", "Not tried before what is missing is there.")
+    if not something_missing(simulator):
+        drawing = find_drawing(settings.suite, settings.libero_assets)
+    yield drawing
     store = _find_place(settings)
     yield store
     if gpu.status == "missing":
@@ -300,6 +303,7 @@ def _accept(arguments: argparse.Namespace, termination: Termination) -> int:
     if arguments.num_episodes is None:
         arguments.num_episodes = episodes
     settings = run_settings(arguments)
+    check_simulator(settings.suite, settings.libero_assets)
 
     from vla_attention.capture.budget.trial import spread
     from vla_attention.capture.machine.device import load_torch
@@ -308,7 +312,6 @@ def _accept(arguments: argparse.Namespace, termination: Termination) -> int:
     chosen = spread(range(settings.suite.num_tasks), tasks)
     device = load_torch(arguments.device, threads.number)
     policy = arguments.family.build(arguments, device)
-    check_installed(settings.suite, settings.libero_assets)
     with ExitStack() as stack:
         settings = replace(settings, task_ids=tuple(chosen))
         if arguments.store is None:
