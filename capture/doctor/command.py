@@ -107,8 +107,12 @@ def _findings(arguments: argparse.Namespace, settings: RunSettings, termination:
 
 
 def _look_for_checkpoint(arguments: argparse.Namespace) -> Finding:
-    """Return where the checkpoint is, without loading it."""
+    """Return where the checkpoint is, or which of its files are missing, without loading it."""
     name, path = arguments.checkpoint, Path(arguments.checkpoint).expanduser()
+    try:
+        arguments.family.check_files(arguments)
+    except UserError as error:
+        return Finding("checkpoint", "missing", str(error))
     not_loaded = "It is not loaded, nor are time and size measured (--no-trial)."
     if path.exists():
         size = format_bytes(_bytes_below(path))
