@@ -32,7 +32,7 @@ from vla_attention.capture.run.run_settings import RunSettings, run_settings
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import INSTALL_CAPTURE, BadArgument, UserError, plural
 from vla_attention.schemas.safe_text import print_line
-from vla_attention.schemas.stores.store_place import check_writable
+from vla_attention.schemas.stores.store_place import check_writable, room_at
 from vla_attention.schemas.threads import use_threads
 
 if TYPE_CHECKING:
@@ -154,7 +154,6 @@ def _find_place(settings: RunSettings) -> Finding:
     """Return whether the store can be written where the run would write it, and the room there."""
 
     def look() -> str:
-        from vla_attention.capture.store.disk_estimate import free_bytes
         from vla_attention.capture.store.store_root import read_existing_root
         from vla_attention.schemas.stores.root import episode_folders
 
@@ -162,7 +161,7 @@ def _find_place(settings: RunSettings) -> Finding:
             read_existing_root(settings.store)
             held.append(len(episode_folders(settings.store)))
         check_writable(settings.store.parent, "--output")
-        return f"{format_bytes(free_bytes(settings.store))} free for {settings.store}."
+        return f"{room_at(settings.store).describe()} free for {settings.store}."
 
     held: list[int] = []
     finding = checked("store", look)
@@ -183,7 +182,7 @@ def _try(settings: RunSettings, policy: Policy, device: str, termination: Termin
     """Run the first replans of a task, or with a budget of as many as the run; yield time and size of that run."""
     from vla_attention.capture.budget.budget import choose_recording, recordings_by_size
     from vla_attention.capture.rollout.episode import max_replans
-    from vla_attention.capture.store.disk_estimate import free_bytes, mean_size
+    from vla_attention.capture.store.disk_estimate import mean_size
 
     try:
         planned = _plan(settings, policy, device, termination)
@@ -209,17 +208,18 @@ def _try(settings: RunSettings, policy: Policy, device: str, termination: Termin
     except UserError as error:
         yield Finding("size", "missing", str(error))
         return
-    estimate, free = choice.estimate, free_bytes(settings.store)
+    estimate, room = choice.estimate, room_at(settings.store)
     text = (
         f"At most {format_bytes(estimate.total_bytes)}: {episodes} episodes, up to {replans} replans each, "
-        f"{format_bytes(estimate.bytes_per_replan)} a replan and {format_bytes(estimate.episode_overhead)} an episode; "
+        f"{format_bytes(estimate.bytes_per_replan)} a replan and {format_bytes(estimate.episode_overhead)} an episode, "
+        f"with {estimate.inodes_per_episode} files and folders each ({estimate.total_inodes:,}); "
         f"measured on {sum(len(trial.sample.records) for trial in trials)} replans of "
         f"{'one task' if len(trials) == 1 else f'{len(trials)} tasks'}."
     )
     if settings.budget is not None:
         text = " ".join([text, *choice.lines])
-    if estimate.total_bytes > free:
-        to_do = f"{format_bytes(free)} are free: give --budget, fewer episodes, or another --output."
+    if estimate.exceeds(room):
+        to_do = f"{room.describe()} are free: give --budget, fewer episodes, or another --output."
         yield Finding("size", "missing", text, to_do)
     else:
         yield Finding("size", "ok", text)
