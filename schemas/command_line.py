@@ -9,6 +9,7 @@ import textwrap
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from vla_attention.schemas.errors import Note, UserError
@@ -166,9 +167,12 @@ def _run(program: str, command: Callable[[], int]) -> int:
 
 def describe_os_error(error: OSError) -> str:
     """What the operating system refused, in one sentence."""
+    from vla_attention.schemas.stores.store_place import why_refused
+
     named = [str(name) for name in (error.filename, error.filename2) if name is not None]
     where = f" {' -> '.join(named)}" if named else ""
-    return f"The operating system refused{where or ' to go on'}: {error.strerror or error or type(error).__name__}."
+    why = why_refused(error, Path(named[-1])) if named else error.strerror or str(error) or type(error).__name__
+    return f"The operating system refused{where or ' to go on'}: {why}."
 
 
 def _drop_output() -> None:

@@ -23,7 +23,8 @@ from vla_attention.capture.doctor.machine import (
     find_simulator,
     something_missing,
 )
-from vla_attention.capture.environments.suites import check_installed, find_suite
+from vla_attention.capture.environments.drawing import check_simulator
+from vla_attention.capture.environments.suites import find_suite
 from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.rollout.recording_plan import RecordingSettings
@@ -31,7 +32,7 @@ from vla_attention.capture.run.run_settings import RunSettings, run_settings
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import INSTALL_CAPTURE, BadArgument, UserError, plural
 from vla_attention.schemas.safe_text import print_line
-from vla_attention.schemas.stores.store_place import check_writable
+from vla_attention.schemas.stores.store_place import check_writable, room_at
 from vla_attention.schemas.threads import use_threads
 
 if TYPE_CHECKING:
@@ -79,10 +80,12 @@ def _findings(arguments: argparse.Namespace, settings: RunSettings, termination:
     yield find_memory()
     gpu = find_gpu(arguments.device, torch)
     yield gpu
-    drawing = find_drawing()
-    yield drawing
     simulator = find_simulator(settings.suite, settings.libero_assets)
     yield from simulator
+    drawing = Finding("drawing", "note", "Not tried before what is missing is there.")
+    if not something_missing(simulator):
+        drawing = find_drawing(settings.suite, settings.libero_assets)
+    yield drawing
     store = _find_place(settings)
     yield store
     if gpu.status == "missing":
@@ -104,8 +107,12 @@ def _findings(arguments: argparse.Namespace, settings: RunSettings, termination:
 
 
 def _look_for_checkpoint(arguments: argparse.Namespace) -> Finding:
-    """Return where the checkpoint is, without loading it."""
+    """Return where the checkpoint is, or which of its files are missing, without loading it."""
     name, path = arguments.checkpoint, Path(arguments.checkpoint).expanduser()
+    try:
+        arguments.family.check_files(arguments)
+    except UserError as error:
+        return Finding("checkpoint", "missing", str(error))
     not_loaded = "It is not loaded, nor are time and size measured (--no-trial)."
     if path.exists():
         size = format_bytes(_bytes_below(path))
@@ -147,7 +154,6 @@ def _find_place(settings: RunSettings) -> Finding:
     """Return whether the store can be written where the run would write it, and the room there."""
 
     def look() -> str:
-        from vla_attention.capture.store.disk_estimate import free_bytes
         from vla_attention.capture.store.store_root import read_existing_root
         from vla_attention.schemas.stores.root import episode_folders
 
@@ -155,7 +161,7 @@ def _find_place(settings: RunSettings) -> Finding:
             read_existing_root(settings.store)
             held.append(len(episode_folders(settings.store)))
         check_writable(settings.store.parent, "--output")
-        return f"{format_bytes(free_bytes(settings.store))} free for {settings.store}."
+        return f"{room_at(settings.store).describe()} free for {settings.store}."
 
     held: list[int] = []
     finding = checked("store", look)
@@ -176,7 +182,7 @@ def _try(settings: RunSettings, policy: Policy, device: str, termination: Termin
     """Run the first replans of a task, or with a budget of as many as the run; yield time and size of that run."""
     from vla_attention.capture.budget.budget import choose_recording, recordings_by_size
     from vla_attention.capture.rollout.episode import max_replans
-    from vla_attention.capture.store.disk_estimate import free_bytes, mean_size
+    from vla_attention.capture.store.disk_estimate import mean_size
 
     try:
         planned = _plan(settings, policy, device, termination)
@@ -202,17 +208,18 @@ def _try(settings: RunSettings, policy: Policy, device: str, termination: Termin
     except UserError as error:
         yield Finding("size", "missing", str(error))
         return
-    estimate, free = choice.estimate, free_bytes(settings.store)
+    estimate, room = choice.estimate, room_at(settings.store)
     text = (
         f"At most {format_bytes(estimate.total_bytes)}: {episodes} episodes, up to {replans} replans each, "
-        f"{format_bytes(estimate.bytes_per_replan)} a replan and {format_bytes(estimate.episode_overhead)} an episode; "
+        f"{format_bytes(estimate.bytes_per_replan)} a replan and {format_bytes(estimate.episode_overhead)} an episode, "
+        f"with {estimate.inodes_per_episode} files and folders each ({estimate.total_inodes:,}); "
         f"measured on {sum(len(trial.sample.records) for trial in trials)} replans of "
         f"{'one task' if len(trials) == 1 else f'{len(trials)} tasks'}."
     )
     if settings.budget is not None:
         text = " ".join([text, *choice.lines])
-    if estimate.total_bytes > free:
-        to_do = f"{format_bytes(free)} are free: give --budget, fewer episodes, or another --output."
+    if estimate.exceeds(room):
+        to_do = f"{room.describe()} are free: give --budget, fewer episodes, or another --output."
         yield Finding("size", "missing", text, to_do)
     else:
         yield Finding("size", "ok", text)
@@ -300,6 +307,7 @@ def _accept(arguments: argparse.Namespace, termination: Termination) -> int:
     if arguments.num_episodes is None:
         arguments.num_episodes = episodes
     settings = run_settings(arguments)
+    check_simulator(settings.suite, settings.libero_assets)
 
     from vla_attention.capture.budget.trial import spread
     from vla_attention.capture.machine.device import load_torch
@@ -308,7 +316,6 @@ def _accept(arguments: argparse.Namespace, termination: Termination) -> int:
     chosen = spread(range(settings.suite.num_tasks), tasks)
     device = load_torch(arguments.device, threads.number)
     policy = arguments.family.build(arguments, device)
-    check_installed(settings.suite, settings.libero_assets)
     with ExitStack() as stack:
         settings = replace(settings, task_ids=tuple(chosen))
         if arguments.store is None:

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import importlib.util
-import json
 import os
-import subprocess
-import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
 from vla_attention.capture.environments.base import Suite
+from vla_attention.capture.environments.drawing import check_drawing
 from vla_attention.capture.environments.libero_installation import find_assets, package_folder
-from vla_attention.capture.environments.robosuite_installation import find_robosuite
+from vla_attention.capture.environments.robosuite_installation import DEFAULT_GL, find_robosuite
 from vla_attention.capture.environments.suites import list_tasks
 from vla_attention.capture.machine.memory import memory_limits
 from vla_attention.schemas.command_line import format_bytes
-from vla_attention.schemas.errors import INSTALL_CAPTURE, UserError
+from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.threads import Threads
 
 #: `ok`: as it should be. `note`: works, but could be better, or is not needed. `missing`: the run needs it.
@@ -47,25 +44,8 @@ def something_missing(findings: Iterable[Finding]) -> bool:
     return any(finding.status == "missing" for finding in findings)
 
 
-#: Seconds after which a check of drawing counts as hanging; the first picture of a GPU's driver can take half a minute.
-_DRAWING_TIMEOUT_S = 120
 #: Instructions with which a processor multiplies bfloat16 itself.
 _BFLOAT16_FLAGS = ("amx_bf16", "avx512_bf16", "bf16")
-
-_DRAW = """
-import json, os, sys
-import mujoco
-model = mujoco.MjModel.from_xml_string(
-    "<mujoco><worldbody><light pos='0 0 3'/><geom type='box' size='.2 .2 .2' rgba='1 0 0 1'/></worldbody></mujoco>")
-data = mujoco.MjData(model)
-mujoco.mj_forward(model, data)
-with mujoco.Renderer(model, 64, 64) as renderer:
-    renderer.update_scene(data)
-    picture = renderer.render()
-    from OpenGL import GL
-    name = GL.glGetString(GL.GL_RENDERER).decode()
-print(json.dumps({"renderer": name, "varies": bool(picture.std() > 1)}))
-"""
 
 
 def find_processor(threads: Threads) -> Finding:
@@ -151,45 +131,16 @@ def _processor_flags(cpuinfo: Path) -> set[str]:
     return {flag for line in lines if line.startswith(("flags", "Features")) for flag in line.split(":")[1].split()}
 
 
-#: Runs a Python program in a process of its own with an environment; returns its exit code, output and errors.
-RunProgram = Callable[[str, Mapping[str, str]], tuple[int, str, str]]
-
-
-def _run_program(program: str, environment: Mapping[str, str]) -> tuple[int, str, str]:
+def find_drawing(
+    suite: Suite, libero_assets: Path | None, draw: Callable[[Suite, Path | None], str] = check_drawing
+) -> Finding:
+    """Draw a picture without a display, in a process of its own."""
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", program],
-            env=dict(environment),
-            capture_output=True,
-            text=True,
-            timeout=_DRAWING_TIMEOUT_S,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return 1, "", f"no picture within {_DRAWING_TIMEOUT_S} s"
-    return done.returncode, done.stdout, done.stderr
-
-
-def find_drawing(run_program: RunProgram = _run_program) -> Finding:
-    """Draw a picture without a display, in a process of its own: drivers that do not fit end the whole process."""
-    if importlib.util.find_spec("mujoco") is None:
-        return Finding("drawing", "missing", "MuJoCo is not installed.", f"Install it: {INSTALL_CAPTURE}.")
-    backend = os.environ.get("MUJOCO_GL", "egl")
-    code, output, errors = run_program(_DRAW, {**os.environ, "MUJOCO_GL": backend})
-    if code:
-        last = (errors.strip().splitlines() or [f"the process ended with code {code}"])[-1]
-        return Finding(
-            "drawing",
-            "missing",
-            f"MuJoCo cannot draw with MUJOCO_GL={backend} ({last}).",
-            "Run scripts/ensure_rendering.sh, which names the system's packages; on a node with a GPU its driver needs "
-            "libEGL_nvidia; MUJOCO_GL=osmesa draws without EGL.",
-        )
-    drawn = json.loads(output.splitlines()[-1])
-    text = f"MUJOCO_GL={backend} draws with {drawn['renderer']}."
-    if not drawn["varies"]:
-        return Finding("drawing", "missing", f"{text} The picture is empty.", "Try MUJOCO_EGL_DEVICE_ID=0, 1 ...")
-    if "llvmpipe" in drawn["renderer"].casefold() or "softpipe" in drawn["renderer"].casefold():
+        renderer = draw(suite, libero_assets)
+    except UserError as error:
+        return Finding("drawing", "missing", str(error))
+    text = f"MUJOCO_GL={os.environ.get('MUJOCO_GL', DEFAULT_GL)} draws with {renderer}."
+    if "llvmpipe" in renderer.casefold() or "softpipe" in renderer.casefold():
         return Finding(
             "drawing", "note", f"{text} That is the processor.", "On a node with a GPU, its EGL driver is faster."
         )

@@ -84,7 +84,8 @@ class Observation:
         person sees it. Policies trained on LIBERO reverse rows and columns (a rotation by 180 degrees): their input is
         upright with left and right exchanged.
     eef_pos: (3,) float64, position of the gripper site in metres, world frame.
-    eef_quat: (4,) float64, orientation of the hand as a quaternion in the order x, y, z, w.
+    eef_quat: (4,) float64, orientation as a quaternion in the order x, y, z, w: of the body above the gripper, not of
+        the gripper site. robosuite gives this one, and policies are trained with it.
     gripper_qpos: (2,) float64, positions of the two finger joints in metres.
     """
 

@@ -271,7 +271,7 @@ class SimulatedEnvironment:
         """Return where things are now; see `TellsMoments`."""
         self._require_episode()
         data, robot = self._simulator.sim.data, self._simulator.robots[0]
-        hand = np.concatenate([data.site_xpos[robot.eef_site_id], self._hand_orientation()])
+        hand = np.concatenate([data.site_xpos[robot.eef_site_id], self._site_orientation(robot.eef_site_id)])
         roots = np.concatenate([data.body_xpos[self._root_of], data.body_xquat[self._root_of]], axis=1)
         touched = np.zeros(len(self.bodies), dtype=bool)
         touched[self._touched_now()] = True
@@ -282,11 +282,13 @@ class SimulatedEnvironment:
             held=np.array(self._held(), dtype=bool),
         )
 
-    def _hand_orientation(self) -> NDArray[np.float64]:
-        """The hand's quaternion (w, x, y, z): that of the body which policies get as `eef_quat`, too."""
-        simulation, robot = self._simulator.sim, self._simulator.robots[0]
-        hand = simulation.model.body_name2id(robot.robot_model.eef_name)
-        return np.array(simulation.data.body_xquat[hand])
+    def _site_orientation(self, site: int) -> NDArray[np.float64]:
+        """A site's quaternion (w, x, y, z). `eef_quat`, which policies get, is that of the body above the gripper."""
+        import mujoco
+
+        quaternion = np.zeros(4)
+        mujoco.mju_mat2Quat(quaternion, self._simulator.sim.data.site_xmat[site].reshape(9))
+        return quaternion
 
     def _touched_now(self) -> NDArray[np.intp]:
         """Numbers in `bodies` of what the gripper touches."""

@@ -68,6 +68,10 @@ def no_arguments(arguments: argparse.Namespace) -> list[str]:
     return []
 
 
+def no_files_to_check(arguments: argparse.Namespace) -> None:
+    """Do nothing: only loading tells whether a checkpoint is whole."""
+
+
 def stored_checkpoint(identity: PolicyIdentity) -> dict[str, Any]:
     """Return the path of the checkpoint: the family's other options have their defaults."""
     return {"checkpoint": identity.checkpoint}
@@ -115,3 +119,5 @@ class PolicyFamily:
     kinds: tuple[str, ...] = ()
     #: The identity in a store -> parsed arguments with which `build` makes this policy again.
     rebuild: Callable[[PolicyIdentity], dict[str, Any]] = stored_checkpoint
+    #: Parsed arguments -> None; raises what `build` would where a local checkpoint lacks files. Loads nothing.
+    check_files: Callable[[argparse.Namespace], None] = no_files_to_check

@@ -18,8 +18,9 @@ class PolicySource:
 
     checkpoint: a path, a name on a hub with the commit (`ORG/NAME@COMMIT`), or a description of random weights.
     untrained: the weights are random. configuration: the source of sizes and layout: the checkpoint itself, a named
-    configuration, a case.json, in words. config_name: the name of that configuration, where it has one. downloads: the
-    commits of all files from the hub, for a store's provenance.
+    configuration, a case.json, in words. config_name: the name of that configuration, where it has one. options: others
+    that the policy was loaded with and that a rerun needs. downloads: the commits of all files from the hub, for a
+    store's provenance.
     """
 
     name: str
@@ -28,6 +29,7 @@ class PolicySource:
     untrained: bool
     configuration: str = "built in"
     config_name: str = ""
+    options: Mapping[str, str] = field(default_factory=dict)
     downloads: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -52,6 +54,7 @@ def describe_policy(policy: Policy, source: PolicySource, digest: str, config: d
         config={
             "configuration": source.configuration,
             **({"config_name": source.config_name} if source.config_name else {}),
+            **source.options,
             **config,
         },
     )

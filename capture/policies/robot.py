@@ -20,6 +20,25 @@ STATE_COLUMNS = (("observation.state",), ("state",), ("joint_position", "gripper
 ACTION_COLUMNS = (("action",), ("actions",))
 
 
+def read_camera_choices(words: Sequence[str], existing: Iterable[str]) -> dict[str, str]:
+    """Return policy camera -> picture (or `none`) of the words of `--camera`. existing: pictures, for the error.
+
+    Raises:
+        BadArgument: a word is not POLICY=PICTURE, or a camera of the policy is named twice.
+    """
+    chosen: dict[str, str] = {}
+    for word in words:
+        camera, sign, picture = word.partition("=")
+        if not (camera and sign and picture):
+            raise BadArgument(
+                f"Cannot use --camera {word}; expected POLICY=PICTURE, with a picture of {listing(existing)} or {NONE}."
+            )
+        if camera in chosen:
+            raise BadArgument(f"--camera names the policy's camera '{camera}' twice.")
+        chosen[camera] = picture
+    return chosen
+
+
 @dataclass(frozen=True)
 class Robot:
     """What a policy reads of a robot.

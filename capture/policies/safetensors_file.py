@@ -1,9 +1,12 @@
-"""safetensors files: the length of the header is checked before it is read, and every error names the file."""
+"""safetensors files, one or several with an index.
+
+The length of a header is checked before it is read, and every error names the file.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +14,12 @@ from typing import Any
 from safetensors import safe_open
 from torch import Tensor
 
-from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint, check_checkpoint_file
+from vla_attention.capture.policies.checkpoints import (
+    CheckpointMismatch,
+    UnreadableCheckpoint,
+    check_checkpoint_file,
+    read_json_object,
+)
 from vla_attention.schemas.errors import listing
 
 #: Bytes of the header: names, shapes and places. A model of a thousand tensors has 0.15 MB; the format allows 100 MB,
@@ -19,6 +27,8 @@ from vla_attention.schemas.errors import listing
 MAX_HEADER_BYTES = 8_000_000
 #: Types of weights. Whole numbers and 8 bits need scales, without which they would be other weights.
 _FLOATS = ("F64", "F32", "F16", "BF16")
+#: Files of one checkpoint; all are open at the same time.
+_MAX_FILES = 200
 
 
 @dataclass(frozen=True)
@@ -76,6 +86,49 @@ def open_safetensors(path: Path) -> Iterator[SafetensorsFile]:
         raise _unreadable(path, error) from error
     with opened as stored:
         yield SafetensorsFile(path, stored)
+
+
+class _Files:
+    """The tensors of several open files, as `safe_open` gives those of one."""
+
+    def __init__(self, file_of: dict[str, Any]) -> None:
+        self._file_of = file_of
+
+    def keys(self) -> list[str]:
+        return list(self._file_of)
+
+    def get_slice(self, name: str) -> Any:
+        return self._file_of[name].get_slice(name)
+
+    def get_tensor(self, name: str) -> Any:
+        return self._file_of[name].get_tensor(name)
+
+
+@contextmanager
+def open_indexed_safetensors(index: Path) -> Iterator[SafetensorsFile]:
+    """Open a checkpoint of several files by its index, which names the file of each tensor.
+
+    Raises:
+        UnreadableCheckpoint: a file is missing or damaged, or does not hold the tensors that the index says.
+    """
+    stated = read_json_object(index).get("weight_map")
+    if not isinstance(stated, dict) or not all(
+        isinstance(file, str) and file.endswith(".safetensors") and Path(file).name == file for file in stated.values()
+    ):
+        raise UnreadableCheckpoint(f"'{index}' has no weight_map from tensors to files beside it.")
+    files = sorted(set(stated.values()))
+    if len(files) > _MAX_FILES:
+        raise UnreadableCheckpoint(f"'{index}' names {len(files)} files; {_MAX_FILES} at most are read.")
+    with ExitStack() as stack:
+        opened = {file: stack.enter_context(open_safetensors(index.parent / file)) for file in files}
+        held = {name: file for file in files for name in opened[file].names()}
+        wrong = sorted(name for name in {*held, *stated} if held.get(name) != stated.get(name))
+        if wrong:
+            raise UnreadableCheckpoint(
+                f"'{index}' and its files disagree on where {listing(wrong)} is: files of two checkpoints, or one is "
+                "missing from the copy."
+            )
+        yield SafetensorsFile(index, _Files({name: opened[file].stored for name, file in held.items()}))
 
 
 def _unreadable(path: Path, error: Exception) -> UnreadableCheckpoint:

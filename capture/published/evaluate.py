@@ -180,10 +180,12 @@ def _place(index: int, suites: Sequence[str]) -> tuple[str, int] | None:
 
 
 def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], threads: Threads, termination: Termination) -> None:
+    from vla_attention.capture.environments.drawing import check_simulator
     from vla_attention.schemas.stores.store_place import check_writable
 
     for job in jobs:
         check_writable(job.settings.store.parent, "--output")
+    check_simulator(jobs[0].settings.suite, jobs[0].settings.libero_assets)
 
     from vla_attention.capture.machine.device import load_torch
     from vla_attention.capture.rollout.episode_faults import EpisodesMissing

@@ -89,14 +89,15 @@ def check_policy_name(name: str) -> None:
 
 def _add_column_arguments(parser: argparse.ArgumentParser, *, of_file: bool) -> None:
     group = parser.add_argument_group("what the policy reads of the data set")
-    group.add_argument(
-        "--camera",
-        action="append",
-        default=[],
-        metavar="POLICY=COLUMN",
-        help=f"pictures of one camera of the policy; {NONE} leaves it black and masked (default: the column of the "
-        "same name, or a usual one)",
-    )
+    if of_file:  # a family has the option itself
+        group.add_argument(
+            "--camera",
+            action="append",
+            default=[],
+            metavar="POLICY=COLUMN",
+            help=f"pictures of one camera of the policy; {NONE} leaves it black and masked (default: the column of "
+            "the same name, or a usual one)",
+        )
     group.add_argument(
         "--state",
         nargs="+",

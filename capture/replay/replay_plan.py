@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.identity import announcement
-from vla_attention.capture.policies.robot import RobotData
+from vla_attention.capture.policies.robot import RobotData, read_camera_choices
 from vla_attention.capture.replay.data_set_files import INDEX_COLUMNS
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, LeRobotDataset, open_dataset
 from vla_attention.capture.replay.video import import_av
@@ -147,16 +147,6 @@ def robot_data(data: LeRobotDataset, arguments: argparse.Namespace) -> RobotData
     Raises:
         BadArgument: a `--camera` is not POLICY=COLUMN, or names a camera of the policy twice.
     """
-    cameras: dict[str, str] = {}
-    for word in arguments.camera:
-        camera, sign, column = word.partition("=")
-        if not (camera and sign and column):
-            raise BadArgument(
-                f"Cannot use --camera {word}; expected POLICY=COLUMN, with a column of {listing(data.cameras)} or none."
-            )
-        if camera in cameras:
-            raise BadArgument(f"--camera names the policy's camera '{camera}' twice.")
-        cameras[camera] = column
     numbers = {
         name: math.prod(feature.shape)
         for name, feature in data.features.items()
@@ -166,7 +156,7 @@ def robot_data(data: LeRobotDataset, arguments: argparse.Namespace) -> RobotData
         name=data.name,
         cameras=data.cameras,
         numbers={name: size for name, size in numbers.items() if name not in INDEX_COLUMNS},
-        chosen_cameras=cameras,
+        chosen_cameras=read_camera_choices(arguments.camera, data.cameras),
         chosen_state=tuple(arguments.state),
         chosen_actions=tuple(arguments.action),
         relative_actions=getattr(arguments, "relative_actions", None),

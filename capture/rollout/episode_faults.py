@@ -15,7 +15,7 @@ from vla_attention.capture.store.episode_writer import ReplanRefused
 from vla_attention.schemas.errors import UserError, listing
 from vla_attention.schemas.stores.store_format import CorruptEpisode, StoreError
 
-#: So many faults of one kind in a row, with no episode recorded between them, end the run: the machine is broken.
+#: So many episodes in a row with the same fault, and none recorded between them, end the run: all others would meet it.
 MOST_IN_A_ROW = 3
 #: Episodes whose fault is told in full at the end; the others are named.
 _MOST_TOLD = 3
@@ -26,7 +26,7 @@ class SimulatorDied(SimulationFailed):
 
 
 class MachineBroken(UserError, RuntimeError):
-    """The same fault came again and again, and would come in every episode."""
+    """Episode after episode met the same fault."""
 
 
 class EpisodesMissing(StoreError):
@@ -37,10 +37,12 @@ class EpisodesMissing(StoreError):
 #: `CorruptEpisode`: what was read back from the disk is not what was written.
 EPISODE_FAULTS = (SimulationFailed, NumbersNotFinite, ReplanRefused, CorruptEpisode)
 
-#: Faults that the machine makes, not the episode, if they come in a row, and what to do then.
-_OF_THE_MACHINE: dict[type[Exception], str] = {
+#: What to do about a fault that episode after episode meets; of the first class that fits.
+_REMEDIES: dict[type[Exception], str] = {
     CameraBlack: "drawing fails on this machine: look at it with vla-attention capture doctor",
     SimulatorDied: "simulators cannot run here: use a smaller --num-envs; see vla-attention capture doctor for memory",
+    SimulationFailed: "look at this machine with vla-attention capture doctor",
+    Exception: "look at the checkpoint and the disk with vla-attention capture doctor",
 }
 
 
@@ -50,22 +52,25 @@ class Faults:
 
     dropped: dict[str, str] = field(default_factory=dict)
     _tried_again: set[str] = field(default_factory=set, init=False)
-    _in_a_row: dict[type[Exception], int] = field(default_factory=dict, init=False)
+    #: In what way episodes failed since the last one that was recorded -> those episodes.
+    _in_a_row: dict[str, set[str]] = field(default_factory=dict, init=False)
 
     def note(self, episode: str, error: Exception) -> bool:
         """Note the fault of an attempt; returns whether the episode shall be tried again.
 
         Raises:
-            MachineBroken: the fault came `MOST_IN_A_ROW` times in a row, and is one of the machine.
+            MachineBroken: it is the `MOST_IN_A_ROW`th episode in a row that failed in the same way.
         """
-        for kind, remedy in _OF_THE_MACHINE.items():
-            if isinstance(error, kind):
-                self._in_a_row[kind] = self._in_a_row.get(kind, 0) + 1
-                if self._in_a_row[kind] >= MOST_IN_A_ROW:
-                    raise MachineBroken(
-                        f"{error} This was the {MOST_IN_A_ROW}rd time in a row, so that the run ends; {remedy}. All "
-                        "episodes that were recorded are whole; go on with --resume."
-                    ) from error
+        way = getattr(error, "reason", "") or type(error).__name__
+        met = self._in_a_row.setdefault(way, set())
+        met.add(episode)
+        if len(met) >= MOST_IN_A_ROW:
+            remedy = next(remedy for kind, remedy in _REMEDIES.items() if isinstance(error, kind))
+            raise MachineBroken(
+                f"{error} {MOST_IN_A_ROW} episodes in a row met this fault, so that the run ends; {remedy}. If only "
+                "some tasks have it, leave them out with --task. All episodes that were recorded are whole; go on with "
+                "--resume."
+            ) from error
         if can_help_to_repeat(error) and episode not in self._tried_again:
             self._tried_again.add(episode)
             return True
@@ -73,7 +78,7 @@ class Faults:
         return False
 
     def note_recorded(self) -> None:
-        """Note that an episode was recorded: what failed before was no fault of the machine."""
+        """Note that an episode was recorded: not all meet what failed before."""
         self._in_a_row.clear()
 
     def raise_missing(self) -> None:

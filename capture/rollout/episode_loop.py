@@ -150,7 +150,7 @@ class EpisodeLoop(ABC):
 
         Raises:
             Terminated: after SIGTERM; the episodes in progress were dropped.
-            MachineBroken: a fault came again and again that every episode would meet.
+            MachineBroken: episode after episode met the same fault.
         """
         with ExitStack() as stack:
             self.claims = stack.enter_context(Claims(self.store.path, self.record.worker))
@@ -225,7 +225,7 @@ class EpisodeLoop(ABC):
         """Note that an episode was dropped after a fault; returns whether it shall be tried again.
 
         Raises:
-            MachineBroken: the fault came again and again, and every episode would meet it.
+            MachineBroken: episode after episode met the same fault.
         """
         self.positions.pop(name, None)
         try:

@@ -48,9 +48,8 @@ class ObservationChecks:
         """
         wrong = [name for name in _STATE if not np.isfinite(getattr(observation, name)).all()]
         if wrong:
-            raise SimulationFailed(
-                f"The simulator gave NaN or infinity as {listing(wrong)} at {where}. Nothing of this episode was kept."
-            )
+            reason = f"The simulator gave NaN or infinity as {listing(wrong)}"
+            raise SimulationFailed(f"{reason} at {where}. Nothing of this episode was kept.", reason)
         lit = frozenset(camera for camera in cameras if camera_frame(observation, camera).any())
         constant = frozenset(camera for camera in cameras if _is_constant(camera_frame(observation, camera)))
         if task_id not in self._lit:

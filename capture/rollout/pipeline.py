@@ -267,10 +267,10 @@ class PipelinedLoop(EpisodeLoop):
                 )
             case Advanced():
                 self._advanced(simulator, answer)
-            case Failed(sentence, expected):
+            case Failed(sentence, expected, reason):
                 if expected:
                     raise SimulatorRefused(sentence)
-                self._fail(simulator, SimulationFailed(sentence))
+                self._fail(simulator, SimulationFailed(sentence, reason))
 
     def _advanced(self, simulator: Simulator, result: Advanced) -> None:
         simulator.asked_at = None

@@ -23,6 +23,7 @@ from vla_attention.capture.environments.base import (
 )
 from vla_attention.capture.environments.coverage import patch_coverage
 from vla_attention.capture.environments.episode_protocol import WAIT_ACTION
+from vla_attention.capture.environments.robosuite_installation import first_exception
 from vla_attention.schemas.episode_steps import TaskGoal
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.groupings.vocabulary import SceneObject
@@ -33,7 +34,14 @@ StopCheck = Callable[[], None]
 
 
 class SimulationFailed(UserError, RuntimeError):
-    """A simulator raised an error, or gave what cannot be. Its episode is lost; a new simulator may do better."""
+    """A simulator raised an error, or gave what cannot be. Its episode is lost; a new simulator may do better.
+
+    reason: what went wrong, the same in every episode that meets it; empty where the class says it.
+    """
+
+    def __init__(self, sentence: str, reason: str = "") -> None:
+        super().__init__(sentence)
+        self.reason = reason
 
 
 @contextmanager
@@ -44,16 +52,17 @@ def naming_the_simulator(title: str) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:
-        raise SimulationFailed(describe_failure(title, error)) from error
+        raise failure(title, error) from error
 
 
-def describe_failure(title: str, error: Exception) -> str:
-    """Return an error of a simulator in one sentence: the episode's title, the error, and the line that raised it."""
-    at = traceback.extract_tb(error.__traceback__)[-1]
-    text = " ".join(str(error).split())
-    return (
-        f"The simulator of {title} failed: {type(error).__name__}: {text} ({Path(at.filename).name}:{at.lineno}). "
-        "Nothing of this episode was kept."
+def failure(title: str, error: Exception) -> SimulationFailed:
+    """Return an error of a simulator with the episode's title, the first exception that led to it, and its line."""
+    first = first_exception(error)
+    at = (traceback.extract_tb(first.__traceback__) or traceback.extract_tb(error.__traceback__))[-1]
+    text = " ".join(str(first).split()).rstrip(".")
+    reason = f"{type(first).__name__}, {Path(at.filename).name}:{at.lineno}"
+    return SimulationFailed(
+        f"The simulator of {title} failed: {text} ({reason}). Nothing of this episode was kept.", reason
     )
 
 

@@ -33,7 +33,7 @@ from vla_attention.capture.rollout.simulation import (
     CameraPatches,
     Simulation,
     SimulationFailed,
-    describe_failure,
+    failure,
 )
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.store_format import Protocol
@@ -120,10 +120,14 @@ class KnownResets:
 
 @dataclass(frozen=True)
 class Failed:
-    """Tells that the simulator failed, in one sentence. expected: a mistake of the user, which all episodes meet."""
+    """Tells that the simulator failed, in one sentence. expected: a mistake of the user, which all episodes meet.
+
+    reason: as in `SimulationFailed`.
+    """
 
     sentence: str
     expected: bool
+    reason: str = ""
 
 
 class SimulatorProcess:
@@ -256,10 +260,11 @@ def main(descriptor: int, temporary: str | None = None) -> None:
         except (EOFError, ConnectionError):
             raise
         except SimulationFailed as error:
-            connection.send(Failed(str(error), expected=False))
+            connection.send(Failed(str(error), False, error.reason))
         except UserError as error:
             connection.send(Failed(str(error), expected=True))
         except Exception as error:
-            connection.send(Failed(describe_failure(server.title, error), expected=False))
+            failed = failure(server.title, error)
+            connection.send(Failed(str(failed), False, failed.reason))
     except (EOFError, ConnectionError):
         return  # the policy's process has ended, or needs this one no more

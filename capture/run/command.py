@@ -18,20 +18,20 @@ def run_capture_of_family(arguments: argparse.Namespace, termination: Terminatio
     """Run `vla-capture FAMILY` on parsed arguments; returns the exit code."""
     threads = use_threads(arguments.threads)
 
-    from vla_attention.capture.environments.suites import check_installed
+    from vla_attention.capture.environments.drawing import check_simulator
     from vla_attention.capture.run.run_settings import run_settings
     from vla_attention.capture.store.store_writer import refuse_recorded
     from vla_attention.schemas.stores.store_place import check_writable
 
     settings = run_settings(arguments)
-    # A missing simulator, an existing store or an unwritable place is an error now, before the minutes for loading a
-    # model and before anything is written.
-    check_installed(settings.suite, settings.libero_assets)
+    # An existing store, an unwritable place or a simulator that cannot run is an error now, before the minutes for
+    # loading a model and before anything is written.
     if settings.mode == "new":
         refuse_recorded(settings.store)
     check_writable(settings.store.parent, "--output")
     if arguments.output_dir is not None:
         check_writable(arguments.output_dir, "--output-dir")
+    check_simulator(settings.suite, settings.libero_assets)
 
     from vla_attention.capture.machine.device import load_torch
     from vla_attention.capture.rollout.progress import say

@@ -1,4 +1,4 @@
-"""The disk space of a run that is printed before the run: an upper bound, or what was measured on some replans.
+"""The disk space and inodes of a run, printed before it: an upper bound, or what was measured on some replans.
 
 What rows, pictures and coverage compress to depends on the policy and the scene, so no formula says it: at 10 mantissa
 bits a number takes 1.4 to 2.1 bytes, a picture a third of its pixels or a tenth. `estimate_disk` gives a bound that
@@ -9,7 +9,6 @@ written (docs/store.md).
 from __future__ import annotations
 
 import math
-import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,6 +27,7 @@ from vla_attention.schemas.effects import EffectsRecorded
 from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX, Recording, RootAttributes
+from vla_attention.schemas.stores.store_place import Room, room_at
 
 #: Exponent bits that differ between probabilities: a float32 in [0, 2) has 0 as its sign and highest exponent bit.
 _EXPONENT_BITS = 7
@@ -57,12 +57,14 @@ EPISODE_OVERHEAD = 300_000
 class DiskEstimate:
     """Upper bound of a run's size, reached when every episode runs to its last step.
 
-    `measured`: on replans of this policy (`SampleOfReplans`), within 10 %. Otherwise no codec could give more.
+    `inodes_per_episode`: files and folders of an episode, however long it is. `measured`: on replans of this policy
+    (`SampleOfReplans`), within 10 %. Otherwise no codec could give more.
     """
 
     bytes_per_replan: int
     max_replans: int
     num_episodes: int
+    inodes_per_episode: int
     episode_overhead: int = EPISODE_OVERHEAD
     measured: bool = False
 
@@ -70,6 +72,15 @@ class DiskEstimate:
     def total_bytes(self) -> int:
         """Bytes of the whole run."""
         return (self.bytes_per_replan * self.max_replans + self.episode_overhead) * self.num_episodes
+
+    @property
+    def total_inodes(self) -> int:
+        """Files and folders of the whole run."""
+        return self.inodes_per_episode * self.num_episodes
+
+    def exceeds(self, room: Room) -> bool:
+        """Whether the run may need more than there is."""
+        return self.total_bytes > room.bytes or (room.inodes is not None and self.total_inodes > room.inodes)
 
 
 def bytes_per_number(mantissa_bits: int) -> float:
@@ -101,7 +112,18 @@ def estimate_disk(
         total += chunks * 4 * (segments + 1) ** 2 * _INCOMPRESSIBLE if recording.contributions else 0
         total += sum(_BYTES_PER_PIECE * span.num_keys for span in site.spans if span.kind == "text")
         total += sum(_COVERAGE_BYTES_PER_PATCH * span.num_keys for span in site.spans if span.camera is not None)
-    return DiskEstimate(int(total), replans, episodes)
+    return DiskEstimate(int(total), replans, episodes, _most_inodes(recording, sites, len(picture_sizes)))
+
+
+def _most_inodes(recording: Recording, sites: Sequence[SiteLayout], pictures: int) -> int:
+    """Most files and folders of an episode: an array is a folder with two files, a group a folder with one."""
+    effects, frames = recording.effects is not None, pictures if recording.frames else 0
+    cameras = sum(span.camera is not None for site in sites for span in site.spans)
+    # Of a site: rows, sums, atoms, roles, uniform attention. Once: actions and state, three arrays of the steps.
+    arrays = len(sites) * (5 + recording.contributions + effects) + 2 + 3 + frames + cameras + effects
+    # The episode, its seal and steps, its sites; pictures twice, objects, effects.
+    groups = 3 + len(sites) + (2 if frames else 0) + (1 if cameras else 0) + effects
+    return 3 * arrays + 2 * groups
 
 
 def _bytes_of_effects(effects: EffectsRecorded, horizon: int, sites: Sequence[SiteLayout]) -> float:
@@ -114,25 +136,22 @@ def _bytes_of_effects(effects: EffectsRecorded, horizon: int, sites: Sequence[Si
     return entries * of_entry / effects.every
 
 
-def free_bytes(path: Path) -> int:
-    """The room for a path that need not exist yet."""
-    existing = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
-    return shutil.disk_usage(existing).free
-
-
 def describe(estimate: DiskEstimate, path: Path) -> str:
-    """The line printed before a run, with a warning when the disk has less room than that."""
-    free, total = free_bytes(path), estimate.total_bytes
+    """The line printed before a run, with a warning when the disk has less room, or fewer inodes, than that."""
+    room, total = room_at(path), estimate.total_bytes
     measured, usual = f", measured, + {format_bytes(estimate.episode_overhead)} each", ""
     if not estimate.measured:
         measured, usual = "", f"; mostly {format_bytes(total * _USUAL[0])} to {format_bytes(total * _USUAL[1])}"
     line = (
         f"Disk: at most {format_bytes(total)} "
         f"({estimate.num_episodes} episodes x up to {estimate.max_replans} replans "
-        f"x {format_bytes(estimate.bytes_per_replan)}{measured}){usual}; {format_bytes(free)} free."
+        f"x {format_bytes(estimate.bytes_per_replan)}{measured}){usual}; {estimate.total_inodes:,} files and folders "
+        f"({estimate.inodes_per_episode} each); {room.describe()} free."
     )
-    if total > free:
+    if total > room.bytes:
         line += " WARNING: that is more than the disk has room for; record fewer layers, denoise steps or episodes."
+    elif estimate.exceeds(room):
+        line += " WARNING: that is more files and folders than inodes are free; record fewer episodes, or elsewhere."
     return line
 
 
@@ -159,9 +178,10 @@ class ArraySize:
 
 @dataclass(frozen=True)
 class EpisodeSize:
-    """Bytes of an episode by its number of replans, as measured on a sample of replans."""
+    """Bytes of an episode by its number of replans, as measured on a sample of replans, and its files and folders."""
 
     arrays: Mapping[str, ArraySize]
+    inodes: int
 
     def bytes_of(self, replans: int) -> int:
         """Bytes of an episode of that many replans, everything included."""
@@ -171,7 +191,7 @@ class EpisodeSize:
         """Bytes of a run of that many episodes, each of that many replans."""
         fixed = round(sum(array.per_chunk for array in self.arrays.values()))
         per_replan = round((self.bytes_of(replans) - fixed) / max(1, replans))
-        return DiskEstimate(per_replan, replans, episodes, episode_overhead=fixed, measured=True)
+        return DiskEstimate(per_replan, replans, episodes, self.inodes, episode_overhead=fixed, measured=True)
 
 
 def mean_size(sizes: Sequence[EpisodeSize]) -> EpisodeSize:
@@ -184,7 +204,7 @@ def mean_size(sizes: Sequence[EpisodeSize]) -> EpisodeSize:
             sum(array.per_replan for array in sizes_of_array) / len(sizes),
             round(sum(array.chunk for array in sizes_of_array) / len(sizes_of_array)),
         )
-    return EpisodeSize(arrays)
+    return EpisodeSize(arrays, max(size.inodes for size in sizes))
 
 
 @dataclass(frozen=True)
@@ -207,19 +227,19 @@ class SampleOfReplans:
         if count < FEWEST_REPLANS:
             raise ValueError(f"a sample of {count} replans says nothing; it needs {FEWEST_REPLANS}")
         half = count // 2
-        of_half, of_all = self._written(recording, half), self._written(recording, count)
+        (of_half, _), (of_all, inodes) = self._written(recording, half), self._written(recording, count)
         sizes = {}
         for name, (measured, chunk) in of_all.items():
             before = of_half.get(name, (0, 1))[0]
             slope = max(0.0, (measured - before) / (count - half))
             sizes[name] = ArraySize(max(0.0, measured - slope * count), slope, chunk)
-        return EpisodeSize(sizes)
+        return EpisodeSize(sizes, inodes)
 
     def bytes_written(self, recording: Recording) -> int:
         """Return the bytes of one episode of all replans of the sample, when they are recorded like this."""
-        return sum(measured for measured, _ in self._written(recording, len(self.records)).values())
+        return sum(measured for measured, _ in self._written(recording, len(self.records))[0].values())
 
-    def _written(self, recording: Recording, count: int) -> dict[str, tuple[int, int]]:
+    def _written(self, recording: Recording, count: int) -> tuple[dict[str, tuple[int, int]], int]:
         full, sites = self.attributes.recording, self.attributes.sites
         records = [smaller_record(record, full, recording, sites) for record in self.records[:count]]
         times = self.denoise_times[_places(full.denoise_steps, recording.denoise_steps)]
@@ -272,8 +292,11 @@ def _write(
     denoise_times: NDArray[np.float64],
     records: Sequence[ReplanRecord],
     steps: RecordedSteps | None,
-) -> dict[str, tuple[int, int]]:
-    """Write one episode; return array -> (its bytes, its replans per chunk), with everything else under ''."""
+) -> tuple[dict[str, tuple[int, int]], int]:
+    """Write one episode; return array -> (its bytes, its replans per chunk), with everything else under ''.
+
+    Also returns the number of its files and folders.
+    """
     store = open_run(path, attributes, "new", durable=False)
     with store.episode(start, denoise_times, len(records)) as writer:
         for record in records:
@@ -289,7 +312,7 @@ def _write(
     everything = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     # What a long episode repeats with every replan here are its prompts; there is one such part per episode.
     sizes[""] = (everything - sum(measured for measured, _ in sizes.values()), 1 << 62)
-    return sizes
+    return sizes, 1 + sum(1 for _ in folder.rglob("*"))
 
 
 def _arrays(group: zarr.Group, above: str = "") -> list[tuple[str, zarr.Array[Any]]]:

@@ -46,6 +46,7 @@ from vla_attention.schemas.stores.store_format import (
     StoreExists,
     episode_name,
 )
+from vla_attention.schemas.stores.store_place import why_refused
 
 
 class StoreWriteFailed(StoreError, OSError):
@@ -53,15 +54,15 @@ class StoreWriteFailed(StoreError, OSError):
 
 
 @contextmanager
-def naming_the_failure(what: str) -> Iterator[None]:
-    """Turn an error of the operating system into one sentence with what was being written."""
+def naming_the_failure(what: str, place: Path) -> Iterator[None]:
+    """Turn an error of the operating system into one sentence with what was being written. place: the store's."""
     try:
         yield
     except OSError as error:
         if isinstance(error, UserError):
             raise
         raise StoreWriteFailed(
-            f"Cannot write {what}: {error.strerror or error}. Nothing of this episode was kept, and the episodes "
+            f"Cannot write {what}: {why_refused(error, place)}. Nothing of this episode was kept, and the episodes "
             "before it are unharmed; remove the cause and go on with --resume."
         ) from error
 
@@ -116,7 +117,7 @@ class EpisodeWriter:
                 f"Cannot store replan {len(self.records)} (environment step {record.env_step}) of {self.what}: "
                 f"{problem}."
             )
-        with naming_the_failure(self.what):
+        with naming_the_failure(self.what, self.store):
             for name, site in self.sites.items():
                 site.append(record.rows[name], record.key_role[name])
         self.prompts.setdefault(record.prompt, len(self.prompts))
@@ -205,7 +206,7 @@ class EpisodeWriter:
             RunMismatch: the store has been replaced by one of another run meanwhile.
             StoreWriteFailed: the disk is full, or refuses in another way.
         """
-        with naming_the_failure(self.what):
+        with naming_the_failure(self.what, self.store):
             self._check_store()
             for site in self.sites.values():
                 self.digests |= site.finish()

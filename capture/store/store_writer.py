@@ -37,7 +37,7 @@ from vla_attention.schemas.stores.store_format import (
     episode_name,
     parse_episode_name,
 )
-from vla_attention.schemas.stores.store_place import check_place
+from vla_attention.schemas.stores.store_place import check_place, why_refused
 from vla_attention.schemas.stores.worker import is_known_dead, this_worker
 
 WriteMode = Literal["new", "resume", "overwrite"]
@@ -71,7 +71,7 @@ class RunStore:
         name = episode_name(start.task_id, start.episode_index)
         folder = partial_folder(self.path) / f"{name}-{process_tag()}"
         try:
-            with naming_the_failure(f"episode {name} of {self.path}"):
+            with naming_the_failure(f"episode {name} of {self.path}", self.path):
                 make_partial(folder)
                 writer = EpisodeWriter(
                     self.path, self.attributes, folder, start, denoise_times, max_replans, self.durable
@@ -128,7 +128,7 @@ def _saying_where(path: Path) -> Iterator[None]:
         if isinstance(error, UserError):
             raise
         raise BadArgument(
-            f"Cannot write a store at {path}: {error.strerror or error}; give another --output."
+            f"Cannot write a store at {path}: {why_refused(error, path)}; give another --output."
         ) from None
 
 

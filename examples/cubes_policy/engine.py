@@ -123,7 +123,7 @@ def share_among_processes(
                     del running[connection]
                     process.close()
                     progress.update(-len(results))
-                    again = faults.note(str(job), SimulationFailed(answer.sentence))
+                    again = faults.note(str(job), SimulationFailed(answer.sentence, answer.reason))
                     what_next = "begins again" if again else "is left out"
                     progress.write(f"{answer.sentence} The job {what_next}.", file=sys.stderr)
                     if again:
@@ -131,6 +131,7 @@ def share_among_processes(
                 elif isinstance(answer, _Done):
                     del running[connection]
                     idle.append(process)
+                    faults.note_recorded()
                     for result in results:
                         receive(result)
                 else:

@@ -1,11 +1,15 @@
-"""Where a store may be made, and where nothing else may be written."""
+"""Where a store may be made, the room there, and where nothing else may be written."""
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
+from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.limits import ROOT_BYTES
 from vla_attention.schemas.regular_files import read_regular
@@ -52,11 +56,65 @@ def _is_store(folder: Path) -> bool:
         return False
 
 
+@dataclass(frozen=True)
+class Room:
+    """What a file system has left for this user.
+
+    inodes: as many files and folders can be made; None where it has no fixed number of them, or does not say.
+    """
+
+    bytes: int
+    inodes: int | None
+
+    def describe(self) -> str:
+        """Return it in words, as the beginning of "... free"."""
+        inodes = "" if self.inodes is None else f" and {self.inodes:,} inodes"
+        return f"{format_bytes(self.bytes)}{inodes}"
+
+
+def room_at(path: Path) -> Room:
+    """Return the room for a path that need not exist yet."""
+    place = _nearest(path)
+    # Some file systems (btrfs, many network ones) say 0 of 0: they make inodes as they need them.
+    counts = os.statvfs(place) if hasattr(os, "statvfs") else None
+    return Room(shutil.disk_usage(place).free, counts.f_favail if counts is not None and counts.f_files else None)
+
+
+def why_refused(error: OSError, path: Path) -> str:
+    """Return why the operating system refused to write below a path: its own words, and what is used up.
+
+    "No space left on device" also stands for a file system that has bytes and no inode left.
+    """
+    words = error.strerror or str(error) or type(error).__name__
+    if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+        return words
+    try:
+        room = room_at(path)
+    except OSError:
+        return words
+    if room.inodes == 0:
+        return (
+            f"{words}: all inodes are used, and every file and folder takes one ({format_bytes(room.bytes)} are free): "
+            "delete files there, or write elsewhere"
+        )
+    return f"{words} ({room.describe()} free; quotas, of files too, may be smaller)"
+
+
+def _nearest(path: Path) -> Path:
+    return next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
+
+
 def check_writable(path: Path, option: str) -> None:
     """Raise `BadArgument` if nothing can be created at `path`, or if it is in a store. Creates nothing itself."""
     refuse_in_store(path, "write to")
-    nearest = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
+    nearest = _nearest(path)
     if not nearest.is_dir():
         raise BadArgument(f"Cannot write to {path}: {nearest} is a file; give another {option}.")
     if not os.access(nearest, os.W_OK | os.X_OK):
         raise BadArgument(f"Cannot write to {path}: no permission to write in {nearest}; give another {option}.")
+    room = room_at(nearest)
+    if room.inodes == 0:
+        raise BadArgument(
+            f"Cannot write to {path}: the file system of {nearest} has no inode left for another file or folder "
+            f"({format_bytes(room.bytes)} are free); delete files there, or give another {option}."
+        )

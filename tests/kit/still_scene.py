@@ -69,3 +69,4 @@ def capture_without_simulator(monkeypatch: pytest.MonkeyPatch) -> None:
         lambda suite, task_id, settings: ToldScene(task_id),
     )
     monkeypatch.setattr("vla_attention.capture.run.capture_run.default_num_envs", lambda: 1)
+    monkeypatch.setattr("vla_attention.capture.environments.drawing.check_drawing", lambda suite, libero_assets: "")

@@ -127,6 +127,21 @@ def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
     }
 
 
+def _check_files(arguments: argparse.Namespace) -> None:
+    from pathlib import Path
+
+    from vla_attention.capture.policies.cosmos.locate import STATISTICS_NAME, find_beside, find_checkpoint, find_weights
+    from vla_attention.capture.policies.cosmos.preprocess import read_statistics
+    from vla_attention.capture.policies.hub import split_hub_name
+
+    name = arguments.checkpoint
+    on_hub = split_hub_name(name) is not None and not Path(name).expanduser().exists()
+    if name not in UNTRAINED_POLICIES and not on_hub:
+        folder = find_checkpoint(name)
+        find_weights(folder)
+        read_statistics(find_beside(folder, arguments.dataset_stats_path, STATISTICS_NAME))
+
+
 def _run_parity(arguments: argparse.Namespace, device: str) -> int:
     from vla_attention.capture.policies.cosmos.parity import run_parity
 
@@ -157,4 +172,5 @@ FAMILY = PolicyFamily(
     ),
     published_rates=PUBLISHED_RATES,
     rebuild=_rebuild,
+    check_files=_check_files,
 )

@@ -97,15 +97,19 @@ def read_config(path: Path) -> PiConfig:
 
 
 def states_sizes(path: Path) -> bool:
-    """Return whether a checkpoint's config.json states all sizes itself, like a case.json (`examples/cubes_policy`)."""
+    """Return whether there is a config.json that states all sizes, like a case.json (`examples/cubes_policy`)."""
+    if not path.is_file():
+        return False
     content = read_json_object(path)
     return "model" in content and isinstance(content.get("config"), Mapping)
 
 
 def stated_name(path: Path) -> str | None:
     """Return the name that a checkpoint's config.json gives its policy, if its sizes are stated there, too."""
+    if not states_sizes(path):
+        return None
     name = read_json_object(path).get("name")
-    if not states_sizes(path) or not isinstance(name, str) or not name:
+    if not isinstance(name, str) or not name:
         return None
     check_text("policy", name)
     return name

@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from vla_attention.capture.policies.pi.config import CAMERA_SLOTS
-from vla_attention.capture.policies.pi.formats import CheckpointFormat
 from vla_attention.capture.policies.pi.lerobot_config import IMAGES, read_lerobot_config
 from vla_attention.capture.policies.pi.lerobot_pipeline import read_lerobot_pipeline
-from vla_attention.capture.policies.pi.preprocess import NormStats, find_norm_stats, read_norm_stats
+from vla_attention.capture.policies.pi.preprocess import NormStats, find_norm_stats
 from vla_attention.capture.policies.robot import Robot, RobotData
 from vla_attention.schemas.errors import BadArgument
 
@@ -67,21 +66,12 @@ def lerobot_robot(folder: Path, data: RobotData) -> Robot:
     )
 
 
-def openpi_robot(folder: Path, data: RobotData, *, relative_actions: int) -> Robot:
+def openpi_robot(data: RobotData, stats: NormStats | None, relative_actions: int = 0) -> Robot:
     """Return the robot of a data set for an openpi checkpoint, whose statistics tell the sizes.
 
-    relative_actions: as the policy's configuration says.
+    stats: None for random weights, which take any sizes up to openpi's. relative_actions: as the policy's configuration
+    says.
     """
-    stats = read_norm_stats(folder)
-    return _openpi_robot(data, stats, relative_actions)
-
-
-def untrained_robot(data: RobotData) -> Robot:
-    """Return the robot of a data set for a policy with random weights, which takes any sizes up to openpi's."""
-    return _openpi_robot(data, None, 0)
-
-
-def _openpi_robot(data: RobotData, stats: NormStats | None, relative_actions: int) -> Robot:
     cameras = data.match_cameras(CAMERA_SLOTS, OPENPI_COLUMNS, _OPTIONAL_SLOTS)
     state, actions = data.state_columns(), data.action_columns()
     state_dim, action_dim = data.size(state), data.size(actions)
@@ -103,13 +93,6 @@ def _openpi_robot(data: RobotData, stats: NormStats | None, relative_actions: in
             f"Cannot use --relative-actions {relative}: the state has {state_dim} numbers and an action {action_dim}."
         )
     return Robot(cameras, state, state_dim, actions, action_dim or _PADDED, relative)
-
-
-def robot_for(folder: Path, found: CheckpointFormat, data: RobotData, *, relative_actions: int = 0) -> Robot:
-    """Return the robot of a data set for a checkpoint folder of any format."""
-    if found == "lerobot":
-        return lerobot_robot(folder, data)
-    return openpi_robot(folder, data, relative_actions=relative_actions)
 
 
 def asset_name(folder: Path) -> str | None:

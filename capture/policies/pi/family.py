@@ -7,10 +7,10 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_attention.capture.environments.episode_protocol import LEROBOT, OPENPI
+from vla_attention.capture.environments.episode_protocol import CAMERAS, LEROBOT, OPENPI
 from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedRate, PublishedScript
 from vla_attention.capture.policies.model_arguments import FORMER_NAMES, UNTRAINED_POLICIES, add_model_arguments
-from vla_attention.capture.policies.robot import Robot
+from vla_attention.capture.policies.robot import NONE, Robot, read_camera_choices
 from vla_attention.schemas.jsonable import from_json
 
 if TYPE_CHECKING:
@@ -72,6 +72,24 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     model.add_argument(
         "--discrete-state-input", action="store_true", help="openpi's pi0.5 trained with the state in its prompt"
     )
+    model.add_argument(
+        "--norm-stats",
+        type=Path,
+        metavar="FILE",
+        help="openpi's norm_stats.json of the training (default: the one in the checkpoint's assets)",
+    )
+    model.add_argument(
+        "--asset-id", metavar="NAME", help="which statistics, where the checkpoint's assets have several"
+    )
+    model.add_argument(
+        "--camera",
+        action="append",
+        default=[],
+        metavar="POLICY=PICTURE",
+        help=f"what one camera of the policy sees: {' or '.join(CAMERAS)} of the simulators, or a column of a "
+        f"data set; {NONE} leaves it black and masked (default: that of the checkpoint's evaluation, or the "
+        "column of the same name)",
+    )
     model.add_argument("--tokenizer", metavar="PATH", help="sentencepiece model of the policy's language model")
     model.add_argument("--paligemma-variant", metavar="NAME", help="checked against the checkpoint (gemma_2b ...)")
     model.add_argument(
@@ -100,15 +118,41 @@ def _build(arguments: argparse.Namespace, device: str) -> PiPolicy:
         paligemma_variant=arguments.paligemma_variant,
         action_expert_variant=arguments.action_expert_variant,
         num_image_tokens=arguments.num_image_tokens,
+        norm_stats=arguments.norm_stats,
+        asset_id=arguments.asset_id,
+        cameras=read_camera_choices(arguments.camera, CAMERAS),
         data=getattr(arguments, "robot_data", None),
         robot=getattr(arguments, "robot", None),
         compiled=getattr(arguments, "compile", False),
     )
 
 
+def _check_files(arguments: argparse.Namespace) -> None:
+    from vla_attention.capture.policies.pi.loading import check_pi_files
+
+    check_pi_files(
+        arguments.checkpoint,
+        tokenizer=arguments.tokenizer,
+        checkpoint_format=arguments.checkpoint_format,
+        config_name=arguments.config_name,
+        model_config=arguments.model_config,
+        norm_stats=arguments.norm_stats,
+        asset_id=arguments.asset_id,
+    )
+
+
 def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
-    of_data_set = {"robot": from_json(Robot, identity.config["robot"])} if "robot" in identity.config else {}
-    same = {**of_data_set, "compile": True} if "denoise_steps" in identity.config else of_data_set
+    facts = identity.config
+    if "robot" in facts:
+        same: dict[str, Any] = {"robot": from_json(Robot, facts["robot"])}
+    else:
+        sources = {camera.name: camera.source for camera in identity.cameras}
+        slots = facts.get("config", {}).get("cameras", ())
+        same = {"camera": [f"{name}={sources.get(name, NONE)}" for name in slots]}
+    same |= {name: Path(facts[name]) for name in ("model_config", "norm_stats") if name in facts}
+    same |= {name: facts[name] for name in ("asset_id",) if name in facts}
+    if "denoise_steps" in facts:
+        same["compile"] = True
     if identity.checkpoint_format == "seeded":
         return {"checkpoint": FORMER_NAMES.get(identity.name, identity.name), **same}
     settings = {"checkpoint": identity.checkpoint, "dtype": identity.config["dtype"], **same}
@@ -158,4 +202,5 @@ FAMILY = PolicyFamily(
     kinds=("pi0", "pi05"),
     reads_data_sets=True,
     rebuild=_rebuild,
+    check_files=_check_files,
 )

@@ -17,9 +17,17 @@ from vla_attention.schemas.errors import listing, unknown_name
 CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot"]
 CHECKPOINT_FORMATS: tuple[CheckpointFormat, ...] = get_args(CheckpointFormat)
 
+#: The weights of both PyTorch formats: one file, or several with an index.
+WEIGHTS = "model.safetensors"
+WEIGHTS_INDEX = "model.safetensors.index.json"
+#: peft's file beside the weights of an adapter.
+ADAPTER = "adapter_config.json"
+#: How far below a folder checkpoints are looked for: LeRobot's are in RUN/checkpoints/STEP/pretrained_model.
+_SEARCH_DEPTH = 3
+
 #: Name of each format in messages, with the files that it consists of.
 FORMAT_TITLES: dict[CheckpointFormat, str] = {
-    "openpi_torch": "openpi's PyTorch format (config.json and model.safetensors)",
+    "openpi_torch": "openpi's PyTorch format (model.safetensors)",
     "openpi_jax": "openpi's JAX format (params/_METADATA)",
     "lerobot": "LeRobot's format (config.json with a type, model.safetensors and policy_preprocessor.json)",
 }
@@ -51,19 +59,27 @@ def detect_format(folder: str | Path, wanted: CheckpointFormat | None = None) ->
     Raises `CheckpointNotFound`, `UnsupportedCheckpoint` (with a description of the folder) or `UnreadableCheckpoint`.
     """
     folder = Path(folder)
+    if folder.is_file():
+        raise CheckpointNotFound(f"'{folder}' is a file; give the folder that holds it, '{folder.absolute().parent}'.")
     if not folder.is_dir():
         raise CheckpointNotFound(f"There is no checkpoint folder at '{folder}'.")
+    if _has(folder / ADAPTER):
+        raise UnsupportedCheckpoint(_adapter(folder))
     has_params = _has(folder / "params" / "_METADATA")
-    has_tensors = _has(folder / "config.json") and _has(folder / "model.safetensors")
+    has_config = _has(folder / "config.json")
+    has_tensors = _has(folder / WEIGHTS) or _has(folder / WEIGHTS_INDEX)
     if wanted is not None:
-        if not (has_params if wanted == "openpi_jax" else has_tensors):
+        has = {"openpi_jax": has_params, "openpi_torch": has_tensors, "lerobot": has_tensors and has_config}
+        if not has[wanted]:
             content = listing(sorted(path.name for path in folder.iterdir()))
             raise UnsupportedCheckpoint(f"'{folder}' is not in {FORMAT_TITLES[wanted]}: it holds {content}.")
         return wanted
     if has_params:
         return "openpi_jax"
-    if has_tensors:
+    if has_tensors and has_config:
         return _format_of_config(folder, read_json_object(folder / "config.json"))
+    if has_tensors and not _has(folder / "policy_preprocessor.json"):
+        return "openpi_torch"  # as its training leaves it
     raise UnsupportedCheckpoint(_what_it_is(folder))
 
 
@@ -107,21 +123,46 @@ def _what_it_is(folder: Path) -> str:
     names = sorted(path.name for path in folder.iterdir())
     if folder.name == "params" and "_METADATA" in names:
         return f"'{folder}' is the params folder of a checkpoint; give its parent '{folder.parent}'."
-    inner = sorted(path.parent.parent.name for path in folder.glob("*/params/_METADATA"))
-    if inner:
+    if inner := _checkpoints_in(folder):
         return f"'{folder}' holds checkpoints rather than being one; give one of its folders {listing(inner)}."
-    if (folder / "pretrained_model" / "config.json").is_file():
-        return f"'{folder}' is a LeRobot training folder; give '{folder / 'pretrained_model'}'."
     if "config.json" in names:
         config = read_json_object(folder / "config.json")
         if config.get("type") in ("pi0", "pi05"):
-            return f"'{folder}' is a LeRobot checkpoint without its model.safetensors: found {listing(names)}."
+            return f"'{folder}' is a LeRobot checkpoint without its {WEIGHTS}: found {listing(names)}."
         family = config.get("type") or _transformers_family(config)
         if family:
             return f"'{folder}' is a checkpoint of another model family: {family}, not pi0 or pi0.5."
+    if "policy_preprocessor.json" in names:
+        return f"'{folder}' is a LeRobot checkpoint without its config.json: found {listing(names)}."
     if any("cosmos" in name.casefold() for name in names):
         return f"'{folder}' is a checkpoint of another model family: Cosmos Policy, not pi0 or pi0.5."
     return (
         f"'{folder}' is not a pi checkpoint: expected {FORMAT_TITLES['openpi_torch']}, {FORMAT_TITLES['openpi_jax']} "
         f"or {FORMAT_TITLES['lerobot']}, found {listing(names)}."
     )
+
+
+def _adapter(folder: Path) -> str:
+    """Return a sentence: the folder is an adapter, of what, and how it becomes a policy."""
+    base = read_json_object(folder / ADAPTER).get("base_model_name_or_path") or "a policy that it does not name"
+    return (
+        f"'{folder}' holds an adapter (LoRA) of {base}, not a whole policy: merge it with peft's "
+        "PeftModel.from_pretrained(policy, ...).merge_and_unload(), save the policy with save_pretrained, and give "
+        "that folder (docs/checkpoints.md has the lines)."
+    )
+
+
+def _checkpoints_in(folder: Path) -> list[str]:
+    """Return the checkpoints below a folder by their paths in it, the highest numbers first; no unfinished ones."""
+    files = {"params/_METADATA": 2, WEIGHTS: 1, WEIGHTS_INDEX: 1}
+    found = {
+        path.parents[up - 1].relative_to(folder)
+        for depth in range(1, _SEARCH_DEPTH + 1)
+        for file, up in files.items()
+        for path in folder.glob(f"{'*/' * depth}{file}")
+    }
+    whole = [path for path in found if not any(part.startswith("tmp_") or ".orbax-" in part for part in path.parts)]
+    by_number = [
+        ([(not part.isdigit(), -int(part) if part.isdigit() else 0, part) for part in p.parts], p) for p in whole
+    ]
+    return [path.as_posix() for _, path in sorted(by_number)]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -31,12 +32,11 @@ from vla_attention.capture.policies.pi.lerobot_config import (
 from vla_attention.capture.policies.pi.lerobot_pipeline import LerobotPipeline, read_lerobot_pipeline
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.openpi_torch import TensorFile, open_tensors
-from vla_attention.capture.policies.pi.processing import simulated_arm
+from vla_attention.capture.policies.pi.processing import simulated_arm, simulator_cameras
 from vla_attention.capture.policies.pi.sizes import infer_config, is_pi05
 from vla_attention.capture.policies.pi.tokenizer import PromptFormat
 from vla_attention.capture.policies.robot import Robot
 from vla_attention.capture.policies.weights import DTYPES
-from vla_attention.schemas.errors import listing
 
 #: LeRobot's names for the pictures of its LIBERO environment -> the simulator's cameras.
 LIBERO_CAMERAS = {IMAGES + "image": "agentview", IMAGES + "image2": "robot0_eye_in_hand"}
@@ -60,30 +60,39 @@ def lerobot_image(frame: NDArray[np.uint8], size: int, *, turned: bool = True) -
     return image * 2.0 - 1.0
 
 
-def slots(config: LerobotConfig, rename: Mapping[str, str], robot: Robot | None = None) -> dict[str, str | None]:
+def slots(
+    config: LerobotConfig,
+    rename: Mapping[str, str],
+    robot: Robot | None = None,
+    chosen: Mapping[str, str] = MappingProxyType({}),
+) -> dict[str, str | None]:
     """Return slot of the model -> camera of the robot (None: of the simulators), in the order of the model's keys.
 
     Slots have the names of their features without "observation.images."; slots with a camera come first, the others
-    (None) are black and masked.
+    (None) are black and masked. chosen: `--camera` with names of slots or features, see `simulator_cameras`.
     """
-    source = {rename.get(feature, feature): camera for feature, camera in LIBERO_CAMERAS.items()}
+    names = [feature.removeprefix(IMAGES) for feature in config.cameras]
     if robot is not None:
-        source = {f"{IMAGES}{slot}": camera for slot, camera in robot.cameras.items()}
-    present = [feature for feature in config.cameras if feature in source]
-    absent = [feature for feature in config.cameras if feature not in source]
-    if not present:
-        raise UnsupportedLerobotFeature(
-            f"The policy's cameras are {listing(config.cameras)}, and the environment offers {listing(source)}: no "
-            "picture would reach the policy."
-        )
-    return {feature.removeprefix(IMAGES): source.get(feature) for feature in [*present, *absent]}
+        source = robot.cameras
+    else:
+        usual = {
+            rename.get(feature, feature).removeprefix(IMAGES): camera for feature, camera in LIBERO_CAMERAS.items()
+        }
+        source = simulator_cameras(names, usual, {name.removeprefix(IMAGES): seen for name, seen in chosen.items()})
+    return {name: source.get(name) for name in sorted(names, key=lambda name: name not in source)}
 
 
 class LerobotProcessing:
     """Processing of a LeRobot policy outside its model, from its checkpoint."""
 
-    def __init__(self, config: LerobotConfig, pipeline: LerobotPipeline, robot: Robot | None = None):
-        cameras = slots(config, pipeline.rename, robot)
+    def __init__(
+        self,
+        config: LerobotConfig,
+        pipeline: LerobotPipeline,
+        robot: Robot | None = None,
+        chosen: Mapping[str, str] = MappingProxyType({}),
+    ):
+        cameras = slots(config, pipeline.rename, robot, chosen)
         self.robot = robot or simulated_arm({slot: camera for slot, camera in cameras.items() if camera is not None})
         for what, given, needed in (
             ("state", config.state_dim, self.robot.state_dim),
@@ -160,19 +169,21 @@ def load_lerobot(
     dtype: torch.dtype | None = None,
     device: str | torch.device = "cpu",
     robot: Robot | None = None,
+    chosen_cameras: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[PiModel, LerobotProcessing]:
     """Load a LeRobot checkpoint: the model, and the processing of images, prompts, states and actions.
 
     sizes: widths and heads, which config.json does not state because it is for full-size models. Only the sizes of
-    the transformers and of the image encoder are taken from it. robot: of a data set; None: the arm of the simulators.
+    the transformers and of the image encoder are taken from it. robot: of a data set; None: the arm of the simulators,
+    with what `chosen_cameras` says of its cameras.
     """
     folder = Path(folder)
     detect_format(folder, "lerobot")
     stated = read_lerobot_config(folder)
     pipeline = read_lerobot_pipeline(folder, stated)
-    processing = LerobotProcessing(stated, pipeline, robot)
+    processing = LerobotProcessing(stated, pipeline, robot, chosen_cameras)
     with open_tensors(folder) as tensors:
-        config = model_config(stated, tensors, pipeline.rename, sizes, robot)
+        config = model_config(stated, tensors, pipeline.rename, sizes, robot, chosen_cameras)
         model = tensors.build(config, dtype=dtype or DTYPES[stated.dtype], device=device)
     return model, processing
 
@@ -183,6 +194,7 @@ def model_config(
     rename: dict[str, str],
     sizes: PiConfig | None,
     robot: Robot | None = None,
+    chosen_cameras: Mapping[str, str] = MappingProxyType({}),
 ) -> PiConfig:
     """Return the model's configuration: sizes from the tensors, everything else from config.json."""
     shapes = tensors.shapes
@@ -206,7 +218,7 @@ def model_config(
         max_token_len=stated.tokenizer_max_length,
         num_denoise_steps=stated.num_inference_steps,
         discrete_state_input=stated.pi05,
-        cameras=tuple(slots(stated, rename, robot)),
+        cameras=tuple(slots(stated, rename, robot, chosen_cameras)),
         time_convention="stepped",
         min_period=stated.min_period,
         max_period=stated.max_period,

@@ -3,30 +3,48 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
-from vla_attention.capture.policies.hub import downloads, hub_version
+from vla_attention.capture.policies.checkpoints import UnsupportedCheckpoint
+from vla_attention.capture.policies.hub import downloads, hub_version, split_hub_name
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.model_arguments import UNTRAINED, UNTRAINED_TINY, check_not_renamed
 from vla_attention.capture.policies.parity_case import CASE_FILE
 from vla_attention.capture.policies.pi.case import CONFIG_FILE, read_config, stated_name, states_sizes
 from vla_attention.capture.policies.pi.compiled import compile_steps
-from vla_attention.capture.policies.pi.config import GEMMA_VARIANTS, GemmaConfig, PiConfig, find_config, find_variant
-from vla_attention.capture.policies.pi.data_set_robot import asset_name, robot_for, untrained_robot
+from vla_attention.capture.policies.pi.config import (
+    CAMERA_SLOTS,
+    GEMMA_VARIANTS,
+    NAMED_CONFIGS,
+    GemmaConfig,
+    PiConfig,
+    find_config,
+    find_variant,
+)
+from vla_attention.capture.policies.pi.data_set_robot import asset_name, lerobot_robot, openpi_robot
 from vla_attention.capture.policies.pi.embedded import dummy_policy, embedded_policy
 from vla_attention.capture.policies.pi.family import SHIPPED
 from vla_attention.capture.policies.pi.formats import CheckpointFormat, detect_format, find_format
 from vla_attention.capture.policies.pi.lerobot import load_lerobot, load_lerobot_weights
+from vla_attention.capture.policies.pi.lerobot_config import read_lerobot_config
+from vla_attention.capture.policies.pi.lerobot_pipeline import read_lerobot_pipeline
 from vla_attention.capture.policies.pi.locate import find_checkpoint, find_tokenizer
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.openpi_jax import implied_config_name, list_leaves, load_openpi_jax
 from vla_attention.capture.policies.pi.openpi_torch import load_openpi_torch, open_tensors
 from vla_attention.capture.policies.pi.policy import PiPolicy
 from vla_attention.capture.policies.pi.preprocess import RELATIVE_ACTIONS, read_norm_stats
-from vla_attention.capture.policies.pi.processing import OpenpiProcessing, Processing
+from vla_attention.capture.policies.pi.processing import (
+    CAMERA_OF_SLOT,
+    OpenpiProcessing,
+    Processing,
+    simulated_arm,
+    simulator_cameras,
+)
 from vla_attention.capture.policies.pi.sizes import is_pi05
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
 from vla_attention.capture.policies.robot import Robot, RobotData
@@ -57,7 +75,8 @@ class CheckpointOptions:
     """A user's choices for a checkpoint; None takes the checkpoint's own value.
 
     config_name: one of openpi's names. model_config: a file like case.json. discrete_state_input: openpi's pi0.5 with
-    the state in the prompt.
+    the state in the prompt. norm_stats, asset_id: see `read_norm_stats`. cameras: policy camera -> camera of the
+    simulators.
     """
 
     checkpoint_format: CheckpointFormat | None = None
@@ -65,6 +84,14 @@ class CheckpointOptions:
     model_config: Path | None = None
     discrete_state_input: bool = False
     dtype: torch.dtype | None = None
+    norm_stats: Path | None = None
+    asset_id: str | None = None
+    cameras: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    def stored(self) -> dict[str, str]:
+        """Return the files and names that a rerun needs, for a store's root."""
+        given = {"model_config": self.model_config, "norm_stats": self.norm_stats, "asset_id": self.asset_id}
+        return {name: str(value) for name, value in given.items() if value is not None}
 
 
 def load_pi_policy(
@@ -89,18 +116,30 @@ def load_pi_policy(
     else:
         chosen = choose_config(folder, detected, options, of_data_set=bool(data or robot))
         config = chosen.config
-    if data is not None:
-        relative = RELATIVE_ACTIONS if chosen.name in _OF_RELATIVE_ACTIONS else 0
-        robot = robot_for(folder, detected, data, relative_actions=relative)
+    norm_stats = None if detected == "lerobot" else read_norm_stats(folder, options.norm_stats, options.asset_id)
+    if data is not None and norm_stats is None:
+        robot = lerobot_robot(folder, data)
+    elif data is not None:
+        robot = openpi_robot(data, norm_stats, RELATIVE_ACTIONS if chosen.name in _OF_RELATIVE_ACTIONS else 0)
     if options.discrete_state_input and config is not None:
         _check_state_input(config)
     # Small files first: if the tokenizer is missing, the minutes for loading the weights are saved.
     prompt_tokenizer = PromptTokenizer(tokenizer)
     processing: Processing
-    if detected == "lerobot":
-        model, processing = load_lerobot(folder, sizes=config, dtype=options.dtype, device=device, robot=robot)
+    if norm_stats is None:
+        model, processing = load_lerobot(
+            folder,
+            sizes=config,
+            dtype=options.dtype,
+            device=device,
+            robot=robot,
+            chosen_cameras=options.cameras,
+        )
     else:
-        norm_stats = read_norm_stats(folder)
+        cameras = None
+        if robot is None:  # before the weights: names may be wrong
+            slots = CAMERA_SLOTS if config is None else config.cameras
+            cameras = simulator_cameras(slots, CAMERA_OF_SLOT, options.cameras)
         dtype = options.dtype or torch.float32
         model, _ = load_pi_model(folder, checkpoint_format=detected, config=config, dtype=dtype, device=device)
         if options.discrete_state_input:
@@ -115,6 +154,7 @@ def load_pi_policy(
             normalisation="quantile" if pi05 else "z-score",
             relative_actions=not pi05,
             robot=robot,
+            cameras=cameras,
         )
     family = "pi05" if model.config.pi05 else "pi0"
     source = PolicySource(
@@ -124,6 +164,7 @@ def load_pi_policy(
         untrained=False,
         configuration=chosen.source,
         config_name=chosen.name if chosen.stated else "",
+        options=options.stored(),
     )
     return PiPolicy(model, prompt_tokenizer, processing, source)
 
@@ -156,8 +197,11 @@ def choose_config(
 ) -> ChosenConfig:
     """Return the configuration of the options, of a case.json beside the checkpoint, or that the checkpoint implies.
 
-    of_data_set: the policy is for the robot of a
-    data set, which the name of the checkpoint's statistics may tell.
+    of_data_set: the policy is for the robot of a data set, which the name of the checkpoint's statistics may tell.
+
+    Raises:
+        BadArgument: options contradict each other or the format.
+        UnsupportedCheckpoint: nothing states the configuration.
     """
     if options.config_name is not None and options.model_config is not None:
         raise BadArgument("Give --config-name or --model-config, not both.")
@@ -165,6 +209,13 @@ def choose_config(
         raise BadArgument(
             "A LeRobot checkpoint states its configuration in config.json; leave --config-name and "
             "--discrete-state-input out."
+        )
+    if options.norm_stats is not None and options.asset_id is not None:
+        raise BadArgument("Give --norm-stats or --asset-id, not both.")
+    if found == "lerobot" and (options.norm_stats is not None or options.asset_id is not None):
+        raise BadArgument(
+            "A LeRobot checkpoint has its statistics in its saved pipelines (policy_preprocessor.json); leave "
+            "--norm-stats and --asset-id out."
         )
     if options.config_name is not None:
         return ChosenConfig.named(options.config_name, stated=True)
@@ -176,12 +227,20 @@ def choose_config(
         return ChosenConfig(read_config(beside), f"{CASE_FILE} beside the checkpoint")
     if found == "openpi_torch" and states_sizes(folder / CONFIG_FILE):
         return ChosenConfig(read_config(folder / CONFIG_FILE), CONFIG_FILE)
-    if of_data_set and found != "lerobot" and asset_name(folder) == DROID_ASSET:
+    if of_data_set and found != "lerobot" and (options.asset_id or asset_name(folder)) == DROID_ASSET:
         name = _droid_config_name(folder, found)
         return ChosenConfig.named(name, f" (its statistics are those of '{DROID_ASSET}')")
     if found == "openpi_jax":
         name = implied_config_name(leaf.path for leaf in list_leaves(folder / "params"))
         return ChosenConfig.named(name, " (not stated by the checkpoint)")
+    if not (folder / CONFIG_FILE).is_file():
+        with open_tensors(folder) as tensors:
+            is_pi05(tensors.shapes)  # whatever else it may be comes first
+        raise UnsupportedCheckpoint(
+            f"'{folder}' has no {CONFIG_FILE}, as openpi's train_pytorch.py leaves it, so that nothing states its "
+            f"heads and the actions of a call. Give --config-name NAME (openpi's {listing(NAMED_CONFIGS)}), or "
+            f"--model-config FILE, a file like {CASE_FILE} (docs/checkpoints.md)."
+        )
     return ChosenConfig(None, "config.json and the tensors")
 
 
@@ -215,6 +274,9 @@ def build_pi_policy(
     paligemma_variant: str | None = None,
     action_expert_variant: str | None = None,
     num_image_tokens: int | None = None,
+    norm_stats: Path | None = None,
+    asset_id: str | None = None,
+    cameras: Mapping[str, str] | None = None,
     data: RobotData | None = None,
     robot: Robot | None = None,
     compiled: bool = False,
@@ -223,30 +285,41 @@ def build_pi_policy(
 
     `checkpoint` is a folder, a name on a hub, or one of the two untrained policies that come with the package:
     `untrained`, `untrained-tiny`. `compiled`: denoise steps through torch.compile. `data` and `robot`: see
-    `load_pi_policy`. Raises `BadArgument` if a variant or the number of image tokens contradicts the policy, or if
-    nothing can be compiled here.
+    `load_pi_policy`; with either, there are no `cameras` of simulators to choose. Raises `BadArgument` if a variant or
+    the number of image tokens contradicts the policy, or if nothing can be compiled here.
     """
     wanted = {
         "--paligemma-variant": find_variant(paligemma_variant) if paligemma_variant else None,
         "--action-expert-variant": find_variant(action_expert_variant) if action_expert_variant else None,
     }
+    if cameras and data is None and robot is not None:
+        raise BadArgument("Cannot use --camera: the pictures of a data set's store are chosen already; leave it out.")
     options = CheckpointOptions(
         checkpoint_format=find_format(checkpoint_format) if checkpoint_format else None,
         config_name=config_name,
         model_config=model_config,
         discrete_state_input=discrete_state_input,
         dtype=find_dtype(dtype) if dtype else None,
+        norm_stats=norm_stats,
+        asset_id=asset_id,
+        cameras={} if data is not None or cameras is None else cameras,
     )
     if config_name is not None:
         find_config(config_name)  # an unknown name is reported before any download
     check_not_renamed(checkpoint)
     if checkpoint in _UNTRAINED:
-        if dataclasses.replace(options, dtype=None) != CheckpointOptions() or options.dtype == torch.bfloat16:
+        of_checkpoints = dataclasses.replace(options, dtype=None, cameras={}) != CheckpointOptions()
+        if of_checkpoints or options.dtype == torch.bfloat16:
             raise BadArgument(
                 f"The policy '{checkpoint}' comes with the program, in float32; --checkpoint-format, --config-name, "
-                "--model-config, --discrete-state-input and --dtype bfloat16 are for checkpoints."
+                "--model-config, --discrete-state-input, --norm-stats, --asset-id and --dtype bfloat16 are for "
+                "checkpoints."
             )
-        policy = _UNTRAINED[checkpoint](device=device, robot=untrained_robot(data) if data else robot)
+        if data is not None:
+            robot = openpi_robot(data, None)
+        elif options.cameras:
+            robot = simulated_arm(simulator_cameras(CAMERA_SLOTS, CAMERA_OF_SLOT, options.cameras))
+        policy = _UNTRAINED[checkpoint](device=device, robot=robot)
     else:
         path = SHIPPED[checkpoint] if checkpoint in SHIPPED else find_checkpoint(checkpoint)
         detect_format(path, options.checkpoint_format)  # a folder without a checkpoint is reported first
@@ -278,6 +351,42 @@ def build_pi_policy(
     if compiled:
         compile_steps(policy.model)
     return policy
+
+
+def check_pi_files(
+    checkpoint: str,
+    *,
+    tokenizer: str | None,
+    checkpoint_format: str | None,
+    config_name: str | None,
+    model_config: Path | None,
+    norm_stats: Path | None,
+    asset_id: str | None,
+) -> None:
+    """Raise what `build_pi_policy` would for a checkpoint of this machine that lacks a file; reads no weights."""
+    is_address = checkpoint.startswith("gs://") or split_hub_name(checkpoint) is not None
+    if checkpoint in (*SHIPPED, *_UNTRAINED) or (is_address and not Path(checkpoint).expanduser().exists()):
+        return
+    folder = find_checkpoint(checkpoint)
+    options = CheckpointOptions(
+        checkpoint_format=find_format(checkpoint_format) if checkpoint_format else None,
+        config_name=config_name,
+        model_config=model_config,
+        norm_stats=norm_stats,
+        asset_id=asset_id,
+    )
+    found = detect_format(folder, options.checkpoint_format)
+    choose_config(folder, found, options)
+    if found == "openpi_jax":
+        list_leaves(folder / "params")
+    else:
+        with open_tensors(folder):
+            pass
+    if found == "lerobot":
+        read_lerobot_pipeline(folder, read_lerobot_config(folder))
+    else:
+        read_norm_stats(folder, norm_stats, asset_id)
+    find_tokenizer(folder, tokenizer)
 
 
 def _sizes(config: GemmaConfig) -> str:

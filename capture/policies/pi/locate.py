@@ -11,6 +11,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+from vla_attention.capture.policies.checkpoints import CheckpointNotFound
 from vla_attention.capture.policies.hub import (
     CheckpointUnavailable,
     fetch_from_hub,
@@ -25,13 +26,17 @@ from vla_attention.schemas.safe_text import check_inner_path
 #: Files of a hub repository that a policy needs; only these are downloaded.
 HUB_FILES = (
     "config.json",
-    "model.safetensors",
+    "model*.safetensors",
+    "model.safetensors.index.json",
+    "adapter_config.json",
     "policy_*.json",
     "policy_*.safetensors",
     "assets/**",
     "tokenizer/**",
     "*.model",
 )
+#: openpi's published checkpoints, in its bucket and below its cache.
+OPENPI_CHECKPOINTS = "openpi-assets/checkpoints"
 #: Folders of an openpi checkpoint that a policy needs; training states are several times as large.
 OPENPI_FOLDERS = ("params", "assets")
 
@@ -45,19 +50,34 @@ def find_checkpoint(name: str) -> Path:
     """Return the folder of a checkpoint.
 
     It is a local folder, `gs://...` in openpi's cache, or `ORG/NAME` or `ORG/NAME@COMMIT` of the hub. What is not in
-    the cache is downloaded; `CheckpointUnavailable` or `MissingDependency` if that fails.
+    the cache is downloaded; `CheckpointUnavailable` or `MissingDependency` if that fails, `CheckpointNotFound` for a
+    path or another name that leads nowhere.
     """
     if name.startswith("gs://"):
         return _from_openpi_cache(name.rstrip("/"))
     path = Path(name).expanduser()
-    on_hub = None if path.exists() else split_hub_name(name)
-    if on_hub is None:
+    if path.exists():
         return path
+    on_hub = split_hub_name(name)
+    if on_hub is None:
+        raise CheckpointNotFound(f"There is no checkpoint folder at '{path}'.{_where_else(path)}")
     how = (
         f"fetch it where there is a network with `hf download {on_hub[0]}`, copy the folder here and give its path "
         "(there is no such local folder)"
     )
     return fetch_from_hub(on_hub[0], HUB_FILES, how, revision=on_hub[1])
+
+
+def _where_else(path: Path) -> str:
+    """Return where a checkpoint of openpi is whose path leads nowhere: a name alone, or a place in openpi's cache."""
+    published = openpi_cache() / OPENPI_CHECKPOINTS
+    place = (published / path if len(path.parts) == 1 else path).absolute()
+    if place.parent != published.absolute() or not place.name.startswith("pi"):
+        return ""
+    address = f"gs://{OPENPI_CHECKPOINTS}/{place.name}"
+    if place.is_dir():
+        return f" openpi's cache has one of this name: give '{place}' or {address}."
+    return f" openpi's checkpoints have addresses: give {address}, which is downloaded once into its cache, '{place}'."
 
 
 def openpi_cache() -> Path:

@@ -1,4 +1,4 @@
-"""Load pi0 and pi0.5 weights from safetensors: openpi's PyTorch format, whose file LeRobot's format has too."""
+"""Load pi0 and pi0.5 weights from safetensors: openpi's PyTorch format, whose files LeRobot's format has too."""
 
 from __future__ import annotations
 
@@ -10,12 +10,16 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from vla_attention.capture.policies.checkpoints import read_json_object
+from vla_attention.capture.policies.checkpoints import UnsupportedCheckpoint, read_json_object
 from vla_attention.capture.policies.pi.config import PiConfig
-from vla_attention.capture.policies.pi.formats import detect_format
+from vla_attention.capture.policies.pi.formats import WEIGHTS, WEIGHTS_INDEX, detect_format
 from vla_attention.capture.policies.pi.model import PiModel, build_model, expected_shapes
 from vla_attention.capture.policies.pi.sizes import PALIGEMMA, TABLE, infer_config
-from vla_attention.capture.policies.safetensors_file import SafetensorsFile, open_safetensors
+from vla_attention.capture.policies.safetensors_file import (
+    SafetensorsFile,
+    open_indexed_safetensors,
+    open_safetensors,
+)
 from vla_attention.capture.policies.weights import Shapes, check_shapes
 
 #: The text table is tied to the language model's output layer. safetensors keeps one name of tied tensors, this one.
@@ -43,7 +47,7 @@ def model_names(stored: Iterable[str]) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class TensorFile:
-    """An open model.safetensors: shapes of its tensors by model name, and a way to read one of them."""
+    """Open weights: shapes of its tensors by model name, and a way to read one of them."""
 
     names: dict[str, str]
     shapes: Shapes
@@ -62,8 +66,20 @@ class TensorFile:
 
 @contextmanager
 def open_tensors(folder: Path) -> Iterator[TensorFile]:
-    """Open a checkpoint's model.safetensors; `UnreadableCheckpoint` for a damaged file, also later while reading."""
-    with open_safetensors(folder / "model.safetensors") as stored:
+    """Open a checkpoint's model.safetensors, or the several files of its index.
+
+    Raises:
+        UnreadableCheckpoint: a file is damaged; also later while reading.
+        UnsupportedCheckpoint: the matrices of an adapter are not merged into the weights.
+    """
+    index = folder / WEIGHTS_INDEX
+    several = index.is_file() and not (folder / WEIGHTS).is_file()
+    with open_indexed_safetensors(index) if several else open_safetensors(folder / WEIGHTS) as stored:
+        if any(".lora_" in name for name in stored.names()):
+            raise UnsupportedCheckpoint(
+                f"'{stored.path}' has the matrices of an adapter (LoRA) beside the weights; merge them with peft's "
+                "merge_and_unload(), save the policy again, and give that folder."
+            )
         names = model_names(stored.names())
         yield TensorFile(names, {name: stored.shape(raw) for name, raw in names.items()}, stored)
 

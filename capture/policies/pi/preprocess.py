@@ -19,7 +19,7 @@ from PIL import Image
 
 from vla_attention.capture.foreign_files.checked_files import MAX_FILES, read_object
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
-from vla_attention.schemas.errors import listing
+from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 
 NormalisationMode = Literal["quantile", "z-score"]
 
@@ -201,24 +201,45 @@ def _statistics(groups: Mapping[str, Any], name: str, where: str) -> Statistics:
     return Statistics(mean=mean, std=std, q01=arrays["q01"], q99=arrays["q99"])
 
 
-def read_norm_stats(checkpoint: str | Path) -> NormStats:
-    """Read the statistics of a checkpoint folder, assets/<asset id>/norm_stats.json.
+def read_norm_stats(checkpoint: str | Path, given: Path | None = None, asset_id: str | None = None) -> NormStats:
+    """Read the statistics of a checkpoint folder, assets/<asset id>/norm_stats.json, or of the given file.
 
-    The asset id may be several folders deep. No file, or more than one, is an error.
+    The asset id may be several folders deep. Without `asset_id` there must be one of them.
+
+    Raises:
+        CheckpointNotFound: there is no such file.
+        UnknownName, BadArgument: there are others than `asset_id`, or several without it.
+        UnreadableCheckpoint: the file holds something else.
     """
-    assets = Path(checkpoint) / "assets"
-    files = find_norm_stats(Path(checkpoint))
-    if not files:
-        raise CheckpointNotFound(f"The checkpoint '{checkpoint}' has no norm_stats.json below '{assets}'.")
-    if len(files) > 1:
-        raise UnreadableCheckpoint(
-            f"The checkpoint '{checkpoint}' has more than one norm_stats.json: {listing(files)}."
+    if given is not None:
+        return _read_norm_stats(given.expanduser(), inside=None)
+    folder = Path(checkpoint)
+    by_name = {path.parent.relative_to(folder / "assets").as_posix(): path for path in find_norm_stats(folder)}
+    if not by_name:
+        raise CheckpointNotFound(
+            f"The checkpoint '{checkpoint}' has no norm_stats.json below '{folder / 'assets'}'; give the one of its "
+            "training with --norm-stats FILE (openpi's is assets/CONFIG/ASSET_ID/norm_stats.json where it was trained)."
         )
+    if asset_id is not None and asset_id not in by_name:
+        raise unknown_name(f"asset id of '{checkpoint}'", asset_id, by_name)
+    if asset_id is None and len(by_name) > 1:
+        raise BadArgument(
+            f"The checkpoint '{checkpoint}' has statistics of {listing(by_name)}; say which with --asset-id NAME, or "
+            "give a file with --norm-stats FILE."
+        )
+    return _read_norm_stats(by_name[asset_id or next(iter(by_name))], inside=folder)
+
+
+def _read_norm_stats(path: Path, inside: Path | None) -> NormStats:
+    if path.is_dir():
+        raise CheckpointNotFound(f"'{path}' is a folder; expected a file norm_stats.json.")
     try:
-        content = read_object(files[0], UnreadableCheckpoint, inside=Path(checkpoint))
+        content = read_object(path, UnreadableCheckpoint, inside=inside)
     except FileNotFoundError:
-        raise UnreadableCheckpoint(f"'{files[0]}' is a link to a file that does not exist.") from None
-    return parse_norm_stats(content, f"'{files[0]}'")
+        if path.is_symlink():
+            raise UnreadableCheckpoint(f"'{path}' is a link to a file that does not exist.") from None
+        raise CheckpointNotFound(f"There is no file of statistics at '{path}'.") from None
+    return parse_norm_stats(content, f"'{path}'")
 
 
 def find_norm_stats(checkpoint: Path) -> list[Path]:

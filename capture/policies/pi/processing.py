@@ -6,6 +6,7 @@ different numbers of actions. A `Processing` does this for one policy; `PiPolicy
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,7 +14,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vla_attention.capture.environments.episode_protocol import OPENPI, OPENPI_REPLAN_STEPS, EvaluationProtocol
+from vla_attention.capture.environments.episode_protocol import (
+    CAMERAS,
+    OPENPI,
+    OPENPI_REPLAN_STEPS,
+    EvaluationProtocol,
+)
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.preprocess import (
     ENVIRONMENT_ACTION_DIM,
@@ -25,13 +31,40 @@ from vla_attention.capture.policies.pi.preprocess import (
     resize_with_pad,
 )
 from vla_attention.capture.policies.pi.tokenizer import PromptFormat
-from vla_attention.capture.policies.robot import Robot
+from vla_attention.capture.policies.robot import NONE, Robot
+from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 
 #: Slot -> environment camera (openpi's LIBERO inputs); other slots are black and masked.
 CAMERA_OF_SLOT = {"base_0_rgb": "agentview", "left_wrist_0_rgb": "robot0_eye_in_hand"}
 
 #: Numbers of the state in both ecosystems: position, axis-angle, two finger joints.
 STATE_DIM = 8
+
+
+def simulator_cameras(
+    policy_cameras: Sequence[str], usual: Mapping[str, str], chosen: Mapping[str, str]
+) -> dict[str, str]:
+    """Return policy camera -> camera of the simulators, in the policy's order; the others are black and masked.
+
+    usual: what a policy camera sees unless `chosen` says another one, or `none`.
+
+    Raises:
+        UnknownName: a chosen camera does not exist, on either side.
+        BadArgument: no camera of the policy would see anything.
+    """
+    for given, camera in chosen.items():
+        if given not in policy_cameras:
+            raise unknown_name("camera of the policy", given, policy_cameras)
+        if camera not in (*CAMERAS, NONE):
+            raise unknown_name("camera of the simulators", camera, [*CAMERAS, NONE])
+    seen = {name: chosen.get(name, usual.get(name, NONE)) for name in policy_cameras}
+    cameras = {name: camera for name, camera in seen.items() if camera != NONE}
+    if not cameras:
+        raise BadArgument(
+            f"None of the policy's cameras {listing(policy_cameras)} would see anything; the simulators have "
+            f"{listing(CAMERAS)}: give --camera POLICY=CAMERA."
+        )
+    return cameras
 
 
 def simulated_arm(cameras: dict[str, str], relative_actions: int = 0) -> Robot:
@@ -85,6 +118,7 @@ class Processing(Protocol):
 class OpenpiProcessing:
     """openpi's client and server transforms: of LIBERO, or of the robot of a data set.
 
+    `cameras`: policy camera -> camera of the simulators, see `simulator_cameras`; None: openpi's of LIBERO.
     `relative_actions`: the model was trained on differences to the state (openpi's pi0_libero), so the state is added.
     `robot`: its own number of them replaces `relative_actions`.
     """
@@ -98,9 +132,12 @@ class OpenpiProcessing:
         relative_actions: bool = False,
         replan_steps: int = OPENPI_REPLAN_STEPS,
         robot: Robot | None = None,
+        cameras: dict[str, str] | None = None,
     ):
-        cameras = {slot: camera for slot, camera in CAMERA_OF_SLOT.items() if slot in config.cameras}
-        self.robot = robot or simulated_arm(cameras, RELATIVE_ACTIONS if relative_actions else 0)
+        if robot is None:
+            seen = cameras or simulator_cameras(config.cameras, CAMERA_OF_SLOT, {})
+            robot = simulated_arm(seen, RELATIVE_ACTIONS if relative_actions else 0)
+        self.robot = robot
         norm_stats.check(normalisation, self.robot.state_dim, config.action_dim, self.robot.action_dim)
         self.protocol = OPENPI
         self.norm_stats = norm_stats

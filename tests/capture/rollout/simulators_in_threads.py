@@ -64,6 +64,7 @@ def simulators_in_threads(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
         "vla_attention.capture.rollout.simulator_source.make_environment", lambda suite, task_id, settings: made.make()
     )
     monkeypatch.setattr(pipeline, "SimulatorProcess", ThreadOfTests)
+    monkeypatch.setattr("vla_attention.capture.environments.drawing.check_drawing", lambda suite, libero_assets: "")
     return made
 
 

@@ -97,7 +97,7 @@ class Broken(StillScene):
     [
         (
             RuntimeError("the context\nis lost"),
-            "of .*a.zarr failed: RuntimeError: the context is lost (test_pipeline.py:",
+            "of .*a.zarr failed: the context is lost (RuntimeError, test_pipeline.py:",
         )
     ],
 )

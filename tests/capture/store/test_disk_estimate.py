@@ -93,9 +93,10 @@ def test_what_is_asked_for_is_what_is_counted():
 
 
 def test_episodes_and_replans_multiply():
-    estimate = DiskEstimate(bytes_per_replan=1000, max_replans=10, num_episodes=3)
+    estimate = DiskEstimate(bytes_per_replan=1000, max_replans=10, num_episodes=3, inodes_per_episode=57)
     assert estimate.total_bytes == 3 * (10_000 + EPISODE_OVERHEAD)
-    assert DiskEstimate(1000, 10, 0).total_bytes == 0
+    assert estimate.total_inodes == 3 * 57
+    assert DiskEstimate(1000, 10, 0, 57).total_bytes == 0
 
 
 @pytest.mark.parametrize(

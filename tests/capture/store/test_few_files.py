@@ -17,6 +17,7 @@ from tests.kit.still_scene import capture_without_simulator
 from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.store import codecs as store_codecs
+from vla_attention.capture.store.disk_estimate import estimate_disk
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import write_store
 
@@ -41,6 +42,10 @@ def check_few(store: Path, most: int = MOST_FILES) -> int:
         folders = {folder, *(path for path in folder.rglob("*") if path.is_dir())}
         assert folders == set(kinds), "a folder that is neither a group nor an array"
         found.append(sum(path.is_file() for path in folder.rglob("*")))
+        root = open_store(store).attributes
+        pictures = sum("frames/" in name for name in episode.attributes.arrays)
+        expected = estimate_disk(root.recording, root.sites, [0] * pictures, 1, 1).inodes_per_episode
+        assert len(folders) + found[-1] <= expected <= 1.6 * (len(folders) + found[-1])
         assert found[-1] == len(kinds) + len(episode.attributes.arrays)
     assert max(found) <= most
     return max(found)

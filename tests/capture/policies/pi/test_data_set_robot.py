@@ -15,6 +15,7 @@ from vla_attention.capture.policies.pi.config import find_config
 from vla_attention.capture.policies.pi.data_set_robot import openpi_robot
 from vla_attention.capture.policies.pi.lerobot import lerobot_image
 from vla_attention.capture.policies.pi.loading import CheckpointOptions, choose_config, load_pi_policy
+from vla_attention.capture.policies.pi.preprocess import read_norm_stats
 from vla_attention.capture.policies.robot import Robot, RobotData
 from vla_attention.schemas.errors import BadArgument
 
@@ -60,7 +61,7 @@ def tokenizer(tmp_path_factory):
 
 def test_openpi_s_conversion_of_droid_is_known_by_its_columns(tmp_path):
     folder = openpi_checkpoint(tmp_path, "pi05_batch2", "droid", 8, 8)
-    assert openpi_robot(folder, DROID, relative_actions=0) == DROID_ROBOT
+    assert openpi_robot(DROID, read_norm_stats(folder)) == DROID_ROBOT
 
 
 @pytest.mark.parametrize(("case", "name"), [("pi05_batch2", "pi05_droid"), ("pi0_batch2", "pi0_droid")])
@@ -112,4 +113,4 @@ def test_pictures_of_data_sets_are_not_turned():
 def test_what_does_not_fit_the_checkpoint_is_said(tmp_path, changes, message):
     folder = openpi_checkpoint(tmp_path, "pi05_batch2", "droid", 8, 8)
     with pytest.raises(BadArgument, match=message):
-        openpi_robot(folder, RobotData(**{**vars(DROID), **changes}), relative_actions=0)
+        openpi_robot(RobotData(**{**vars(DROID), **changes}), read_norm_stats(folder))

@@ -14,7 +14,7 @@ from tests.kit.policy_inputs import assert_same_input, make_observation
 from tests.kit.small_tokenizer import train_small_tokenizer
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint, UnsupportedCheckpoint
 from vla_attention.capture.policies.pi.lerobot import lerobot_image
-from vla_attention.capture.policies.pi.lerobot_config import UnsupportedLerobotFeature, read_lerobot_config
+from vla_attention.capture.policies.pi.lerobot_config import read_lerobot_config
 from vla_attention.capture.policies.pi.lerobot_pipeline import LerobotNormaliser, read_lerobot_pipeline
 from vla_attention.capture.policies.pi.loading import CheckpointOptions, load_pi_policy
 from vla_attention.capture.policies.pi.preprocess import libero_state
@@ -194,7 +194,7 @@ def test_renamed_cameras_and_empty_cameras_that_only_a_number_states(checkpoint,
         config["empty_cameras"] = 1
 
     edit(checkpoint / "config.json", change)
-    with pytest.raises(UnsupportedLerobotFeature, match=r"top, .*wrist.*the environment offers .*no picture"):
+    with pytest.raises(BadArgument, match=r"None of the policy's cameras top, wrist.*agentview, .*--camera"):
         load_pi_policy(checkpoint, tokenizer_path)
     names = {"observation.images.image": "observation.images.wrist"}
     step = {"registry_name": "rename_observations_processor", "config": {"rename_map": names}}

@@ -21,6 +21,7 @@ from vla_attention.capture.policies.pi.preprocess import (
     resize_with_pad,
 )
 from vla_attention.capture.policies.pi.tokenizer import digitise_state
+from vla_attention.schemas.errors import UserError
 
 FOLDER = GOLDEN / "libero_preproc"
 MODES = {"z-score": "z", "quantile": "q"}
@@ -117,8 +118,17 @@ def test_statistics_come_from_the_checkpoint_s_assets(tmp_path, stats):
     second = tmp_path / "assets" / "droid" / "norm_stats.json"
     second.parent.mkdir()
     second.write_text("{}")
-    with pytest.raises(UnreadableCheckpoint, match="more than one"):
-        read_norm_stats(tmp_path)
+    for wrong, said in (
+        ({}, r"statistics of droid, physical-intelligence/libero; say which with --asset-id NAME"),
+        ({"asset_id": "libero"}, r"Unknown asset id .*Existing: droid, physical-intelligence/libero"),
+        ({"given": tmp_path / "none.json"}, "no file of statistics at"),
+        ({"given": tmp_path / "assets"}, "is a folder; expected a file"),
+        ({"asset_id": "droid"}, "norm_stats"),
+    ):
+        with pytest.raises(UserError, match=said):
+            read_norm_stats(tmp_path, **wrong)
+    for right in ({"asset_id": "physical-intelligence/libero"}, {"given": FOLDER / "norm_stats.json"}):
+        np.testing.assert_array_equal(read_norm_stats(tmp_path, **right).actions.q99, stats.actions.q99)
 
 
 def numbers(dim, **more):
