@@ -289,7 +289,7 @@ def _layout(run: Run) -> dict[str, str]:
     site = next(site for site in run.stores[0].attributes.sites if site.name == run.question.site)
     spans = {}
     for span in site.spans:
-        grid = f" of {span.grid.rows} x {span.grid.columns} patches" if span.grid else ""
+        grid = f" of {span.grid.describe()}" if span.grid else ""
         spans[span.name] = f"keys {span.start}-{span.stop - 1}{grid}{', growing' if span.growing else ''}"
     return spans
 

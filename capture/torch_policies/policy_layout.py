@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import Literal
 
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
-from vla_attention.schemas.layout import ROLES_OF_KIND, Role, SiteLayout, Span, find_role
+from vla_attention.schemas.layout import ROLES_OF_KIND, Role, SiteLayout, Span, find_role, picture_size
 from vla_attention.schemas.safe_text import check_name, check_text
 
 #: How a picture becomes the model's input image: its sides stretched; padded on two sides; padded left and on top only.
@@ -276,6 +276,9 @@ class PolicyLayout:
         """Raise `BadArgument` with everything that does not fit together."""
         check_text("policy's name", self.name)
         check_text("policy's family", self.family)
+        sites = [site.keys for site in self.sites]
+        for camera in dict.fromkeys(camera for site in sites for camera in site.pictured):
+            picture_size(sites, camera)  # raises the error that names the sizes, where sites have other ones
         if problems := list(self._problems()):
             raise BadArgument(f"The layout of '{self.name}' is wrong: {'; '.join(problems)}.")
 
