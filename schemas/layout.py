@@ -85,6 +85,12 @@ ROLES_OF_KIND: dict[SpanKind, tuple[Role, ...]] = {
 }
 
 
+def kinds_and_roles() -> str:
+    """Every kind of span with the roles that its keys can have, for messages; docs/your-policy.md has it, too."""
+    kinds = [f"{kind} ({', '.join(role.label for role in roles)})" for kind, roles in ROLES_OF_KIND.items()]
+    return f"Kinds of spans, with the roles that their keys can have: {', '.join(kinds)}"
+
+
 def check_site_name(name: str) -> None:
     """Raise `BadArgument` unless a name can be a site's: one part of a path, and of no other group of an episode."""
     check_name("site", name)
