@@ -186,7 +186,7 @@ def _allowed_host(given: str) -> str:
 
 def _other_host(name: str) -> str:
     return (
-        f"The page of vla-attention view is asked for as {name}, and answers to {LOOPBACK} only. If that is the proxy "
+        f"The page of vla-attention view is asked for as {name}, a host that it does not know. If that is the proxy "
         f"through which you reach this machine (JupyterHub, Open OnDemand), start it again with --allow-host {name}."
     )
 

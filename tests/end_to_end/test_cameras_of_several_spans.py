@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,10 +23,11 @@ from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.measures.patch_maps import PictureMap
 from vla_attention.analyze.objects.object_attention import object_tables
 from vla_attention.analyze.objects.object_settings import ObjectSettings
+from vla_attention.capture.effects.arguments import EffectSettings
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_picture, patch_pixels
 from vla_attention.capture.torch_policies.policy_layout import RecordedSite
 from vla_attention.capture.torch_policies.record import record
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument, Note
 from vla_attention.schemas.groupings.builtin_groupings import BUILTIN_GROUPINGS
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import resolve
@@ -86,6 +88,9 @@ def test_everything_that_goes_by_camera_takes_all_its_keys(data):
         if tokens.coverage and camera in tokens.coverage:
             covered = weights(tokens, "object:plate_1")[:, layout.patch_keys(camera)]
             np.testing.assert_allclose(covered, tokens.coverage[camera][..., 1], rtol=1e-6)
+    reference = resolve(BUILTIN_GROUPINGS["reference"](vocabulary), tokens)
+    first = next(span.camera for span in layout.spans if span.camera is not None)
+    assert np.flatnonzero(reference.weights[0, :, 0]).tolist() == list(range(len(keys_of(layout, first))))
     np.testing.assert_array_equal(of_cameras, visual.weights[..., visual.names.index("visual")])
 
 
@@ -253,6 +258,32 @@ def test_a_knock_out_of_a_camera_hides_every_key(tmp_path):
     rows = store.episodes[0].read("joint/rows")
     assert (rows[..., [0, 1, 2, 3, 10]] == 0).all()
     np.testing.assert_allclose(rows.sum(axis=-1), 1, atol=1e-3)
+
+
+def test_effects_of_a_camera_cut_every_key(tmp_path):
+    policy = SmallPolicy()
+    with (
+        warnings.catch_warnings(),
+        record(
+            tmp_path / "a.zarr",
+            policy,
+            layout=policy_layout(),
+            tokenizer=policy.tokenizer,
+            durable=False,
+            effects=EffectSettings(("cameras",), ("action",)),
+        ) as run,
+        run.episode(task_id=0, episode_index=0, instruction="pick the bowl") as episode,
+        episode.replan(env_step=0, repeat=lambda call: policy.act(**policy_inputs())) as replan,
+    ):
+        warnings.simplefilter("ignore", Note)  # the made-up noise is none of a known generator
+        replan.actions = policy.act(**policy_inputs())
+    episode = open_store(tmp_path / "a.zarr").episodes[0]
+    effects = episode.attributes.effects
+    of_camera = [
+        any(edit.selector == "camera:front" for edit in effects.conditions[number].keys) for number in effects.condition
+    ]
+    (cut,) = episode.read("joint/cut")[of_camera]
+    assert np.flatnonzero(cut).tolist() == [0, 1, 2, 3, 10]
 
 
 def test_masks_of_a_picture_cover_the_patches_of_its_tiles(tmp_path):
