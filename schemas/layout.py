@@ -25,8 +25,8 @@ from vla_attention.schemas.safe_text import check_free_text, check_name
 SiteName = str
 SpanKind = Literal["image", "text", "state", "action", "latent"]
 ROLE_DTYPE = np.uint8
-#: How far the end of a part of a picture may lie outside: 1/3 + 2/3 of decimals.
-_ROUNDING = 1e-6
+#: What sums and quotients of fractions of a picture are off by, at most.
+_ROUNDING = 1e-9
 #: Groups and arrays of an episode beside those of its sites.
 RESERVED_NAMES = frozenset(
     {
@@ -129,13 +129,18 @@ class PatchGrid:
         check_at_most("The height of a picture", self.image_height, PICTURE_SIDE, least=1)
         check_at_most("The width of a picture", self.image_width, PICTURE_SIDE, least=1)
         check_at_most("The number of pixels of a picture", self.image_height * self.image_width, PICTURE_PIXELS)
-        top, left, height, width = self.part
-        inside = min(top, left) >= 0 and max(top + height, left + width) <= 1 + _ROUNDING
+        wrong = BadArgument(
+            f"A patch grid covers the part {self.part!r} of its picture; expected (top, left, height, width) in "
+            "fractions of the whole picture, inside of it and at least a pixel large: (0, 0, 1, 1) is all of it."
+        )
+        try:
+            top, left, height, width = part = tuple(map(float, self.part))
+        except (TypeError, ValueError):
+            raise wrong from None
+        inside = min(part) >= 0 and max(top + height, left + width) <= 1 + _ROUNDING
         if not (inside and height * self.image_height >= 1 and width * self.image_width >= 1):
-            raise BadArgument(
-                f"A patch grid covers the part {self.part} of its picture; expected (top, left, height, width) in "
-                "fractions of the whole picture, inside of it and at least a pixel large: (0, 0, 1, 1) is all of it."
-            )
+            raise wrong
+        object.__setattr__(self, "part", part)  # a list or whole numbers are the same part
 
     @property
     def num_patches(self) -> int:
@@ -145,7 +150,7 @@ class PatchGrid:
     @property
     def covers_all(self) -> bool:
         """Whether the grid covers the whole picture."""
-        return tuple(self.part) == (0, 0, 1, 1)
+        return self.part == (0, 0, 1, 1)
 
     def centres(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Where the centres of the rows (row,) and of the columns (column,) lie, in fractions of the whole picture."""
@@ -172,7 +177,7 @@ class PatchGrid:
 def _shares(patches: int, first: float, length: float, cells: int) -> NDArray[np.float64]:
     borders = (np.arange(cells + 1) / cells - first) * patches / length  # of the cells, in units of a patch
     whole = np.rint(borders)
-    borders = np.where(np.abs(borders - whole) < _ROUNDING, whole, borders)
+    borders = np.where(np.abs(borders - whole) < 1000 * _ROUNDING, whole, borders)
     patch = np.arange(patches)[:, None]
     inside = np.minimum(borders[1:], patch + 1) - np.maximum(borders[:-1], patch)
     shares: NDArray[np.float64] = np.clip(inside, 0.0, None)
@@ -257,8 +262,8 @@ class SiteLayout:
             seen.add(span.name)
             position = span.stop
         check_at_most(f"The number of keys of site '{self.name}'", position, KEYS)
-        for camera in self.cameras:
-            check_picture_sizes(camera, self.grids(camera))
+        for camera, grids in self._grids.items():
+            _check_picture_sizes(camera, grids)
 
     def _check_numbers(self) -> None:
         check_at_most(f"The number of layers of site '{self.name}'", len(self.layers), AXIS)
@@ -303,8 +308,16 @@ class SiteLayout:
 
     @property
     def pictured(self) -> tuple[str, ...]:
-        """Names of the cameras that have patches, in the order of their first keys."""
-        return tuple(camera for camera in self.cameras if self.grids(camera))
+        """Names of the cameras that have patches, in the order of their first patches."""
+        return tuple(self._grids)
+
+    @property
+    def _grids(self) -> dict[str, tuple[PatchGrid, ...]]:
+        found: dict[str, tuple[PatchGrid, ...]] = {}
+        for span in self.spans:
+            if span.camera is not None and span.grid is not None:
+                found[span.camera] = (*found.get(span.camera, ()), span.grid)
+        return found
 
     def camera_spans(self, camera: str) -> tuple[Span, ...]:
         """Return all spans of a camera, in key order; the error lists the existing cameras."""
@@ -315,7 +328,8 @@ class SiteLayout:
 
     def grids(self, camera: str) -> tuple[PatchGrid, ...]:
         """Return the grids of a camera's spans, in key order; empty where none of its keys lies in the picture."""
-        return tuple(span.grid for span in self.camera_spans(camera) if span.grid is not None)
+        self.camera_spans(camera)  # raises the error that lists the cameras
+        return self._grids.get(camera, ())
 
     def patch_keys(self, camera: str) -> NDArray[np.int64]:
         """Keys of the patches of all grids of a camera, shape (patch,), in key order: the patches of its coverage."""
@@ -346,7 +360,7 @@ class SiteLayout:
         return np.repeat(np.arange(len(lengths), dtype=np.int32), lengths)
 
 
-def check_picture_sizes(camera: str, grids: Sequence[PatchGrid]) -> None:
+def _check_picture_sizes(camera: str, grids: Sequence[PatchGrid]) -> None:
     """Raise `BadArgument` unless all grids of a camera are of one picture."""
     sizes = listing(dict.fromkeys(f"{grid.image_height} x {grid.image_width}" for grid in grids))
     if len({(grid.image_height, grid.image_width) for grid in grids}) > 1:
@@ -363,9 +377,7 @@ def camera_grids(sites: Sequence[SiteLayout], camera: str) -> tuple[PatchGrid, .
         UnknownName: no site has patches of the camera.
         BadArgument: two sites have different patches of it.
     """
-    by_site = {site.name: site.grids(camera) for site in sites if camera in site.pictured}
-    if not by_site:
-        raise unknown_name("camera with patches", camera, dict.fromkeys(name for one in sites for name in one.pictured))
+    by_site = _grids_of_sites(sites, camera)
     if len(set(by_site.values())) > 1:
         grids = "; ".join(f"'{name}' {listing(one.describe() for one in own)}" for name, own in by_site.items())
         raise BadArgument(
@@ -375,12 +387,17 @@ def camera_grids(sites: Sequence[SiteLayout], camera: str) -> tuple[PatchGrid, .
     return next(iter(by_site.values()))
 
 
+def _grids_of_sites(sites: Sequence[SiteLayout], camera: str) -> dict[str, tuple[PatchGrid, ...]]:
+    found = {site.name: site.grids(camera) for site in sites if camera in site.pictured}
+    if not found:
+        raise unknown_name("camera with patches", camera, dict.fromkeys(name for one in sites for name in one.pictured))
+    return found
+
+
 def picture_size(sites: Sequence[SiteLayout], camera: str) -> tuple[int, int]:
     """Height and width in pixels of a camera's picture as the model sees it; errors as `camera_grids`."""
-    grids = [grid for site in sites if camera in site.pictured for grid in site.grids(camera)]
-    if not grids:
-        raise unknown_name("camera with patches", camera, dict.fromkeys(name for one in sites for name in one.pictured))
-    check_picture_sizes(camera, grids)
+    grids = [grid for own in _grids_of_sites(sites, camera).values() for grid in own]
+    _check_picture_sizes(camera, grids)
     return grids[0].image_height, grids[0].image_width
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,14 +18,18 @@ from vla_attention.schemas.cached_property import cached_property
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout
 
+#: Cells along a side of a map that adds several grids.
+_MOST_CELLS = 128
+
 
 @dataclass(frozen=True)
 class PictureMap:
     """How the patches of a camera lie on a map of its picture: `rows` x `columns` even cells.
 
     The cells of one grid over the whole picture are its patches. Of several grids (tiles, a thumbnail, frames of other
-    times), or of one over a part, they are as small as the smallest patches: each patch's mass is spread evenly over
-    its area, and masses of patches at one place are added, so that a map sums to the mass of all patches.
+    times), or of one over a part, they are as small as the smallest patches, at most 128 along a side: each patch's
+    mass is spread evenly over its area, and masses of patches at one place are added, so that a map sums to the mass of
+    all patches.
 
     Attributes:
         grids: of the camera, in key order.
@@ -42,12 +47,18 @@ class PictureMap:
     @property
     def rows(self) -> int:
         """Number of rows of cells."""
-        return _cells([(grid.rows, grid.part[2]) for grid in self.grids], self.grids[0].image_height)
+        return self._cells([(grid.rows, grid.part[2]) for grid in self.grids], self.grids[0].image_height)
 
     @property
     def columns(self) -> int:
         """Number of columns of cells."""
-        return _cells([(grid.columns, grid.part[3]) for grid in self.grids], self.grids[0].image_width)
+        return self._cells([(grid.columns, grid.part[3]) for grid in self.grids], self.grids[0].image_width)
+
+    def _cells(self, sides: Sequence[tuple[int, float]], pixels: int) -> int:
+        """Cells along a side: (number of patches, part of the side) of each grid, and the picture's pixels."""
+        if self.cells_are_patches:
+            return sides[0][0]
+        return min(max(math.ceil(patches / length - 1e-6) for patches, length in sides), pixels, _MOST_CELLS)
 
     @property
     def cells_are_patches(self) -> bool:
@@ -98,12 +109,6 @@ class PictureMap:
             found.append((height * width / grid.num_patches, first, patch))
             first += grid.num_patches
         return np.stack([patch for _, _, patch in sorted(found, key=lambda one: one[:2])])
-
-
-def _cells(sides: list[tuple[int, float]], pixels: int) -> int:
-    """Cells along a side as small as the smallest patches, but for those of grids that are smaller than pixels."""
-    finest = max(math.ceil(patches / length - 1e-6) for patches, length in sides)
-    return min(finest, max(pixels, *(patches for patches, _ in sides)))
 
 
 def map_note(layout: SiteLayout, camera: str, outside: float | None) -> str:

@@ -301,11 +301,37 @@ def test_masks_of_a_picture_cover_the_patches_of_its_tiles(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "part", [(0, 0, 448, 448), (0.5, 0.0, 0.6, 1.0), (-0.1, 0, 0.5, 0.5), (0, 0, 0.0, 1), (0, 0, float("nan"), 1)]
+    "part",
+    [
+        (0, 0, 448, 448),
+        (0.5, 0.0, 0.6, 1.0),
+        (-0.1, 0, 0.5, 0.5),
+        (0, 0, 0.0, 1),
+        (0, 0, float("nan"), 1),
+        (0, 1),
+        None,
+        "all",
+    ],
 )
 def test_a_part_that_is_none_of_the_picture_is_refused(part):
     with pytest.raises(BadArgument, match=r"expected \(top, left, height, width\) in fractions"):
         PatchGrid(2, 2, 8, 8, part)
+    assert PatchGrid(2, 2, 8, 8, [0, 0, 1, 1]) == PatchGrid(2, 2, 8, 8)
+    assert len({PatchGrid(2, 2, 8, 8, np.array([0, 0.5, 1, 0.5])), PatchGrid(2, 2, 8, 8, (0.0, 0.5, 1.0, 0.5))}) == 1
+
+
+def test_a_map_of_several_grids_has_a_limited_number_of_cells():
+    keys = 2**16
+    spans = (
+        Span("a", "image", 0, keys, "front", PatchGrid(keys, 1, 1000, 1000)),
+        Span("b", "image", keys, keys + 1, "front", PatchGrid(1, 1, 8, 8, (0.5, 0.5, 0.125, 0.125))),
+    )
+    with pytest.raises(BadArgument, match="one size"):
+        SiteLayout("joint", spans)
+    small = replace(spans[1], grid=PatchGrid(1, 1, 1000, 1000, (0.5, 0.5, 0.001, 0.001)))
+    picture = PictureMap.of(SiteLayout("joint", (spans[0], small)), "front")
+    assert (picture.rows, picture.columns) == (128, 128)
+    np.testing.assert_allclose(picture.spread(np.ones(keys + 1)).sum(), keys + 1)
 
 
 def test_grids_of_pictures_of_two_sizes_are_refused_in_one_site_and_in_two():

@@ -103,7 +103,7 @@ export function camerasOf(layout: SiteDocument): string[] {
 
 /** Cameras that have patches. */
 export function picturedCameras(layout: SiteDocument): string[] {
-  return camerasOf(layout).filter((camera) => gridSpans(layout, camera).length);
+  return [...new Set(layout.spans.flatMap((span) => (span.camera !== null && span.grid ? [span.camera] : [])))];
 }
 
 export function spanNamed(layout: SiteDocument, name: string): SpanDocument {

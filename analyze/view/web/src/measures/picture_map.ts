@@ -3,6 +3,8 @@ import { gridSpans, patchKeys } from "../grouping/tokens";
 import { coversAll, type GridDocument, type SiteDocument } from "../store/documents";
 
 const ROUNDING = 1e-6;
+/** Cells along a side of a map that adds several grids. */
+const MOST_CELLS = 128;
 
 /** Even cells over a picture, row by row from its top left corner. */
 export interface Cells {
@@ -40,9 +42,11 @@ export class PictureMap implements Cells {
     this.keys = patchKeys(layout, camera);
     this.height = grids[0]!.image_height;
     this.width = grids[0]!.image_width;
-    this.rows = numCells(grids.map(({ rows, part }) => [rows, part[2]]), this.height);
-    this.columns = numCells(grids.map(({ columns, part }) => [columns, part[3]]), this.width);
     this.cellsArePatches = grids.length === 1 && coversAll(grids[0]!);
+    const cells = (sides: readonly (readonly [number, number])[], pixels: number): number =>
+      this.cellsArePatches ? sides[0]![0] : numCells(sides, pixels);
+    this.rows = cells(grids.map(({ rows, part }) => [rows, part[2]]), this.height);
+    this.columns = cells(grids.map(({ columns, part }) => [columns, part[3]]), this.width);
     let first = 0;
     const placed = grids.map((grid): Placed => {
       const [top, left, height, width] = grid.part;
@@ -101,7 +105,7 @@ export class PictureMap implements Cells {
 
 function numCells(sides: readonly (readonly [number, number])[], pixels: number): number {
   const finest = Math.max(...sides.map(([patches, length]) => Math.ceil(patches / length - ROUNDING)));
-  return Math.min(finest, Math.max(pixels, ...sides.map(([patches]) => patches)));
+  return Math.min(finest, pixels, MOST_CELLS);
 }
 
 function shares(patches: number, first: number, length: number, cells: number): Float64Array[] {

@@ -179,7 +179,7 @@ function parseGrid(value: unknown, where: string): GridDocument | null {
 function parsePart(value: unknown, where: string): GridDocument["part"] {
   if (value === undefined) return [0, 0, 1, 1];
   const [top, left, height, width, ...more] = list(value, where, 4).map((each, i) => finite(each, `${where}[${i}]`));
-  const inside = Math.min(top!, left!) >= 0 && Math.max(top! + height!, left! + width!) <= 1 + 1e-6;
+  const inside = Math.min(top!, left!) >= 0 && Math.max(top! + height!, left! + width!) <= 1 + 1e-9;
   if (!inside || width === undefined || more.length) throw new StoreError(`The store cannot be shown: ${where} is no part of a picture.`);
   return [top!, left!, height!, width];
 }
