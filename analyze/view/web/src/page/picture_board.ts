@@ -53,10 +53,9 @@ export function mapNote({ row, site }: Pick<Shown, "row" | "site">, camera: stri
   const spans = cameraSpans(site.layout, camera);
   const [placed, others] = [spans.filter((span) => span.grid), spans.filter((span) => !span.grid)];
   const names = (those: readonly SpanDocument[]): string => listing(those.map((span) => span.name));
-  const adds = placed.length > 1 ? `; the map adds ${names(placed)}` : "";
-  if (!others.length) return adds;
   const outside = (100 * massOf(row, others)) / share;
-  return `${adds}; ${outside.toFixed(1)}% of it on ${names(others)}, which the map leaves out: nowhere in the picture`;
+  const leavesOut = others.length ? `, ${outside.toFixed(1)}% of that on keys of ${names(others)}, which lie nowhere in the picture` : "";
+  return leavesOut + (placed.length > 1 ? `; the map adds ${names(placed)}` : "");
 }
 
 /** How many patches of a picture are named for those who cannot see it. */
