@@ -213,6 +213,16 @@ def test_its_groups_and_its_report_are_drawn(made, tmp_path):
     assert main(["report", str(path), "--output", str(tmp_path / "report.html")]) == 0
 
 
+def test_runs_whose_spans_are_of_other_cameras_are_not_compared(tmp_path, capsys):
+    layout = spans_of(KINDS["pooled beside"])
+    other = replace(layout, spans=tuple(replace(s, camera=None) if s.name == "pooled" else s for s in layout.spans))
+    for name, one in (("a", layout), ("b", other)):
+        tokens = tokens_of(one, [small_prompt(one, "put the bowl on the plate", "1 2")])
+        write_store(tmp_path / f"{name}.zarr", spec=StoreSpec(tokens=tokens))
+    assert main(["compare", *(str(tmp_path / f"{name}.zarr") for name in "ab"), "--output", str(tmp_path / "c")]) == 2
+    assert "pooled keys 26-27 of camera front" in " ".join(capsys.readouterr().err.split())
+
+
 def test_objects_of_a_camera_are_measured_on_all_its_patches(made):
     path, layout = made
     tables = object_tables(question_about(path), ObjectSettings(spatial=True))
