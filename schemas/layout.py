@@ -25,6 +25,8 @@ from vla_attention.schemas.safe_text import check_free_text, check_name
 SiteName = str
 SpanKind = Literal["image", "text", "state", "action", "latent"]
 ROLE_DTYPE = np.uint8
+#: What sums and quotients of fractions of a picture are off by, at most.
+_ROUNDING = 1e-9
 #: Groups and arrays of an episode beside those of its sites.
 RESERVED_NAMES = frozenset(
     {
@@ -83,6 +85,12 @@ ROLES_OF_KIND: dict[SpanKind, tuple[Role, ...]] = {
 }
 
 
+def kinds_and_roles() -> str:
+    """Every kind of span with the roles that its keys can have, for messages; docs/your-policy.md has it, too."""
+    kinds = [f"{kind} ({', '.join(role.label for role in roles)})" for kind, roles in ROLES_OF_KIND.items()]
+    return f"Kinds of spans, with the roles that their keys can have: {', '.join(kinds)}"
+
+
 def check_site_name(name: str) -> None:
     """Raise `BadArgument` unless a name can be a site's: one part of a path, and of no other group of an episode."""
     check_name("site", name)
@@ -102,30 +110,86 @@ def find_role(label: str) -> Role:
 
 @dataclass(frozen=True)
 class PatchGrid:
-    """How an image span's keys tile the model's input image: row-major from its top left corner."""
+    """How an image span's keys tile a camera's picture, or a part of it: row-major from the top left corner.
+
+    `image_height`, `image_width`: pixels of the camera's whole picture. `part`: (top, left, height, width) of what the
+    patches cover, in fractions of the whole picture: (0.5, 0, 0.5, 0.5) is the quarter at the bottom left.
+    """
 
     rows: int
     columns: int
     image_height: int
     image_width: int
+    part: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
-        """Check that the grid and the picture have a size."""
+        """Check that the grid and the picture have a size, and that the part lies in the picture."""
         check_at_most("The number of rows of a patch grid", self.rows, KEYS, least=1)
         check_at_most("The number of columns of a patch grid", self.columns, KEYS, least=1)
         check_at_most("The height of a picture", self.image_height, PICTURE_SIDE, least=1)
         check_at_most("The width of a picture", self.image_width, PICTURE_SIDE, least=1)
         check_at_most("The number of pixels of a picture", self.image_height * self.image_width, PICTURE_PIXELS)
+        wrong = BadArgument(
+            f"A patch grid covers the part {self.part!r} of its picture; expected (top, left, height, width) in "
+            "fractions of the whole picture, inside of it and at least a pixel large: (0, 0, 1, 1) is all of it."
+        )
+        try:
+            top, left, height, width = part = tuple(map(float, self.part))
+        except (TypeError, ValueError):
+            raise wrong from None
+        inside = min(part) >= 0 and max(top + height, left + width) <= 1 + _ROUNDING
+        if not (inside and height * self.image_height >= 1 and width * self.image_width >= 1):
+            raise wrong
+        object.__setattr__(self, "part", part)  # a list or whole numbers are the same part
 
     @property
     def num_patches(self) -> int:
         """Number of keys that the grid covers."""
         return self.rows * self.columns
 
+    @property
+    def covers_all(self) -> bool:
+        """Whether the grid covers the whole picture."""
+        return self.part == (0, 0, 1, 1)
+
+    def centres(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Where the centres of the rows (row,) and of the columns (column,) lie, in fractions of the whole picture."""
+        top, left, height, width = self.part
+        down, across = ((np.arange(count) + 0.5) / count for count in (self.rows, self.columns))
+        return down * height + top, across * width + left
+
+    def shares(self, rows: int, columns: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """How the patches lie on `rows` x `columns` even cells of the whole picture.
+
+        Returns:
+            Of every row of patches the share that lies in each row of cells (patch row, row), and the same of columns
+            (patch column, column); both sum to 1 over the cells.
+        """
+        top, left, height, width = self.part
+        return _shares(self.rows, top, height, rows), _shares(self.columns, left, width, columns)
+
+    def describe(self) -> str:
+        """The grid in words."""
+        part = ", ".join(f"{side:.4g}" for side in self.part)
+        return f"{self.rows} x {self.columns} patches" + ("" if self.covers_all else f" of the part ({part})")
+
+
+def _shares(patches: int, first: float, length: float, cells: int) -> NDArray[np.float64]:
+    borders = (np.arange(cells + 1) / cells - first) * patches / length  # of the cells, in units of a patch
+    whole = np.rint(borders)
+    borders = np.where(np.abs(borders - whole) < 1000 * _ROUNDING, whole, borders)
+    patch = np.arange(patches)[:, None]
+    inside = np.minimum(borders[1:], patch + 1) - np.maximum(borders[:-1], patch)
+    shares: NDArray[np.float64] = np.clip(inside, 0.0, None)
+    return shares
+
 
 @dataclass(frozen=True)
 class Span:
     """A run of neighbouring keys [start, stop) of one kind.
+
+    `camera`: all spans that name a camera are the camera: tiles, a thumbnail, frames of other times, and keys without
+    a `grid`, such as a pooled token, which lie nowhere in the picture.
 
     `growing`: the keys of tokens that are generated one after another. Action query q sees the first
     `q + growing_offset` of them; the others do not exist yet. Tokens that are not generated at a replan have the role
@@ -165,7 +229,8 @@ class SiteLayout:
     `layers`: the blocks that have this site; empty where all recorded blocks have it. `heads`: its number of heads, and
     `num_action_queries`: its number of action queries; 0 where they are those of the policy and of the recording.
 
-    Raises `BadArgument` when spans leave a gap, overlap, share a name, or a grid does not match its span's length.
+    Raises `BadArgument` when spans leave a gap, overlap, share a name, or a grid does not match its span's length, or
+    grids of one camera are of pictures of different sizes.
     """
 
     name: SiteName
@@ -197,6 +262,8 @@ class SiteLayout:
             seen.add(span.name)
             position = span.stop
         check_at_most(f"The number of keys of site '{self.name}'", position, KEYS)
+        for camera, grids in self._grids.items():
+            _check_picture_sizes(camera, grids)
 
     def _check_numbers(self) -> None:
         check_at_most(f"The number of layers of site '{self.name}'", len(self.layers), AXIS)
@@ -224,8 +291,8 @@ class SiteLayout:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Camera names, in key order."""
-        return tuple(span.camera for span in self.spans if span.camera is not None)
+        """Camera names, in the order of their first keys."""
+        return tuple(dict.fromkeys(span.camera for span in self.spans if span.camera is not None))
 
     @property
     def growing_span(self) -> Span | None:
@@ -239,12 +306,35 @@ class SiteLayout:
                 return span
         raise unknown_name("span", name, [span.name for span in self.spans])
 
-    def camera_span(self, camera: str) -> Span:
-        """Return the span that holds a camera's patches; the error lists the existing cameras."""
+    @property
+    def pictured(self) -> tuple[str, ...]:
+        """Names of the cameras that have patches, in the order of their first patches."""
+        return tuple(self._grids)
+
+    @property
+    def _grids(self) -> dict[str, tuple[PatchGrid, ...]]:
+        found: dict[str, tuple[PatchGrid, ...]] = {}
         for span in self.spans:
-            if span.camera == camera:
-                return span
-        raise unknown_name("camera", camera, self.cameras)
+            if span.camera is not None and span.grid is not None:
+                found[span.camera] = (*found.get(span.camera, ()), span.grid)
+        return found
+
+    def camera_spans(self, camera: str) -> tuple[Span, ...]:
+        """Return all spans of a camera, in key order; the error lists the existing cameras."""
+        spans = tuple(span for span in self.spans if span.camera == camera)
+        if not spans:
+            raise unknown_name("camera", camera, self.cameras)
+        return spans
+
+    def grids(self, camera: str) -> tuple[PatchGrid, ...]:
+        """Return the grids of a camera's spans, in key order; empty where none of its keys lies in the picture."""
+        self.camera_spans(camera)  # raises the error that lists the cameras
+        return self._grids.get(camera, ())
+
+    def patch_keys(self, camera: str) -> NDArray[np.int64]:
+        """Keys of the patches of all grids of a camera, shape (patch,), in key order: the patches of its coverage."""
+        of_grids = [np.arange(span.start, span.stop) for span in self.camera_spans(camera) if span.grid is not None]
+        return np.concatenate(of_grids) if of_grids else np.zeros(0, dtype=np.int64)
 
     def frame(self, name: str) -> Span:
         """Return a latent frame by its name, by `frameN`, or as `curr_last`.
@@ -268,6 +358,47 @@ class SiteLayout:
         """Index into `spans` for each key, shape (key,)."""
         lengths = [span.num_keys for span in self.spans]
         return np.repeat(np.arange(len(lengths), dtype=np.int32), lengths)
+
+
+def _check_picture_sizes(camera: str, grids: Sequence[PatchGrid]) -> None:
+    """Raise `BadArgument` unless all grids of a camera are of one picture."""
+    sizes = listing(dict.fromkeys(f"{grid.image_height} x {grid.image_width}" for grid in grids))
+    if len({(grid.image_height, grid.image_width) for grid in grids}) > 1:
+        raise BadArgument(
+            f"The grids of camera '{camera}' are of pictures of {sizes} pixels; expected one size, that of the whole "
+            "picture, and what a grid covers of it in its part=(top, left, height, width)."
+        )
+
+
+def camera_grids(sites: Sequence[SiteLayout], camera: str) -> tuple[PatchGrid, ...]:
+    """The grids of a camera in key order, the same at every site that has its patches; its coverage has these patches.
+
+    Raises:
+        UnknownName: no site has patches of the camera.
+        BadArgument: two sites have different patches of it.
+    """
+    by_site = _grids_of_sites(sites, camera)
+    if len(set(by_site.values())) > 1:
+        grids = "; ".join(f"'{name}' {listing(one.describe() for one in own)}" for name, own in by_site.items())
+        raise BadArgument(
+            f"Sites have different patches of camera '{camera}' ({grids}), so patches of it are not the same at both: "
+            "what objects cover is stored once for a camera. Leave out masks and coverage of it."
+        )
+    return next(iter(by_site.values()))
+
+
+def _grids_of_sites(sites: Sequence[SiteLayout], camera: str) -> dict[str, tuple[PatchGrid, ...]]:
+    found = {site.name: site.grids(camera) for site in sites if camera in site.pictured}
+    if not found:
+        raise unknown_name("camera with patches", camera, dict.fromkeys(name for one in sites for name in one.pictured))
+    return found
+
+
+def picture_size(sites: Sequence[SiteLayout], camera: str) -> tuple[int, int]:
+    """Height and width in pixels of a camera's picture as the model sees it; errors as `camera_grids`."""
+    grids = [grid for own in _grids_of_sites(sites, camera).values() for grid in own]
+    _check_picture_sizes(camera, grids)
+    return grids[0].image_height, grids[0].image_width
 
 
 @dataclass(frozen=True)

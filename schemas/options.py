@@ -9,12 +9,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vla_attention.schemas.errors import Note, listing, unknown_name
+from vla_attention.schemas.errors import BadArgument, Note, listing, unknown_name
 
 _RANGE = re.compile(r"(\d+)-(\d+)")
 #: Numbers that a range may name; axes of stores are far shorter.
 _MOST_IN_RANGE = 10_000
-TASK_HELP = "task ids, ranges as 0-3, or the instruction in quotes"
+TASK_HELP = "task ids, ranges as 0-3, several as 0,5, or the instruction in quotes"
 
 
 def add_option(
@@ -65,21 +65,27 @@ class Numbers(argparse.Action):
 
 
 def number_range(text: str) -> list[int]:
-    """The type of an option of numbers: `3`, or the range `0-2`."""
-    if matched := _RANGE.fullmatch(text):
-        first, last = int(matched[1]), int(matched[2])
-        if last < first or last - first >= _MOST_IN_RANGE:
-            raise argparse.ArgumentTypeError(f"'{text}' is no range of numbers; write the smaller one first, as 0-2")
-        return list(range(first, last + 1))
-    try:
-        return [int(text)]
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is neither a number nor a range as 0-2") from None
+    """The type of an option of numbers: `3`, the range `0-2`, or several of them with commas between, `0,5-7`."""
+    numbers: list[int] = []
+    for part in text.strip().removesuffix(",").split(","):
+        if matched := _RANGE.fullmatch(part.strip()):
+            first, last = int(matched[1]), int(matched[2])
+            if last < first or len(numbers) + last - first >= _MOST_IN_RANGE:
+                raise argparse.ArgumentTypeError(f"'{text}' is no range; write the smaller number first, as 0-2")
+            numbers += range(first, last + 1)
+            continue
+        try:
+            numbers.append(int(part))
+        except ValueError:
+            raise argparse.ArgumentTypeError(
+                f"'{text}' is neither a number, nor a range as 0-2, nor several with commas between, as 0,5"
+            ) from None
+    return numbers
 
 
 def task_choice(text: str) -> list[int] | str:
-    """The type of `--task`: numbers, or the instruction of a task."""
-    return number_range(text) if re.fullmatch(r"-?\d+(-\d+)?", text) else text
+    """The type of `--task`: numbers, or the instruction of a task, which has letters."""
+    return text if any(character.isalpha() for character in text) else number_range(text)
 
 
 def add_task(group: argparse._ActionsContainer, dest: str, which: str, *, was: Sequence[str] = ()) -> None:
@@ -125,6 +131,7 @@ def resolve_tasks(chosen: Sequence[int | str], instructions: Mapping[int, str], 
 
     Raises:
         UnknownName: no task has an instruction.
+        BadArgument: a text without letters, which is no instruction, is no list of numbers either.
     """
     numbers: list[int] = []
     for one in chosen:
@@ -132,6 +139,12 @@ def resolve_tasks(chosen: Sequence[int | str], instructions: Mapping[int, str], 
             numbers.append(one)
             continue
         named = [number for number, text in instructions.items() if _folded(text) == _folded(one)]
+        if not named and not any(character.isalpha() for character in one):
+            try:
+                numbers += number_range(one)
+            except argparse.ArgumentTypeError as error:
+                raise BadArgument(f"{error}; tasks are named by numbers or by their instruction.") from None
+            continue
         if not named:
             raise unknown_name(f"task of {where} with the instruction", one, instructions.values())
         if len(named) > 1:

@@ -55,8 +55,8 @@ FAULTS = (
     Fault(
         "span off by one: a camera without its last patch",
         "schemas/groupings/selectors.py",
-        "    span = tokens.layout.camera_span(argument)\n    return _key_range(tokens, span.start, span.stop)",
-        "    span = tokens.layout.camera_span(argument)\n    return _key_range(tokens, span.start, span.stop - 1)",
+        "camera_spans(argument):\n        member[0, span.start : span.stop] = True",
+        "camera_spans(argument):\n        member[0, span.start : span.stop - 1] = True",
         ("tests/schemas/groupings",),
     ),
     Fault(

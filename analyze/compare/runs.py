@@ -285,12 +285,13 @@ def _protocol(run: Run, name: str) -> tuple[int, ...]:
 
 
 def _layout(run: Run) -> dict[str, str]:
-    """Span of the run's site -> its keys and grid, as text."""
+    """Span of the run's site -> its keys, camera and grid, as text."""
     site = next(site for site in run.stores[0].attributes.sites if site.name == run.question.site)
     spans = {}
     for span in site.spans:
-        grid = f" of {span.grid.rows} x {span.grid.columns} patches" if span.grid else ""
-        spans[span.name] = f"keys {span.start}-{span.stop - 1}{grid}{', growing' if span.growing else ''}"
+        grid = f" of {span.grid.describe()}" if span.grid else ""
+        camera = f" of camera {span.camera}" if span.camera not in (None, span.name) else ""
+        spans[span.name] = f"keys {span.start}-{span.stop - 1}{camera}{grid}{', growing' if span.growing else ''}"
     return spans
 
 

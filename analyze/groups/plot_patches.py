@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.patch_maps import seen_cameras
+from vla_attention.analyze.measures.patch_maps import PictureMap, seen_cameras
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.show.patch_pictures import NO_PICTURE, upright
 from vla_attention.analyze.show.plot_axes import hide_frame
@@ -19,7 +19,7 @@ from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure
 from vla_attention.analyze.show.plot_text import explain, shortened, title
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import resolve
-from vla_attention.schemas.layout import PatchGrid, Piece
+from vla_attention.schemas.layout import Piece, picture_size
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.store_format import PolicyCameraView
 
@@ -85,8 +85,8 @@ def _picture_rows(
         return []
     if not grouping.overlap:
         return [everything]
-    spans = [item.tokens.layout.camera_span(camera) for camera in cameras]
-    seen = [i for i in everything if any(weights[span.start : span.stop, i].any() for span in spans)]
+    keys = [item.tokens.layout.patch_keys(camera) for camera in cameras]
+    seen = [i for i in everything if any(weights[own, i].any() for own in keys)]
     return [(i,) for i in seen] or [everything]
 
 
@@ -107,55 +107,57 @@ def _draw_pictures(
     for row, members in enumerate(layers):
         for column, camera in enumerate(cameras):
             axes = figure.add_subplot(grid[row, column])
-            span = item.tokens.layout.camera_span(camera)
-            assert span.grid is not None
-            chosen = weights[span.start : span.stop][:, members]
-            _draw_camera(axes, item, camera, replan, span.grid, _mixture(chosen, colors[list(members)]))
+            picture = PictureMap.of(item.tokens.layout, camera)
+            chosen = np.moveaxis(picture.highest(weights[picture.keys][:, members].T), 0, -1)
+            _draw_camera(axes, item, camera, replan, picture, _mixture(chosen, colors[list(members)]))
             name = camera if len(members) > 1 else f"{camera}: {grouping.names[members[0]]}"
             axes.set_title(shortened(name, 44), size=8)
 
 
 def _mixture(weights: NDArray[np.float32], colors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Colour and opacity (patch, 4) of patches of which groups take shares (patch, group)."""
-    total = weights.sum(axis=1, keepdims=True)
+    """Colour and opacity (row, column, 4) of cells of which groups take shares (row, column, group)."""
+    total = weights.sum(axis=-1, keepdims=True)
     mixed = weights @ colors / np.where(total > 0, total, 1.0)
-    return np.concatenate([mixed, _OPACITY * np.minimum(total, 1.0)], axis=1)
+    return np.concatenate([mixed, _OPACITY * np.minimum(total, 1.0)], axis=-1)
 
 
 def _draw_camera(
-    axes: Axes, item: SelectedEpisode, camera: str, replan: int, grid: PatchGrid, colors: NDArray[np.float64]
+    axes: Axes, item: SelectedEpisode, camera: str, replan: int, picture: PictureMap, patches: NDArray[np.float64]
 ) -> None:
     name = f"frames/{camera}"
     stored = name in item.episode.attributes.arrays
     frame = (
         item.episode.read(name, replan)
         if stored
-        else np.full((grid.image_height, grid.image_width, 3), NO_PICTURE, dtype=np.uint8)
+        else np.full((*picture_size([item.tokens.layout], camera), 3), NO_PICTURE, dtype=np.uint8)
     )
-    patches = colors.reshape(grid.rows, grid.columns, 4)
     view = next((view for view in item.store.attributes.policy.cameras if view.name == camera), None)
     if view is not None:  # as a person sees the scene, like all other pictures of it
         frame, patches = upright(frame, view), upright(patches, view)
     height, width = frame.shape[:2]
     axes.imshow(frame, interpolation="nearest")
     axes.imshow(patches, extent=(-0.5, width - 0.5, height - 0.5, -0.5), interpolation="nearest")
-    axes.set_xticks(np.arange(1, grid.columns) * width / grid.columns - 0.5, minor=True)
-    axes.set_yticks(np.arange(1, grid.rows) * height / grid.rows - 0.5, minor=True)
+    axes.set_xticks(np.arange(1, picture.columns) * width / picture.columns - 0.5, minor=True)
+    axes.set_yticks(np.arange(1, picture.rows) * height / picture.rows - 0.5, minor=True)
     axes.grid(which="minor", color="white", linewidth=0.25, alpha=0.6)
-    _number_patches(axes, grid, (height, width), view)
+    _number_patches(axes, picture, (height, width), view)
     hide_frame(axes)
     if not stored:
         axes.set_xlabel("no pictures in the store", size=7, color=NOTE_COLOR)
 
 
-def _number_patches(axes: Axes, grid: PatchGrid, size: tuple[int, int], view: PolicyCameraView | None) -> None:
-    """Number rows and columns of patches as `patch:` selectors count them: in the picture that the model sees."""
+def _number_patches(axes: Axes, picture: PictureMap, size: tuple[int, int], view: PolicyCameraView | None) -> None:
+    """Number rows and columns of patches as `patch:` selectors count them: in the picture that the model sees.
+
+    Where the camera has several grids they count in fractions of the picture.
+    """
     for axis, count, length, turned in (
-        (axes.yaxis, grid.rows, size[0], view is not None and not view.upright),
-        (axes.xaxis, grid.columns, size[1], view is not None and view.mirrored),
+        (axes.yaxis, picture.rows, size[0], view is not None and not view.upright),
+        (axes.xaxis, picture.columns, size[1], view is not None and view.mirrored),
     ):
-        numbers = np.arange(0, count, max(1, count // 4))
-        places = (numbers + 0.5) * length / count - 0.5
+        counted = picture.cells_are_patches
+        numbers: NDArray[np.number] = np.arange(0, count, max(1, count // 4)) if counted else np.arange(5) / 4
+        places = (numbers + 0.5) * length / count - 0.5 if counted else numbers * length - 0.5
         axis.set_ticks(length - 1 - places if turned else places, [str(number) for number in numbers])
     axes.tick_params(which="both", length=0, labelsize=6, labelcolor=NOTE_COLOR, pad=1)
 

@@ -86,7 +86,7 @@ def object_tables(question: Question, settings: ObjectSettings | None = None, ke
             steps:
             mass        sum over patches of row x covered area, mean over replans
             share       mass / mass of all patches of all cameras, mean over replans
-            area_share  covered area / area of these cameras' pictures, mean over replans
+            area_share  covered area / area of all patches of these cameras, mean over replans
             enrichment  share of this camera's mass / area_share, of these means: 1 is what attention gives that is
                         uniform over the picture. A mean of quotients would give a sliver that is in sight at one
                         replan as much weight as all other replans. Of all cameras together: sum W S / sum W A, with W
@@ -102,8 +102,8 @@ def object_tables(question: Question, settings: ObjectSettings | None = None, ke
         pointing: with `settings.spatial`, one row per (episode, layer or "layers_avg"[, head], camera, item): means
             over denoise steps and over the replans at which the item has a mask (`mask_replans` of `num_replans`; null
             where there is none):
-            mask_patches                          number of patches of the mask
-            centre_row, centre_column             centre of attention in patch units, of this camera's map
+            mask_patches                          number of cells of the mask (`View`: patches, or those of the map)
+            centre_row, centre_column             centre of attention in cells of this camera's map
             centre_row_share, centre_column_share the same as a part of the picture's height and width
             distance, distance_uniform            from it, and from the middle of the picture, to the object's centre
             pointing, pointing_chance             pointing game, and the share of patches that would score
@@ -240,7 +240,7 @@ def _measure_episode(
     measured = {view.camera: _Measured() for view in views}
     heads = len(selection.heads) if selection.per_head else 1
     cells = (item.tokens.num_replans, len(selection.layers), len(selection.denoise), heads)
-    maps = {view.camera: np.zeros((*cells[:2], heads, view.grid.num_patches)) for view in views}
+    maps = {view.camera: np.zeros((*cells[:2], heads, len(view.picture.keys))) for view in views}
     waiting: dict[str, list[NDArray[np.float32]]] = {view.camera: [] for view in views}
     places: list[tuple[int, int]] = []
     done = 0
@@ -250,11 +250,11 @@ def _measure_episode(
             rows = rows.copy()
             rows[:, :, list(item.without)] = 0.0
         for view in views:
-            own = rows[:, :, view.span.start : view.span.stop]
+            own = rows.take(view.picture.keys, axis=-1)
             maps[view.camera][:, part.layer] += own / len(selection.denoise)
             mass = np.matmul(own, view.area).astype(np.float64)
             _put(measured[view.camera].by_item, "mass", mass[:, None], [(part.layer, part.denoise)], cells)
-            waiting[view.camera].append(own.copy())
+            waiting[view.camera].append(own)
         places.append((part.layer, part.denoise))
         if len(places) * heads >= _MAPS_TOGETHER or len(places) == cells[1] * cells[2] - done:
             for view in views:
@@ -301,7 +301,10 @@ def _measure_maps(maps: NDArray[np.float32], view: View, settings: ObjectSetting
     by_map = {"camera_mass": maps.sum(axis=-1, dtype=np.float64)}
     if not settings.spatial:
         return _Measured(by_map, by_item)
-    rows, columns = view.grid.rows, view.grid.columns
+    picture = view.picture
+    rows, columns = picture.rows, picture.columns
+    if not picture.cells_are_patches:
+        maps = picture.spread(maps).reshape(*maps.shape[:-1], -1)
     centre = centre_of_mass(maps, view.centres)
     by_map |= {"centre_row": centre[..., 0], "centre_column": centre[..., 1]}
     distance = distance_in_pictures(centre[:, :, None, :], view.item_centres[:, None], rows, columns)
@@ -341,7 +344,7 @@ def _shares(episode: _Episode) -> dict[str, _Shares]:
     of_camera = {view.camera: over_denoise(measured[view.camera].by_map["camera_mass"])[..., None] for view in views}
     image = np.asarray(sum(of_camera.values()))
     area = {view.camera: view.area.sum(axis=1, dtype=np.float64) for view in views}
-    patches = {view.camera: view.grid.num_patches for view in views}
+    patches = {view.camera: len(view.picture.keys) for view in views}
 
     def enrichment(cameras: Sequence[str]) -> Array:
         """Sum W S / sum W A over cameras, see `object_tables`."""
@@ -399,7 +402,7 @@ def _pointing_part(episode: _Episode) -> pl.DataFrame:
         by_replan = {
             "mask_patches": view.sizes.astype(np.float64),
             "distance_uniform": distance_of_uniform(view),
-            "pointing_chance": mask_sizes(view.hit_masks) / view.grid.num_patches,
+            "pointing_chance": mask_sizes(view.hit_masks) / (view.picture.rows * view.picture.columns),
         }
         values: dict[str, NDArray[np.float64] | NDArray[np.int64]] = {
             "num_replans": np.array([len(there)]),
@@ -430,7 +433,7 @@ def _over_steps(episode: _Episode, values: Array) -> Array:
 
 
 def _centres(view: View, measured: _Measured) -> dict[str, Array]:
-    sides = {"centre_row": view.grid.rows, "centre_column": view.grid.columns}
+    sides = {"centre_row": view.picture.rows, "centre_column": view.picture.columns}
     places = {name: measured.by_map[name] for name in sides}
     return places | {f"{name}_share": places[name] / length for name, length in sides.items()}
 

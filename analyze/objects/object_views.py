@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.patch_maps import seen_cameras
+from vla_attention.analyze.measures.patch_maps import PictureMap, seen_cameras
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.pointing_and_iou import (
@@ -24,7 +24,6 @@ from vla_attention.analyze.objects.pointing_and_iou import (
 from vla_attention.analyze.stores.selection import site_that
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import SceneObject
-from vla_attention.schemas.layout import PatchGrid, Span
 from vla_attention.schemas.stores.store_format import RootAttributes
 
 #: Stands for all cameras together in the column `camera`.
@@ -40,19 +39,19 @@ class View:
 
     Attributes:
         camera: its name.
-        span: its keys.
-        grid: how they tile the picture.
+        picture: its patches, and how they lie on the map of its picture, whose cells are counted below. Of one grid
+            over the whole picture these are its patches; of several grids a cell shows what the smallest patch there
+            shows.
         area: covered share of each patch (replan, patch, item) float32, 0..1.
-        masks: 1 for the patches that belong to an item, else 0, (replan, patch, item) float32.
-        hit_masks: `masks` with the patches that count as hits in the pointing game.
-        sizes: number of patches of each mask, (replan, item).
-        centres: of the patches, (patch, 2).
+        masks: 1 for the cells that belong to an item, else 0, (replan, cell, item) float32.
+        hit_masks: `masks` with the cells that count as hits in the pointing game.
+        sizes: number of cells of each mask, (replan, item).
+        centres: of the cells, (cell, 2).
         item_centres: of the items, weighted by covered area, (replan, item, 2); NaN where there is none.
     """
 
     camera: str
-    span: Span
-    grid: PatchGrid
+    picture: PictureMap
     area: NDArray[np.float32]
     masks: NDArray[np.float32]
     hit_masks: NDArray[np.float32]
@@ -74,9 +73,9 @@ def site_of_pictures(root: RootAttributes, wanted: str | None) -> str:
     Raises:
         BadArgument: the wanted site, or every site, has no camera.
     """
-    site = site_that(root, wanted, lambda site: bool(site.cameras))
+    site = site_that(root, wanted, lambda site: bool(site.pictured))
     if site is None:
-        seeing = [site.name for site in root.sites if site.cameras]
+        seeing = [site.name for site in root.sites if site.pictured]
         raise BadArgument(
             f"Site '{wanted or root.sites[0].name}' has no pictures; choose one with --site: {', '.join(seeing)}."
         )
@@ -106,25 +105,24 @@ def views_of(item: SelectedEpisode, members: NDArray[np.float32], settings: Obje
     views = []
     coverage = item.tokens.coverage or {}
     for camera in cameras_of(item):
-        span = item.tokens.layout.camera_span(camera)
-        grid = span.grid
-        assert grid is not None
+        picture = PictureMap.of(item.tokens.layout, camera)
+        rows, columns = picture.rows, picture.columns
         # Areas of objects add up to that of their class; the sum may exceed 1 by rounding.
         area = np.minimum(coverage[camera] @ members, np.float32(1.0))
-        masks = object_masks(area, settings.mask_coverage)
-        near = near_patches(grid.rows, grid.columns, settings.tolerance)
-        centres = patch_centres(grid.rows, grid.columns)
+        shown = area if picture.cells_are_patches else picture.finest(area.swapaxes(1, 2)).swapaxes(1, 2)
+        masks = object_masks(shown, settings.mask_coverage)
+        near = near_patches(rows, columns, settings.tolerance)
+        centres = patch_centres(rows, columns)
         views.append(
             View(
                 camera=camera,
-                span=span,
-                grid=grid,
+                picture=picture,
                 area=area,
                 masks=masks.astype(np.float32),
                 hit_masks=(grown(masks, near) if settings.spatial else masks).astype(np.float32),
                 sizes=mask_sizes(masks).astype(np.int64),
                 centres=centres,
-                item_centres=centre_of_mass(area.transpose(0, 2, 1), centres),
+                item_centres=centre_of_mass(shown.transpose(0, 2, 1), centres),
             )
         )
     return views
@@ -132,7 +130,7 @@ def views_of(item: SelectedEpisode, members: NDArray[np.float32], settings: Obje
 
 def distance_of_uniform(view: View) -> Array:
     """Distance from the picture's middle, where a uniform map has its centre, to every item's, shape (replan, item)."""
-    rows, columns = view.grid.rows, view.grid.columns
+    rows, columns = view.picture.rows, view.picture.columns
     return distance_in_pictures(np.array([rows / 2, columns / 2]), view.item_centres, rows, columns)
 
 

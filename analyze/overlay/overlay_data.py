@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.aggregate import overall_layer, replans_of
 from vla_attention.analyze.measures.frames import Axis, long_table, rows_of_episode
-from vla_attention.analyze.measures.patch_maps import mean_rows, mean_uniform, seen_cameras
+from vla_attention.analyze.measures.patch_maps import PictureMap, map_note, mean_rows, mean_uniform, seen_cameras
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, check_replan
 from vla_attention.analyze.overlay.colours import (
@@ -27,7 +27,7 @@ from vla_attention.analyze.show.patch_pictures import upright
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.groupings.grouping import Grouping, parse_group_argument, with_groups
 from vla_attention.schemas.groupings.resolve import check_names, resolve
-from vla_attention.schemas.layout import Role
+from vla_attention.schemas.layout import Role, picture_size
 from vla_attention.schemas.stores.store_format import PolicyCameraView
 
 #: A group's patches are those of which it takes at least this share.
@@ -42,20 +42,24 @@ class EpisodeOverlay:
         item: the episode.
         env_step: environment step of each replan, (replan,).
         views: how each shown camera's picture was turned.
-        maps: by camera, mass of every patch (replan, row, column) in the stored orientation.
+        pictures: by camera, how its patches lie on its map.
+        maps: by camera, mass of every cell of its map (replan, row, column) in the stored orientation.
+        outside: by camera, mass of its keys that lie nowhere in the picture, (replan,).
         image_mass: mass of all image keys of all cameras, (replan,).
-        uniform_mass: by camera, what uniform attention gives every patch, (replan, row, column).
+        uniform_mass: by camera, what uniform attention gives every cell, (replan, row, column).
         num_image_keys: image keys of all cameras.
         ratio: ratio of the question's grouping at each replan (replan,), NaN where undefined; None when it has no
             ratio.
         uniform_ratio: what uniform attention would give, (replan,); None as above.
-        outlines: by group and camera, which patches the group takes, (replan or 1, row, column).
+        outlines: by group and camera, at which cells the group takes a patch, (replan or 1, row, column).
     """
 
     item: SelectedEpisode
     env_step: NDArray[np.int64]
     views: dict[str, PolicyCameraView]
+    pictures: dict[str, PictureMap]
     maps: dict[str, NDArray[np.float64]]
+    outside: dict[str, NDArray[np.float64]]
     image_mass: NDArray[np.float64]
     uniform_mass: dict[str, NDArray[np.float64]]
     num_image_keys: int
@@ -71,6 +75,11 @@ class EpisodeOverlay:
     def has_frames(self, camera: str) -> bool:
         """Whether the camera's pictures were stored."""
         return f"frames/{camera}" in self.item.episode.attributes.arrays
+
+    def share(self, camera: str, replan: int) -> float | None:
+        """Part of all image attention on the keys of a camera, those outside of its map too; None without any."""
+        of_image = self.image_mass[replan]
+        return float((self.maps[camera][replan].sum() + self.outside[camera][replan]) / of_image) if of_image else None
 
     def values(self, measure: Measure) -> dict[str, NDArray[np.float64]]:
         """By camera, what overlays show (replan, row, column); see `overlays.patch_values`."""
@@ -94,7 +103,7 @@ def camera_names(question: Question, wanted: Sequence[str] | None) -> tuple[str,
     """
     cameras = seen_cameras(question.selected[0])
     if not cameras:
-        sites = [site.name for site in question.stores[0].attributes.sites if site.cameras]
+        sites = [site.name for site in question.stores[0].attributes.sites if site.pictured]
         raise BadArgument(
             f"The keys of site '{question.site}' are no patches of pictures, so an overlay has nothing to show; "
             f"sites with cameras: {listing(sites)}. Choose with --site."
@@ -143,14 +152,12 @@ def episode_overlay(
     uniform_keys = uniform_keys * ((mean * valid).sum(axis=1) / (uniform_keys * valid).sum(axis=1))[:, None]
     attributes = item.store.attributes.policy
     by_name = {view.name: view for view in attributes.cameras}
-    maps, of_uniform, views = {}, {}, {}
-    for camera in cameras:
-        span = tokens.layout.camera_span(camera)
-        assert span.grid is not None
-        maps[camera], of_uniform[camera] = (
-            keys[:, span.start : span.stop].reshape(-1, span.grid.rows, span.grid.columns)
-            for keys in (mean, uniform_keys)
-        )
+    pictures = {camera: PictureMap.of(tokens.layout, camera) for camera in cameras}
+    maps, of_uniform, outside, views = {}, {}, {}, {}
+    for camera, picture in pictures.items():
+        maps[camera], of_uniform[camera] = (picture.spread(keys[:, picture.keys]) for keys in (mean, uniform_keys))
+        placeless = [span for span in tokens.layout.camera_spans(camera) if span.grid is None]
+        outside[camera] = sum((mean[:, span.start : span.stop].sum(axis=1) for span in placeless), np.zeros(len(mean)))
         views[camera] = by_name.get(camera, PolicyCameraView(camera, camera, True, False))
     ratio = uniform = None
     if question.grouping.ratio is not None:
@@ -162,31 +169,29 @@ def episode_overlay(
         item=item,
         env_step=item.episode.read("env_step").astype(np.int64),
         views=views,
+        pictures=pictures,
         maps=maps,
+        outside=outside,
         image_mass=(mean * image).sum(axis=1),
         uniform_mass=of_uniform,
         num_image_keys=int(image.sum(axis=1).max()),
         ratio=ratio,
         uniform_ratio=uniform,
-        outlines=_outlines(item, cameras, groups),
+        outlines=_outlines(item, pictures, groups),
     )
 
 
 def _outlines(
-    item: SelectedEpisode, cameras: Sequence[str], groups: Grouping | None
+    item: SelectedEpisode, pictures: Mapping[str, PictureMap], groups: Grouping | None
 ) -> dict[str, dict[str, NDArray[np.bool_]]]:
     if groups is None:
         return {}
     weights = resolve(groups, item.tokens).weights
-    outlines: dict[str, dict[str, NDArray[np.bool_]]] = {}
-    for i, name in enumerate(groups.names):
-        outlines[name] = {}
-        for camera in cameras:
-            span = item.tokens.layout.camera_span(camera)
-            assert span.grid is not None
-            taken = weights[:, span.start : span.stop, i] >= OUTLINE_WEIGHT
-            outlines[name][camera] = taken.reshape(-1, span.grid.rows, span.grid.columns)
-    return outlines
+    taken = {camera: weights[:, picture.keys] >= OUTLINE_WEIGHT for camera, picture in pictures.items()}
+    return {
+        name: {camera: picture.highest(taken[camera][..., i]) for camera, picture in pictures.items()}
+        for i, name in enumerate(groups.names)
+    }
 
 
 def check_outlines(question: Question, groups: Grouping | None) -> None:
@@ -205,9 +210,8 @@ def draw(
 ) -> NDArray[np.uint8]:
     """One overlay (row, column, 3), turned as a person sees the scene, with outlines."""
     frame = overlay.item.episode.read(f"frames/{camera}", replan) if overlay.has_frames(camera) else None
-    grid = overlay.item.tokens.layout.camera_span(camera).grid
-    assert grid is not None
-    image = overlay_image(frame, values[camera][replan], scale, smooth, (grid.image_height, grid.image_width))
+    size = picture_size([overlay.item.tokens.layout], camera)
+    image = overlay_image(frame, values[camera][replan], scale, smooth, size)
     for i, by_camera in enumerate(overlay.outlines.values()):
         member = by_camera[camera]
         color = outline_color(i)
@@ -216,10 +220,10 @@ def draw(
 
 
 def overlay_table(overlay: EpisodeOverlay, replans: Sequence[int]) -> pl.DataFrame:
-    """The numbers that overlays show, one row per (camera, replan, patch).
+    """The numbers that overlays show, one row per (camera, replan, cell of its map); see `PictureMap`.
 
-    `row` and `column` count in the stored picture, as selectors such as patch:CAMERA[r0:r1,c0:c1] do; `shown_row` and
-    `shown_column` in the picture as it is drawn.
+    `row` and `column` count in the stored picture, as selectors such as patch:CAMERA[r0:r1,c0:c1] do where the cells
+    are the patches of one grid; `shown_row` and `shown_column` in the picture as it is drawn.
     """
     lift, share = overlay.values("lift"), overlay.values("share")
     chosen = list(replans)
@@ -253,7 +257,7 @@ def chosen_replans(overlay: EpisodeOverlay, wanted: Sequence[int] | None, most: 
 
 
 def orientation_note(overlay: EpisodeOverlay) -> str:
-    """How the pictures were turned for display, in a sentence; empty when they are shown as stored."""
+    """How the pictures were turned for display, and what their maps add up and leave out; empty when nothing is so."""
     mirrored = [camera for camera, view in overlay.views.items() if view.mirrored]
     turned = [camera for camera, view in overlay.views.items() if not view.upright]
     notes = []
@@ -263,7 +267,11 @@ def orientation_note(overlay: EpisodeOverlay) -> str:
     if turned:
         which = "Pictures are" if len(turned) == len(overlay.views) else f"{listing(turned)}:"
         notes.append(f"{which} shown right way up; the model sees them upside down.")
+    layout = overlay.item.tokens.layout
+    for camera, beside in overlay.outside.items():
+        placed = overlay.maps[camera].sum()
+        notes.append(map_note(layout, camera, float(beside.sum() / max(beside.sum() + placed, np.finfo(float).tiny))))
     missing = [camera for camera in overlay.views if not overlay.has_frames(camera)]
     if missing:
         notes.append(f"No pictures were stored of {listing(missing)}: attention alone, on grey.")
-    return " ".join(notes)
+    return " ".join(note for note in notes if note)

@@ -93,7 +93,7 @@ def study_overlay(
         UserError: a subclass that says which name or number does not exist.
     """
     outlined = outline_grouping(settings.groups)
-    seeing = site_that(stores[0].attributes, settings.site, lambda site: bool(site.cameras))
+    seeing = site_that(stores[0].attributes, settings.site, lambda site: bool(site.pictured))
     question = ask(stores, replace(settings, groups=(), site=seeing or settings.site))
     check_outlines(question, outlined)
     shown = camera_names(question, cameras)

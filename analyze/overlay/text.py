@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from vla_attention.analyze.overlay.overlay_data import orientation_note
 from vla_attention.analyze.overlay.overlay_study import OverlayStudy
 from vla_attention.analyze.show.answer import Section
@@ -23,16 +25,16 @@ def overlay_sections(study: OverlayStudy) -> list[Section]:
         shown = {replan: upright(lift[camera][replan], overlay.views[camera]) for replan in study.replans}
 
         def share(replan: int) -> float:
-            of_image = overlay.image_mass[replan]
-            return float(100 * overlay.maps[camera][replan].sum() / of_image) if of_image else float("nan")
+            part = overlay.share(camera, replan)
+            return float("nan") if part is None else 100 * part
 
         def place(replan: int) -> str:
-            row, column = divmod(int(shown[replan].argmax()), shown[replan].shape[1])
+            row, column = divmod(int(np.nan_to_num(shown[replan]).argmax()), shown[replan].shape[1])
             return f"{row},{column}"
 
         return (
             number(f"{camera} %", share),
-            number("most", lambda replan: float(shown[replan].max())),
+            number("most", lambda replan: float(np.fmax.reduce(shown[replan], axis=None))),
             texts("at", place),
         )
 

@@ -325,8 +325,7 @@ def _view(
     scale: Scale,
     lifts: Mapping[str, NDArray[np.float64]],
 ) -> CameraView:
-    mass, of_image = overlay.maps[camera][replan].sum(), overlay.image_mass[replan]
-    share = f"{format_percent(mass / of_image if of_image else None, 0)} of image attention"
+    share = f"{format_percent(overlay.share(camera, replan), 0)} of image attention"
     lift = upright(lifts[camera][replan], overlay.views[camera])
     row, column = divmod(int(np.nan_to_num(lift).argmax()), lift.shape[1])
     peak = format_number(float(lift[row, column]))

@@ -181,7 +181,7 @@ class _EpisodeSummary:
 def _describe_span(span: Span, tokens: EpisodeTokens) -> str:
     codes = tokens.key_role[0, span.start : span.stop]
     roles = ", ".join(f"{Role(code).label} {int((codes == code).sum())}" for code in sorted(set(codes.tolist())))
-    grid = f"  {span.grid.rows} x {span.grid.columns} patches" if span.grid else ""
+    grid = f"  {span.grid.describe()}" if span.grid else ""
     growing = "  growing: generated one after another" if span.growing else ""
     return f"{span.name:<18} {span.start:>4}..{span.stop - 1:<4} {roles}{grid}{growing}"
 

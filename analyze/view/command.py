@@ -20,6 +20,7 @@ _EXAMPLES = """examples:
   vla-attention view runs/cubes.zarr reruns/cubes/no_text.zarr         a run beside its rerun
   vla-attention view hf://datasets/ORG/NAME/libero_10.zarr
   vla-attention view runs/cubes.zarr --port 8765 --no-open           on another machine, with ssh -L 8765:127.0.0.1:8765
+  vla-attention view runs/cubes.zarr --port 8765 --allow-host hub.example.org      behind a proxy, as JupyterHub
   vla-attention view runs/cubes.zarr --output public/cubes             a folder for a web server
 
 The page is served to this machine only, to whoever has the printed link, until Ctrl-C. It asks nothing of any other
@@ -38,6 +39,13 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses")
     parser.add_argument("--port", type=int, default=0, metavar="N", help="port of the page (default: any free one)")
+    parser.add_argument(
+        "--allow-host",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="also answer under this host's name, that of a proxy (JupyterHub, Open OnDemand); may be repeated",
+    )
     parser.add_argument("--no-open", action="store_true", help="print the link only")
     add_option(
         parser,
@@ -92,12 +100,18 @@ def _serve(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None
     from vla_attention.analyze.stores.prompt_notes import prompt_notes
     from vla_attention.analyze.view.server import ViewerServer
 
-    with ViewerServer(stores, arguments.port, keep_link=True) as server:
+    with ViewerServer(stores, arguments.port, allow_hosts=arguments.allow_host, keep_link=True) as server:
         again = f"; with --port {server.port} its link stays the same" if server.keeps_link else ""
         # At once, also into a file that somebody follows.
         for line in prompt_notes([(store.store, episode) for store in stores for episode in store.store.episodes]):
             print(f"note: {line}")
         print(f"The page: {server.link}\nIt is served to this machine only, until Ctrl-C{again}.", flush=True)
+        if arguments.allow_host:
+            print(
+                f"Behind a proxy: its address of port {server.port}, and then {server.token}/ (JupyterHub: "
+                f"https://{arguments.allow_host[0]}/user/NAME/proxy/{server.port}/{server.token}/).",
+                flush=True,
+            )
         if not arguments.no_open:
             open_in_browser(server.link)
         server.serve_forever()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hmac
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from urllib.parse import unquote_to_bytes
 
@@ -22,7 +23,8 @@ PAGE_FILES = {
 STORES_DOCUMENT = "stores.json"
 #: What of a store is served. Whatever else lies in its folder stays there.
 _STORE_FILES = ("zarr.json", INDEX_FILE, EPISODES_GROUP)
-_HOST = re.compile(r"(127\.0\.0\.1|localhost|\[::1\])(:[0-9]{1,5})?", re.IGNORECASE)
+_LOOPBACK = frozenset({"127.0.0.1", "localhost", "[::1]"})
+_HOST = re.compile(r"([0-9a-z_](?:[0-9a-z_.-]{0,252})|\[[0-9a-f:.]{2,45}\])(?::[0-9]{1,5})?")
 _SUMMARY = re.compile(r"([0-9]{1,4})\.summary\.json")
 
 
@@ -53,27 +55,38 @@ class Wanted:
     file: str = ""
 
 
-def is_loopback(host: str) -> bool:
-    """Whether the host that a request names is this machine's loopback.
+def name_of_host(host: str) -> str | None:
+    """The name of a host, in lower case, without the port that may follow it; None for what is none."""
+    match = _HOST.fullmatch(host.lower())
+    return match and match[1]
+
+
+def is_allowed(host: str, allowed: Collection[str] = ()) -> bool:
+    """Whether the host that a request names is this machine's loopback, or one of the allowed (`name_of_host`).
 
     A site elsewhere can let its own name mean 127.0.0.1 (DNS rebinding); the browser then sends that name.
     """
-    return _HOST.fullmatch(host) is not None
+    name = name_of_host(host)
+    return name is not None and (name in _LOOPBACK or name in allowed)
 
 
 def wanted(target: str, token: str, num_stores: int) -> Wanted:
-    """What the target of a request (`/TOKEN/PATH`) names.
+    """What the target of a request (`/TOKEN/PATH`) names; a proxy may have a path of its own before the token.
 
     Every part of the path is decoded once, and by itself: a slash, a backslash or a control character that appears then
     is refused, as is `..`.
 
     Raises:
-        WrongToken: it does not begin with the token.
+        WrongToken: it does not have the token.
         NothingThere: nothing of that name is served.
     """
     path = target.partition("?")[0]
-    first, *parts = path.removeprefix("/").split("/")
-    if not path.startswith("/") or not hmac.compare_digest(first.encode("utf-8", "replace"), token.encode()):
+    first, *parts = path.split("/")
+    if first:
+        raise WrongToken
+    while parts and parts[0] and not hmac.compare_digest(parts[0].encode("utf-8", "replace"), token.encode()):
+        del parts[0]
+    if not parts or not parts.pop(0):
         raise WrongToken
     if not parts:  # the link without its last slash; relative addresses of the page would miss the token
         raise NothingThere

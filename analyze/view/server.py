@@ -1,8 +1,8 @@
 """The viewer's web server: on the loopback only, for who has the link, and for files of the stores only.
 
 The link's secret part keeps out other users and programs of this machine, the check of the host keeps out sites that
-a browser has open, and the content security policy keeps the page from asking for anything elsewhere, whatever a store
-holds.
+a browser has open (the host of a proxy is allowed by its name), and the content security policy keeps the page from
+asking for anything elsewhere, whatever a store holds.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ from vla_attention.analyze.view.paths import (
     Wanted,
     WrongToken,
     byte_range,
-    is_loopback,
+    is_allowed,
+    name_of_host,
     wanted,
 )
 from vla_attention.analyze.view.served_stores import ServedStore, stores_document
@@ -80,18 +81,22 @@ class ViewerServer(ThreadingHTTPServer):
     Args:
         stores: what the page shows.
         port: of the link; 0 is any free one.
+        allow_hosts: names under which a proxy asks for the page, beside the loopback's.
         keep_link: whether to take the link that these stores had on this port before. `keeps_link` says whether they
             will have this one again.
 
     Raises:
-        BadArgument: the port cannot be had.
+        BadArgument: the port cannot be had, or an allowed host is no name of one.
     """
 
     daemon_threads = True
 
-    def __init__(self, stores: Sequence[ServedStore], port: int = 0, *, keep_link: bool = False) -> None:
+    def __init__(
+        self, stores: Sequence[ServedStore], port: int = 0, *, allow_hosts: Sequence[str] = (), keep_link: bool = False
+    ) -> None:
         if not 0 <= port < 2**16:
             raise BadArgument(f"Cannot use --port {port}; expected a number from 1 to 65535, or 0 for any free port.")
+        self.allowed = frozenset(map(_allowed_host, allow_hosts))
         self.stores = tuple(stores)
         folder = files("vla_attention.analyze.view") / "bundle"
         self.page = {name: (folder / name).read_bytes() for name in PAGE_FILES}
@@ -169,6 +174,23 @@ def _json(document: dict[str, Any]) -> Answer:
     return Answer.of(json.dumps(document, allow_nan=False).encode(), _JSON)
 
 
+def _allowed_host(given: str) -> str:
+    name = name_of_host(given)
+    if name is None:
+        raise BadArgument(
+            f"Cannot use --allow-host '{given}': expected the name of a host, as hub.example.org, without https:// and "
+            "without a path."
+        )
+    return name
+
+
+def _other_host(name: str) -> str:
+    return (
+        f"The page of vla-attention view is asked for as {name}, a host that it does not know. If that is the proxy "
+        f"through which you reach this machine (JupyterHub, Open OnDemand), start it again with --allow-host {name}."
+    )
+
+
 def _nothing() -> Answer:
     return Answer.refused(404, "There is nothing here.")
 
@@ -192,8 +214,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _answer(self) -> None:
         hosts = self.headers.get_all("Host", [])
-        if len(hosts) != 1 or not is_loopback(hosts[0].strip()):
-            self.send_error(403)
+        if len(hosts) != 1 or not is_allowed(hosts[0].strip(), self.server.allowed):
+            name = name_of_host(hosts[0].strip()) if len(hosts) == 1 else None
+            self.send_error(403, name and _other_host(name))
             return
         if "Content-Length" in self.headers or "Transfer-Encoding" in self.headers:
             self.send_error(400)
@@ -233,13 +256,14 @@ class _Handler(BaseHTTPRequestHandler):
                 self.close_connection = True
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Refuse a request, without a word of what it said, and close the connection."""
+        """Refuse a request, by `message` where it is a sentence of ours, and close the connection."""
         self.close_connection = True
         self.command = getattr(self, "command", None) or "GET"
         self.request_version = self.protocol_version  # of a request that is none, it is not known
         headers = {"Allow": "GET, HEAD"} if code in (405, 501) else {}
         status = 405 if code == 501 else code
-        self._send(Answer.refused(status, f"{HTTPStatus(status).phrase}.", **headers))
+        sentence = message if status == HTTPStatus.FORBIDDEN and message else f"{HTTPStatus(status).phrase}."
+        self._send(Answer.refused(status, sentence, **headers))
 
     def log_message(self, format: str, *args: object) -> None:
         """Nothing is printed: the terminal shows the link."""

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.effects.arguments import EffectSettings
-from vla_attention.capture.policies.policy import Policy, camera_grid
+from vla_attention.capture.policies.policy import Policy
 from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.layout import picture_size
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 
 #: Pictures of an episode that count, evenly over its replans: neighbours look alike, and each takes a millisecond.
@@ -58,8 +59,7 @@ def pictures_of(
         )
     fitting = []
     for camera in (view.name for view in policy.cameras):
-        grid = camera_grid(policy.sites, camera)
-        wanted = (grid.image_height, grid.image_width, 3)
+        wanted = (*picture_size(policy.sites, camera), 3)
         shapes = {
             tuple(one.attributes.arrays[f"frames/{camera}"].shape[1:]) if one.has(f"frames/{camera}") else ()
             for one in store.episodes

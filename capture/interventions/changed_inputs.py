@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.interventions.prompts import changed_instruction
-from vla_attention.capture.policies.policy import GivenInputs, camera_grid
-from vla_attention.schemas.errors import BadArgument, unknown_name
+from vla_attention.capture.policies.policy import GivenInputs
+from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.groupings.resolve import EmptyGroup
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import ImageChange, Interventions
-from vla_attention.schemas.layout import PatchGrid, SiteLayout
+from vla_attention.schemas.layout import PatchGrid, SiteLayout, camera_grids
 from vla_attention.schemas.stores.store_format import episode_name
 
 
@@ -100,9 +100,14 @@ def changed_picture(
         return noise(picture, np.random.default_rng((change.seed, *place)))
     if change.kind == "rotated":
         return rotated(picture)
-    grid = camera_grid(sites, change.camera)
+    grids = camera_grids(sites, change.camera)
     if change.kind == "shifted":
-        return shifted(picture, grid, change.rows, change.columns)
+        if len(grids) > 1 or not grids[0].covers_all:
+            raise BadArgument(
+                f"Cannot shift the picture of camera '{change.camera}' by patches: it has "
+                f"{listing(grid.describe() for grid in grids)}, and a shift needs one grid over the whole picture."
+            )
+        return shifted(picture, grids[0], change.rows, change.columns)
     patches = object_patches(change, context, known=allow_empty)
     if not patches.any() and not allow_empty:
         raise EmptyGroup(
@@ -110,7 +115,7 @@ def changed_picture(
             f"{episode_name(context.task_id, context.episode_index)}; add --allow-empty to leave such pictures as they "
             "are."
         )
-    mask = patch_pixels(patches, grid, picture.shape)
+    mask = patch_pixels(patches, grids, picture.shape)
     return masked(picture, mask) if change.kind == "masked" else filled(picture, mask)
 
 
@@ -174,11 +179,18 @@ def shifted(picture: Picture, grid: PatchGrid, rows: int, columns: int) -> Pictu
     return np.ascontiguousarray(picture[row[:, None], column[None, :]])
 
 
-def patch_pixels(patches: NDArray[np.bool_], grid: PatchGrid, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return the mask of the pixels that belong to the chosen patches (patch,), row by row from the top left."""
-    row = np.arange(shape[0]) * grid.rows // shape[0]
-    column = np.arange(shape[1]) * grid.columns // shape[1]
-    mask: NDArray[np.bool_] = patches.reshape(grid.rows, grid.columns)[row[:, None], column[None, :]]
+def patch_pixels(patches: NDArray[np.bool_], grids: Sequence[PatchGrid], shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Return the mask of the pixels that belong to the chosen patches (patch,) of a camera's grids, in order."""
+    mask = np.zeros(shape[:2], dtype=bool)
+    for grid in grids:
+        own, patches = patches[: grid.num_patches], patches[grid.num_patches :]
+        if grid.covers_all:
+            row = np.arange(shape[0]) * grid.rows // shape[0]
+            column = np.arange(shape[1]) * grid.columns // shape[1]
+            mask |= own.reshape(grid.rows, grid.columns)[row[:, None], column[None, :]]
+        else:
+            down, across = grid.shares(*shape[:2])
+            mask |= (down > 0).T @ own.reshape(grid.rows, grid.columns) @ (across > 0)
     return mask
 
 

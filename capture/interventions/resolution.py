@@ -126,7 +126,7 @@ def site_tokens(
             key_role=key_role[layout.name][None],
             prompts=(prompt,) if reads else (),
             objects=tuple(objects),
-            coverage={camera: values[None] for camera, values in coverage.items() if camera in layout.cameras},
+            coverage={camera: values[None] for camera, values in coverage.items() if camera in layout.pictured},
         )
     return tokens
 
@@ -144,7 +144,7 @@ def run_vocabularies(
             spans=tuple(span.name for span in layout.spans),
             roles=tuple(role.label for role in Role),
             words=tuple(dict.fromkeys(word for sentence in sentences for word in sentence)) if reads else (),
-            objects=tuple(thing.name for thing in objects) if layout.cameras else (),
+            objects=tuple(thing.name for thing in objects) if layout.pictured else (),
             layout=layout,
             sentences=sentences if reads else (),
         )

@@ -6,6 +6,7 @@ simulator, to episodes or to files.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
@@ -20,8 +21,7 @@ from vla_attention.capture.environments.base import (
 )  # policies and their users import it here
 from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
 from vla_attention.capture.recording.attention import AttentionEditor, FactorEditor, RowCollector
-from vla_attention.schemas.errors import unknown_name
-from vla_attention.schemas.layout import PatchGrid, Prompt, SiteLayout
+from vla_attention.schemas.layout import Prompt, SiteLayout, picture_size
 from vla_attention.schemas.stores.store_format import PolicyCameraView, PolicyIdentity
 
 
@@ -228,15 +228,5 @@ class UnitsPolicy(Protocol):
 
 def stored_picture_sizes(policy: Policy, image_size: int) -> list[int]:
     """Return the bytes of every picture that is stored of a call; image_size: side of the cameras' own pictures."""
-    grids = [camera_grid(policy.sites, camera.name) for camera in policy.cameras]
-    sizes = [grid.image_height * grid.image_width * 3 for grid in grids]
-    return sizes + [image_size**2 * 3] * len(grids) * policy.needs_camera_frames
-
-
-def camera_grid(sites: Sequence[SiteLayout], camera: str) -> PatchGrid:
-    """Return how the patches of a camera tile its model image, from the site that has the camera's keys."""
-    for site in sites:
-        for span in site.spans:
-            if span.camera == camera and span.grid is not None:
-                return span.grid
-    raise unknown_name("camera", camera, [name for site in sites for name in site.cameras])
+    sizes = [math.prod(picture_size(policy.sites, camera.name)) * 3 for camera in policy.cameras]
+    return sizes + [image_size**2 * 3] * len(sizes) * policy.needs_camera_frames

@@ -22,7 +22,7 @@ from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.machine.provenance import describe_machine
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.identity import downloads_of
-from vla_attention.capture.policies.policy import Policy, PolicyInput, camera_grid
+from vla_attention.capture.policies.policy import Policy, PolicyInput
 from vla_attention.capture.policies.robot import Robot
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, DataSetFrame, LeRobotDataset
 from vla_attention.capture.replay.replay_plan import (
@@ -42,6 +42,7 @@ from vla_attention.capture.rollout.recording_plan import plan_recording, recordi
 from vla_attention.capture.store.episode_writer import EpisodeWriter
 from vla_attention.capture.store.store_writer import RunStore, open_run
 from vla_attention.schemas.errors import listing
+from vla_attention.schemas.layout import picture_size
 
 
 class RobotPolicy(Policy, Protocol):
@@ -160,8 +161,7 @@ def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: 
 
 def _picture_sizes(data: LeRobotDataset, policy: RobotPolicy) -> list[int]:
     """Return the bytes of every picture that is stored of a call."""
-    grids = [camera_grid(policy.sites, camera.name) for camera in policy.cameras]
-    sizes = [grid.image_height * grid.image_width * 3 for grid in grids]
+    sizes = [math.prod(picture_size(policy.sites, camera.name)) * 3 for camera in policy.cameras]
     if policy.needs_camera_frames:
         sizes += [math.prod(data.feature(camera.source).shape) for camera in policy.cameras]
     return sizes

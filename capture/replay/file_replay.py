@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +11,6 @@ import torch
 
 from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.policies.noise import noise_seed
-from vla_attention.capture.policies.policy import camera_grid
 from vla_attention.capture.policies.robot import NONE, RobotData
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode
 from vla_attention.capture.replay.policy_file import ReplayPolicy
@@ -32,6 +32,7 @@ from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.session import RecordedRun
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions, RerunSource
+from vla_attention.schemas.layout import picture_size
 from vla_attention.schemas.stores.root import read_run
 from vla_attention.schemas.stores.store_format import RootAttributes
 
@@ -127,8 +128,7 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
     )
     if base is not None:
         _check_base(arguments.rerun_of, base[0], run.attributes)
-    grids = [camera_grid(run.attributes.sites, camera) for camera in cameras]
-    sizes = [grid.image_height * grid.image_width * 3 for grid in grids]
+    sizes = [math.prod(picture_size(run.attributes.sites, camera)) * 3 for camera in cameras]
     with run:
         todo = announce(plan, run.attributes, layout.action_horizon, sizes)
         seed = plan.seed if interventions.noise is None else interventions.noise.seed

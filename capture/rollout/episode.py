@@ -16,7 +16,7 @@ from vla_attention.capture.effects.measurement import EffectMeasurement, Episode
 from vla_attention.capture.environments.base import Environment, Moment, Task
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
 from vla_attention.capture.interventions.run_changes import RunChanges
-from vla_attention.capture.policies.policy import Policy, camera_grid
+from vla_attention.capture.policies.policy import Policy
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.rollout.episode_loop import EpisodeResult, StepReport, episode_start
 from vla_attention.capture.rollout.observation_checks import ObservationChecks
@@ -27,6 +27,7 @@ from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.episode_steps import EpisodeSteps
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.layout import camera_grids
 from vla_attention.schemas.stores.store_format import Protocol, episode_name
 
 
@@ -91,10 +92,7 @@ def recorded_times(run: EpisodeRun) -> NDArray[np.float64]:
 
 def policy_cameras(policy: Policy) -> tuple[CameraPatches, ...]:
     """Return the policy's cameras with their patches."""
-    grids = [camera_grid(policy.sites, camera.name) for camera in policy.cameras]
-    return tuple(
-        CameraPatches(camera, grid.rows, grid.columns) for camera, grid in zip(policy.cameras, grids, strict=True)
-    )
+    return tuple(CameraPatches(camera, camera_grids(policy.sites, camera.name)) for camera in policy.cameras)
 
 
 @dataclass

@@ -9,6 +9,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from vla_attention.capture.environments.robosuite_installation import first_exce
 from vla_attention.schemas.episode_steps import TaskGoal
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.layout import PatchGrid
 from vla_attention.schemas.stores.store_format import PolicyCameraView, Protocol
 
 #: Raises an exception when the process shall stop.
@@ -68,11 +70,10 @@ def failure(title: str, error: Exception) -> SimulationFailed:
 
 @dataclass(frozen=True)
 class CameraPatches:
-    """A camera of the policy, and the rows and columns of the patches that tile its model image."""
+    """A camera of the policy, and the grids of patches that tile its model image, in key order."""
 
     view: PolicyCameraView
-    rows: int
-    columns: int
+    grids: tuple[PatchGrid, ...]
 
 
 @dataclass(frozen=True)
@@ -188,11 +189,10 @@ class Simulation:
                     f"The segmentation has the shape {segmentation.shape} and type {segmentation.dtype}; expected "
                     f"whole numbers for the picture's {expected} pixels."
                 )
-            return patch_coverage(
+            return camera_coverage(
                 segmentation,
                 len(self.environment.objects),
-                camera.rows,
-                camera.columns,
+                camera.grids,
                 flip_rows=view.upright,
                 flip_columns=view.mirrored,
                 visible=view.visible,
@@ -200,3 +200,32 @@ class Simulation:
         except BadArgument as error:
             where = f"replan {self._replan} (environment step {self.protocol.wait_steps + self._step}) of {self._what}"
             raise BadArgument(f"Cannot store {where}, camera '{view.source}': {error}") from None
+
+
+def camera_coverage(
+    segmentation: NDArray[np.integer],
+    num_objects: int,
+    grids: Sequence[PatchGrid],
+    *,
+    flip_rows: bool = False,
+    flip_columns: bool = False,
+    visible: float = 1.0,
+) -> NDArray[np.float32]:
+    """Return the share of every patch of a camera's grids that each object covers, (patch, object).
+
+    grids: of `schemas.layout.camera_grids`; their patches follow each other. Other arguments: as in `patch_coverage`.
+    """
+    cover = partial(
+        patch_coverage, segmentation, num_objects, flip_rows=flip_rows, flip_columns=flip_columns, visible=visible
+    )
+    of_grids = []
+    for grid in grids:
+        if grid.covers_all:
+            of_grids.append(cover(grid.rows, grid.columns))
+            continue
+        height, width = segmentation.shape
+        down, across = grid.shares(height, width)
+        pixels = cover(height, width).reshape(height, width, num_objects)
+        covered = np.einsum("ih,hwo,jw->ijo", down, pixels, across, optimize=True)
+        of_grids.append(covered.reshape(grid.num_patches, num_objects).astype(np.float32))
+    return np.concatenate(of_grids)

@@ -111,14 +111,14 @@ def estimate_disk(
         total += 4 * site.num_keys * _INCOMPRESSIBLE + _CHUNK_OVERHEAD
         total += chunks * 4 * (segments + 1) ** 2 * _INCOMPRESSIBLE if recording.contributions else 0
         total += sum(_BYTES_PER_PIECE * span.num_keys for span in site.spans if span.kind == "text")
-        total += sum(_COVERAGE_BYTES_PER_PATCH * span.num_keys for span in site.spans if span.camera is not None)
+        total += sum(_COVERAGE_BYTES_PER_PATCH * span.num_keys for span in site.spans if span.grid is not None)
     return DiskEstimate(int(total), replans, episodes, _most_inodes(recording, sites, len(picture_sizes)))
 
 
 def _most_inodes(recording: Recording, sites: Sequence[SiteLayout], pictures: int) -> int:
     """Most files and folders of an episode: an array is a folder with two files, a group a folder with one."""
     effects, frames = recording.effects is not None, pictures if recording.frames else 0
-    cameras = sum(span.camera is not None for site in sites for span in site.spans)
+    cameras = sum(span.grid is not None for site in sites for span in site.spans)
     # Of a site: rows, sums, atoms, roles, uniform attention. Once: actions and state, three arrays of the steps.
     arrays = len(sites) * (5 + recording.contributions + effects) + 2 + 3 + frames + cameras + effects
     # The episode, its seal and steps, its sites; pictures twice, objects, effects.
@@ -128,7 +128,7 @@ def _most_inodes(recording: Recording, sites: Sequence[SiteLayout], pictures: in
 
 def _bytes_of_effects(effects: EffectsRecorded, horizon: int, sites: Sequence[SiteLayout]) -> float:
     """Bytes of the effects of one replan, with `_MOST_ITEMS` of each kind."""
-    cameras = sum(span.camera is not None for site in sites for span in site.spans)
+    cameras = sum(len(site.cameras) for site in sites)
     tokens = sum(span.num_keys for site in sites for span in site.spans if span.kind == "text")
     counts = {"text": _MOST_ITEMS, "cameras": 2 + 2 * cameras, "objects": _MOST_ITEMS, "tokens": tokens}
     entries = len(effects.readers) * sum(counts[item] for item in effects.items) + _MOST_ITEMS

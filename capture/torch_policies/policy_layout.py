@@ -13,7 +13,15 @@ from functools import lru_cache
 from typing import Literal
 
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
-from vla_attention.schemas.layout import ROLES_OF_KIND, Role, SiteLayout, Span, find_role
+from vla_attention.schemas.layout import (
+    ROLES_OF_KIND,
+    Role,
+    SiteLayout,
+    Span,
+    find_role,
+    kinds_and_roles,
+    picture_size,
+)
 from vla_attention.schemas.safe_text import check_name, check_text
 
 #: How a picture becomes the model's input image: its sides stretched; padded on two sides; padded left and on top only.
@@ -134,7 +142,7 @@ class RecordedSite:
                 raise unknown_name("span", given, names)
         missing = [name for name in names if name not in self.role_of_span]
         if missing:
-            raise BadArgument(f"Site '{self.name}' says no role for the spans {listing(missing)}.")
+            raise BadArgument(f"Site '{self.name}' says no role for the spans {listing(missing)}. {kinds_and_roles()}.")
         for span in self.keys.spans:
             self._check_role(span)
         start, stop = self.action_queries
@@ -142,15 +150,21 @@ class RecordedSite:
             raise BadArgument(f"Site '{self.name}' has the action queries {start}..{stop}, which are none.")
 
     def _check_role(self, span: Span) -> None:
-        """Raise an error unless keys of the span's kind can have the role that is given for them."""
-        if span.kind not in ROLES_OF_KIND:
-            raise unknown_name("kind of span", span.kind, ROLES_OF_KIND)
-        allowed = ROLES_OF_KIND[span.kind]
-        if self.role_of(span) not in allowed:
-            raise BadArgument(
-                f"Site '{self.name}' gives the span '{span.name}' of kind '{span.kind}' the role "
-                f"'{self.role_of_span[span.name]}'; its keys can be {listing(role.label for role in allowed)}."
-            )
+        """Raise an error unless the span's kind and the role that is given for its keys exist and fit together."""
+        kind, role = span.kind, self.role_of_span[span.name]
+        if kind not in ROLES_OF_KIND:
+            wrong = f"there is no kind '{kind}'"
+        elif str(role).casefold() not in [known.label for known in Role]:
+            wrong = f"there is no role '{role}'"
+        elif self.role_of(span) not in ROLES_OF_KIND[kind]:
+            wrong = "they do not fit together"
+        else:
+            return
+        raise BadArgument(
+            f"Site '{self.name}' gives the span '{span.name}' the kind '{kind}' and the role '{role}': {wrong}. "
+            f"{kinds_and_roles()}. Tokens that the policy itself adds, such as one for the time, registers and learned "
+            "queries, are of the kind state with the role learned."
+        )
 
     @property
     def name(self) -> str:
@@ -276,6 +290,9 @@ class PolicyLayout:
         """Raise `BadArgument` with everything that does not fit together."""
         check_text("policy's name", self.name)
         check_text("policy's family", self.family)
+        sites = [site.keys for site in self.sites]
+        for camera in dict.fromkeys(camera for site in sites for camera in site.pictured):
+            picture_size(sites, camera)  # raises the error that names the sizes, where sites have other ones
         if problems := list(self._problems()):
             raise BadArgument(f"The layout of '{self.name}' is wrong: {'; '.join(problems)}.")
 

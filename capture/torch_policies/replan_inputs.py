@@ -11,12 +11,11 @@ from typing import Any, SupportsIndex
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.environments.coverage import patch_coverage
-from vla_attention.capture.policies.policy import camera_grid
+from vla_attention.capture.rollout.simulation import camera_coverage
 from vla_attention.capture.torch_policies.policy_layout import PictureFit, PolicyLayout
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing, unknown_name
 from vla_attention.schemas.groupings.vocabulary import SceneObject
-from vla_attention.schemas.layout import PatchGrid, Prompt
+from vla_attention.schemas.layout import Prompt, camera_grids, picture_size
 from vla_attention.schemas.safe_text import check_text
 
 
@@ -150,17 +149,15 @@ def read_inputs(
         for camera in values.get(what, ()):
             if camera not in cameras:
                 raise unknown_name(f"camera of {what}", camera, cameras)
+    pictures = values.get("frames", {})
     frames = {
-        camera: model_picture(values["frames"][camera], camera, camera_grid(sites, camera), fits.get(camera, "stretch"))
+        camera: model_picture(pictures[camera], camera, picture_size(sites, camera), fits.get(camera, "stretch"))
         for camera in cameras
-        if camera in values.get("frames", ())
+        if camera in pictures
     }
     coverage = {camera: np.asarray(array, dtype=np.float32) for camera, array in values.get("coverage", {}).items()}
     for camera, mask in values.get("masks", {}).items():
-        grid = camera_grid(sites, camera)
-        coverage[camera] = patch_coverage(
-            np.asarray(mask), len(facts.objects), grid.rows, grid.columns, flip_rows=False, flip_columns=False
-        )
+        coverage[camera] = camera_coverage(np.asarray(mask), len(facts.objects), camera_grids(sites, camera))
     seed = values.get("noise_seed", facts.seed)
     return ReplanInputs(
         env_step=whole_number("env_step of a replan", env_step),
@@ -229,7 +226,7 @@ def read_actions(given: Any) -> NDArray[np.float64] | None:
     return actions
 
 
-def model_picture(picture: Any, camera: str, grid: PatchGrid, fit: PictureFit) -> NDArray[np.uint8]:
+def model_picture(picture: Any, camera: str, size: tuple[int, int], fit: PictureFit) -> NDArray[np.uint8]:
     """Return a camera's picture as (height, width, 3) uint8 of the model's input size.
 
     picture: (height, width, 3) uint8, or (3, height, width) with numbers from 0 to 1, as an array or a tensor; a batch
@@ -239,7 +236,7 @@ def model_picture(picture: Any, camera: str, grid: PatchGrid, fit: PictureFit) -
         BadArgument: another shape or type.
     """
     levels = _levels(picture, camera)
-    height, width = grid.image_height, grid.image_width
+    height, width = size
     if levels.shape[:2] == (height, width):
         return levels
     if fit == "stretch":

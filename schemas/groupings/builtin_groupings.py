@@ -138,13 +138,17 @@ def reference(vocabulary: Vocabulary, text_keys: int | None = None) -> Grouping:
             proxy=True,
             published_denoise="last",
         )
-    images = [span.num_keys for span in spans if span.kind == "image"]
+    images = [span for span in spans if span.kind == "image"]
     if vocabulary.layout is None or not images or not any(span.kind == "text" for span in spans):
         raise GroupingError(
             "The grouping 'reference' is defined for the sites 'joint' (pi) and 'self' (Cosmos) only; "
             "choose with --site."
         )
-    first, wanted = images[0], PUBLISHED_TEXT_KEYS if text_keys is None else text_keys
+    # As many keys as the first camera has, in all of its spans.
+    own = [
+        span for span in images if span is images[0] or (span.camera is not None and span.camera == images[0].camera)
+    ]
+    first, wanted = sum(span.num_keys for span in own), PUBLISHED_TEXT_KEYS if text_keys is None else text_keys
     last = min(first + wanted, vocabulary.layout.num_keys) - 1
     if last < first:
         raise GroupingError(f"Cannot use the grouping 'reference:{wanted}': expected at least one text key.")

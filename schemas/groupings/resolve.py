@@ -179,8 +179,7 @@ def cell_coverage(tokens: EpisodeTokens) -> NDArray[np.float32]:
         )
     area = np.zeros((replans, keys, 1 + things), dtype=np.float32)
     for camera, coverage in (tokens.coverage or {}).items():
-        span = tokens.layout.camera_span(camera)
-        area[:, span.start : span.stop, 1:] = coverage
+        area[:, tokens.layout.patch_keys(camera), 1:] = coverage
     area[:, :, 0] = np.clip(1.0 - area[:, :, 1:].sum(axis=2), 0.0, 1.0)
     return area
 

@@ -21,8 +21,9 @@ from vla_attention.schemas.layout import SiteLayout, find_role
 #: The (key, cell) pairs that a selector takes, axes (replan or 1, key, cell or 1). `resolve` says what a cell is.
 Membership = NDArray[np.bool_]
 
+_NUMBER = r"[0-9]{0,9}(?:\.[0-9]{1,20})?"
 _PATCH = re.compile(
-    r"(?P<camera>[^\[]+)\[(?P<r0>[0-9]{0,9}):(?P<r1>[0-9]{0,9})\s*,\s*(?P<c0>[0-9]{0,9}):(?P<c1>[0-9]{0,9})\]"
+    rf"(?P<camera>[^\[]+)\[(?P<r0>{_NUMBER}):(?P<r1>{_NUMBER})\s*,\s*(?P<c0>{_NUMBER}):(?P<c1>{_NUMBER})\]"
 )
 _KEYS = re.compile(r"([0-9]{1,9})(?:-([0-9]{1,9}))?")
 _OBJECT_CLASSES = ("@interest", "@robot", "@background")
@@ -74,8 +75,10 @@ def _missing(kind: str, name: str, existing: Sequence[str]) -> str | None:
 
 
 def _camera_keys(argument: str, tokens: EpisodeTokens) -> Membership:
-    span = tokens.layout.camera_span(argument)
-    return _key_range(tokens, span.start, span.stop)
+    member = no_keys(tokens)
+    for span in tokens.layout.camera_spans(argument):
+        member[0, span.start : span.stop] = True
+    return member
 
 
 def _camera_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
@@ -182,8 +185,7 @@ def _object_keys(argument: str, tokens: EpisodeTokens) -> Membership:
         }.get(argument, thing.name == argument)
     covered = np.zeros(tokens.layout.num_keys, dtype=bool)
     for camera in tokens.coverage or {}:
-        span = tokens.layout.camera_span(camera)
-        covered[span.start : span.stop] = True
+        covered[tokens.layout.patch_keys(camera)] = True
     member: Membership = (covered[:, None] & chosen)[None]
     return member
 
@@ -199,22 +201,39 @@ def _object_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -
 def _patch_keys(argument: str, tokens: EpisodeTokens) -> Membership:
     match = _PATCH.fullmatch(argument)
     if match is None:
-        raise SelectorError(f"Cannot read selector 'patch:{argument}'; expected patch:CAMERA[r0:r1,c0:c1].")
-    span = tokens.layout.camera_span(match["camera"])
-    if span.grid is None:
-        raise SelectorError(f"Camera '{match['camera']}' has no patch grid.")
-    rows, columns = span.grid.rows, span.grid.columns
-    r0, r1 = int(match["r0"] or 0), int(match["r1"] or rows)
-    c0, c1 = int(match["c0"] or 0), int(match["c1"] or columns)
+        raise SelectorError(
+            f"Cannot read selector 'patch:{argument}'; expected patch:CAMERA[r0:r1,c0:c1] with rows and columns of "
+            "patches, or with fractions of the picture such as 0.5."
+        )
+    camera, ends = match["camera"], [match[name] for name in ("r0", "r1", "c0", "c1")]
+    grids = tokens.layout.grids(camera)
+    if not grids:
+        raise SelectorError(f"Camera '{camera}' has no patch grid.")
+    given = [end for end in ends if end]
+    fractions = any("." in end for end in given) or not given
+    if len(grids) > 1 and not fractions:
+        raise SelectorError(
+            f"Selector 'patch:{argument}' counts patches, and camera '{camera}' has {len(grids)} grids "
+            f"({listing(grid.describe() for grid in grids)}); expected fractions of the whole picture, which take "
+            f"patches of all of them, such as patch:{camera}[0.0:0.5,0.25:1.0]; & span:NAME takes one grid's."
+        )
+    rows, columns = (1, 1) if fractions else (grids[0].rows, grids[0].columns)
+    r0, r1, c0, c1 = (float(end) if end else last for end, last in zip(ends, (0, rows, 0, columns), strict=True))
     if not (0 <= r0 < r1 <= rows and 0 <= c0 < c1 <= columns):
         raise SelectorError(
-            f"Selector 'patch:{argument}' leaves the grid of camera '{match['camera']}', which has {rows} rows and "
+            f"Selector 'patch:{argument}' leaves the picture of camera '{camera}', whose sides are 1 in fractions; "
+            "expected 0 <= r0 < r1 <= 1 and 0 <= c0 < c1 <= 1."
+            if fractions
+            else f"Selector 'patch:{argument}' leaves the grid of camera '{camera}', which has {rows} rows and "
             f"{columns} columns of patches; expected 0 <= r0 < r1 <= {rows} and 0 <= c0 < c1 <= {columns}."
         )
-    grid = np.zeros((rows, columns), dtype=bool)
-    grid[r0:r1, c0:c1] = True
+    chosen = []
+    for grid in grids:
+        centres = grid.centres() if fractions else (np.arange(rows), np.arange(columns))
+        inside = [(first <= at) & (at < stop) for at, first, stop in zip(centres, (r0, c0), (r1, c1), strict=True)]
+        chosen.append(np.outer(*inside).ravel())
     member = no_keys(tokens)
-    member[0, span.start : span.stop, 0] = grid.ravel()
+    member[0, tokens.layout.patch_keys(camera), 0] = np.concatenate(chosen)
     return member
 
 
@@ -261,7 +280,7 @@ def _has_objects(vocabulary: Vocabulary, layout: SiteLayout) -> bool:
 
 
 SELECTOR_KINDS: dict[str, SelectorKind] = {
-    "camera": SelectorKind("the patches of one camera", _camera_keys, _camera_problem, _has_cameras),
+    "camera": SelectorKind("every key of one camera", _camera_keys, _camera_problem, _has_cameras),
     "role": SelectorKind("every key with one role", _role_keys, _role_problem),
     "span": SelectorKind("every key of one span", _span_keys, _span_problem),
     "frame": SelectorKind("every key of one latent frame", _frame_keys, _frame_problem, _has_frames),
@@ -281,8 +300,8 @@ SELECTOR_KINDS: dict[str, SelectorKind] = {
         _has_objects,
     ),
     "patch": SelectorKind(
-        "a region of a camera's patch grid: camera[r0:r1,c0:c1], rows and columns from the top left, "
-        "r1 and c1 excluded",
+        "a region of a camera's picture: camera[r0:r1,c0:c1], rows and columns of its patch grid from the top left, "
+        "r1 and c1 excluded, or fractions of the picture, such as 0.5, by the patches' centres",
         _patch_keys,
         _patch_problem,
         _has_cameras,

@@ -15,7 +15,17 @@ from numpy.typing import NDArray
 
 from vla_attention.schemas.episode_steps import POSE, POSES
 from vla_attention.schemas.errors import listing
-from vla_attention.schemas.layout import INVALID_ROLES, ROLES_OF_KIND, Piece, Prompt, Role, SiteLayout, Span
+from vla_attention.schemas.layout import (
+    INVALID_ROLES,
+    ROLES_OF_KIND,
+    Piece,
+    Prompt,
+    Role,
+    SiteLayout,
+    Span,
+    camera_grids,
+    picture_size,
+)
 from vla_attention.schemas.precision import mass_error_bound
 from vla_attention.schemas.stores.store_format import Recording
 
@@ -279,11 +289,10 @@ def picture_problems(
     sites: Sequence[SiteLayout], camera: str, shape: tuple[int, ...], dtype: np.dtype[Any]
 ) -> Iterator[str]:
     """A camera's picture (row, column, channel): of a known camera, uint8, and of the size that its patches tile."""
-    grid = _grids(sites).get(camera)
-    if grid is None:
-        yield f"frames/{camera} is of a camera that no site has; existing: {listing(_grids(sites))}"
+    if camera not in (cameras := _cameras(sites)):
+        yield f"frames/{camera} is of a camera that no site has; existing: {listing(cameras)}"
         return
-    expected = (grid.image_height, grid.image_width, 3)
+    expected = (*picture_size(sites, camera), 3)
     if (shape, dtype) != (expected, np.dtype(np.uint8)):
         yield f"frames/{camera} has pictures of shape {shape} and type {dtype}; expected {expected} and uint8"
 
@@ -292,8 +301,8 @@ def camera_picture_problems(
     sites: Sequence[SiteLayout], camera: str, shape: tuple[int, ...], dtype: np.dtype[Any]
 ) -> Iterator[str]:
     """A camera's own picture (row, column, channel), of any size: of a known camera, uint8, three channels."""
-    if camera not in _grids(sites):
-        yield f"camera_frames/{camera} is of a camera that no site has; existing: {listing(_grids(sites))}"
+    if camera not in (cameras := _cameras(sites)):
+        yield f"camera_frames/{camera} is of a camera that no site has; existing: {listing(cameras)}"
     elif len(shape) != 3 or shape[-1] != 3 or dtype != np.dtype(np.uint8):
         yield (
             f"camera_frames/{camera} has pictures of shape {shape} and type {dtype}; expected (height, width, 3) and "
@@ -310,15 +319,15 @@ def coverage_problems(
 ) -> Iterator[str]:
     """Coverage (replan, patch, object): of a known camera, float32; shares of each patch that sum to 1."""
     name = f"objects/{camera}"
-    grid = _grids(sites).get(camera)
-    if grid is None:
-        yield f"{name} is of a camera that no site has; existing: {listing(_grids(sites))}"
+    if camera not in (cameras := _cameras(sites)):
+        yield f"{name} is of a camera that no site has; existing: {listing(cameras)}"
         return
-    expected = (grid.num_patches, num_objects)
+    grids = camera_grids(sites, camera)
+    expected = (sum(grid.num_patches for grid in grids), num_objects)
     if (coverage.shape[1:], coverage.dtype) != (expected, np.dtype(np.float32)):
         yield (
             f"{name} has the shape {coverage.shape[1:]} and type {coverage.dtype}; expected {expected} and float32: "
-            f"the camera's {grid.rows} x {grid.columns} patches, and the scene's objects"
+            f"the camera's {listing(grid.describe() for grid in grids)}, and the scene's objects"
         )
         return
     inside = (coverage >= 0) & (coverage <= 1 + _COVERAGE_TOLERANCE)
@@ -381,9 +390,9 @@ def step_problems(name: str, values: NDArray[np.float32], first: int = 0) -> Ite
             )
 
 
-def _grids(sites: Sequence[SiteLayout]) -> dict[str, Any]:
-    """The patch grid of each camera."""
-    return {span.camera: span.grid for site in sites for span in site.spans if span.camera and span.grid}
+def _cameras(sites: Sequence[SiteLayout]) -> list[str]:
+    """The cameras that have patches at some site."""
+    return list(dict.fromkeys(camera for site in sites for camera in site.pictured))
 
 
 def counter_problems(env_step: NDArray[np.integer], noise_seed: NDArray[np.integer]) -> Iterator[str]:

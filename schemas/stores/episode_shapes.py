@@ -123,9 +123,8 @@ def misfits(root: RootAttributes, attributes: EpisodeAttributes) -> Iterator[str
         for segment in attributes.segments.get(site.name, ()):
             if segment.span not in spans or segment.role not in _ROLES:
                 yield f"its segment '{segment.role}' of span '{segment.span}' is none of site '{site.name}'"
-        for span in site.spans:
-            if span.camera is not None:
-                shapes[f"objects/{span.camera}"] = (replans, span.num_keys, len(attributes.objects))
+        for camera in site.pictured:
+            shapes[f"objects/{camera}"] = (replans, len(site.patch_keys(camera)), len(attributes.objects))
     for name, shape in listed.items():
         yield from shape_problems(name, shape, shapes.get(name, (replans,)))
     yield from effect_misfits(root, attributes)

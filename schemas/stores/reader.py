@@ -343,7 +343,7 @@ class StoredEpisode:
     def coverage(self, root: RootAttributes, site: str) -> Mapping[str, NDArray[np.float32]]:
         """Object coverage (replan, patch, object) by camera of a site; of each camera read when it is asked for."""
         stored = [name.removeprefix("objects/") for name in self.attributes.arrays if name.startswith("objects/")]
-        return _StoredCoverage(self, [camera for camera in stored if camera in root.site(site).cameras])
+        return _StoredCoverage(self, [camera for camera in stored if camera in root.site(site).pictured])
 
 
 class _StoredCoverage(Mapping[str, NDArray[np.float32]]):

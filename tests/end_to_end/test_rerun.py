@@ -47,7 +47,7 @@ def test_a_libero_store_is_made_again_and_without_an_object_and_a_word(
         tokens = episode.tokens(store.attributes, site.name)
         rows = episode.read(f"{site.name}/rows")
         if camera in site.cameras:
-            span = site.camera_span(camera)
+            (span,) = site.camera_spans(camera)
             names = [thing.name for thing in tokens.objects]
             covered = np.asarray(tokens.coverage[camera])[..., names.index("alphabet_soup_1")]
             assert (covered > 0).any()

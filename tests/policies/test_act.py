@@ -58,7 +58,7 @@ def test_keys_are_the_latent_the_state_and_feature_maps_of_the_picture_s_shape(c
     store = record(case, tmp_path, tokenizer=None)
     assert roles_of(store, "cross") == ["learned", "state", *["image"] * (2 * ROWS * COLUMNS)]
     assert roles_of(store, "self") == ["action"] * CHUNK
-    grid = store.attributes.sites[0].camera_span("wrist").grid
+    (grid,) = store.attributes.sites[0].grids("wrist")
     assert (grid.rows, grid.columns, grid.image_height, grid.image_width) == (ROWS, COLUMNS, 64, 96)
 
 
@@ -73,7 +73,7 @@ def test_the_feature_map_s_order_is_row_by_row(case):
         case.call({**case.observation, name: picture})
     handle.remove()
     moved = (inputs[0] != inputs[1]).any(dim=-1)[:, 0].nonzero().flatten().tolist()
-    span = case.layout.site("cross").keys.camera_span("wrist")
+    (span,) = case.layout.site("cross").keys.camera_spans("wrist")
     assert moved == [span.start + 1 * COLUMNS + 1]
 
 

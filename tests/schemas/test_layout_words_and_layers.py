@@ -32,7 +32,7 @@ def test_a_layout_finds_spans_and_cameras():
     layout = SiteLayout("joint", (span("a", 0, 2, camera="cam"), span("b", 2, 5)))
     assert layout.num_keys == 5
     assert layout.span_of_key().tolist() == [0, 0, 1, 1, 1]
-    assert layout.camera_span("cam").name == "a"
+    assert [span.name for span in layout.camera_spans("cam")] == ["a"]
     with pytest.raises(LookupError, match="Existing: a, b"):
         layout.span("c")
 

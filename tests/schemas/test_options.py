@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import warnings
 
 import pytest
@@ -41,8 +42,23 @@ def test_an_output_is_a_store_or_a_folder():
 
 def test_ranges_and_numbers_are_one_list():
     assert parser().parse_args(["--layers", "0-2", "7", "9-9"]).layers == [0, 1, 2, 7, 9]
-    for wrong in ("2-1", "1-99999", "x", "1-", "1.5"):
-        with pytest.raises(argparse.ArgumentTypeError, match=f"^'{wrong}' is"):
+    assert parser().parse_args(["--layers", "0,5", "7-8,2", "3, 4", "1,"]).layers == [0, 5, 7, 8, 2, 3, 4, 1]
+    for wrong in (
+        "2-1",
+        "1-99999",
+        "x",
+        "1-",
+        "1.5",
+        "0;5",
+        "0..5",
+        "[0]",
+        ",",
+        "",
+        "0,,5",
+        "0,x",
+        ",".join(["0-9999"] * 2),
+    ):
+        with pytest.raises(argparse.ArgumentTypeError, match=f"^'{re.escape(wrong)}' is"):
             number_range(wrong)
 
 
@@ -55,11 +71,20 @@ def test_a_range_of_layers_stays_on_one_side_of_the_published_numbers():
     assert select_layers(range(16, 20), 28, "cosmos").blocks == (16, 17, 18, 19)
 
 
-def test_tasks_are_chosen_by_number_or_by_their_words():
+def test_tasks_are_chosen_by_number_or_by_their_words(capsys):
     given = parser().parse_args(["--task", "1-2", "LIFT the green cube", "0"]).task_id
     assert given == [1, 2, "LIFT the green cube", 0]
     assert resolve_tasks(given, INSTRUCTIONS, "the suite") == (1, 2, 0)
     with pytest.warns(Note, match="Tasks 0, 4 of the suite have the instruction 'lift the red cube': all of them"):
         assert resolve_tasks(["lift the red cube"], INSTRUCTIONS, "the suite") == (0, 4)
+    assert parser().parse_args(["--task", "0,5", "1, 2-3"]).task_id == [0, 5, 1, 2, 3]
+    assert resolve_tasks(["0,4", 1], INSTRUCTIONS, "the suite") == (0, 4, 1)
+    for wrong in ("0;5", "0..5", "[0, 5]", "0:5", "#3", ",", ""):  # no letter, so no instruction
+        with pytest.raises(SystemExit):
+            parser().parse_args(["--task", wrong])
+        assert f"'{wrong}' is" in capsys.readouterr().err
+        with pytest.raises(BadArgument, match=f"'{re.escape(wrong)}' is"):
+            resolve_tasks([wrong], INSTRUCTIONS, "the suite")
+    assert resolve_tasks(["1, 2, 3!"], {7: "1, 2, 3!"}, "the suite") == (7,)
     with pytest.raises(UnknownName, match="Did you mean 'lift the green cube'"):
         resolve_tasks(["lift the gren cube"], INSTRUCTIONS, "the suite")

@@ -31,7 +31,7 @@ from vla_attention.schemas.episode_steps import HAND, EpisodeSteps, TaskGoal
 from vla_attention.schemas.groupings.key_counts import uniform_of_roles
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange, RerunSource
-from vla_attention.schemas.layout import Role, SiteLayout
+from vla_attention.schemas.layout import Role, SiteLayout, picture_size
 from vla_attention.schemas.precision import round_mantissa
 from vla_attention.schemas.segments import segment_members, segments_of
 from vla_attention.schemas.stores.digest import with_digest
@@ -264,11 +264,11 @@ def episode_records(spec: StoreSpec, task: int, episode: int) -> tuple[EpisodeSt
     records = []
     for replan in range(tokens.num_replans):
         frames, coverage = {}, {}
-        for span in tokens.layout.spans:
-            if span.camera is not None and span.grid is not None and span.camera in covered:
-                size = (span.grid.image_height, span.grid.image_width, 3)
-                frames[span.camera] = generator.integers(0, 256, size, dtype=np.uint8)
-                coverage[span.camera] = covered[span.camera][replan]
+        for camera in tokens.layout.pictured:
+            if camera in covered:
+                size = (*picture_size([tokens.layout], camera), 3)
+                frames[camera] = generator.integers(0, 256, size, dtype=np.uint8)
+                coverage[camera] = covered[camera][replan]
         noise_seed, state = int(generator.integers(2**63 - 1)), generator.normal(size=8)
         # Drawn also where others are planted: a rerun with other actions was made from the same states.
         drawn = generator.normal(size=(5, 7))

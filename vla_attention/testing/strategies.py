@@ -10,8 +10,8 @@ import numpy as np
 from vla_attention.schemas.errors import MissingDependency
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, ObjectKind, SceneObject
-from vla_attention.schemas.layout import Role, SiteLayout
-from vla_attention.testing.tokens import SpelledPrompt, site_layout, spell_prompt, tokens_of
+from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, SpanKind
+from vla_attention.testing.tokens import SpelledPrompt, spell_prompt, tokens_of
 
 try:
     from hypothesis import strategies as st
@@ -19,6 +19,8 @@ except ImportError:
     raise MissingDependency("vla_attention.testing.strategies needs hypothesis: pip install hypothesis.") from None
 
 NOUNS = ("bowl", "plate", "drawer", "stove", "mug")
+#: Parts of its picture that a span of a camera covers; None: a token that lies nowhere in it.
+PARTS = ((0.0, 0.0, 1.0, 1.0), (0.0, 0.5, 0.5, 0.5), (0.5, 0.0, 0.5, 1.0), (1 / 3, 0.125, 1 / 3, 0.5), None)
 OBJECTS: dict[str, ObjectKind] = {
     "bowl_1": "object",
     "plate_1": "object",
@@ -29,11 +31,25 @@ OBJECTS: dict[str, ObjectKind] = {
 
 @st.composite
 def layouts(draw: st.DrawFn) -> SiteLayout:
-    """One to three cameras of different grids, a prompt, perhaps a state token, actions."""
-    size = st.integers(1, 4)
-    grids = {f"camera{i}": (draw(size), draw(size)) for i in range(draw(st.integers(1, 3)))}
-    text_keys, state_keys, action_keys = draw(st.integers(8, 14)), draw(st.integers(0, 1)), draw(st.integers(1, 4))
-    return site_layout(grids, 14, text_keys, action_keys, state_keys)
+    """One to three cameras of one to four spans each, a prompt, perhaps a state token, actions; in any order.
+
+    The first span of a camera has a grid over the whole picture. Others have one, or a tile, or are pooled tokens.
+    """
+    parts: list[tuple[str, SpanKind, int, str | None, PatchGrid | None]] = []
+    for i in range(draw(st.integers(1, 3))):
+        for j in range(draw(st.sampled_from([1, 1, 2, 3, 4]))):
+            part = draw(st.sampled_from(PARTS)) if j else PARTS[0]
+            rows, columns = draw(st.integers(1, 4)), draw(st.integers(1, 4))
+            grid = None if part is None else PatchGrid(rows, columns, 48, 64, part)
+            parts.append((f"camera{i}_{j}", "image", 1 if grid is None else rows * columns, f"camera{i}", grid))
+    lengths = {"prompt": draw(st.integers(8, 14)), "state": draw(st.integers(0, 1)), "actions": draw(st.integers(1, 4))}
+    kinds: dict[str, SpanKind] = {"prompt": "text", "state": "state", "actions": "action"}
+    parts += [(name, kinds[name], length, None, None) for name, length in lengths.items() if length]
+    spans, start = [], 0
+    for name, kind, length, camera, grid in draw(st.permutations(parts)) if draw(st.booleans()) else parts:
+        spans.append(Span(name, kind, start, start + length, camera, grid))
+        start += length
+    return SiteLayout("joint", tuple(spans))
 
 
 @st.composite
@@ -49,7 +65,7 @@ def episode_tokens(draw: st.DrawFn) -> EpisodeTokens:
     for camera in layout.cameras:
         if camera not in masked:
             seed = draw(st.integers(0, 2**16))
-            patches = layout.camera_span(camera).num_keys
+            patches = len(layout.patch_keys(camera))
             share = np.random.default_rng(seed).dirichlet(np.full(len(objects), 0.4), size=(replans, patches))
             coverage[camera] = share.astype(np.float32)
     return tokens_of(layout, prompts, objects, coverage, masked)
@@ -72,8 +88,10 @@ def prompts_for(draw: st.DrawFn, layout: SiteLayout) -> SpelledPrompt:
 def groupings(draw: st.DrawFn, tokens: EpisodeTokens) -> Grouping:
     """A disjoint, complete grouping: later groups give up what earlier ones took; the last one is the rest."""
     cameras = tokens.layout.cameras
-    grid = tokens.layout.camera_span(cameras[0]).grid
-    assert grid is not None
+    grids = tokens.layout.grids(cameras[0])
+    ends: list[float] = [draw(st.integers(1, grids[0].rows)), draw(st.integers(1, grids[0].columns))]
+    if len(grids) > 1:
+        ends = [end / whole for end, whole in zip(ends, (grids[0].rows, grids[0].columns), strict=True)]
     assert tokens.prompt_index is not None
     choices = [
         *(f"camera:{camera}" for camera in cameras),
@@ -81,7 +99,7 @@ def groupings(draw: st.DrawFn, tokens: EpisodeTokens) -> Grouping:
         *(f"span:{span.name}" for span in tokens.layout.spans),
         *(f"word:{word}" for word in sorted({word.text for i in set(tokens.prompt_index) for word in tokens.words[i]})),
         *(f"object:{name}" for name in (*OBJECTS, "@interest", "@robot", "@background")),
-        f"patch:{cameras[0]}[0:{draw(st.integers(1, grid.rows))},0:{draw(st.integers(1, grid.columns))}]",
+        f"patch:{cameras[0]}[0:{ends[0]},0:{ends[1]}]",
         f"keys:0-{draw(st.integers(0, tokens.layout.num_keys - 1))}",
     ]
     atoms = draw(st.lists(st.sampled_from(choices), min_size=1, max_size=4, unique=True))

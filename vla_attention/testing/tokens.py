@@ -80,7 +80,7 @@ def tokens_of(
     role_of_kind = {"image": Role.IMAGE, "text": Role.PADDING, "state": Role.STATE, "action": Role.ACTION}
     roles = np.zeros((len(prompts), layout.num_keys), dtype=np.uint8)
     for span in layout.spans:
-        roles[:, span.start : span.stop] = Role.MASKED_IMAGE if span.name in masked else role_of_kind[span.kind]
+        roles[:, span.start : span.stop] = Role.MASKED_IMAGE if span.camera in masked else role_of_kind[span.kind]
     text = layout.span("prompt")
     numbers: dict[Prompt, int] = {}
     index = []
@@ -143,7 +143,7 @@ def _random_coverage(
     generator: np.random.Generator, layout: SiteLayout, camera: str, replans: int, objects: int, evenness: float
 ) -> NDArray[np.float32]:
     """Area of each patch that each object covers, shape (replan, patch, object); the areas of a patch sum to 1."""
-    patches = layout.camera_span(camera).num_keys
+    patches = len(layout.patch_keys(camera))
     return generator.dirichlet(np.full(objects, evenness), (replans, patches)).astype(np.float32)
 
 

@@ -112,14 +112,9 @@ def test_uniform_attention_has_lift_1_everywhere(data):
         np.testing.assert_allclose(lifts[~np.isnan(lifts)], 1.0, rtol=CLOSE)
         # What nobody sees has none.
         means = uniform.mean(axis=(1, 2, 3, 4))
-        image = np.concatenate([means[:, span.start : span.stop].ravel() for span in spans_of(study)])
+        seen_at = [picture.spread(means[:, picture.keys]) for picture in overlay.pictures.values()]
+        image = np.concatenate([cells.ravel() for cells in seen_at])
         assert np.isnan(lifts).sum() == (image == 0).sum() * (len(lifts) // len(image))
-
-
-def spans_of(study) -> list:
-    """The spans of the cameras that are shown, in the order of the maps."""
-    layout = study.question.selected[0].tokens.layout
-    return [layout.camera_span(camera) for camera in study.overlay.maps]
 
 
 def all_one(table: pl.DataFrame, column: str) -> None:

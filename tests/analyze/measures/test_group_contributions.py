@@ -118,7 +118,7 @@ def test_a_segment_is_taken_whole_always_or_not_at_all(store, weight, replans, k
     """A half of every key is no whole segment, and neither are all keys at some replans only."""
     item = question_about(store).selected[0]
     weights = np.zeros((item.tokens.num_replans, item.tokens.layout.num_keys, 1), dtype=np.float32)
-    span = item.tokens.layout.camera_span("base_0_rgb")
+    (span,) = item.tokens.layout.camera_spans("base_0_rgb")
     weights[:replans, span.start : span.stop, 0] = weight
     resolved = ResolvedGrouping(("g",), weights, weights.sum(axis=1, dtype=np.float64), item.valid.sum(axis=1))
     parts = whole_segments(item, resolved, "joint")

@@ -51,7 +51,7 @@ def follow_bowl(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray
     rows = random_rows(tokens, rows.shape[1:-1], seed=10 * task + episode, spread=0.5)
     assert tokens.coverage is not None
     for camera in CAMERAS:
-        span = tokens.layout.camera_span(camera)
+        (span,) = tokens.layout.camera_spans(camera)
         rows[:, 1, :, 1][..., span.start : span.stop] *= 1 + 29 * tokens.coverage[camera][:, None, None, :, 0]
     return rows / rows.sum(axis=-1, keepdims=True)
 

@@ -31,7 +31,7 @@ def place_of(replan: int) -> tuple[int, int]:
 
 
 def follow(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
-    span = tokens.layout.camera_span(CAMERA)
+    (span,) = tokens.layout.camera_spans(CAMERA)
     for replan in range(len(rows)):
         row, column = place_of(replan)
         rows[replan][..., span.start + 4 * row + column] = 3.0

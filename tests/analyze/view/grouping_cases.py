@@ -134,7 +134,7 @@ def _quoted(generator: np.random.Generator, name: str) -> str:
 
 def _atom(generator: np.random.Generator, tokens: EpisodeTokens) -> str:
     layout = tokens.layout
-    camera = next((span for span in layout.spans if span.grid is not None), None)
+    camera = next((name for name in layout.pictured), None)
     words = [word.text for line in tokens.words for word in line]
     choices: list[str] = [f"span:{_quoted(generator, span.name)}" for span in layout.spans]
     choices += [f"camera:{_quoted(generator, name)}" for name in layout.cameras]
@@ -150,11 +150,16 @@ def _atom(generator: np.random.Generator, tokens: EpisodeTokens) -> str:
     if tokens.coverage:
         named = [thing.name for thing in tokens.objects[:4]]
         choices += [f"object:{name}" for name in (*named, "@interest", "@robot", "@background")] * 2
-    if camera is not None and camera.grid is not None:
-        rows, columns = camera.grid.rows, camera.grid.columns
+    if camera is not None:
+        rows, columns = layout.grids(camera)[0].rows, layout.grids(camera)[0].columns
         r, c = int(generator.integers(0, rows)), int(generator.integers(0, columns))
-        regions = [f"{camera.camera}[{r}:,:{c + 1}]", f"{camera.camera}[:{rows}, {c}:{columns}]"]
-        choices += [f"patch:{_quoted(generator, region) if ' ' in camera.name else region}" for region in regions] * 2
+        regions = [f"{camera}[{r}:,:{c + 1}]", f"{camera}[:{rows}, {c}:{columns}]"]
+        regions += [
+            f"{camera}[{r / rows}:1,:{(c + 1) / columns:.17f}]",
+            f"{camera}[.25:, 0:0.{c + 3}]",
+            f"{camera}[:,:]",
+        ]
+        choices += [f"patch:{_quoted(generator, region) if ' ' in camera else region}" for region in regions] * 2
     last = int(generator.integers(0, layout.num_keys))
     choices += [f"keys:0-{last}", f"keys:{last}"]
     return str(generator.choice(choices))
@@ -185,7 +190,12 @@ def _wrong_atom(generator: np.random.Generator, tokens: EpisodeTokens) -> str:
             "span:promt",
         ),
         *(f"patch:{camera}[0:99,0:1]", f"patch:{camera}[0:1]", f"patch:{camera}", "patch:nowhere[0:1,0:1]"),
-        f"patch:{camera}[1:1,0:1]",
+        *(
+            f"patch:{camera}[1:1,0:1]",
+            f"patch:{camera}[0.5:1.5,:]",
+            f"patch:{camera}[0.5:0.5,:]",
+            f"patch:{camera}[.:,:]",
+        ),
     ]
     if tokens.words:
         line = [word.text for word in tokens.words[0]]

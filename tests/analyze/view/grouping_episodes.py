@@ -24,6 +24,8 @@ _INSTRUCTIONS = (
     "🤖 move the ﬁrst İstanbul mug",
     "ǅungla Σίσυφος ΌΣΟΣ",
 )
+#: Parts of a picture that further spans of a camera cover; None: a pooled token.
+_SIDES = ((0.0, 0.0, 1.0, 1.0), (0.0, 0.5, 0.5, 0.5), (1 / 3, 0.1, 1 / 3, 0.6), None)
 _Part = tuple[str, str, int, PatchGrid | None, bool]
 
 
@@ -37,7 +39,7 @@ def made_up_episode(seed: int, number: int) -> EpisodeTokens:
         return libero_tokens(2, seed)
     if kind == 1:
         return _cosmos(generator)
-    layout = _layout(generator, growing=kind in (2, 3), latent=False, joint=number % 2 == 0)
+    layout = _layout(generator, growing=kind in (2, 3), latent=False, joint=number % 2 == 0, several=number % 5 > 2)
     absent = Role.ABSENT if kind in (2, 4) else Role.PADDING
     return _tokens(generator, layout, absent, _num_objects(generator, number))
 
@@ -47,7 +49,9 @@ def _num_objects(generator: np.random.Generator, number: int) -> int:
     return int(generator.choice([0, 1, 5, 7, 8, 12, 20])) if number % 11 else 150
 
 
-def _layout(generator: np.random.Generator, *, growing: bool, latent: bool, joint: bool) -> SiteLayout:
+def _layout(
+    generator: np.random.Generator, *, growing: bool, latent: bool, joint: bool, several: bool = False
+) -> SiteLayout:
     parts: list[_Part] = []
     if latent:
         grid = PatchGrid(2, 3, 8, 12)
@@ -58,7 +62,14 @@ def _layout(generator: np.random.Generator, *, growing: bool, latent: bool, join
         for i in range(int(generator.integers(1, 4))):
             rows, columns = (int(n) for n in generator.integers(1, 5, 2))
             name = str(generator.choice(["base_0_rgb", "left wrist", "cam(é)", "camera"])) + f"{i or ''}"
-            parts.append((name, "image", rows * columns, PatchGrid(rows, columns, 4 * rows, 4 * columns), False))
+            whole = PatchGrid(rows, columns, 48, 64)
+            parts.append((name, "image", rows * columns, whole, False))
+            for j in range(int(generator.integers(0, 4)) if several else 0):  # tiles, other grids, and pooled tokens
+                part = _SIDES[int(generator.integers(0, len(_SIDES)))]
+                grid = None if part is None else PatchGrid(rows, 2, 48, 64, part)
+                parts.append((f"{name}#{j}", "image", 2 if part is None else 2 * rows, grid, False))
+        if several:  # a camera's spans need not follow each other
+            parts = [parts[int(i)] for i in generator.permutation(len(parts))]
         parts.append(("prompt", "text", int(generator.integers(12, 20)), None, False))
         if joint:
             parts += [("state", "state", 1, None, False), ("actions", "action", 4, None, False)]
@@ -67,7 +78,8 @@ def _layout(generator: np.random.Generator, *, growing: bool, latent: bool, join
     spans, start = [], 0
     offset = int(generator.integers(0, 3))
     for name, kind, length, grid, grows in parts:
-        camera = name if grid is not None and name != "proprio" else None
+        seen = kind == "image" or (grid is not None and name != "proprio")
+        camera = name.partition("#")[0] if seen else None
         own = grid if camera is not None else None
         spans.append(
             Span(name, kind, start, start + length, camera, own, grows, offset if grows else 0)  # type: ignore[arg-type]
@@ -100,8 +112,8 @@ def _tokens(generator: np.random.Generator, layout: SiteLayout, absent: Role, nu
                 key_role[replan, span.stop - missing : span.stop] = Role.ABSENT
     masked = layout.cameras[1:2] if generator.random() < 0.4 else ()
     for camera in masked:
-        span = layout.camera_span(camera)
-        key_role[:, span.start : span.stop] = Role.MASKED_IMAGE
+        for span in layout.camera_spans(camera):
+            key_role[:, span.start : span.stop] = Role.MASKED_IMAGE
     choices = [str(text) for text in generator.choice(_INSTRUCTIONS, 2)]
     prompts: list[Prompt] = []
     index = []
@@ -156,9 +168,9 @@ def _coverage(
 ) -> dict[str, NDArray[np.float32]]:
     """Covered areas; some patches are covered in part only."""
     coverage = {}
-    for camera in layout.cameras:
+    for camera in layout.pictured:
         if camera not in without:
-            shape = (replans, layout.camera_span(camera).num_keys)
+            shape = (replans, len(layout.patch_keys(camera)))
             share = generator.dirichlet(np.full(len(objects), 0.4), size=shape)
             coverage[camera] = (share * generator.choice([1.0, 0.6], (*shape, 1))).astype(np.float32)
     return coverage

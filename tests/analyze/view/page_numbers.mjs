@@ -61,14 +61,13 @@ async function answerOf({ base, root, packed, episode, query, summary }) {
     }),
   );
   const cameras = [...shown.frames].map(([camera, frame]) => {
-    const span = site.layout.spans.find((each) => each.camera === camera);
+    const map = new engine.PictureMap(site.layout, camera);
     const view = reading.viewOf(store.root.policy.cameras, camera);
-    const all = reading.shownValues(row, valid, uniform, state.measure);
-    const own = all.slice(span.start, span.stop);
+    const own = reading.shownValues(map, row, valid, uniform, state.measure);
     const scale = reading.scaleFor(own, state.measure, 1);
     const painting = { scale: { ...scale, high: 3 }, colours: reading.colourTable(state.colours), opacity: 0.8, smooth: state.smooth };
-    const { height, width, pixels } = reading.overlayPixels(frame, own, span, view, painting);
-    const things = reading.objectsAt(shown, camera, 0);
+    const { height, width, pixels } = reading.overlayPixels(frame, own, map, view, painting);
+    const things = reading.objectsAt(shown, camera, map, 0);
     return { camera, values: plainList(own), high: scale.high, height, width, pixels: [...pixels], things, stored: frame !== null };
   });
   return {

@@ -13,6 +13,12 @@ import pytest
 
 from tests.analyze.view.grouping_cases import grouping_cases
 from tests.analyze.view.viewer_in_node import needs_node, run_in_node
+from tests.end_to_end.test_cameras_of_several_spans import KINDS, spans_of
+from vla_attention.analyze.measures.patch_maps import PictureMap
+from vla_attention.schemas.groupings.grouping import Grouping
+from vla_attention.schemas.groupings.resolve import resolve
+from vla_attention.schemas.jsonable import to_json
+from vla_attention.testing.tokens import small_prompt, tokens_of
 
 NUM_CASES = 300
 #: The measures of a group that the page computes; those of the tables may be more.
@@ -58,3 +64,20 @@ def test_300_groupings_have_the_same_weights_masses_and_errors(tmp_path, cases):
     pairs = zip(cases["cases"], answers, strict=True)
     wrong = {i: found for i, (case, answer) in enumerate(pairs) if (found := of_case(case, answer))}
     assert not wrong, "\n".join(f"case {i}: {found[:3]}" for i, found in list(wrong.items())[:10])
+
+
+@needs_node
+@pytest.mark.parametrize("kind", KINDS)
+def test_painted_cells_take_the_patches_whose_centre_is_there(tmp_path, kind):
+    layout = spans_of(KINDS[kind])
+    tokens = tokens_of(layout, [small_prompt(layout, "put the bowl on the plate", "1 2")])
+    picture = PictureMap.of(layout, "front")
+    cells = [0, 1, picture.columns, picture.rows * picture.columns - 1]
+    given = {"layout": to_json(layout), "camera": "front", "cells": cells}
+    (selectors,) = run_in_node(tmp_path, {"episodes": [], "painted": [given]})["painted"]
+    for selector, there in zip(selectors, (cells, cells[:2]), strict=True):
+        centres = [np.meshgrid(*grid.centres(), indexing="ij") for grid in picture.grids]
+        down, across = (np.concatenate([of[axis].ravel() for of in centres]) for axis in (0, 1))
+        cell = np.floor(down * picture.rows) * picture.columns + np.floor(across * picture.columns)
+        taken = resolve(Grouping("one", {"one": (selector,)}), tokens).weights[0, picture.keys, 0]
+        np.testing.assert_array_equal(taken > 0, np.isin(cell, there))

@@ -6,6 +6,8 @@ The page's own script reads the golden stores over HTTP ranges, as a browser doe
 from __future__ import annotations
 
 import math
+import shutil
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs
 
@@ -15,6 +17,7 @@ import pytest
 
 import vla_attention as va
 from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answers
+from tests.end_to_end.test_cameras_of_several_spans import write_spans_store
 from tests.kit.golden_stores import FOLDER
 from tests.kit.http_ranges import serve
 from vla_attention.analyze.measures.question import ask
@@ -31,14 +34,24 @@ CLOSE = 2e-6
 QUERIES = {
     "joint": ("", "?layer=1&denoise=2&head=3&replan=2", "?layer=2&replan=1&measure=raw&smooth=1"),
     "cosmos": ("?site=cross&replan=1", "?site=self&layer=1&head=1&measure=rank"),
+    "spans": ("", "?layer=2&measure=raw&replan=1&smooth=1"),
     "packed": ("?layer=1&replan=2",),
 }
 CASES = [(f"version2/{name}", query) for name, queries in QUERIES.items() for query in queries]
 
 
 @pytest.fixture(scope="module")
-def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], dict[str, Any]]:
-    with serve(FOLDER.parent) as served:
+def stores(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the golden stores, and one of a camera with tiles, a thumbnail and pooled tokens."""
+    folder = tmp_path_factory.mktemp("stores")
+    shutil.copytree(FOLDER.parent / "version2", folder / "version2")
+    write_spans_store(folder / "version2" / "spans.zarr", "tiles and thumbnail")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def answers(stores: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], dict[str, Any]]:
+    with serve(stores) as served:
         questions = [
             PageQuestion(
                 f"{served.url}/{name.partition('/')[0]}/",
@@ -66,9 +79,9 @@ each_case = pytest.mark.parametrize(("name", "query"), CASES)
 
 
 @each_case
-def test_ratio_and_masses_of_every_replan(answers, name, query):
+def test_ratio_and_masses_of_every_replan(answers, stores, name, query):
     answer = answers[name, query]
-    run = va.open(FOLDER.parent / f"{name}.zarr")
+    run = va.open(stores / f"{name}.zarr")
     asked, _ = settings_of(query, answer["site"])
     which = (pl.col("task_id") == 0) & (pl.col("episode_index") == 0)
     mean = pl.col("layer") == "layers_avg"
@@ -92,9 +105,9 @@ def test_ratio_and_masses_of_every_replan(answers, name, query):
 
 
 @each_case
-def test_the_lift_of_every_head(answers, name, query):
+def test_the_lift_of_every_head(answers, stores, name, query):
     answer = answers[name, query]
-    run = va.open(FOLDER.parent / f"{name}.zarr")
+    run = va.open(stores / f"{name}.zarr")
     asked, replan = settings_of(query, answer["site"])
     asked = {field: value for field, value in asked.items() if field in ("site", "denoise")}
     mine = (pl.col("task_id") == 0) & (pl.col("episode_index") == 0) & (pl.col("replan") == replan)
@@ -114,11 +127,11 @@ def test_the_lift_of_every_head(answers, name, query):
 
 
 @each_case
-def test_rows_patches_words_and_their_readers(answers, name, query):
+def test_rows_patches_words_and_their_readers(answers, stores, name, query):
     answer = answers[name, query]
     asked, replan = settings_of(query, answer["site"])
     question = ask(
-        va.open(FOLDER.parent / f"{name}.zarr").stores,
+        va.open(stores / f"{name}.zarr").stores,
         settings_from_keywords(grouping="default", per_head=True, **asked),
     )
     item = question.selected[0]
@@ -146,15 +159,13 @@ def test_rows_patches_words_and_their_readers(answers, name, query):
 
 
 @each_case
-def test_pictures_have_the_pixels_of_vla_analyze_overlay(answers, name, query):
+def test_pictures_have_the_pixels_of_vla_analyze_overlay(answers, stores, name, query):
     answer = answers[name, query]
     if not answer["cameras"]:
         assert answer["site"] == "cross"
         return
     asked, replan = settings_of(query, answer["site"])
-    study = study_overlay(
-        va.open(FOLDER.parent / f"{name}.zarr").stores, settings_from_keywords(grouping="default", **asked)
-    )
+    study = study_overlay(va.open(stores / f"{name}.zarr").stores, settings_from_keywords(grouping="default", **asked))
     item = study.question.selected[0]
     overlay = episode_overlay(study.question, item, list(study.overlay.maps), ratios_of(study.question, item))
     assert [camera["camera"] for camera in answer["cameras"]] == list(overlay.maps)

@@ -12,7 +12,7 @@ from vla_attention.analyze.view.paths import (
     Wanted,
     WrongToken,
     byte_range,
-    is_loopback,
+    is_allowed,
     wanted,
 )
 
@@ -54,8 +54,26 @@ def test_everything_else_is_nothing(path):
         wanted(f"/token/{path}", "token", 1)
 
 
+def test_a_proxy_may_put_its_own_path_before_the_token():
+    assert wanted("/user/me/proxy/absolute/8765/token/stores.json", "token", 1) == Wanted(document=True)
+
+
 @pytest.mark.parametrize(
-    "target", ["", "/", "token/", "/toke/", "/tokens/", "//token/", "/Token/", "/%74oken/", "/tökén/"]
+    "target",
+    [
+        "",
+        "/",
+        "/a//token/",
+        "/a/tokens/stores.json",
+        "/a/%74oken/",
+        "token/",
+        "/toke/",
+        "/tokens/",
+        "//token/",
+        "/Token/",
+        "/%74oken/",
+        "/tökén/",
+    ],
 )
 def test_a_target_without_the_whole_token_is_refused(target):
     with pytest.raises(WrongToken):
@@ -76,7 +94,7 @@ def test_no_path_leads_out_of_a_store(rest):
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.1:80", "localhost:8765", "LOCALHOST", "[::1]:8765"])
 def test_hosts_of_the_loopback_are_let_in(host):
-    assert is_loopback(host)
+    assert is_allowed(host)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +109,7 @@ def test_hosts_of_the_loopback_are_let_in(host):
     ],
 )
 def test_other_hosts_are_not(host):
-    assert not is_loopback(host)
+    assert not is_allowed(host)
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.client import HTTPConnection
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from urllib.parse import urljoin
+from urllib.request import urlopen
 
 import pytest
 
+from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answers
 from tests.kit.http_ranges import serve
 from tests.kit.viewer import ask, ask_target, send, served
 from vla_attention.analyze.copy.copying import copy_store
@@ -102,10 +111,82 @@ def test_nothing_is_said_without_the_token(server, target):
     assert b"a.zarr" not in reply.body
 
 
-@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "", None])
+@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example:8000", "", None, "a b", "<b>", "x" * 300])
 def test_another_host_is_refused_even_with_the_token(server, host):
     reply = ask(server, "stores.json", host=host)
-    assert (reply.status, reply.body) == (403, b"Forbidden.\n")
+    assert reply.status == 403
+    named = host is not None and "example" in host
+    assert (f"--allow-host {host.partition(':')[0]}" if named else "Forbidden.") in reply.body.decode()
+    assert named or reply.body == b"Forbidden.\n"
+
+
+@pytest.mark.parametrize("host", ["hub.example.org", "HUB.example.org:443", "10.0.0.7:80", "localhost:8765"])
+def test_allowed_hosts_are_let_in_and_no_other(store, host):
+    with served(store, allow_hosts=("hub.example.org", "10.0.0.7:80")) as server:
+        assert ask(server, "stores.json", host=host).status == 200
+        for other in ("example.org", "a.hub.example.org", "hub.example.org.evil.example", "hub.example.org@evil"):
+            assert ask(server, "stores.json", host=other).status == 403
+        assert ask_target(server, "/stores.json", host=host).status == 403
+
+
+@pytest.mark.parametrize(
+    "name", ["https://hub.example.org", "hub.example.org/user", "*", "", "a b", "hub.example.org:x"]
+)
+def test_what_is_no_name_of_a_host_is_refused(name):
+    with pytest.raises(BadArgument, match=r"--allow-host .*expected the name of a host"):
+        ViewerServer((), allow_hosts=(name,))
+
+
+@contextmanager
+def proxied(server: ViewerServer, prefix: str, strips: bool) -> Iterator[str]:
+    """The address of a proxy that hands on what is below `prefix`, with its own Host, as JupyterHub and others do."""
+
+    class Proxy(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            assert self.path.startswith(prefix)
+            target = f"/{self.path.removeprefix(prefix)}" if strips else self.path
+            kept = {"Range": self.headers["Range"]} if "Range" in self.headers else {}
+            connection = HTTPConnection("127.0.0.1", server.port)
+            connection.request("GET", target, headers={"Host": "hub.example.org", "X-Forwarded-Proto": "https", **kept})
+            reply = connection.getresponse()
+            body = reply.read()
+            self.send_response(reply.status)
+            for name, value in reply.getheaders():
+                self.send_header(name, value)
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Proxy) as proxy:
+        threading.Thread(target=proxy.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+        yield f"http://127.0.0.1:{proxy.server_address[1]}{prefix}"
+        proxy.shutdown()
+
+
+@needs_node
+@pytest.mark.parametrize(
+    ("prefix", "strips"),
+    [("/user/me/proxy/8765/", True), ("/user/me/proxy/absolute/8765/", False), ("/node/c01/8765/", False)],
+)
+def test_the_page_reads_its_store_behind_a_proxy(store, tmp_path, prefix, strips):
+    with (
+        served(store, allow_hosts=("hub.example.org",)) as server,
+        proxied(server, prefix, strips) as address,
+    ):
+        base = f"{address}{server.token}/"
+
+        def read(name: str) -> bytes:
+            with urlopen(urljoin(base, name)) as reply:  # noqa: S310 - the test's own proxy
+                return reply.read()
+
+        for name in re.findall(r'(?:href|src)="([^"]+)"', read("").decode()):
+            assert name == "data:," or read(name)
+        (entry,) = json.loads(read("stores.json"))["stores"]
+        (answer,) = page_answers(tmp_path, [PageQuestion(base, entry["root"])])
+        assert answer.get("failure") is None
+        assert len(answer["replans"]) == 2
 
 
 def test_two_hosts_are_refused(server):

@@ -167,6 +167,9 @@ def test_it_ends_with_one_sentence(store, signal, code, word, tmp_path, monkeypa
     assert found
     assert found[2] == found[3]
     assert done.stderr.strip() == f"vla-analyze view: {word}; nothing was left half written."
-    # Started again on the same port, it has the same link.
-    again = ["view", str(store), "--no-open", "--port", found[3]]
-    assert run_stopped("vla_attention.analyze", again, moment, signal=signal).stdout == done.stdout
+    # Started again on the same port, it has the same link; and says how a proxy has it.
+    again = ["view", str(store), "--no-open", "--port", found[3], "--allow-host", "hub.example.org"]
+    said = run_stopped("vla_attention.analyze", again, moment, signal=signal).stdout
+    assert said.startswith(done.stdout)
+    token = found[1].split("/")[3]
+    assert f"https://hub.example.org/user/NAME/proxy/{found[3]}/{token}/" in said

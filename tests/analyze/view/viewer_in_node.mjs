@@ -119,7 +119,13 @@ function measured(one) {
   };
 }
 
-const answers = { cases: measured };
+/** The selector after cells were painted, and after half of them were erased again. */
+function painted({ layout, camera, cells }) {
+  const drawn = engine.paintedPatches("role:bos", layout, camera, cells, false);
+  return [drawn, engine.paintedPatches(drawn, layout, camera, cells.slice(cells.length / 2), true)];
+}
+
+const answers = { cases: measured, painted };
 const results = {};
 for (const [kind, answer] of Object.entries(answers)) {
   results[kind] = (given[kind] ?? []).map((one) => {

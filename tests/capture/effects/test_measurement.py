@@ -44,7 +44,7 @@ def coverage_of(policy) -> dict[str, np.ndarray]:
     """Red cube on parts of some patches, the table everywhere else."""
     coverage = {}
     for camera in policy.cameras:
-        patches = next(s.camera_span(camera.name).num_keys for s in policy.sites if camera.name in s.cameras)
+        patches = next(len(s.patch_keys(camera.name)) for s in policy.sites if camera.name in s.cameras)
         red = np.random.default_rng(patches).choice([0.0, 0.25, 1.0], patches)
         coverage[camera.name] = np.stack([red, 1 - red], axis=1).astype(np.float32)
     return coverage
@@ -111,7 +111,7 @@ def test_what_is_cut_is_stored_for_each_entry():
     assert np.flatnonzero(cut["without_word_red"]).tolist() == list(red.keys)
     assert not cut["unchanged"].any()
     assert not cut["noise"].any()
-    span = policy.sites[0].camera_span(policy.cameras[0].name)
+    (span,) = policy.sites[0].camera_spans(policy.cameras[0].name)
     np.testing.assert_array_equal(
         cut["without_object_red_cube"][span.start : span.stop], context.coverage[policy.cameras[0].name][:, 0]
     )

@@ -21,7 +21,7 @@ def picture():
 def mask():
     patches = np.zeros(16, dtype=bool)
     patches[[5, 6]] = True
-    return changed_inputs.patch_pixels(patches, GRID, (32, 32, 3))
+    return changed_inputs.patch_pixels(patches, (GRID,), (32, 32, 3))
 
 
 def test_blank_noise_and_turned(picture):
@@ -50,7 +50,7 @@ def test_patches_become_their_pixels(mask):
     expected = np.zeros((32, 32), dtype=bool)
     expected[8:16, 8:24] = True
     np.testing.assert_array_equal(mask, expected)
-    odd = changed_inputs.patch_pixels(np.eye(3, dtype=bool).ravel(), PatchGrid(3, 3, 10, 10), (10, 10))
+    odd = changed_inputs.patch_pixels(np.eye(3, dtype=bool).ravel(), (PatchGrid(3, 3, 10, 10),), (10, 10))
     assert odd.sum() == 4 * 4 + 3 * 3 + 3 * 3
 
 

@@ -65,7 +65,7 @@ def test_what_is_stored(base, tmp_path, capsys):
     assert f"Interventions: {expected.describe()}." in capsys.readouterr().out.splitlines()
     before, after = base.episodes[0], changed.episodes[0]
     rows = after.read("joint/rows")
-    span = changed.attributes.sites[0].camera_span("base_0_rgb")
+    (span,) = changed.attributes.sites[0].camera_spans("base_0_rgb")
     assert (rows[:, 0, ..., span.start : span.stop] > 0).all()
     assert (rows[:, 1:, ..., span.start : span.stop] == 0).all()
     np.testing.assert_allclose(rows.sum(-1), 1, atol=1e-5)

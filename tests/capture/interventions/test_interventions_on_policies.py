@@ -98,7 +98,7 @@ def first_camera(policy) -> str:
 
 def keys_of(policy, camera: str) -> tuple[str, slice]:
     site = next(site for site in policy.sites if camera in site.cameras)
-    span = site.camera_span(camera)
+    (span,) = site.camera_spans(camera)
     return site.name, slice(span.start, span.stop)
 
 

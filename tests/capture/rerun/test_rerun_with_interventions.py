@@ -46,7 +46,7 @@ def test_a_knockout_is_exact_stored_and_applied_again(pi_store, tmp_path, capsys
     assert store.attributes.interventions.name == "without_camera_base_0_rgb_layers_0_1"
     assert store.attributes.rerun_of.run == open_store(pi_store).run
     [old], [new] = open_store(pi_store).episodes[:1], store.episodes
-    span = store.attributes.sites[0].camera_span("base_0_rgb")
+    (span,) = store.attributes.sites[0].camera_spans("base_0_rgb")
     before, after = (episode.read("joint/rows")[..., span.start : span.stop] for episode in (old, new))
     assert (before > 0).all()
     assert (after[:, :2] == 0).all()

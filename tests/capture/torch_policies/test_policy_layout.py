@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from tests.kit.paths import ROOT
 from vla_attention.capture.torch_policies.policy_layout import (
     CallRule,
     CameraPicture,
@@ -15,7 +16,7 @@ from vla_attention.capture.torch_policies.policy_layout import (
 )
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.jsonable import from_json, to_json
-from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span
+from vla_attention.schemas.layout import ROLES_OF_KIND, PatchGrid, Role, SiteLayout, Span
 
 KEYS = SiteLayout(
     "joint",
@@ -95,6 +96,37 @@ def test_rules_and_sites_check_themselves():
     with pytest.raises(BadArgument, match="no role for the spans actions"):
         RecordedSite(KEYS, (0, 1), {"image_front": "image", "prompt": "text"})
 
-    wrong = "gives the span 'image_front' of kind 'image' the role 'instruction'; its keys can be image, masked_image"
-    with pytest.raises(BadArgument, match=wrong):
-        RecordedSite(KEYS, (0, 1), {**ROLES, "image_front": "instruction"})
+
+@pytest.mark.parametrize(
+    ("kind", "role", "wrong"),
+    [
+        ("time", "learned", "there is no kind 'time'"),
+        ("learned", "learned", "there is no kind 'learned'"),
+        ("states", "state", "there is no kind 'states'"),
+        ("state", "time", "there is no role 'time'"),
+        ("state", "learnt", "there is no role 'learnt'"),
+        ("latent", "learned", "they do not fit together"),
+        ("image", "instruction", "they do not fit together"),
+        (None, None, "there is no kind 'None'"),
+    ],
+)
+def test_a_wrong_kind_or_role_shows_all_that_there_are_and_which_fit_together(kind, role, wrong):
+    keys = SiteLayout("joint", (Span("clock", kind, 0, 1),))
+    with pytest.raises(BadArgument) as caught:
+        RecordedSite(keys, (0, 1), {"clock": role})
+    said = str(caught.value)
+    assert f"gives the span 'clock' the kind '{kind}' and the role '{role}': {wrong}" in said
+    with pytest.raises(BadArgument) as missing:
+        RecordedSite(keys, (0, 1), {})
+    for one, roles in ROLES_OF_KIND.items():
+        assert f"{one} ({', '.join(known.label for known in roles)})" in str(missing.value)
+        assert f"{one} ({', '.join(known.label for known in roles)})" in said
+
+
+def test_the_guide_has_every_kind_with_its_roles():
+    guide = (ROOT / "docs" / "your-policy.md").read_text(encoding="utf-8")
+    table = guide.split("| kind | roles of its keys |")[1].split("\n\n")[0]
+    rows = [re.findall(r"`(\w+)`", "|".join(row.split("|")[1:3])) for row in table.splitlines()[2:]]
+    assert {kind: roles for kind, *roles in rows} == {
+        kind: [role.label for role in roles] for kind, roles in ROLES_OF_KIND.items()
+    }

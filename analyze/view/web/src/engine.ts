@@ -15,6 +15,7 @@ export * from "./groups/draft";
 export * from "./groups/rectangles";
 export * from "./groups/selector_edit";
 export * from "./measures/masses";
+export * from "./measures/picture_map";
 export * from "./measures/ranks";
 export * from "./measures/replans";
 export * from "./measures/segments";

@@ -14,10 +14,9 @@ from vla_attention.capture.policies.cosmos.config import LIBERO_FRAMES, CosmosCo
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, random_policy
 from vla_attention.capture.policies.cosmos.latents import cross_layout, self_layout
 from vla_attention.capture.policies.cosmos.loading import build_cosmos_policy, select_call
-from vla_attention.capture.policies.policy import camera_grid
 from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
 from vla_attention.schemas.errors import BadArgument, UnknownName
-from vla_attention.schemas.layout import Role
+from vla_attention.schemas.layout import Role, camera_grids
 
 
 def recorders_for(policy, queries="mean"):
@@ -81,7 +80,7 @@ def test_the_published_layout():
     action = layout.span("action")
     assert (action.start, action.stop) == (784, 980)
     assert layout.cameras == ("wrist", "primary")
-    grid = layout.camera_span("primary").grid
+    (grid,) = layout.grids("primary")
     assert (grid.rows, grid.columns, grid.image_height) == (14, 14, 224)
     assert cross_layout(CosmosConfig()).num_keys == 512
     assert self_layout(EMBEDDED_CONFIG).num_keys == 441
@@ -107,10 +106,8 @@ def test_frames_are_what_the_model_sees(dummy, prepared):
         assert camera.upright
         assert not camera.mirrored
         assert camera.visible == pytest.approx(212 / 224)
-        assert (camera_grid(dummy.sites, camera.name).rows, camera_grid(dummy.sites, camera.name).image_width) == (
-            4,
-            64,
-        )
+        (grid,) = camera_grids(dummy.sites, camera.name)
+        assert (grid.rows, grid.image_width) == (4, 64)
 
 
 def test_what_a_call_was_given_gives_the_same_input_again(dummy, prepared):

@@ -66,7 +66,7 @@ def test_full_size_layouts():
         ("prompt", "text", 768, 968),
         ("actions", "action", 968, 978),
     ]
-    grid = layout.camera_span("left_wrist_0_rgb").grid
+    (grid,) = layout.grids("left_wrist_0_rgb")
     assert (grid.rows, grid.columns, grid.image_height, grid.image_width) == (16, 16, 224, 224)
     pi0 = site_layout(find_config("pi0_libero"))
     assert [(s.name, s.start, s.stop) for s in pi0.spans[3:]] == [

@@ -109,13 +109,15 @@ function reference(vocabulary: Vocabulary, textKeys: string | null = null): Grou
     const description = "the published Cosmos scripts' frames: 'linguistic' is a blank picture, and holds no language";
     return makeGrouping({ name, groups, ratio, description });
   }
-  const image = spans.find((span) => span.kind === "image");
+  const [image, ...images] = spans.filter((span) => span.kind === "image");
   if (!image || !spans.some((span) => span.kind === "text")) {
     throw new GroupingError(
       "The grouping 'reference' is defined for the sites 'joint' (pi) and 'self' (Cosmos) only; choose with --site.",
     );
   }
-  const first = image.stop - image.start;
+  // As many keys as the first camera has, in all of its spans.
+  const own = [image, ...images.filter((span) => span.camera !== null && span.camera === image.camera)];
+  const first = own.reduce((sum, span) => sum + span.stop - span.start, 0);
   const wanted = textKeys ?? PUBLISHED_TEXT_KEYS;
   const last = Math.min(first + Number(wanted), numKeys(vocabulary.layout)) - 1;
   if (last < first) {

@@ -1,7 +1,7 @@
 /** Sets of (key, cell) pairs, and the areas of cells, in float32 and in numpy's order of addition, as resolve.py. */
 import type { Membership } from "./selectors";
 import { GroupingError, thousands } from "./text";
-import { cameraSpan, type EpisodeTokens } from "./tokens";
+import { type EpisodeTokens, patchKeys } from "./tokens";
 
 const CLAIMED_BYTES = 64_000_000;
 const EXPANSION = 100;
@@ -66,11 +66,11 @@ function areasOfCells(tokens: EpisodeTokens): Float32Array {
   }
   const area = new Float32Array(replans * keys * cells);
   for (const [camera, coverage] of tokens.coverage) {
-    const span = cameraSpan(tokens.layout, camera);
+    const own = patchKeys(tokens.layout, camera);
     for (let replan = 0; replan < replans; replan++) {
       for (let patch = 0; patch < coverage.patches; patch++) {
         const from = (replan * coverage.patches + patch) * coverage.objects;
-        const to = (replan * keys + span.start + patch) * cells + 1;
+        const to = (replan * keys + own[patch]!) * cells + 1;
         area.set(coverage.values.subarray(from, from + coverage.objects), to);
       }
     }

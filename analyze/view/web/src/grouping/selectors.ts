@@ -1,17 +1,20 @@
 /**
  * The kinds of selectors: the keys that each takes, and what makes a name wrong. schemas/groupings/selectors.py.
  */
-import type { SiteDocument } from "../store/documents";
+import { coversAll, type GridDocument, type SiteDocument } from "../store/documents";
 import type { Atom } from "./selector_parser";
 import { casefold, didYouMean, listing, SelectorError, SPACE } from "./text";
 import {
-  cameraSpan,
+  cameraSpans,
   camerasOf,
   type EpisodeTokens,
   findRole,
+  gridSpans,
+  keysOfSpans,
   latentFrame,
   NO_COVERAGE,
   NO_WORDS,
+  patchKeys,
   spanNamed,
   type Vocabulary,
 } from "./tokens";
@@ -35,10 +38,8 @@ interface SelectorKind {
 }
 
 const s = `[${SPACE}]*`;
-const PATCH = new RegExp(
-  `^(?<camera>[^\\[]+)\\[(?<r0>[0-9]{0,9}):(?<r1>[0-9]{0,9})${s},${s}(?<c0>[0-9]{0,9}):(?<c1>[0-9]{0,9})\\]$`,
-  "u",
-);
+const N = "[0-9]{0,9}(?:\\.[0-9]{1,20})?";
+const PATCH = new RegExp(`^(?<camera>[^\\[]+)\\[(?<r0>${N}):(?<r1>${N})${s},${s}(?<c0>${N}):(?<c1>${N})\\]$`, "u");
 const KEYS = /^([0-9]{1,9})(?:-([0-9]{1,9}))?$/;
 const OBJECT_CLASSES = ["@interest", "@robot", "@background"];
 const WORD_CLASSES = ["content", "stop", "all"];
@@ -152,8 +153,7 @@ function objectKeys(argument: string, tokens: EpisodeTokens): Membership {
     const taken = Object.hasOwn(byClass, argument) ? byClass[argument]! : thing.name === argument;
     if (!taken) return;
     for (const camera of tokens.coverage.keys()) {
-      const span = cameraSpan(tokens.layout, camera);
-      for (let key = span.start; key < span.stop; key++) bits[key * cells + 1 + i] = 1;
+      for (const key of patchKeys(tokens.layout, camera)) bits[key * cells + 1 + i] = 1;
     }
   });
   return { replans: 1, keys: tokens.keys, cells, bits };
@@ -166,41 +166,69 @@ function objectProblem(argument: string, vocabulary: Vocabulary): string | null 
   return isClass ? null : missing("object", argument, vocabulary.objects);
 }
 
-/** A region of a camera's patch grid: rows r0 to r1 and columns c0 to c1, the ends excluded. */
+/** A region of a camera's picture, the ends excluded: rows and columns of its patch grid, or fractions of the picture. */
 export interface PatchRegion {
   readonly camera: string;
+  readonly fractions: boolean;
   readonly r0: number;
   readonly r1: number;
   readonly c0: number;
   readonly c1: number;
 }
 
-/** The region that the argument of `patch:` names; throws `SelectorError` unless the camera's grid has it. */
+function describeGrid(grid: GridDocument): string {
+  const sides = grid.part.map((side) => Number(side.toPrecision(4))).join(", ");
+  return `${grid.rows} x ${grid.columns} patches${coversAll(grid) ? "" : ` of the part (${sides})`}`;
+}
+
+/** The region that the argument of `patch:` names; throws `SelectorError` unless the camera's picture has it. */
 export function patchRegion(argument: string, layout: SiteDocument): PatchRegion {
   const match = PATCH.exec(argument)?.groups;
-  if (!match) throw new SelectorError(`Cannot read selector 'patch:${argument}'; expected patch:CAMERA[r0:r1,c0:c1].`);
+  if (!match) {
+    throw new SelectorError(
+      `Cannot read selector 'patch:${argument}'; expected patch:CAMERA[r0:r1,c0:c1] with rows and columns of ` +
+        "patches, or with fractions of the picture such as 0.5.",
+    );
+  }
   const camera = match.camera!;
-  const span = cameraSpan(layout, camera);
-  if (!span.grid) throw new SelectorError(`Camera '${camera}' has no patch grid.`);
-  const { rows, columns } = span.grid;
+  const grids = gridSpans(layout, camera).map(({ grid }) => grid);
+  if (!grids.length) throw new SelectorError(`Camera '${camera}' has no patch grid.`);
+  const given = [match.r0!, match.r1!, match.c0!, match.c1!].filter((end) => end !== "");
+  const fractions = !given.length || given.some((end) => end.includes("."));
+  if (grids.length > 1 && !fractions) {
+    throw new SelectorError(
+      `Selector 'patch:${argument}' counts patches, and camera '${camera}' has ${grids.length} grids ` +
+        `(${listing(grids.map(describeGrid))}); expected fractions of the whole picture, which take ` +
+        `patches of all of them, such as patch:${camera}[0.0:0.5,0.25:1.0]; & span:NAME takes one grid's.`,
+    );
+  }
+  const [rows, columns] = fractions ? [1, 1] : [grids[0]!.rows, grids[0]!.columns];
   const [r0, r1] = [Number(match.r0), Number(match.r1 || rows)];
   const [c0, c1] = [Number(match.c0), Number(match.c1 || columns)];
   if (!(r0 < r1 && r1 <= rows && c0 < c1 && c1 <= columns)) {
     throw new SelectorError(
-      `Selector 'patch:${argument}' leaves the grid of camera '${camera}', which has ${rows} rows and ` +
-        `${columns} columns of patches; expected 0 <= r0 < r1 <= ${rows} and 0 <= c0 < c1 <= ${columns}.`,
+      fractions
+        ? `Selector 'patch:${argument}' leaves the picture of camera '${camera}', whose sides are 1 in fractions; ` +
+            "expected 0 <= r0 < r1 <= 1 and 0 <= c0 < c1 <= 1."
+        : `Selector 'patch:${argument}' leaves the grid of camera '${camera}', which has ${rows} rows and ` +
+            `${columns} columns of patches; expected 0 <= r0 < r1 <= ${rows} and 0 <= c0 < c1 <= ${columns}.`,
     );
   }
-  return { camera, r0, r1, c0, c1 };
+  return { camera, fractions, r0, r1, c0, c1 };
 }
 
-function patchKeys(argument: string, tokens: EpisodeTokens): Membership {
-  const { camera, r0, r1, c0, c1 } = patchRegion(argument, tokens.layout);
-  const span = cameraSpan(tokens.layout, camera);
-  const { columns } = span.grid!;
+function patchMembers(argument: string, tokens: EpisodeTokens): Membership {
+  const { camera, fractions, r0, r1, c0, c1 } = patchRegion(argument, tokens.layout);
   const member = noKeys(tokens);
-  for (let row = r0; row < r1; row++) {
-    member.bits.fill(1, span.start + row * columns + c0, span.start + row * columns + c1);
+  for (const { start, stop, grid } of gridSpans(tokens.layout, camera)) {
+    const [top, left, height, width] = grid.part;
+    for (let key = start; key < stop; key++) {
+      const column = (key - start) % grid.columns;
+      const row = (key - start - column) / grid.columns;
+      const down = fractions ? ((row + 0.5) / grid.rows) * height + top : row;
+      const across = fractions ? ((column + 0.5) / grid.columns) * width + left : column;
+      if (r0 <= down && down < r1 && c0 <= across && across < c1) member.bits[key] = 1;
+    }
   }
   return member;
 }
@@ -221,7 +249,14 @@ function numberKeys(argument: string, tokens: EpisodeTokens): Membership {
 const cameraProblem: SelectorKind["problem"] = (argument, _, layout) => missing("camera", argument, camerasOf(layout));
 
 const SELECTOR_KINDS: Record<string, SelectorKind> = {
-  camera: spanKind(cameraSpan, cameraProblem),
+  camera: {
+    keys(argument, tokens) {
+      const member = noKeys(tokens);
+      for (const key of keysOfSpans(cameraSpans(tokens.layout, argument))) member.bits[key] = 1;
+      return member;
+    },
+    problem: cameraProblem,
+  },
   role: {
     keys: roleKeys,
     problem: (argument) => {
@@ -238,7 +273,7 @@ const SELECTOR_KINDS: Record<string, SelectorKind> = {
   words: { keys: wordsKeys, problem: wordsProblem },
   object: { keys: objectKeys, problem: objectProblem },
   patch: {
-    keys: patchKeys,
+    keys: patchMembers,
     problem: (argument, vocabulary, layout) => cameraProblem(argument.split("[")[0]!, vocabulary, layout),
   },
   keys: { keys: numberKeys, problem: () => null }, // a range that leaves the site is found when the keys are taken

@@ -1,6 +1,6 @@
 /** What selectors need of one episode's keys at one site, and the names in it: schemas/groupings/vocabulary.py. */
 import { INVALID_ROLES, ROLES } from "../store/documents";
-import type { PromptDocument, ObjectDocument, SiteDocument, SpanDocument } from "../store/documents";
+import type { GridDocument, PromptDocument, ObjectDocument, SiteDocument, SpanDocument } from "../store/documents";
 import { type UniformKeys, uniformOfVersion1 } from "./key_counts";
 import { BadArgument, casefold, characters, decimalDigits, listing, shortened, unknownName, visible } from "./text";
 import { wordsOf, type Word } from "./words";
@@ -98,7 +98,12 @@ function onceIfSame(roles: KeyRole): KeyRole {
 // Spans by name: schemas/layout.py.
 
 export function camerasOf(layout: SiteDocument): string[] {
-  return layout.spans.flatMap((span) => (span.camera === null ? [] : [span.camera]));
+  return [...new Set(layout.spans.flatMap((span) => (span.camera === null ? [] : [span.camera])))];
+}
+
+/** Cameras that have patches. */
+export function picturedCameras(layout: SiteDocument): string[] {
+  return [...new Set(layout.spans.flatMap((span) => (span.camera !== null && span.grid ? [span.camera] : [])))];
 }
 
 export function spanNamed(layout: SiteDocument, name: string): SpanDocument {
@@ -107,10 +112,26 @@ export function spanNamed(layout: SiteDocument, name: string): SpanDocument {
   throw unknownName("span", name, layout.spans.map((span) => span.name));
 }
 
-export function cameraSpan(layout: SiteDocument, camera: string): SpanDocument {
-  const found = layout.spans.find((span) => span.camera === camera);
-  if (found) return found;
+/** All spans of a camera, in key order. */
+export function cameraSpans(layout: SiteDocument, camera: string): SpanDocument[] {
+  const found = layout.spans.filter((span) => span.camera === camera);
+  if (found.length) return found;
   throw unknownName("camera", camera, camerasOf(layout));
+}
+
+/** Those of them whose keys are patches. */
+export function gridSpans(layout: SiteDocument, camera: string): (SpanDocument & { grid: GridDocument })[] {
+  return cameraSpans(layout, camera).filter((span): span is SpanDocument & { grid: GridDocument } => span.grid !== null);
+}
+
+/** Numbers of the keys of some spans, in order. */
+export function keysOfSpans(spans: readonly SpanDocument[]): number[] {
+  return spans.flatMap(({ start, stop }) => Array.from({ length: stop - start }, (_, i) => start + i));
+}
+
+/** Keys of the patches of all grids of a camera: the patches of its coverage. */
+export function patchKeys(layout: SiteDocument, camera: string): number[] {
+  return keysOfSpans(gridSpans(layout, camera));
 }
 
 /** A latent frame by its name, by `frameN`, or as `curr_last`: the last frame with a current camera picture. */

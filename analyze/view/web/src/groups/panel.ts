@@ -8,7 +8,8 @@ import { readGroupingFile } from "../grouping/grouping_files";
 import { ofReplan } from "../grouping/resolve";
 import type { Atom } from "../grouping/selector_parser";
 import { attempt } from "../grouping/text";
-import type { EpisodeTokens } from "../grouping/tokens";
+import { type EpisodeTokens, picturedCameras } from "../grouping/tokens";
+import { PictureMap } from "../measures/picture_map";
 import type { Place } from "../page/baselines";
 import { button, choice, element } from "../page/dom";
 import { type PageContext, type PanelInstance, registerPanel } from "../page/panels";
@@ -307,9 +308,9 @@ class GroupsPanel implements PanelInstance {
       const group = resolved!.names.indexOf(name);
       const own = ofReplan(resolved!.weights, replan).subarray(group * tokens.keys, (group + 1) * tokens.keys);
       const members = new Map<string, Uint8Array>();
-      for (const span of tokens.layout.spans) {
-        if (!span.camera || !span.grid) continue;
-        members.set(span.camera, Uint8Array.from(own.subarray(span.start, span.stop), (weight) => (weight >= OUTLINED ? 255 : 0)));
+      for (const camera of picturedCameras(tokens.layout)) {
+        const cells = new PictureMap(tokens.layout, camera).highest(own);
+        members.set(camera, Uint8Array.from(cells, (weight) => (weight >= OUTLINED ? 255 : 0)));
       }
       this.page.pictures.setOutline(`group:${name}`, name, colours.get(name)!, members);
       const places = words.flatMap((word, i) => (word.keys.length && word.keys.every((key) => own[key]! >= 0.5) ? [i] : []));

@@ -7,9 +7,9 @@ import {
   type Selector,
   selectorText,
 } from "../grouping/selector_parser";
-import { patchRegion } from "../grouping/selectors";
+import { patchRegion, type PatchRegion } from "../grouping/selectors";
 import { attempt, trimmed } from "../grouping/text";
-import { cameraSpan } from "../grouping/tokens";
+import { type Cells, PictureMap } from "../measures/picture_map";
 import type { SiteDocument } from "../store/documents";
 import { coveringRectangles } from "./rectangles";
 
@@ -49,8 +49,9 @@ export function hasPart(text: string, atom: Atom): boolean {
 }
 
 /**
- * The selector with patches of a camera painted or erased. The union's `patch:` parts of that camera become as few
- * rectangles as possible, at the place of the first; other parts stay. Null where the camera's name cannot be written.
+ * The selector with cells of a camera's map painted or erased. The union's `patch:` parts of that camera whose borders are
+ * those of cells become as few rectangles as possible, at the place of the first; other parts stay. Null where the camera's
+ * name cannot be written.
  */
 export function paintedPatches(
   text: string,
@@ -59,11 +60,11 @@ export function paintedPatches(
   patches: readonly number[],
   erase: boolean,
 ): string | null {
-  const { rows, columns } = cameraSpan(layout, camera).grid!;
+  const { rows, columns, cellsArePatches } = new PictureMap(layout, camera);
   const mask = new Uint8Array(rows * columns);
   const parts: (Selector | null)[] = [];
   for (const part of partsOf(text)) {
-    const region = regionOf(part, layout);
+    const region = regionOf(part, layout, { rows, columns });
     if (region?.camera !== camera) {
       parts.push(part);
       continue;
@@ -74,13 +75,27 @@ export function paintedPatches(
   for (const patch of patches) mask[patch] = erase ? 0 : 1;
   if (!parts.includes(null)) parts.push(null);
   const painted = coveringRectangles(mask, rows, columns).map(
-    ({ r0, r1, c0, c1 }): Atom => ({ kind: "patch", argument: `${camera}[${r0}:${r1},${c0}:${c1}]` }),
+    ({ r0, r1, c0, c1 }): Atom => {
+      const [a, b, c, d] = cellsArePatches ? [r0, r1, c0, c1] : [r0 / rows, r1 / rows, c0 / columns, c1 / columns].map(decimal);
+      return { kind: "patch", argument: `${camera}[${a}:${b},${c}:${d}]` };
+    },
   );
   if (painted.some((atom) => atomText(atom) === null)) return null;
   return unionText(parts.flatMap((part) => (part === null ? painted : [part])));
 }
 
-function regionOf(part: Selector, layout: SiteDocument): ReturnType<typeof patchRegion> | null {
+function decimal(part: number): string {
+  return Number.isInteger(part) ? part.toFixed(1) : String(part);
+}
+
+/** The region of a `patch:` part in cells; null where its borders are not those of cells. */
+function regionOf(part: Selector, layout: SiteDocument, { rows, columns }: Cells): PatchRegion | null {
   if (typeof part === "string" || isOperation(part) || part.kind !== "patch") return null;
-  return attempt(() => patchRegion(part.argument, layout)).value ?? null;
+  const region = attempt(() => patchRegion(part.argument, layout)).value;
+  if (!region) return null;
+  if (!region.fractions) return new PictureMap(layout, region.camera).cellsArePatches ? region : null;
+  const inCells = (side: number, cells: number): number => (Math.round(side * cells) / cells === side ? Math.round(side * cells) : NaN);
+  const [r0, r1] = [inCells(region.r0, rows), inCells(region.r1, rows)];
+  const [c0, c1] = [inCells(region.c0, columns), inCells(region.c1, columns)];
+  return Number.isNaN(r0 + r1 + c0 + c1) ? null : { ...region, r0, r1, c0, c1 };
 }

@@ -1,5 +1,6 @@
 /** What is below the pointer: a patch's share and objects, or a word and the heads that read it most. */
 import { ofReplan } from "../grouping/resolve";
+import { PictureMap } from "../measures/picture_map";
 import type { HeadRows } from "../store/episode";
 import { sentenceOf } from "../store/errors";
 import { uniformKeys } from "./baselines";
@@ -41,20 +42,19 @@ export interface ObjectOfPatch {
   share: number;
 }
 
-/** The objects that cover a patch, and the part of the camera's attention that lies on each. */
-export function objectsAt(shown: Shown, camera: string, patch: number): ObjectOfPatch[] {
+/** The objects that cover the smallest patch at a cell, and the part of the attention on the camera's patches on each. */
+export function objectsAt(shown: Shown, camera: string, map: PictureMap, cell: number): ObjectOfPatch[] {
   const coverage = shown.coverage.get(camera);
-  const span = shown.site.layout.spans.find((each) => each.camera === camera);
-  if (!coverage || !span) return [];
+  const [patch] = map.patchesAt(cell);
+  if (!coverage || patch === undefined) return [];
   const first = coverage.replans === 1 ? 0 : shown.replan * coverage.patches * coverage.objects;
   const at = (place: number, thing: number): number => coverage.values[first + place * coverage.objects + thing]!;
-  let camera_ = 0;
-  for (let key = span.start; key < span.stop; key++) camera_ += shown.row[key]!;
+  const ofPatches = map.keys.reduce((sum, key) => sum + shown.row[key]!, 0);
   return shown.tokens.objects
     .map(({ name }, thing) => {
       let mass = 0;
-      for (let place = 0; place < coverage.patches; place++) mass += shown.row[span.start + place]! * at(place, thing);
-      return { name, covered: at(patch, thing), share: mass / camera_ };
+      for (let place = 0; place < coverage.patches; place++) mass += shown.row[map.keys[place]!]! * at(place, thing);
+      return { name, covered: at(patch, thing), share: mass / ofPatches };
     })
     .filter(({ covered }) => covered >= LEAST_COVERED)
     .sort((a, b) => b.covered - a.covered);
@@ -87,19 +87,18 @@ export class Inspector {
 
   #patch(camera: string, patch: number): void {
     const shown = this.#shown;
-    const span = shown?.site.layout.spans.find((each) => each.camera === camera);
-    if (!shown || !span) return;
-    const { columns } = span.grid!;
-    const { mass, lift } = measuresOfKeys([span.start + patch], shown);
-    let image = 0;
-    for (let key = span.start; key < span.stop; key++) image += shown.row[key]!;
+    if (!shown) return;
+    const map = new PictureMap(shown.site.layout, camera);
+    const { columns } = map;
+    const { mass, lift } = measuresOfKeys(map.patchesAt(patch).map((place) => map.keys[place]!), shown);
+    const image = map.keys.reduce((sum, key) => sum + shown.row[key]!, 0);
     const number = (name: string, value: number, text: string): HTMLElement =>
       element("strong", { "data-number": name, "data-value": String(value) }, text);
-    const things = objectsAt(shown, camera, patch).map(
+    const things = objectsAt(shown, camera, map, patch).map(
       ({ name, covered, share }) => `${name} covers ${formatPercent(covered, 0)} of it and has ${formatPercent(share)} of this picture's attention`,
     );
     this.host.replaceChildren(
-      `${camera}, patch row ${Math.floor(patch / columns)} column ${patch % columns}: `,
+      `${camera}, ${map.cellsArePatches ? "patch" : "patches at"} row ${Math.floor(patch / columns)} column ${patch % columns}: `,
       number("patch-mass", mass, formatPercent(mass, 2)),
       " of all attention, ",
       number("patch-share", mass / image, formatPercent(mass / image, 2)),

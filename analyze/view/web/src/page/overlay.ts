@@ -2,8 +2,9 @@
  * Attention laid over a picture: values of patches, their scale, and pixels. The same as analyze/overlay/colours.py and
  * analyze/show/patch_pictures.py. Pure functions.
  */
-import { keyLifts, keyRanks } from "../measures/ranks";
-import type { CameraDocument, SpanDocument } from "../store/documents";
+import type { Cells, PictureMap } from "../measures/picture_map";
+import { keyRanks, overUniform } from "../measures/ranks";
+import type { CameraDocument } from "../store/documents";
 import type { Picture } from "../store/episode";
 import type { Measure } from "./state";
 
@@ -22,11 +23,16 @@ export interface Scale {
   readonly unit: string;
 }
 
-/** What is shown of every key, (key): per cent of the attention, lift over uniform attention, or rank in per cent. */
-export function shownValues(row: Float64Array, valid: Uint8Array, uniform: Float64Array, measure: Measure): Float64Array {
-  if (measure === "raw") return row.map((value) => 100 * value);
-  if (measure === "lift") return keyLifts(row, valid, uniform);
-  return keyRanks(row, valid).map((rank) => 100 * rank);
+/**
+ * What is shown of every cell of a camera's map: per cent of the attention, lift over uniform attention (as `keyLifts`), or
+ * the highest rank of a patch there in per cent. `row`, `valid` and `uniform` are of keys.
+ */
+export function shownValues(map: PictureMap, row: Float64Array, valid: Uint8Array, uniform: Float64Array, measure: Measure): Float64Array {
+  if (measure === "raw") return map.spread(row).map((value) => 100 * value);
+  if (measure === "rank") return map.highest(keyRanks(row, valid)).map((rank) => 100 * rank);
+  const ofValid = overUniform(row, valid, uniform);
+  const given = map.spread(uniform.map((value, key) => (valid[key] ? value : 0)));
+  return map.spread(row).map((value, cell) => (given[cell]! > 0 ? value / given[cell]! / ofValid : NaN));
 }
 
 function roundUp(value: number): number {
@@ -54,9 +60,8 @@ export function scaleFor(values: readonly number[] | Float64Array, measure: Meas
     : { high, uniform: even, label: "share of all attention on a patch", unit: "%" };
 }
 
-/** The row and column of a grid on which a pixel or a pointer lies, in the stored picture; all in 0 to 1. */
-export function patchAt(x: number, y: number, span: SpanDocument, view: CameraDocument): number {
-  const grid = span.grid!;
+/** The cell of a map on which a pixel or a pointer lies, in the stored picture; all in 0 to 1. */
+export function patchAt(x: number, y: number, grid: Cells, view: CameraDocument): number {
   const across = view.mirrored ? 1 - x : x;
   const down = view.upright ? y : 1 - y;
   const column = Math.min(grid.columns - 1, Math.max(0, Math.floor(across * grid.columns)));
@@ -64,9 +69,8 @@ export function patchAt(x: number, y: number, span: SpanDocument, view: CameraDo
   return row * grid.columns + column;
 }
 
-/** Where a patch is shown: its left, top, width and height in parts of the picture. */
-export function placeOfPatch(patch: number, span: SpanDocument, view: CameraDocument): [number, number, number, number] {
-  const { rows, columns } = span.grid!;
+/** Where a cell is shown: its left, top, width and height in parts of the picture. */
+export function placeOfPatch(patch: number, { rows, columns }: Cells, view: CameraDocument): [number, number, number, number] {
   const column = patch % columns;
   const row = (patch - column) / columns;
   const across = view.mirrored ? columns - 1 - column : column;
@@ -103,18 +107,17 @@ export interface Painting {
 /**
  * A picture with attention over it as a person sees the scene, RGBA (row, column, 4).
  *
- * `values`: of the span's patches, in the stored order; NaN leaves the picture as it is.
+ * `values`: of the map's cells, in the stored order; NaN leaves the picture as it is.
  */
 export function overlayPixels(
   frame: Picture | null,
   values: Float64Array,
-  span: SpanDocument,
+  grid: PictureMap,
   view: CameraDocument,
   { scale, colours, opacity, smooth }: Painting,
 ): { height: number; width: number; pixels: Uint8ClampedArray<ArrayBuffer> } {
-  const grid = span.grid!;
-  const height = frame ? frame.height : grid.image_height;
-  const width = frame ? frame.width : grid.image_width;
+  const height = frame ? frame.height : grid.height;
+  const width = frame ? frame.width : grid.width;
   const pixels = new Uint8ClampedArray(height * width * 4);
   const down = between(height, grid.rows, smooth);
   const across = between(width, grid.columns, smooth);

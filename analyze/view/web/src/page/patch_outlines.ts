@@ -1,22 +1,23 @@
 /** Outlines of patches on a canvas that shows a picture as a person sees it. */
-import type { CameraDocument, SpanDocument } from "../store/documents";
+import type { Cells } from "../measures/picture_map";
+import type { CameraDocument } from "../store/documents";
 import { placeOfPatch } from "./overlay";
 
 /** Lines along the border of the member patches. */
 export function strokePatches(
   context: CanvasRenderingContext2D,
-  { span, view, canvas }: { span: SpanDocument; view: CameraDocument; canvas: HTMLCanvasElement },
+  { map, view, canvas }: { map: Cells; view: CameraDocument; canvas: HTMLCanvasElement },
   member: (patch: number) => boolean,
   colour: string,
   width: number,
 ): void {
-  const { rows, columns } = span.grid!;
+  const { rows, columns } = map;
   context.strokeStyle = colour;
   context.lineWidth = width;
   context.beginPath();
   for (let patch = 0; patch < rows * columns; patch++) {
     if (!member(patch)) continue;
-    const [left, top, across, down] = placeOfPatch(patch, span, view);
+    const [left, top, across, down] = placeOfPatch(patch, map, view);
     const [x, y] = [left * canvas.width, top * canvas.height];
     const [right, bottom] = [x + across * canvas.width, y + down * canvas.height];
     const row = Math.floor(patch / columns);

@@ -1,5 +1,8 @@
 /** The cameras' pictures with attention over them: one canvas a camera, with outlines, a brush and a cursor. */
 import { ofReplan } from "../grouping/resolve";
+import { listing } from "../grouping/text";
+import { cameraSpans, keysOfSpans } from "../grouping/tokens";
+import { PictureMap } from "../measures/picture_map";
 import { finiteMean } from "../measures/masses";
 import { overUniform } from "../measures/ranks";
 import type { CameraDocument, SpanDocument } from "../store/documents";
@@ -9,6 +12,7 @@ import { type Painting, type Scale, overlayPixels, patchAt, placeOfPatch, scaleF
 import { patchesBetween, strokePatches } from "./patch_outlines";
 import type { Shown } from "./shown";
 
+/** `patch`: a cell of the camera's map. */
 export type PatchListener = (camera: string, patch: number, replan: number) => void;
 
 export interface Brush {
@@ -33,11 +37,25 @@ interface Drawn {
   canvas: HTMLCanvasElement;
   note: HTMLElement;
   painted: HTMLCanvasElement;
-  span: SpanDocument;
+  map: PictureMap;
   view: CameraDocument;
-  /** The patch below the pointer or the cursor; -1: none. */
+  /** The cell of the map below the pointer or the cursor; -1: none. */
   patch: number;
   cursor: boolean;
+}
+
+function massOf(row: Float64Array, spans: readonly SpanDocument[]): number {
+  return keysOfSpans(spans).reduce((sum, key) => sum + row[key]!, 0);
+}
+
+/** What a camera's map adds up and leaves out; empty where its keys are the patches of one grid. `map_note` of patch_maps.py. */
+export function mapNote({ row, site }: Pick<Shown, "row" | "site">, camera: string, share: number): string {
+  const spans = cameraSpans(site.layout, camera);
+  const [placed, others] = [spans.filter((span) => span.grid), spans.filter((span) => !span.grid)];
+  const names = (those: readonly SpanDocument[]): string => listing(those.map((span) => span.name));
+  const outside = (100 * massOf(row, others)) / share;
+  const leavesOut = others.length ? `, ${outside.toFixed(1)}% of that on keys of ${names(others)}, which lie nowhere in the picture` : "";
+  return leavesOut + (placed.length > 1 ? `; the map adds ${names(placed)}` : "");
 }
 
 /** How many patches of a picture are named for those who cannot see it. */
@@ -118,10 +136,9 @@ export class PictureBoard {
     this.#drawn.clear();
     this.host.replaceChildren();
     for (const camera of cameras) {
-      const span = shown.site.layout.spans.find((each) => each.camera === camera)!;
-      const grid = span.grid!;
+      const map = new PictureMap(shown.site.layout, camera);
       const canvas = element("canvas", { "data-camera": camera, tabindex: 0, role: "img" });
-      canvas.style.aspectRatio = `${grid.image_width} / ${grid.image_height}`;
+      canvas.style.aspectRatio = `${map.width} / ${map.height}`;
       const note = element("span", { class: "soft" });
       const figure = element("figure", {}, canvas, element("figcaption", {}, camera, " ", note));
       const drawn: Drawn = {
@@ -129,7 +146,7 @@ export class PictureBoard {
         canvas,
         note,
         painted: document.createElement("canvas"),
-        span,
+        map,
         view: viewOf(shown.store.root.policy.cameras, camera),
         patch: -1,
         cursor: false,
@@ -144,7 +161,7 @@ export class PictureBoard {
     const { canvas } = drawn;
     const patchOf = (event: PointerEvent): number => {
       const box = canvas.getBoundingClientRect();
-      return patchAt((event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height, drawn.span, drawn.view);
+      return patchAt((event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height, drawn.map, drawn.view);
     };
     canvas.addEventListener("pointermove", (event) => {
       const patch = patchOf(event);
@@ -186,7 +203,7 @@ export class PictureBoard {
     const painting = this.#painting!;
     if (painting.camera !== camera || painting.last === patch) return;
     const from = painting.last < 0 ? patch : painting.last;
-    const patches = patchesBetween(from, patch, drawn.span.grid!.columns);
+    const patches = patchesBetween(from, patch, drawn.map.columns);
     painting.last = patch;
     this.#brush!.paint(camera, patches, painting.erase);
   }
@@ -210,10 +227,10 @@ export class PictureBoard {
       const steps: Record<string, [number, number]> = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
       const step = steps[event.key];
       if (!step) return;
-      const [left, top, width, height] = placeOfPatch(drawn.patch, drawn.span, drawn.view);
+      const [left, top, width, height] = placeOfPatch(drawn.patch, drawn.map, drawn.view);
       const x = Math.min(Math.max(left + (0.5 + step[0]) * width, 0), 1 - width / 2);
       const y = Math.min(Math.max(top + (0.5 + step[1]) * height, 0), 1 - height / 2);
-      this.#hover(camera, drawn, patchAt(x, y, drawn.span, drawn.view));
+      this.#hover(camera, drawn, patchAt(x, y, drawn.map, drawn.view));
     }
     event.preventDefault();
     event.stopPropagation();
@@ -230,7 +247,7 @@ export class PictureBoard {
   #patchValues(): { values: number[]; uniform: number } {
     const shown = this.#shown!;
     const { site, state, tokens } = shown;
-    const spans = [...this.#drawn.values()].map((drawn) => drawn.span);
+    const maps = [...this.#drawn.values()].map((drawn) => drawn.map);
     const values: number[] = [];
     const expected: number[] = [];
     const rows = this.#preview ? null : shown.allRows;
@@ -240,13 +257,11 @@ export class PictureBoard {
       const uniform = rows ? ofReplan(shown.allUniform, replan) : (this.#preview ?? shown).uniform;
       const first = rows && tokens.keyRole.replans > 1 ? replan * site.keys : 0;
       const valid = rows ? tokens.valid.subarray(first, first + site.keys) : shown.valid;
-      const all = shownValues(row, valid, uniform, state.measure);
       const ofValid = overUniform(row, valid, uniform);
-      for (const span of spans) {
-        for (let key = span.start; key < span.stop; key++) {
-          values.push(all[key]!);
-          expected.push(valid[key] && uniform[key]! > 0 ? 100 * uniform[key]! * ofValid : NaN);
-        }
+      const given = uniform.map((value, key) => (valid[key] ? value : 0));
+      for (const map of maps) {
+        for (const value of shownValues(map, row, valid, uniform, state.measure)) values.push(value);
+        for (const value of map.spread(given)) expected.push(value > 0 ? 100 * value * ofValid : NaN);
       }
     }
     return { values, uniform: finiteMean(expected) || 0 };
@@ -279,12 +294,11 @@ export class PictureBoard {
     if (!this.#scale) return;
     const { state } = shown;
     const { row, uniform } = this.#preview ?? shown;
-    const values = shownValues(row, shown.valid, uniform, state.measure);
     const painting: Painting = { scale: this.#scale, colours: colourTable(state.colours), opacity: state.opacity, smooth: state.smooth };
     for (const [camera, drawn] of this.#drawn) {
-      const { span, view, painted, canvas } = drawn;
-      const own = values.slice(span.start, span.stop);
-      const { height, width, pixels } = overlayPixels(shown.frames.get(camera) ?? null, own, span, view, painting);
+      const { map, view, painted, canvas } = drawn;
+      const own = shownValues(map, row, shown.valid, uniform, state.measure);
+      const { height, width, pixels } = overlayPixels(shown.frames.get(camera) ?? null, own, map, view, painting);
       painted.width = width;
       painted.height = height;
       painted.getContext("2d")!.putImageData(new ImageData(pixels, width, height), 0, 0);
@@ -296,12 +310,11 @@ export class PictureBoard {
 
   #describe(camera: string, drawn: Drawn, own: Float64Array): void {
     const shown = this.#shown!;
-    const { columns } = drawn.span.grid!;
+    const { columns } = drawn.map;
     const best = [...own.keys()].filter((i) => !Number.isNaN(own[i]!)).sort((a, b) => own[b]! - own[a]!);
     const named = best.slice(0, NAMED_PATCHES).map((patch) => `row ${Math.floor(patch / columns)} column ${patch % columns}`);
-    let share = 0;
-    for (let key = drawn.span.start; key < drawn.span.stop; key++) share += shown.row[key]!;
-    drawn.note.textContent = `${(100 * share).toFixed(1)}% of the attention`;
+    const share = massOf(shown.row, cameraSpans(shown.site.layout, camera));
+    drawn.note.textContent = `${(100 * share).toFixed(1)}% of the attention${mapNote(shown, camera, share)}`;
     drawn.canvas.dataset.mass = String(share);
     drawn.canvas.setAttribute(
       "aria-label",

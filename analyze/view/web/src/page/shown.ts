@@ -1,11 +1,12 @@
 /** What is on the page at one moment: everything that its parts draw, read for one state. */
 import type { UniformKeys } from "../grouping/key_counts";
 import { ofReplan } from "../grouping/resolve";
-import { EpisodeTokens } from "../grouping/tokens";
+import { EpisodeTokens, patchKeys, picturedCameras } from "../grouping/tokens";
 import type { Word } from "../grouping/words";
 import { wordsOf } from "../grouping/words";
 import type { PromptDocument } from "../store/documents";
 import type { Coverage, Episode, Picture, Selection, SiteInfo } from "../store/episode";
+import { StoreError } from "../store/errors";
 import type { Store } from "../store/open";
 import { baselineNote, uniformKeys } from "./baselines";
 import { type EffectsShown, effectsOf } from "./effects_shown";
@@ -106,11 +107,14 @@ const tokensOfEpisodes = new WeakMap<Episode, Map<string, Promise<EpisodeTokens>
 async function readTokens(episode: Episode, site: SiteInfo): Promise<EpisodeTokens> {
   const { layout } = site;
   const coverage = new Map<string, Coverage>();
-  const cameras = layout.spans.flatMap((span) => (span.camera && span.grid ? [span.camera] : []));
+  const cameras = picturedCameras(layout);
   const [keyRole] = await Promise.all([
     episode.keyRole(layout.name),
     ...cameras.map(async (camera) => {
       const found = await episode.coverage(camera);
+      if (found && found.patches !== patchKeys(layout, camera).length) {
+        throw new StoreError(`The array objects/${camera} has ${found.patches} patches; expected those of the camera's grids.`);
+      }
       if (found) coverage.set(camera, found);
     }),
   ]);
@@ -145,12 +149,10 @@ export function tokensOf(episode: Episode, site: SiteInfo): Promise<EpisodeToken
 /** Cameras of a site whose patches are not all masked, in the order of the keys. */
 export function seenCameras(tokens: EpisodeTokens): string[] {
   const { codes, keys, replans } = tokens.keyRole;
-  return tokens.layout.spans.flatMap((span) => {
-    if (span.camera === null || !span.grid) return [];
-    for (let replan = 0; replan < replans; replan++) {
-      for (let key = span.start; key < span.stop; key++) if (codes[replan * keys + key] === 1) return [span.camera];
-    }
-    return [];
+  return picturedCameras(tokens.layout).filter((camera) => {
+    const own = patchKeys(tokens.layout, camera);
+    for (let replan = 0; replan < replans; replan++) if (own.some((key) => codes[replan * keys + key] === 1)) return true;
+    return false;
   });
 }
 
@@ -162,7 +164,7 @@ async function readsWhole(episode: Episode, site: SiteInfo, selection: Selection
 }
 
 async function picturesOf(episode: Episode, site: SiteInfo, replan: number): Promise<Map<string, Picture | null>> {
-  const cameras = site.layout.spans.flatMap((span) => (span.camera && span.grid ? [span.camera] : []));
+  const cameras = picturedCameras(site.layout);
   return new Map(await Promise.all(cameras.map(async (camera) => [camera, await episode.frame(camera, replan)] as const)));
 }
 

@@ -6,7 +6,7 @@
 import { type EffectsDocument, parseEffects } from "./effects_document";
 import { type StepsDocument, parseSteps } from "./steps_document";
 import { StoreError } from "./errors";
-import { type Fields, flag, list, name, object, oneOf, text, whole, wholes } from "./json_fields";
+import { type Fields, finite, flag, list, name, object, oneOf, text, whole, wholes } from "./json_fields";
 import * as limits from "./limits";
 
 export const ROLES = {
@@ -39,6 +39,12 @@ export interface GridDocument {
   columns: number;
   image_height: number;
   image_width: number;
+  /** Top, left, height and width of what it covers, in fractions of the whole picture. */
+  part: readonly [number, number, number, number];
+}
+
+export function coversAll({ part }: GridDocument): boolean {
+  return part[0] === 0 && part[1] === 0 && part[2] === 1 && part[3] === 1;
 }
 
 export interface SpanDocument {
@@ -161,9 +167,21 @@ function parseGrid(value: unknown, where: string): GridDocument | null {
     columns: whole(fields.columns, `${where}.columns`, limits.KEYS, 1),
     image_height: whole(fields.image_height, `${where}.image_height`, limits.PICTURE_SIDE, 1),
     image_width: whole(fields.image_width, `${where}.image_width`, limits.PICTURE_SIDE, 1),
+    part: parsePart(fields.part, `${where}.part`),
   };
   whole(grid.image_height * grid.image_width, `the number of pixels of ${where}`, limits.PICTURE_PIXELS);
+  if (!(grid.part[2] * grid.image_height >= 1 && grid.part[3] * grid.image_width >= 1)) {
+    throw new StoreError(`The store cannot be shown: ${where} covers less than a pixel.`);
+  }
   return grid;
+}
+
+function parsePart(value: unknown, where: string): GridDocument["part"] {
+  if (value === undefined) return [0, 0, 1, 1];
+  const [top, left, height, width, ...more] = list(value, where, 4).map((each, i) => finite(each, `${where}[${i}]`));
+  const inside = Math.min(top!, left!) >= 0 && Math.max(top! + height!, left! + width!) <= 1 + 1e-9;
+  if (!inside || width === undefined || more.length) throw new StoreError(`The store cannot be shown: ${where} is no part of a picture.`);
+  return [top!, left!, height!, width];
 }
 
 function parseSite(value: unknown, where: string): SiteDocument {
@@ -194,6 +212,15 @@ function parseSite(value: unknown, where: string): SiteDocument {
       growing_offset: span.growing_offset === undefined ? 0 : whole(span.growing_offset, `${at}.growing_offset`, limits.KEYS),
     };
   });
+  const sizes = new Map<string, GridDocument>();
+  for (const { camera, grid } of spans) {
+    if (camera === null || !grid) continue;
+    const first = sizes.get(camera) ?? grid;
+    if (first.image_height !== grid.image_height || first.image_width !== grid.image_width) {
+      throw new StoreError(`The store cannot be shown: the grids of camera "${camera}" are of pictures of different sizes.`);
+    }
+    sizes.set(camera, grid);
+  }
   return {
     name: name(fields.name, `${where}.name`),
     spans,
