@@ -46,7 +46,7 @@ from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens
 from vla_attention.analyze.ratios.analysis import Analysis, analyse
 from vla_attention.analyze.show.numbers import format_number
 from vla_attention.analyze.stores.parallel import map_episodes
-from vla_attention.analyze.stores.prompt_notes import prompt_notes
+from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
@@ -176,7 +176,7 @@ def study_of(analysis: Analysis, opened: BaseAndReruns, dimensions: Sequence[int
     names = [episode.name for episode in opened.base.episodes]
     pairings = [pair_episodes(condition, members, names) for condition in opened.reruns]
     spread = _spread(opened, all_members, question.settings, dimensions)
-    notes = [*opened.notes, *prompt_notes(question.episodes)]
+    notes = [*opened.notes, *run_notes(question.episodes)]
     if not stores_executed(opened.base):
         notes.append("The base does not store how many steps of a chunk were executed: effects are over whole chunks.")
     groups = [condition.group for condition in opened.reruns if condition.group is not None]

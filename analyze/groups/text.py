@@ -8,7 +8,7 @@ from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.show.answer import Section
 from vla_attention.analyze.show.numbers import format_number, of_tasks
 from vla_attention.analyze.show.tables import Table, texts
-from vla_attention.analyze.stores.prompt_notes import prompt_notes
+from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.grouping import Grouping
 
@@ -24,7 +24,7 @@ def preview_sections(question: Question, preview: GroupPreview) -> list[Section]
         f"{of_tasks(len(question.selected), question.num_tasks)}",
         *question.skipped,
     ]
-    notes = [*prompt_notes(question.episodes), *_overlaps(preview)]
+    notes = [*run_notes(question.episodes), *_overlaps(preview)]
     if grouping.ratio is not None and preview.uniform_ratio is not None:
         sides = " / ".join(" + ".join(side) for side in (grouping.ratio.numerator, grouping.ratio.denominator))
         notes.append(f"Ratio {sides}: uniform attention alone gives {_range(*preview.uniform_ratio)}.")

@@ -17,8 +17,8 @@ from vla_attention.analyze.show.headings import run_header
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.units import Units
 from vla_attention.analyze.stores.checking import faults_of_each
-from vla_attention.analyze.stores.prompt_notes import prompt_notes
 from vla_attention.analyze.stores.read_ahead import read_ahead
+from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.analyze.stores.selection import (
     Selection,
     check_combinable,
@@ -85,7 +85,7 @@ class Question:
     def _remarks_on_numbers(self) -> tuple[str, ...]:
         return (
             *self.skipped,
-            *prompt_notes(self.episodes),
+            *run_notes(self.episodes),
             *baseline_notes(self.stores),
             *contribution_notes(self.stores),
         )

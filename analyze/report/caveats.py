@@ -18,7 +18,7 @@ from vla_attention.analyze.ratios.summary_text import FEW_EPISODES
 from vla_attention.analyze.report.section_parts import Section
 from vla_attention.analyze.show.headings import untrained_sentence
 from vla_attention.analyze.show.numbers import format_number, format_percent, plural
-from vla_attention.analyze.stores.prompt_notes import prompt_notes
+from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, mass_error_bound
@@ -75,7 +75,7 @@ def caveats(analysis: Analysis, masses: Mapping[str, float], sinks: pl.DataFrame
         *_compute_type(question),
         *_rounding(question),
         *(Caveat("Left out", line, True) for line in question.skipped),
-        *(Caveat("Prompts", line, True) for line in prompt_notes(question.episodes)),
+        *(Caveat("Changed or cut", line, True) for line in run_notes(question.episodes)),
         *(Caveat("Baseline of version 1", line, True) for line in baseline_notes(question.stores)),
         *(Caveat("Contributions of version 1", line, True) for line in contribution_notes(question.stores)),
         *_related_tasks(question),

@@ -10,8 +10,8 @@ import polars as pl
 
 from vla_attention.analyze.show.headings import wrap
 from vla_attention.analyze.show.numbers import of_tasks, plural, solved_text
-from vla_attention.analyze.stores.prompt_notes import prompt_notes
 from vla_attention.analyze.stores.read_ahead import read_ahead
+from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.analyze.stores.selection import select_episodes
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS
@@ -105,8 +105,8 @@ def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
     yield f"  run        suite {protocol.suite}, protocol {protocol_text(protocol)}"
     if root.data_set is not None:
         yield f"  data set   {root.data_set.describe()}"
-    for note in prompt_notes([(store, episode) for episode in episodes]):
-        yield f"  prompts    {note}"
+    for note in run_notes([(store, episode) for episode in episodes]):
+        yield f"  note       {note}"
     summary = _EpisodeSummary.of(root, episodes)
     yield f"  episodes   {len(episodes)} ({solved_text(summary.success)}), tasks {listing(store.task_ids, 100)}"
     labels = [

@@ -97,13 +97,13 @@ def _write(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None
 
 def _serve(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None:
     from vla_attention.analyze.show.browser import open_in_browser
-    from vla_attention.analyze.stores.prompt_notes import prompt_notes
+    from vla_attention.analyze.stores.run_notes import run_notes
     from vla_attention.analyze.view.server import ViewerServer
 
     with ViewerServer(stores, arguments.port, allow_hosts=arguments.allow_host, keep_link=True) as server:
         again = f"; with --port {server.port} its link stays the same" if server.keeps_link else ""
         # At once, also into a file that somebody follows.
-        for line in prompt_notes([(store.store, episode) for store in stores for episode in store.store.episodes]):
+        for line in run_notes([(store.store, episode) for store in stores for episode in store.store.episodes]):
             print(f"note: {line}")
         print(f"The page: {server.link}\nIt is served to this machine only, until Ctrl-C{again}.", flush=True)
         if arguments.allow_host:

@@ -166,7 +166,8 @@ def inspect(policy: object, call: Callable[[], object], *, first_row: Callable[[
     recording refuses, and the reason below the table.
 
     first_row: where `call` has a batch, the same call with the first row of its inputs alone, noise included. Calls
-    whose first row is not what this call gives, as where heads are folded outside of the batch, are refused.
+    whose first row is not what this call gives, as where heads are folded outside of the batch, are refused. Modules
+    that are called another number of times for one row (a vision tower, once for each picture) are not compared.
 
     Raises:
         NoAttention: no attention was seen.
@@ -193,16 +194,32 @@ def _first_row(call: AttentionCall) -> Tensor:
     return call.rows(slice(None, None, step), slice(0, 1))[0].cpu()
 
 
+def _calls_by_module(calls: Sequence[CallShape]) -> dict[str, list[int]]:
+    """The numbers of the calls of each module, in order."""
+    numbers: dict[str, list[int]] = {}
+    for number, call in enumerate(calls):
+        numbers.setdefault(call.module, []).append(number)
+    return numbers
+
+
 def _compare_first_rows(shapes: _Shapes, alone: _Shapes) -> None:
     """Refuse calls whose first row is another one without the other rows of the batch."""
-    modules = [call.module for call in shapes.calls]
-    if modules != [call.module for call in alone.calls]:
+    of_all, of_one = (_calls_by_module(watched.calls) for watched in (shapes, alone))
+    pairs = [
+        pair
+        for module, numbers in of_all.items()
+        if len(numbers) == len(of_one.get(module, ()))
+        for pair in zip(numbers, of_one[module], strict=True)
+    ]
+    if not pairs or of_all.keys() != of_one.keys():
         raise OtherCalls(
-            f"The call given as first_row made {len(alone.calls)} attention calls, and that of all rows {len(modules)} "
-            "or others: both must be the same policy call."
+            f"The call given as first_row made {len(alone.calls)} attention calls in {len(of_one)} modules, and that "
+            f"of all rows {len(shapes.calls)} in {len(of_all)}: both must be the same policy call."
         )
-    pairs = zip(shapes.first_rows or (), alone.first_rows or (), alone.calls, strict=True)
-    for number, (rows, expected, shape) in enumerate(pairs):
+    assert shapes.first_rows is not None
+    assert alone.first_rows is not None
+    for number, other in pairs:
+        rows, expected, shape = shapes.first_rows[number], alone.first_rows[other], alone.calls[other]
         if rows is None or expected is None or shapes.refused[number]:
             continue
         if rows.shape != expected.shape:

@@ -21,6 +21,7 @@ from vla_attention.capture.interventions.resolution import (
     has_empty_group,
     make_editors,
     run_vocabularies,
+    selectors_of,
     site_tokens,
 )
 from vla_attention.capture.torch_policies.attention_calls import CallShape
@@ -30,7 +31,8 @@ from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs
 from vla_attention.capture.torch_policies.replan_text import ReplanText
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
+from vla_attention.schemas.groupings.vocabulary import SceneObject, Vocabulary
 from vla_attention.schemas.interventions import AttentionScale, Interventions, KeyKnockout
 from vla_attention.schemas.layout import Prompt, SiteLayout
 
@@ -126,7 +128,17 @@ class SessionKnockouts:
     def check_names(self, sites: Sequence[SiteLayout], instruction: str, objects: Sequence[SceneObject]) -> None:
         """Raise `SelectorError` for a selector with a name that does not exist in an episode of this instruction."""
         if self.any:
-            check_selectors(self.interventions, run_vocabularies(sites, [instruction], objects))
+            check_selectors(self.interventions, self._vocabularies(sites, instruction, objects))
+
+    def _vocabularies(
+        self, sites: Sequence[SiteLayout], instruction: str, objects: Sequence[SceneObject]
+    ) -> dict[str, Vocabulary]:
+        """The names of an episode; where groups may be empty, words that its instruction lacks are no mistake."""
+        words: list[str] = []
+        if self.allow_empty:
+            atoms = (atom for text in selectors_of(self.interventions) for atom in atoms_of(parse_selector(text)))
+            words = [atom.argument for atom in atoms if atom.kind == "word"]
+        return run_vocabularies(sites, [instruction, *words], objects)
 
     def edits(
         self,
@@ -139,7 +151,7 @@ class SessionKnockouts:
     ) -> dict[str, Sequence[SiteEdit]]:
         """Return the edits of one replan by site; errors as `RunChanges.editors`."""
         tokens = site_tokens(sites, key_role, prompt, objects, coverage)
-        vocabularies = run_vocabularies(sites, [prompt.instruction_text], objects)
+        vocabularies = self._vocabularies(sites, prompt.instruction_text, objects)
         has_empty_group(self.interventions, tokens, vocabularies, place, allow_empty=self.allow_empty)
         editors = make_editors(self.interventions, tokens, vocabularies, place)
         return {site: editor.edits for site, editor in editors.items()}

@@ -20,7 +20,7 @@ ObjectKind = Literal["object", "fixture", "robot", "background"]
 #: Why a site has no words to name, or no objects, and what to do about it.
 NO_WORDS = (
     "the keys of this site spell no words; choose a site with text by --site (Cosmos: cross); a text that was captured "
-    "without its tokenizer needs a capture with --t5-tokenizer"
+    "without its tokenizer needs a capture with --t5-tokenizer, va.record with tokenizer=..."
 )
 NO_COVERAGE = (
     "no selected episode has object coverage at this site: captures take it from the simulator's segmentation, "

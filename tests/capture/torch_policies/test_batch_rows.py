@@ -131,6 +131,24 @@ def test_a_repeatable_call_with_a_batch_tells_where_the_heads_are(tmp_path, outs
         assert run.attributes.provenance["rows of the batch of own setting"] == "apart (2 rows)"
 
 
+def test_inspect_leaves_out_a_tower_that_is_called_once_for_each_picture():
+    policy = folded_policy(True, FOLDED["sdpa"])
+    policy.tower = nn.MultiheadAttention(8, 2, batch_first=True)
+    tokens, prefix = (torch.randn(3, count, 8, generator=torch.Generator().manual_seed(count)) for count in (3, 6))
+
+    def act(rows):
+        with torch.no_grad():
+            for picture in prefix[:rows]:
+                policy.tower(picture[None], picture[None], picture[None])
+            hidden = tokens[:rows]
+            for block in policy.blocks:
+                hidden = block(hidden, prefix[:rows])
+
+    table = str(va.inspect(policy, lambda: act(3), first_row=lambda: act(1)))
+    assert "tower" in table
+    assert re.search(r"Recording refuses blocks\.\{0,1\}, 3 x 9: .* heads are folded outside", table)
+
+
 @pytest.mark.parametrize("outside", [True, False])
 def test_inspect_holds_the_first_row_against_a_call_of_one_row(outside):
     policy = folded_policy(outside, FOLDED["sdpa"])

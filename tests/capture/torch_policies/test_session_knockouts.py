@@ -142,3 +142,13 @@ def test_a_word_in_a_prompt_of_changing_length(tmp_path):
         rows = episode.read("joint/rows")
         assert (rows[..., key] == 0).all()
         assert (rows[..., key - 1] > 0).all()
+
+
+@pytest.mark.parametrize("group", ["word:plate", "word:plate | word:red"])
+def test_a_word_that_the_instruction_lacks_changes_nothing_where_that_is_allowed(tmp_path, group):
+    policy = SmallPolicy()
+    with pytest.raises(SelectorError):
+        act_recorded(tmp_path, policy, knockout=group)
+    (tmp_path / "allowed").mkdir()
+    _, actions = act_recorded(tmp_path / "allowed", policy, knockout=group, allow_empty=True)
+    assert torch.equal(actions, policy.act(**given()))

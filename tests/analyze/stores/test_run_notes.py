@@ -1,4 +1,4 @@
-"""A run whose prompts were cut or replaced is told so by every command that answers from it."""
+"""Every command says of the run that it answers from what was changed in it, and that its prompts were cut."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 from tests.kit.planted_effects import planted_effects
 from vla_attention.analyze.__main__ import main
-from vla_attention.schemas.interventions import Interventions, PromptChange
+from vla_attention.schemas.interventions import Interventions, KeyKnockout, PromptChange
 from vla_attention.testing.stores import StoreSpec, write_store
 from vla_attention.testing.tokens import small_tokens
 
@@ -17,6 +17,10 @@ SPEC = StoreSpec(tasks=(0,), episodes=3, plant_effects=planted_effects())
 KINDS = {
     "cut": (SPEC, "the policy never read the end of its prompt ('and then the drawer')"),
     "replaced": (replace(SPEC, interventions=Interventions("shuffled", prompt=PromptChange("shuffled"))), "shuffled"),
+    "knocked out": (
+        replace(SPEC, interventions=Interventions("blind", keys=(KeyKnockout("role:image"),))),
+        "role:image",
+    ),
     "neither": (SPEC, ""),
 }
 COMMANDS = {
@@ -57,6 +61,7 @@ def stores(tmp_path_factory):
     [
         *(("cut", command) for command in COMMANDS),
         *(("replaced", command) for command in ("ratios", "list", "effects", "compare")),
+        *(("knocked out", command) for command in ("ratios", "words", "groups", "report")),
         *(("neither", command) for command in ("ratios", "list")),
     ],
 )
@@ -72,4 +77,4 @@ def test_every_command_says_it(stores, tmp_path, monkeypatch, capsys, kind, comm
     said = printed.out + printed.err + ((tmp_path / "a.html").read_text() if command == "report" else "")
     said = " ".join(said.replace("&#39;", "'").split())
     expected = KINDS[kind][1]
-    assert (expected in said) if expected else ("Prompts were cut" not in said and "another instruction" not in said)
+    assert (expected in said) if expected else ("Prompts were cut" not in said and "was changed" not in said)
