@@ -166,7 +166,7 @@ export function findRole(label: string): number {
 /** Why a site has no words to name, or no objects, and what to do about it. */
 export const NO_WORDS =
   "the keys of this site spell no words; choose a site with text by --site (Cosmos: cross); a text that was captured " +
-  "without its tokenizer needs a capture with --t5-tokenizer";
+  "without its tokenizer needs a capture with --t5-tokenizer, va.record with tokenizer=...";
 export const NO_COVERAGE =
   "no selected episode has object coverage at this site: captures take it from the simulator's segmentation, " +
   "va.record from the masks or coverage that replan() is given, and replays of data sets have none; choose a site " +
