@@ -148,6 +148,43 @@ class TokensFirstPolicy(OddPolicy):
         return tokens.transpose(0, 1)
 
 
+class Masked(nn.Module):
+    """Attention of (batch, token, width) with a mask as a number for each logit, and positions (token, width)."""
+
+    def __init__(self):
+        super().__init__()
+        self.num_heads, self.qkv = HEADS, nn.Linear(WIDTH, 3 * WIDTH)
+
+    def forward(self, tokens, prefix, mask, positions):
+        given = torch.cat([prefix, tokens + positions], dim=1)
+        q, k, v = (part.unflatten(-1, (HEADS, -1)).transpose(1, 2) for part in self.qkv(given).chunk(3, dim=-1))
+        q = q[:, :, -tokens.shape[1] :]
+        self.kept = (q @ k.mT).detach() / q.shape[-1] ** 0.5 + mask[:, None]
+        mixed = nn.functional.scaled_dot_product_attention(q, k, v, attn_mask=mask[:, None])
+        return tokens + mixed.transpose(1, 2).flatten(2)
+
+
+@pytest.mark.parametrize("hidden", [-torch.inf, torch.finfo(torch.float32).min, -1e4])
+@pytest.mark.parametrize("batch", [2, ACTIONS])
+def test_masks_and_positions_are_no_rows(tmp_path, hidden, batch):
+    class MaskedPolicy(OddPolicy):
+        @torch.no_grad()
+        def act(self, batch=1):
+            counts = (PREFIX, ACTIONS)
+            prefix, tokens = (torch.linspace(0, 9, batch * n * WIDTH).sin().view(batch, n, -1) for n in counts)
+            mask = torch.zeros(batch, ACTIONS, PREFIX + ACTIONS)
+            mask[:, :, 4] = hidden
+            for block in self.blocks:
+                tokens = block(tokens, prefix, mask, torch.ones(ACTIONS, WIDTH))
+            return tokens
+
+    policy = MaskedPolicy(None)
+    policy.blocks = nn.ModuleList(Masked() for _ in policy.blocks)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert recorded(tmp_path / "a.zarr", policy, batch)[0] < 2e-6
+
+
 @pytest.mark.parametrize("batch", [2, ACTIONS, PREFIX])
 def test_tokens_before_the_batch_as_many_as_rows_or_not(tmp_path, batch):
     with warnings.catch_warnings():
@@ -180,6 +217,29 @@ def test_where_a_module_is_given_something_that_has_no_copy_the_one_around_it_te
         assert recorded(tmp_path / "a.zarr", surrounded(False, "given a lock"))[0] < 2e-6
     with pytest.raises(BatchRowsMixed):
         recorded(tmp_path / "b.zarr", surrounded(True, "given a lock"))
+
+
+def test_what_a_module_counts_beside_its_attributes_is_as_if_it_had_not_been_called_again(tmp_path):
+    def counting():
+        policy, noted = folded_policy(False, FOLDED["sdpa"]), []
+        for block in policy.blocks:
+            block.register_buffer("calls", torch.zeros(()))
+            block.statistics = nn.BatchNorm1d(WIDTH)
+
+            def count(block, given, result):
+                block.statistics(given[0].flatten(0, 1))
+                block.calls.data.add_(1)  # which torch counts no version of
+                noted.append(len(noted))
+
+            block.register_forward_hook(count)
+        return policy, noted
+
+    (own, own_noted), (policy, noted) = counting(), counting()
+    own.act(2)
+    recorded(tmp_path / "a.zarr", policy)
+    assert noted == own_noted
+    for (name, numbers), wanted in zip(policy.state_dict().items(), own.state_dict().values(), strict=True):
+        assert torch.equal(numbers, wanted), name
 
 
 def test_where_nothing_tells_a_sentence_says_that_rows_may_be_mixed(tmp_path):
