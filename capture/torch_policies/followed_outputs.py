@@ -168,6 +168,9 @@ class OutputFollower:
 
     def _project(self, way: OutputWay, place: _Place | None, given: Tensor, result: Tensor) -> None:
         way.dtypes.add(given.dtype)
+        if torch._C._functorch.is_functorch_wrapped_tensor(given):
+            way.misfit = "runs inside of torch.vmap, where tensors have no numbers"
+            return
         if place is None or not place.scaled:
             # Whatever was done to it, these may be its numbers: other code than torch's may have moved them.
             order_and_tokens = _token_order(given, way.mixed, way)

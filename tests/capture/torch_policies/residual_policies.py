@@ -308,6 +308,7 @@ UNKNOWN: dict[str, tuple[Add, str]] = {
     ),
     "adaLN in one function": (lambda b, c: torch.addcmul(c.stream, b.out(c.mixed), chunk(b, c, 2)), "addcmul"),
     "clamped": (lambda b, c: c.stream + b.out(c.mixed).clamp(-100, 100), "clamp"),
+    "projected inside of vmap": (lambda b, c: c.stream + torch.vmap(b.out)(c.mixed), "vmap"),
     "second linear layer": (lambda b, c: c.stream + b.second(b.out(c.mixed)), "linear"),
     "gate of a sum": (lambda b, c: c.stream + chunk(b, c, 2) * (b.out(c.mixed) + b.mlp(c.normed)), "mul"),
     "gate of a sum with an older branch": (
