@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -39,19 +41,28 @@ Given = tuple[tuple[Any, ...], dict[str, Any]]
 
 @dataclass(frozen=True)
 class ModuleCall:
-    """The first recorded call of a batch: its shape, a module that makes it, and a copy of what that was given."""
+    """The first recorded call of a batch: its shape, a module that makes it, and a copy of what that was given.
+
+    autocast: the devices under autocast, and their dtypes.
+    """
 
     shape: CallShape
     module: nn.Module
     args: tuple[Any, ...]
     kwargs: dict[str, Any]
+    autocast: tuple[tuple[str, torch.dtype], ...]
 
     @classmethod
     def of(cls, shape: CallShape, modules: Sequence[nn.Module], given: Sequence[Given]) -> ModuleCall | None:
-        """Copy what the innermost running module was given that was given tokens; None without such a module."""
+        """Copy what the innermost running module was given that was given tokens, and nothing that has no copy."""
+        devices = (device for device in ("cpu", "cuda") if torch.is_autocast_enabled(device))
+        autocast = tuple((device, torch.get_autocast_dtype(device)) for device in devices)
         for module, arguments in zip(reversed(modules), reversed(given), strict=True):
             if any(_batch_axis(value, shape.batch) is not None for value in pytree.tree_leaves(arguments)):
-                return cls(shape, module, *pytree.tree_map(_copied, arguments))
+                # A lock, a file, a tensor with gradients have no copy: a module around it may not be given them.
+                with suppress(Exception):
+                    args, kwargs = pytree.tree_map(_copied, arguments)
+                    return cls(shape, module, args, kwargs, autocast)
         return None
 
 
@@ -87,16 +98,25 @@ def rows_of_module_apart(policy: FoundPolicy, call: ModuleCall) -> bool | None:
     None: not known, because the module cannot be called again, or because no rows or those of everything change.
     Policy and random numbers are as before afterwards.
     """
-    batch, heads = call.shape.batch, call.shape.heads
-    found: list[Tensor] = []
+    batch = call.shape.batch
+    unchanged: Tensor | None = None
     state = CallState(policy.policy, call.module.forward)
-    for change in (False, True):
+    for last_axis in (None, False, True):  # as many tokens as rows: either axis may be the batch
         watcher = _Rows(call.shape)
         try:
             args, kwargs = pytree.tree_map(_copied, (call.args, call.kwargs))
-            if change:
-                args, kwargs = pytree.tree_map(lambda value: _first_row_changed(value, batch), (args, kwargs))
-            with torch.no_grad(), watch_attention(policy, watcher):
+            if last_axis is not None:
+                tokens = [
+                    value for value in pytree.tree_leaves((args, kwargs)) if _batch_axis(value, batch) is not None
+                ]
+                ndim = max(value.ndim for value in tokens)  # of (token, width) beside others, the batch is none
+                change = partial(_first_row_changed, batch=batch, ndim=ndim, last_axis=last_axis)
+                args, kwargs = pytree.tree_map(change, (args, kwargs))
+            with ExitStack() as stack:
+                stack.enter_context(torch.no_grad())
+                for device, dtype in call.autocast:
+                    stack.enter_context(torch.autocast(device, dtype))
+                stack.enter_context(watch_attention(policy, watcher))
                 call.module(*args, **kwargs)
         except Exception:  # of the policy's own code: it keeps something that this call lacks
             return None
@@ -104,17 +124,29 @@ def rows_of_module_apart(policy: FoundPolicy, call: ModuleCall) -> bool | None:
             state.again()
         if watcher.rows is None:
             return None
-        found.append(watcher.rows)
-    if found[0].shape != found[1].shape:
+        if unchanged is None:
+            unchanged = watcher.rows
+        elif unchanged.shape != watcher.rows.shape:
+            return None
+        elif (apart := _apart(unchanged, watcher.rows)) is not None:
+            return apart
+    return None
+
+
+def _apart(unchanged: Tensor, changed: Tensor) -> bool | None:
+    """Return whether only rows of the first row of the batch differ; False: those that are its with the heads outside.
+
+    unchanged, changed: (batch, head, query, key).
+    """
+    batch, heads = unchanged.shape[:2]
+    moved = (unchanged - changed).abs().flatten(2).amax(dim=2)  # (batch, head)
+    differ = moved > _MOVED * moved.max()
+    if int(differ.sum()) != heads:
         return None
-    moved = (found[0] - found[1]).abs().flatten(2).amax(dim=2)  # (batch, head)
-    changed = moved > _MOVED * moved.max()
-    if int(changed.sum()) != heads:
-        return None
-    if bool(changed[0].all()):
+    if bool(differ[0].all()):
         return True
     # With the heads outside, the first row of the batch has every `batch`-th of the folded rows.
-    return False if bool(changed.flatten()[::batch].all()) else None
+    return False if bool(differ.flatten()[::batch].all()) else None
 
 
 #: Share of the largest change of rows that counts as one.
@@ -126,20 +158,27 @@ _LOWEST_FACTOR = 0.05
 _TOLERANCE = 1e-3
 
 
-def _batch_axis(value: Any, batch: int) -> int | None:
-    """The axis of the batch in tokens (batch, token, width), or (token, batch, width); None for what is no tokens."""
+def _batch_axis(value: Any, batch: int, last_axis: bool = False) -> int | None:
+    """The axis of the batch in tokens (batch, token, width), or (token, batch, width); None for what is no tokens.
+
+    last_axis: of two that are as large, the second.
+    """
     if not isinstance(value, Tensor) or not value.is_floating_point() or value.ndim not in (2, 3):
         return None
-    return next((axis for axis in range(value.ndim - 1) if value.shape[axis] == batch), None)
+    axes = [axis for axis in range(value.ndim - 1) if value.shape[axis] == batch]
+    return axes[-1 if last_axis else 0] if axes else None
 
 
-def _first_row_changed(value: Any, batch: int) -> Any:
-    """Change tokens in the first row of the batch; all else is as it was."""
-    axis = _batch_axis(value, batch)
-    if axis is not None:
+def _first_row_changed(value: Any, batch: int, ndim: int, last_axis: bool) -> Any:
+    """Change tokens of so many axes in the first row of the batch; all else is as it was."""
+    axis = _batch_axis(value, batch, last_axis)
+    if axis is not None and value.ndim == ndim:
         row = value.select(axis, 0)
+        spread = row.float().std(correction=0)
+        if not spread.isfinite():
+            return value  # a mask
         # Not a multiple: norms take those away.
-        row += row.float().std(correction=0) * torch.linspace(-1, 1, row.shape[-1], device=row.device).to(row.dtype)
+        row += spread * torch.linspace(-1, 1, row.shape[-1], device=row.device).to(row.dtype)
     return value
 
 

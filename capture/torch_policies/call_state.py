@@ -26,9 +26,9 @@ class CallState:
     """The state of a policy and of random numbers when this was made.
 
     Of the policy: the attributes of its modules and objects, the entries of lists, queues and dictionaries there, the
-    numbers of tensors and arrays that are no weights, and generators. Of the repeatable call: generators, entries and
-    attributes of what it names (`self`, variables around it, global ones). What is held elsewhere, or by code that is
-    not Python's, is not seen.
+    numbers of tensors and arrays that are no weights, and generators. Of the repeatable call, and of the modules'
+    hooks: generators, entries and attributes of what they name (`self`, variables around them, global ones). What is
+    held elsewhere, or by code that is not Python's, is not seen.
     """
 
     def __init__(self, policy: object, call: Callable[..., Any]) -> None:
@@ -76,6 +76,9 @@ class CallState:
             self._put_back.append(_entries_of(part.__dict__, MODULE_ATTRIBUTES))
             for child in part._modules.values():
                 self._take(child, depth, numbers=numbers)
+            for hook in (*part._forward_pre_hooks.values(), *part._forward_hooks.values()):
+                for named in _named_by(hook):
+                    self._take(named, min(depth, _DEPTH_OF_CALL), numbers=False)
             held = [part._buffers, *(value for name, value in part.__dict__.items() if name not in MODULE_ATTRIBUTES)]
         else:
             attributes = getattr(part, "__dict__", None)
@@ -145,9 +148,11 @@ def _numbers_of(part: Any) -> Callable[[], None]:
         return fill
     saved, inference = part.detach().clone(), part.is_inference()
     written = None if inference else part._version
+    plain = type(part) is Tensor and part.layout is torch.strided and not part.is_meta
 
     def put_back() -> None:
-        if not inference and part._version == written:
+        # The version counts neither what is written through `.data` nor the statistics of batch norms.
+        if not inference and part._version == written and (not plain or torch.equal(part.detach(), saved)):
             return
         with torch.inference_mode(inference), torch.no_grad():
             part.detach().copy_(saved)

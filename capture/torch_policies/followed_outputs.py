@@ -11,7 +11,7 @@ may only be added to the stream as it is. What is multiplied with a gate and the
 the stream, but the sum of two branches.
 
 The output must pass no other way: where a tensor that is made of it (by an adapter beside the projection, say) meets it
-on its way, or the stream until the next attention call, the block adds more than the projection gave.
+on its way, or the stream later, more than the projection gave is added.
 """
 
 from __future__ import annotations
@@ -42,8 +42,14 @@ from vla_attention.capture.torch_policies.watched_block import WatchedBlock
 _RMS_NORMS = {torch.nn.functional.rms_norm, torch.rms_norm}
 #: Functions whose result is as old as what they are given.
 _AGELESS = {
-    *SAME_NUMBERS, *PRODUCTS, *QUOTIENTS, *SUMS, Tensor.__getitem__, Tensor.expand, Tensor.chunk, torch.chunk,
-    Tensor.split, torch.split, Tensor.narrow, torch.narrow, Tensor.unbind, torch.unbind,
+    *SAME_NUMBERS, *PRODUCTS, *QUOTIENTS, *SUMS, Tensor.__getitem__, Tensor.expand, Tensor.expand_as, Tensor.chunk,
+    torch.chunk, Tensor.split, torch.split, Tensor.narrow, torch.narrow, Tensor.unbind, torch.unbind,
+}  # fmt: skip
+#: How many arguments of a function count: of type_as and view_as one, of zeros_like none, whose numbers are not used.
+_COUNTING = {
+    **dict.fromkeys((*SAME_NUMBERS, Tensor.expand_as), 1),
+    **dict.fromkeys((torch.zeros_like, torch.ones_like, torch.empty_like, torch.full_like, torch.randn_like), 0),
+    **dict.fromkeys((Tensor.new_zeros, Tensor.new_ones, Tensor.new_empty, Tensor.new_full, Tensor.new_tensor), 0),
 }  # fmt: skip
 #: Numbers that are all smaller are taken for zeros.
 _TINY = 1e-30
@@ -96,12 +102,13 @@ class _Place:
 
 @dataclass(frozen=True)
 class _Stream:
-    """A tensor that is taken for the residual stream after the output of `way` was added.
+    """A tensor that is taken for the residual stream after the outputs of `ways` were added, that of `way` last.
 
     scaled: it was multiplied. summed: something else was added to it since.
     """
 
     way: OutputWay
+    ways: frozenset[OutputWay]
     scaled: bool = False
     summed: bool = False
 
@@ -126,8 +133,12 @@ class OutputFollower:
 
     def begin(self, way: OutputWay, result: Tensor) -> None:
         """Follow the output of a call that has just run; result: what the policy got of it."""
-        self._streams.keep(lambda stream: False)
-        self._derived.keep(lambda ways: not ways.isdisjoint(self._ways))
+        known = set(self._ways)
+        for tensor in self._streams.tensors():
+            if (stream := self._streams.get(tensor)) is not None:
+                self._streams.put(tensor, replace(stream, summed=True))
+                known |= stream.ways
+        self._derived.keep(lambda ways: not ways.isdisjoint(known))
         self._derived.drop(result)
         if not self._ways:
             self._made.keep(lambda age: False)
@@ -157,6 +168,9 @@ class OutputFollower:
 
     def _project(self, way: OutputWay, place: _Place | None, given: Tensor, result: Tensor) -> None:
         way.dtypes.add(given.dtype)
+        if torch._C._functorch.is_functorch_wrapped_tensor(given):
+            way.misfit = "runs inside of torch.vmap, where tensors have no numbers"
+            return
         if place is None or not place.scaled:
             # Whatever was done to it, these may be its numbers: other code than torch's may have moved them.
             order_and_tokens = _token_order(given, way.mixed, way)
@@ -190,9 +204,8 @@ class OutputFollower:
 
     def follow(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], run: Callable[[], Any]) -> Any:
         """Run a function, and follow what it makes of the tensors that are followed."""
-        # Of functions such as type_as and view_as, the other tensors do not count.
         operands = (*args, *kwargs.values())
-        given = list(tensors_among(operands[:1] if function in SAME_NUMBERS else operands))
+        given = list(tensors_among(operands[: _COUNTING.get(function, len(operands))]))
         followed = [(tensor, place) for tensor in given if (place := self._places.get(tensor)) is not None]
         if not followed and self._streams:
             return self._follow_stream(function, given, run)
@@ -212,7 +225,7 @@ class OutputFollower:
             if any(place.way in self._ways_of(other) for other in given if other is not tensor):
                 place.way.computed = f"{self._block.running_module} adds {_ANOTHER_WAY} to"
         elif addition.to_stream:
-            self._finish(place.way, addition.added, result)
+            self._finish(place.way, addition.added, given, result)
         else:
             self._put(result, replace(place, joined=addition.added))
         return result
@@ -277,7 +290,7 @@ class OutputFollower:
         factor = 1 if first is tensor else kwargs.get("alpha", 1)
         if not isinstance(other, Tensor) or other.numel() != tensor.numel() or place.way in self._ways_of(other):
             return None
-        to_stream = self._may_be_stream(other, tensor, place.way)
+        to_stream = self._may_be_stream(other, tensor, place.way) and not self._ways_of(other)
         if place.joined is not None:
             return None if factor != 1 else _Addition(place.joined, to_stream)
         numbers, way = place.numbers(tensor), place.way
@@ -292,25 +305,31 @@ class OutputFollower:
             way.mismatches.append(difference(numbers, place.start))
         return _Addition(way.added(factors), to_stream)
 
-    def _finish(self, way: OutputWay, added: AddedUpdate, stream: Tensor) -> None:
-        """End a way: its output was added to the residual stream."""
+    def _finish(self, way: OutputWay, added: AddedUpdate, given: Sequence[Tensor], stream: Tensor) -> None:
+        """End a way: its output was added to the residual stream; given: the summands."""
+        before, again = self._streams_among(given)
         self._ways.remove(way)
-        self._places.keep(lambda place: place.way is not way)
-        self._streams.put(stream, _Stream(way))
+        for tensor in self._places.tensors():
+            if (place := self._places.get(tensor)) is not None and place.way is way:
+                self._derived.put(tensor, self._ways_of(tensor))  # that it is added once more is another way
+                self._places.drop(tensor)
+        self._streams.put(stream, _Stream(way, before | {way}))
         self._derived.drop(stream)
         with self._block.computing():
             way.take(added)
+        self._lose_again(again)
 
     def _follow_stream(self, function: Any, given: Sequence[Tensor], run: Callable[[], Any]) -> Any:
         """Run a function, and see whether the block adds more than the output to what was taken for the stream."""
         streams = [(tensor, stream) for tensor in given if (stream := self._streams.get(tensor)) is not None]
-        again = {stream.way for _, stream in streams} & frozenset().union(*map(self._ways_of, given))
+        _, again = self._streams_among(given)
         result = self._derive(function, given, run)
+        if isinstance(result, Tensor) and any(result is tensor for tensor in given) and (ways := self._ways_of(result)):
+            again |= ways.intersection(self._streams_among(self._streams.sharing(result))[0])  # a part written over
         self._left(function, given, [], result)
-        for way in again:
-            self._lose(way, f"{self._block.running_module} adds {_ANOTHER_WAY} to a sum with")
+        self._lose_again(again)
         for tensor, stream in streams:
-            if stream.way in again or not isinstance(result, Tensor) or result.numel() != tensor.numel():
+            if again or not isinstance(result, Tensor) or result.numel() != tensor.numel():
                 continue
             if function in SAME_NUMBERS:
                 self._streams.put(result, stream)
@@ -324,9 +343,20 @@ class OutputFollower:
                     self._streams.put(result, replace(stream, summed=True))
         return result
 
+    def _streams_among(self, given: Sequence[Tensor]) -> tuple[frozenset[OutputWay], frozenset[OutputWay]]:
+        """Return the outputs that are in streams among tensors, and those of them that the tensors bring once more."""
+        streams = [stream.ways for tensor in given if (stream := self._streams.get(tensor)) is not None]
+        ways = frozenset[OutputWay]().union(*streams)
+        return ways, ways.intersection(frozenset[OutputWay]().union(*map(self._ways_of, given)))
+
+    def _lose_again(self, ways: frozenset[OutputWay]) -> None:
+        """Take back that outputs were added to the residual stream: they are added to it in another way, too."""
+        for way in ways:
+            self._lose(way, f"{self._block.running_module} adds {_ANOTHER_WAY} to a sum with")
+
     def _lose(self, way: OutputWay, computed: str) -> None:
         """Take back that an output was added to the residual stream; computed: what was instead."""
-        self._streams.keep(lambda stream: stream.way is not way)
+        self._streams.keep(lambda stream: way not in stream.ways)
         way.computed = computed
         with self._block.computing():
             way.take(None)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -95,7 +96,8 @@ def _bytes_of_tensor(tensor: Tensor) -> Iterator[bytes | memoryview]:
     head = f"{tensor.dtype} {tuple(tensor.shape)}".encode()
     if hasattr(tensor, "__tensor_flatten__"):  # a subclass that holds tensors, such as torchao's
         names, context = tensor.__tensor_flatten__()
-        yield from _all([head, str(context), *(getattr(tensor, name) for name in names)])
+        context = re.sub(r" at 0x[0-9a-f]+", "", str(context))  # of an object that says only where it is in memory
+        yield from _all([head, context, *(getattr(tensor, name) for name in names)])
     elif tensor.is_nested:
         yield from _all([head, *tensor.unbind()])
     elif tensor.is_quantized:

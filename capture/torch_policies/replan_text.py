@@ -209,7 +209,8 @@ class ReplanText:
         """Raise `KeysShifted` where a row's keys are not at the places of the layout, as padding on the left does.
 
         Token ids with placeholders for patches tell it for each key. Without them, patches do whose first keys nothing
-        may see while no key of the text is padding: a camera without a picture is masked whole.
+        may see while no key behind them is padding, of the patches or of the text: a camera without a picture is masked
+        whole, and the edges of a picture that is not square on both sides.
         """
         given, text = self.inputs[row].roles, self.layout.text if site in self.layout.text_sites else None
         spans = text.spans if text is not None else [span.name for span in site.keys.spans if span.kind == "text"]
@@ -217,17 +218,20 @@ class ReplanText:
             return
         keys = np.arange(site.keys.num_keys) if present is None else np.flatnonzero(present)
         of_text = np.isin(keys, text_keys(site, spans, None))
-        wrong = None
+        wrong, known = None, False
         if self.seen.ids is not None and text is not None and text.skip_ids:
             ids = self.seen.ids[row]
             is_text = ~np.isin(ids, text.skip_ids)
             is_text[: text.skip_first] = False
-            if of_text.any() and len(ids) == np.flatnonzero(of_text)[-1] + 1:
+            known = bool(of_text.any()) and len(ids) == np.flatnonzero(of_text)[-1] + 1
+            if known:
                 wrong = next(iter(keys[: len(ids)][is_text != of_text[: len(ids)]]), None)
-        if wrong is None and valid is not None and valid[keys[of_text]].all():
+        if not known and valid is not None:
             first = keys[np.argmax(valid[keys])]
             span = site.keys.spans[site.keys.span_of_key()[first]]
-            wrong = span.start if span.kind == "image" and first > max(span.start, keys[0]) else None
+            behind = keys[(keys > first) & (of_text | (keys < span.stop))]
+            shifted = span.kind == "image" and first > max(span.start, keys[0]) and valid[behind].all()
+            wrong = span.start if shifted else None
         if wrong is not None:
             span = site.keys.spans[site.keys.span_of_key()[wrong]]
             raise KeysShifted(

@@ -118,6 +118,15 @@ class TensorTable(Generic[_Known]):
         """Forget a tensor."""
         self.entries.pop(id(tensor), None)
 
+    def tensors(self) -> list[Tensor]:
+        """Return the tensors of which anything is known."""
+        return [tensor for reference, _ in self.entries.values() if (tensor := reference()) is not None]
+
+    def sharing(self, tensor: Tensor) -> list[Tensor]:
+        """Return the tensors of which anything is known that have the storage of another one."""
+        storage = tensor.untyped_storage().data_ptr()
+        return [known for known in self.tensors() if known.untyped_storage().data_ptr() == storage]
+
     def keep(self, wanted: Callable[[_Known], bool]) -> None:
         """Forget the tensors of which something else is known."""
         for number in [number for number, (_, known) in self.entries.items() if not wanted(known)]:

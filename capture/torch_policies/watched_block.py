@@ -165,13 +165,14 @@ class WatchedBlock:
 
     def saw(self, call: AttentionCall) -> None:
         """Tell the watcher about a call, and count it."""
-        with self.computing():
-            if call.shape.number != self._number:  # another call came between a softmax and its product
-                call = replace(call, shape=replace(call.shape, number=self._number))
-            self._number += 1
-            inside = getattr(self.watcher, "inside", None)
-            if inside is not None:
+        if call.shape.number != self._number:  # another call came between a softmax and its product
+            call = replace(call, shape=replace(call.shape, number=self._number))
+        inside = getattr(self.watcher, "inside", None)
+        if inside is not None:
+            with self._failing(), _without_modes():  # under the policy's autocast, which it keeps
                 inside(call.shape, self._running, self._given)
+        with self.computing():
+            self._number += 1
             self._way = self.watcher.saw(call)
 
     def take_way(self) -> OutputWay | None:

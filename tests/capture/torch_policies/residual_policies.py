@@ -265,6 +265,10 @@ WAYS: dict[str, Way] = {
         lambda b, c: (c.stream + b.mlp(c.normed)) + chunk(b, c, 1) * b.out(c.mixed),
         lambda b, c, s: projected(b, s) * chunk(b, c, 1),
     ),
+    "sum with zeros as large": Way(
+        lambda b, c: (lambda update: (c.stream.expand_as(update) + torch.zeros_like(update)) + update)(b.out(c.mixed)),
+        lambda b, c, s: projected(b, s),
+    ),
     "turned around": Way(
         lambda b, c: c.stream + (b.out(c.mixed).transpose(0, 1) * chunk(b, c, 2).transpose(0, 1)).transpose(0, 1),
         lambda b, c, s: projected(b, s) * chunk(b, c, 2),
@@ -279,6 +283,12 @@ WAYS: dict[str, Way] = {
 def added_in_place(block: Block, call: Call) -> Tensor:
     tokens = call.stream + block.out(call.mixed)
     tokens += block.beside(call.mixed)
+    return tokens
+
+
+def added_to_some_numbers(block: Block, call: Call) -> Tensor:
+    tokens = call.stream + block.out(call.mixed)
+    tokens[..., :5].add_(block.beside(call.mixed)[..., :5])
     return tokens
 
 
@@ -298,6 +308,7 @@ UNKNOWN: dict[str, tuple[Add, str]] = {
     ),
     "adaLN in one function": (lambda b, c: torch.addcmul(c.stream, b.out(c.mixed), chunk(b, c, 2)), "addcmul"),
     "clamped": (lambda b, c: c.stream + b.out(c.mixed).clamp(-100, 100), "clamp"),
+    "projected inside of vmap": (lambda b, c: c.stream + torch.vmap(b.out)(c.mixed), "vmap"),
     "second linear layer": (lambda b, c: c.stream + b.second(b.out(c.mixed)), "linear"),
     "gate of a sum": (lambda b, c: c.stream + chunk(b, c, 2) * (b.out(c.mixed) + b.mlp(c.normed)), "mul"),
     "gate of a sum with an older branch": (
@@ -341,6 +352,15 @@ UNKNOWN: dict[str, tuple[Add, str]] = {
         "adds something else",
     ),
     "another way in place": (added_in_place, "adds something else"),
+    "another way in place of some numbers": (added_to_some_numbers, "adds something else"),
+    "added twice": (
+        lambda b, c: (lambda update: c.stream + update + 0.5 * update)(b.out(c.mixed)),
+        "adds something else",
+    ),
+    "feed-forward of what was added": (
+        lambda b, c: (lambda update: c.stream + update + b.mlp(update))(b.out(c.mixed)),
+        "adds something else",
+    ),
     "another way behind the feed-forward": (added_behind_the_feed_forward, "adds something else"),
     "added constant": (lambda b, c: c.stream + chunk(b, c, 2) * (b.out(c.mixed) + b.second.bias), "add"),
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 import warnings
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 from torch import nn
 
 import vla_attention as va
-from tests.capture.torch_policies.test_odd_policies import HEADS, OddPolicy, layout, logits
+from tests.capture.torch_policies.test_odd_policies import ACTIONS, HEADS, PREFIX, WIDTH, OddPolicy, layout, logits
 from vla_attention.capture.torch_policies.batch_rows import BatchRowsMixed
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.schemas.errors import Note
@@ -95,6 +96,150 @@ def test_heads_outside_of_the_batch_are_refused_and_inside_they_are_right(tmp_pa
     assert off < 2e-6
     assert torch.equal(actions, folded_policy(False, multiply, kind).act(batch))
     assert getattr(inside.blocks[0], "count", 1) == 1  # as if the module had not been called again
+
+
+class Surroundings(nn.Module):
+    """Calls a block in ways that a second call has to repeat."""
+
+    def __init__(self, block, kind):
+        super().__init__()
+        self.block, self.out, self.kind = block, block.out, kind
+
+    @property
+    def kept(self):
+        return self.block.kept.float()
+
+    def forward(self, tokens, prefix):
+        if self.kind == "autocast":
+            with torch.autocast("cpu", torch.bfloat16):
+                return self.block(self.out(tokens), prefix)
+        return self.block(tokens, prefix, threading.Lock())
+
+
+class TokensFirst(nn.Module):
+    """Attention of (token, batch, width)."""
+
+    def __init__(self, outside):
+        super().__init__()
+        self.outside, self.num_heads, self.qkv = outside, HEADS, nn.Linear(WIDTH, 3 * WIDTH)
+
+    def forward(self, tokens, prefix):
+        given = torch.cat([prefix, tokens])
+        q, k, v = (part.unflatten(-1, (HEADS, -1)) for part in self.qkv(given).chunk(3, dim=-1))
+        q = q[len(prefix) :]
+        self.kept = torch.einsum("qbhd,kbhd->bhqk", q, k).detach() / q.shape[-1] ** 0.5
+        order = (2, 1, 0, 3) if self.outside else (1, 2, 0, 3)
+        mixed = FOLDED["sdpa"](*(part.permute(order).flatten(0, 1) for part in (q, k, v)))
+        mixed = mixed.unflatten(0, (HEADS, -1)).transpose(0, 1) if self.outside else mixed.unflatten(0, (-1, HEADS))
+        return tokens + mixed.permute(2, 0, 1, 3).flatten(2)
+
+
+class TokensFirstPolicy(OddPolicy):
+    def __init__(self, outside):
+        super().__init__(None)
+        self.blocks = nn.ModuleList(TokensFirst(outside) for _ in self.blocks)
+
+    @torch.no_grad()
+    def act(self, batch=1):
+        numbers = torch.Generator().manual_seed(1)
+        prefix, tokens = (torch.randn(count, batch, WIDTH, generator=numbers) for count in (PREFIX, ACTIONS))
+        for block in self.blocks:
+            tokens = block(tokens, prefix)
+        return tokens.transpose(0, 1)
+
+
+class Masked(nn.Module):
+    """Attention of (batch, token, width) with a mask as a number for each logit, and positions (token, width)."""
+
+    def __init__(self):
+        super().__init__()
+        self.num_heads, self.qkv = HEADS, nn.Linear(WIDTH, 3 * WIDTH)
+
+    def forward(self, tokens, prefix, mask, positions):
+        given = torch.cat([prefix, tokens + positions], dim=1)
+        q, k, v = (part.unflatten(-1, (HEADS, -1)).transpose(1, 2) for part in self.qkv(given).chunk(3, dim=-1))
+        q = q[:, :, -tokens.shape[1] :]
+        self.kept = (q @ k.mT).detach() / q.shape[-1] ** 0.5 + mask[:, None]
+        mixed = nn.functional.scaled_dot_product_attention(q, k, v, attn_mask=mask[:, None])
+        return tokens + mixed.transpose(1, 2).flatten(2)
+
+
+@pytest.mark.parametrize("hidden", [-torch.inf, torch.finfo(torch.float32).min, -1e4])
+@pytest.mark.parametrize("batch", [2, ACTIONS])
+def test_masks_and_positions_are_no_rows(tmp_path, hidden, batch):
+    class MaskedPolicy(OddPolicy):
+        @torch.no_grad()
+        def act(self, batch=1):
+            counts = (PREFIX, ACTIONS)
+            prefix, tokens = (torch.linspace(0, 9, batch * n * WIDTH).sin().view(batch, n, -1) for n in counts)
+            mask = torch.zeros(batch, ACTIONS, PREFIX + ACTIONS)
+            mask[:, :, 4] = hidden
+            for block in self.blocks:
+                tokens = block(tokens, prefix, mask, torch.ones(ACTIONS, WIDTH))
+            return tokens
+
+    policy = MaskedPolicy(None)
+    policy.blocks = nn.ModuleList(Masked() for _ in policy.blocks)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert recorded(tmp_path / "a.zarr", policy, batch)[0] < 2e-6
+
+
+@pytest.mark.parametrize("batch", [2, ACTIONS, PREFIX])
+def test_tokens_before_the_batch_as_many_as_rows_or_not(tmp_path, batch):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert recorded(tmp_path / "a.zarr", TokensFirstPolicy(False), batch)[0] < 2e-6
+    with pytest.raises(BatchRowsMixed):
+        recorded(tmp_path / "b.zarr", TokensFirstPolicy(True), batch)
+
+
+def surrounded(outside, kind):
+    policy = folded_policy(outside, FOLDED["sdpa"])
+    policy.blocks = nn.ModuleList(Surroundings(block, kind) for block in policy.blocks)
+    for outer in policy.blocks:
+        forward = outer.block.forward
+        outer.block.forward = lambda tokens, prefix, lock=None, forward=forward: forward(tokens, prefix)
+    return policy
+
+
+def test_a_module_inside_of_an_autocast_is_called_again_under_it(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert recorded(tmp_path / "a.zarr", surrounded(False, "autocast"))[0] < 1e-2
+    with pytest.raises(BatchRowsMixed):
+        recorded(tmp_path / "b.zarr", surrounded(True, "autocast"))
+
+
+def test_where_a_module_is_given_something_that_has_no_copy_the_one_around_it_tells(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert recorded(tmp_path / "a.zarr", surrounded(False, "given a lock"))[0] < 2e-6
+    with pytest.raises(BatchRowsMixed):
+        recorded(tmp_path / "b.zarr", surrounded(True, "given a lock"))
+
+
+def test_what_a_module_counts_beside_its_attributes_is_as_if_it_had_not_been_called_again(tmp_path):
+    def counting():
+        policy, noted = folded_policy(False, FOLDED["sdpa"]), []
+        for block in policy.blocks:
+            block.register_buffer("calls", torch.zeros(()))
+            block.statistics = nn.BatchNorm1d(WIDTH)
+
+            def count(block, given, result):
+                block.statistics(given[0].flatten(0, 1))
+                block.calls.data.add_(1)  # which torch counts no version of
+                noted.append(len(noted))
+
+            block.register_forward_hook(count)
+        return policy, noted
+
+    (own, own_noted), (policy, noted) = counting(), counting()
+    own.act(2)
+    recorded(tmp_path / "a.zarr", policy)
+    assert noted == own_noted
+    for (name, numbers), wanted in zip(policy.state_dict().items(), own.state_dict().values(), strict=True):
+        assert torch.equal(numbers, wanted), name
 
 
 def test_where_nothing_tells_a_sentence_says_that_rows_may_be_mixed(tmp_path):

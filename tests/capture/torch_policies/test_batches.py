@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -200,3 +202,44 @@ def test_padding_on_the_left_moves_the_keys_and_is_refused(tmp_path, texts, text
         roles = [Role(code).label for code in episode.read("joint/key_role")[0]]
         assert roles[:4] == ["image"] * 4
         assert roles.count("padding") == 11 - 4 - 2 - len(row_text.split())
+
+
+class MaskedPolicy(PaddedPolicy):
+    """Its rows are given with the keys that may be seen, as text of 0 and 1."""
+
+    @torch.no_grad()
+    def act(self, ids: list[int], seen: list[str]) -> torch.Tensor:
+        mask = torch.tensor([[key == "1" for key in row] for row in seen])
+        return self.blocks[0](self.words(torch.tensor([ids] * len(seen))), mask[:, None, None])
+
+
+@pytest.mark.parametrize("text", [{"skip_ids": (IMAGE,)}, None])
+@pytest.mark.parametrize("hidden", ["0110", "0101"])  # the edges of a wide picture, patches that are left out
+def test_patches_that_are_hidden_for_other_reasons_are_not_padding(tmp_path, text, hidden):
+    policy = MaskedPolicy("right")
+    ids = [IMAGE] * 4 + policy.tokenizer.encode("pick up the red bowl")
+    with va.record(tmp_path / "a.zarr", policy, layout=padded_layout(text), durable=False) as run:
+        facts = [{"task_id": row, "episode_index": 0, "instruction": ""} for row in range(2)]
+        with run.episodes(facts) as found, found.replan(env_step=0):
+            policy.act(ids, ["1" * 11, hidden + "1" * 7])
+    roles = [Role(code).label for code in open_store(tmp_path / "a.zarr").episodes[1].read("joint/key_role")[0]]
+    assert roles[:4] == ["image" if seen == "1" else "masked_image" for seen in hidden]
+
+
+def test_padding_on_the_left_of_a_text_before_the_patches(tmp_path):
+    spans = (
+        va.Span("head", "text", 0, 2),
+        va.Span("image_front", "image", 2, 6, "front", va.PatchGrid(2, 2, 8, 8)),
+        va.Span("prompt", "text", 6, 11),
+    )
+    roles = {"head": "template", "image_front": "image", "prompt": "instruction"}
+    site = va.RecordedSite(va.SiteLayout("joint", spans), (0, 1), roles)
+    policy, layout = MaskedPolicy("left"), replace(padded_layout(None), sites=(site,))
+    with va.record(tmp_path / "a.zarr", policy, layout=layout, durable=False) as run:
+        facts = [{"task_id": row, "episode_index": 0, "instruction": ""} for row in range(2)]
+        with (
+            pytest.raises(KeysShifted, match="row 1 of the batch"),
+            run.episodes(facts) as found,
+            found.replan(env_step=0),
+        ):
+            policy.act([1] * 11, ["1" * 11, "000" + "1" * 8])

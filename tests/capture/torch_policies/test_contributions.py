@@ -25,9 +25,10 @@ from tests.capture.torch_policies.residual_policies import (
     Way,
     residual_layout,
 )
-from vla_attention.capture.torch_policies.policy_layout import CallRule
+from vla_attention.capture.torch_policies.policy_layout import CallRule, RecordedSite
 from vla_attention.capture.torch_policies.session import ContributionsUnknown
 from vla_attention.schemas.errors import Note
+from vla_attention.schemas.layout import SiteLayout, Span
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 
@@ -258,6 +259,61 @@ def test_attention_that_projects_its_output_itself(tmp_path, batch_first):
     ]
     for row, episode in enumerate(stored(tmp_path).episodes):
         close(episode.read("joint/contribution")[0, 0, 0], gram_of(torch.stack(parts, dim=2)[row]))
+
+
+MEMORY = 5
+
+
+def with_cross_attention(again):
+    """A policy whose blocks have a cross-attention behind the first; again: what is added of the first behind that."""
+
+    def add(block, call):
+        update = block.out(call.mixed)
+        tokens = call.stream + update
+        memory = torch.linspace(-1, 1, MEMORY * WIDTH).view(1, MEMORY, WIDTH)
+        q, k, v = (
+            linear(given).unflatten(-1, (HEADS, DIM)).transpose(1, 2)
+            for linear, given in ((block.query, block.norm(tokens)), (block.key, memory), (block.value, memory))
+        )
+        crossed = block.cross_out(nn.functional.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
+        return again(block, call, tokens, crossed, update)
+
+    policy = ResidualPolicy(add)
+    for block in policy.blocks:
+        block.cross_out = nn.Linear(HEADS * DIM, WIDTH)
+    return policy
+
+
+AGAIN = {
+    "no": lambda b, c, tokens, crossed, update: tokens + crossed,
+    "behind": lambda b, c, tokens, crossed, update: (tokens + crossed) + update,
+    "with the second": lambda b, c, tokens, crossed, update: tokens + (crossed + update),
+    "adapter": lambda b, c, tokens, crossed, update: (tokens + crossed) + b.beside(c.mixed),
+}
+
+
+@pytest.mark.parametrize("crosses", [True, False], ids=["recorded", "not recorded"])
+@pytest.mark.parametrize("again", AGAIN.values(), ids=AGAIN)
+def test_a_second_attention_that_adds_the_output_of_the_first_again(tmp_path, again, crosses):
+    (joint,) = residual_layout().sites
+    memory = SiteLayout("cross", (Span("prompt", "text", 0, MEMORY),))
+    cross = RecordedSite(memory, (0, ACTIONS), {"prompt": "instruction"}, "blocks.{block}.cross_out")
+    rules = (
+        CallRule(r"blocks\.(?P<block>\d+)", "joint", keys=joint.keys.num_keys),
+        CallRule(r"blocks\.(?P<block>\d+)", "cross" if crosses else None, keys=MEMORY),
+    )
+    layout = residual_layout(sites=(joint, cross) if crosses else (joint,), rules=rules)
+    policy = with_cross_attention(again)
+    if again is AGAIN["no"]:
+        way = Way(policy.blocks[0].add, WAYS["plain"].part)
+        close(
+            recorded(tmp_path, policy, layout=layout).episodes[0].read("joint/contribution")[0], expected(policy, way)
+        )
+        return
+    run = va.record(tmp_path / "a.zarr", policy, layout=layout, durable=False)
+    with run, pytest.warns(Note, match="adds something else that is computed of what the attention gave"):
+        fill(run, policy)
+    assert not stored(tmp_path).attributes.recording.contributions
 
 
 class Experts(nn.Module):

@@ -158,3 +158,16 @@ def test_what_has_none_is_named_and_recorded_all_the_same(tmp_path, make, name):
         attributes = record(tmp_path / "a.zarr", policy)
     assert name in attributes.provenance["not in the digest of weights"]
     assert attributes.recording.contributions  # the projection may be offloaded too
+
+
+def test_where_an_object_is_in_memory_is_no_part_of_the_digest():
+    class Placed(Wrapped):
+        def __init__(self, inner):
+            super().__init__(inner)
+            self.layout_of_blocks = object()
+
+        def __tensor_flatten__(self):
+            return ["inner"], {"layout": self.layout_of_blocks}
+
+    one, other = (with_weight(nn.Parameter(Placed(torch.ones(3)))) for _ in range(2))
+    assert policy_digest(one) == policy_digest(other)
