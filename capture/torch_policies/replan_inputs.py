@@ -149,6 +149,11 @@ def read_inputs(
         for camera in values.get(what, ()):
             if camera not in cameras:
                 raise unknown_name(f"camera of {what}", camera, cameras)
+            if not any(camera in site.pictured for site in sites):
+                raise BadArgument(
+                    f"The camera '{camera}' has no patches in the layout, so that its picture has no size: leave it "
+                    f"out of {what}, or give a span of it a grid (va.PatchGrid)."
+                )
     pictures = values.get("frames", {})
     frames = {
         camera: model_picture(pictures[camera], camera, picture_size(sites, camera), fits.get(camera, "stretch"))

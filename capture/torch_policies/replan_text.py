@@ -224,8 +224,10 @@ class ReplanText:
             is_text = ~np.isin(ids, text.skip_ids)
             is_text[: text.skip_first] = False
             known = bool(of_text.any()) and len(ids) == np.flatnonzero(of_text)[-1] + 1
-            if known:
-                wrong = next(iter(keys[: len(ids)][is_text != of_text[: len(ids)]]), None)
+            if known and (is_text != of_text[: len(ids)]).any():
+                first = int(np.argmax(is_text != of_text[: len(ids)]))
+                # Nothing but skipped ids from there on: the padding on the right is among them.
+                wrong = keys[first] if is_text[first:].any() else None
         if not known and valid is not None:
             first = keys[np.argmax(valid[keys])]
             span = site.keys.spans[site.keys.span_of_key()[first]]

@@ -11,6 +11,7 @@ from torch import nn
 
 import vla_attention as va
 from tests.kit.small_torch_policy import WORDS, SmallPolicy, WordTokenizer, given, small_layout
+from vla_attention.capture.torch_policies.prompts import PromptDoesNotFit
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.recorded_episodes import NothingRecorded, RecordingStopped
 from vla_attention.capture.torch_policies.replan_text import KeysShifted
@@ -243,3 +244,29 @@ def test_padding_on_the_left_of_a_text_before_the_patches(tmp_path):
             found.replan(env_step=0),
         ):
             policy.act([1] * 11, ["1" * 11, "000" + "1" * 8])
+
+
+def test_a_padding_id_among_those_that_are_skipped_is_no_padding_on_the_left(tmp_path):
+    policy = PaddedPolicy("right")
+    layout = padded_layout({"skip_ids": (IMAGE, 0)})
+    with (
+        va.record(tmp_path / "a.zarr", policy, layout=layout, tokenizer=policy.tokenizer, durable=False) as run,
+        pytest.raises(PromptDoesNotFit, match=r"5 text tokens, and the layout's prompt has 7 keys: .* skip_ids"),
+        run.episode(task_id=0, episode_index=0, instruction="pick the bowl") as episode,
+        episode.replan(env_step=0),
+    ):
+        policy.act(["pick the bowl"])
+
+
+@pytest.mark.parametrize("what", ["frames", "masks", "coverage"])
+def test_a_picture_of_a_camera_without_patches_has_no_size(tmp_path, what):
+    layout = padded_layout(None)
+    pooled = va.Span("image_front", "image", 0, 4, "front")
+    site = replace(layout.sites[0], keys=replace(layout.sites[0].keys, spans=(pooled, layout.sites[0].keys.spans[1])))
+    with (
+        va.record(tmp_path / "a.zarr", PaddedPolicy("right"), layout=replace(layout, sites=(site,))) as run,
+        pytest.raises(BadArgument, match=r"'front' has no patches in the layout, .* leave it out of"),
+        run.episode(task_id=0, episode_index=0, instruction="") as episode,
+        episode.replan(env_step=0, **{what: {"front": np.zeros((8, 8, 3), np.uint8)}}),
+    ):
+        pass
