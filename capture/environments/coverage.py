@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.layout import PatchGrid
 
 
 def overlap_lengths(pixels: int, cells: int, visible: float = 1.0) -> NDArray[np.float64]:
@@ -62,3 +66,32 @@ def patch_coverage(
     for index in np.unique(seen):
         coverage[:, :, index] = row_share @ (seen == index) @ column_share.T
     return coverage.reshape(grid_rows * grid_columns, num_objects).astype(np.float32)
+
+
+def camera_coverage(
+    segmentation: NDArray[np.integer],
+    num_objects: int,
+    grids: Sequence[PatchGrid],
+    *,
+    flip_rows: bool = False,
+    flip_columns: bool = False,
+    visible: float = 1.0,
+) -> NDArray[np.float32]:
+    """Return the share of every patch of a camera's grids that each object covers, (patch, object).
+
+    grids: of `schemas.layout.camera_grids`; their patches follow each other. Other arguments: as in `patch_coverage`.
+    """
+    cover = partial(
+        patch_coverage, segmentation, num_objects, flip_rows=flip_rows, flip_columns=flip_columns, visible=visible
+    )
+    of_grids = []
+    for grid in grids:
+        if grid.covers_all:
+            of_grids.append(cover(grid.rows, grid.columns))
+            continue
+        height, width = segmentation.shape
+        down, across = grid.shares(height, width)
+        pixels = cover(height, width).reshape(height, width, num_objects)
+        covered = np.einsum("ih,hwo,jw->ijo", down, pixels, across, optimize=True)
+        of_grids.append(covered.reshape(grid.num_patches, num_objects).astype(np.float32))
+    return np.concatenate(of_grids)

@@ -9,7 +9,6 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,7 @@ from vla_attention.capture.environments.base import (
     TellsMoments,
     camera_frame,
 )
-from vla_attention.capture.environments.coverage import patch_coverage
+from vla_attention.capture.environments.coverage import camera_coverage
 from vla_attention.capture.environments.episode_protocol import WAIT_ACTION
 from vla_attention.capture.environments.robosuite_installation import first_exception
 from vla_attention.schemas.episode_steps import TaskGoal
@@ -200,32 +199,3 @@ class Simulation:
         except BadArgument as error:
             where = f"replan {self._replan} (environment step {self.protocol.wait_steps + self._step}) of {self._what}"
             raise BadArgument(f"Cannot store {where}, camera '{view.source}': {error}") from None
-
-
-def camera_coverage(
-    segmentation: NDArray[np.integer],
-    num_objects: int,
-    grids: Sequence[PatchGrid],
-    *,
-    flip_rows: bool = False,
-    flip_columns: bool = False,
-    visible: float = 1.0,
-) -> NDArray[np.float32]:
-    """Return the share of every patch of a camera's grids that each object covers, (patch, object).
-
-    grids: of `schemas.layout.camera_grids`; their patches follow each other. Other arguments: as in `patch_coverage`.
-    """
-    cover = partial(
-        patch_coverage, segmentation, num_objects, flip_rows=flip_rows, flip_columns=flip_columns, visible=visible
-    )
-    of_grids = []
-    for grid in grids:
-        if grid.covers_all:
-            of_grids.append(cover(grid.rows, grid.columns))
-            continue
-        height, width = segmentation.shape
-        down, across = grid.shares(height, width)
-        pixels = cover(height, width).reshape(height, width, num_objects)
-        covered = np.einsum("ih,hwo,jw->ijo", down, pixels, across, optimize=True)
-        of_grids.append(covered.reshape(grid.num_patches, num_objects).astype(np.float32))
-    return np.concatenate(of_grids)

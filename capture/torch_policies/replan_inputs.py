@@ -11,7 +11,7 @@ from typing import Any, SupportsIndex
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.rollout.simulation import camera_coverage
+from vla_attention.capture.environments.coverage import camera_coverage
 from vla_attention.capture.torch_policies.policy_layout import PictureFit, PolicyLayout
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing, unknown_name
 from vla_attention.schemas.groupings.vocabulary import SceneObject
