@@ -40,7 +40,7 @@ def cut_notes(episodes: Episodes) -> tuple[str, ...]:
 def _never_read(prompts: Iterable[Prompt]) -> str:
     """The end of a prompt behind its last piece; empty where all of it was read, or where nobody knows."""
     for prompt in prompts:
-        lost = prompt.text[max((piece.stop for piece in prompt.pieces), default=len(prompt.text)) :]
+        lost = prompt.text[prompt.pieces[-1].stop :] if prompt.pieces else ""
         if lost.strip():
             return visible(lost.strip())
     return ""

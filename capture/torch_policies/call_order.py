@@ -95,6 +95,8 @@ class CallOrder:
         #: Kind, queries and keys of calls that no rule names -> their modules.
         self._unnamed: dict[tuple[str, int, int], dict[str, None]] = {}
         self._noted: set[tuple[str, int, int]] = set()
+        #: Whether an autoregressive policy made fewer tokens than planned, in every block as many.
+        self.fewer_tokens = False
 
     def place(self, shape: CallShape) -> CallPlace | None:
         """Return what the next call is, or None if it does not fit.
@@ -243,11 +245,11 @@ class CallOrder:
         few_are_fine = self.layout.stops_early and max(counts) <= expected
         if len(counts) > 1 or not (counts == {expected} or few_are_fine):
             given = listing(f"block {block}: {count}" for block, count in times.items())
-            fewer = max(counts) < expected and len(counts) == 1
+            self.fewer_tokens = max(counts) < expected and len(counts) == 1
             yield (
                 f"the blocks of site '{site.name}' must compute {'at most ' if self.layout.stops_early else ''}"
                 f"{expected} times a policy call, once for each generated token, but did otherwise ({given})"
-                f"{'; stops_early=True is for policies that may generate fewer' * fewer}"
+                f"{'; stops_early=True is for policies that may generate fewer' * self.fewer_tokens}"
             )
 
 

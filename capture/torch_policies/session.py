@@ -339,8 +339,10 @@ class RecordedRun:
         try:
             self._store_replan(replan, recorder, text, episodes, given, rows, places, count, before)
         except CallsDoNotFit as error:
-            fewer_tokens = "stops_early" in str(error)  # then nothing was called otherwise
-            raise error if every_function or fewer_tokens else CallsDoNotFit(f"{error}\n{_BY_NAMES}") from None
+            # Where there were fewer tokens, nothing was called otherwise.
+            if every_function or recorder.order.fewer_tokens:
+                raise
+            raise CallsDoNotFit(f"{error}\n{_BY_NAMES}") from None
 
     def _store_replan(
         self,

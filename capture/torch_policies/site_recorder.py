@@ -165,8 +165,9 @@ class ReplanRecorder:
 
     def inside(self, shape: CallShape, modules: Sequence[nn.Module], given: Sequence[Given]) -> None:
         """Keep what the module of the first recorded call was given, if that is wanted."""
-        if self.keeps_module and shape.batch == self.batch and self._is_recorded(self.order.place(shape)):
-            self.module_call = self.module_call or ModuleCall.of(shape, modules, given)
+        wanted = self.keeps_module and self.module_call is None and shape.batch == self.batch
+        if wanted and self._is_recorded(self.order.place(shape)):
+            self.module_call = ModuleCall.of(shape, modules, given)
 
     def saw(self, call: AttentionCall) -> OutputWay | None:
         """Keep the rows of a call, if it is recorded; its output is followed for the contributions."""

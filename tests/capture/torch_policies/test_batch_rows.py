@@ -203,20 +203,15 @@ def surrounded(outside, kind):
     return policy
 
 
-def test_a_module_inside_of_an_autocast_is_called_again_under_it(tmp_path):
+@pytest.mark.parametrize(("kind", "most"), [("autocast", 1e-2), ("given a lock", 2e-6)])
+def test_a_module_is_called_again_under_its_autocast_or_the_one_around_it_where_arguments_have_no_copy(
+    tmp_path, kind, most
+):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert recorded(tmp_path / "a.zarr", surrounded(False, "autocast"))[0] < 1e-2
+        assert recorded(tmp_path / "a.zarr", surrounded(False, kind))[0] < most
     with pytest.raises(BatchRowsMixed):
-        recorded(tmp_path / "b.zarr", surrounded(True, "autocast"))
-
-
-def test_where_a_module_is_given_something_that_has_no_copy_the_one_around_it_tells(tmp_path):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert recorded(tmp_path / "a.zarr", surrounded(False, "given a lock"))[0] < 2e-6
-    with pytest.raises(BatchRowsMixed):
-        recorded(tmp_path / "b.zarr", surrounded(True, "given a lock"))
+        recorded(tmp_path / "b.zarr", surrounded(True, kind))
 
 
 def test_what_a_module_counts_beside_its_attributes_is_as_if_it_had_not_been_called_again(tmp_path):
