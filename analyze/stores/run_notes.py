@@ -16,12 +16,16 @@ def run_notes(episodes: Episodes) -> tuple[str, ...]:
     """A line on each store whose run was changed, and on each in which prompts were cut; empty without any."""
     episodes = list(episodes)
     stores = {str(store.path): store for store, _ in episodes}
-    changed = tuple(
+    return (*change_notes(stores.values()), *cut_notes(episodes))
+
+
+def change_notes(stores: Iterable[Store]) -> tuple[str, ...]:
+    """A line on each store whose run was changed, from its root alone; empty without any."""
+    return tuple(
         f"The run in {store.path.name} was changed: {visible(store.attributes.interventions.describe())}."
-        for store in stores.values()
+        for store in stores
         if not store.attributes.interventions.is_none
     )
-    return (*changed, *cut_notes(episodes))
 
 
 def cut_notes(episodes: Episodes) -> tuple[str, ...]:

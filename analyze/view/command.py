@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from vla_attention.analyze.view.served_stores import ServedStore
+    from vla_attention.schemas.stores.reader import Store
     from vla_attention.schemas.stores.store_url import StorePlace
 
 _EXAMPLES = """examples:
@@ -95,15 +96,31 @@ def _write(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None
     print(write_site(arguments.output, stores))
 
 
+def _notes(stores: Sequence[Store]) -> tuple[str, ...]:
+    """What is said of the runs before the page opens, which neither damaged episodes nor a slow address may delay."""
+    from contextlib import suppress
+    from pathlib import Path
+
+    from vla_attention.analyze.stores.run_notes import change_notes, cut_notes
+    from vla_attention.schemas.errors import UserError
+
+    readable = []
+    for store in stores:
+        for episode in store.episodes if isinstance(store.path, Path) else ():
+            with suppress(UserError):
+                if episode.attributes.prompts:
+                    readable.append((store, episode))
+    return (*change_notes(stores), *cut_notes(readable))
+
+
 def _serve(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None:
     from vla_attention.analyze.show.browser import open_in_browser
-    from vla_attention.analyze.stores.run_notes import run_notes
     from vla_attention.analyze.view.server import ViewerServer
 
     with ViewerServer(stores, arguments.port, allow_hosts=arguments.allow_host, keep_link=True) as server:
         again = f"; with --port {server.port} its link stays the same" if server.keeps_link else ""
         # At once, also into a file that somebody follows.
-        for line in run_notes([(store.store, episode) for store in stores for episode in store.store.episodes]):
+        for line in _notes([store.store for store in stores]):
             print(f"note: {line}")
         print(f"The page: {server.link}\nIt is served to this machine only, until Ctrl-C{again}.", flush=True)
         if arguments.allow_host:

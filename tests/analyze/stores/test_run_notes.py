@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -78,3 +79,13 @@ def test_every_command_says_it(stores, tmp_path, monkeypatch, capsys, kind, comm
     said = " ".join(said.replace("&#39;", "'").split())
     expected = KINDS[kind][1]
     assert (expected in said) if expected else ("Prompts were cut" not in said and "was changed" not in said)
+
+
+def test_the_page_opens_beside_a_damaged_episode(stores, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("vla_attention.analyze.view.server.ViewerServer.serve_forever", lambda self: None)
+    damaged = shutil.copytree(stores["cut"], tmp_path / "cut.zarr")
+    (damaged / "episodes/task000_episode001/zarr.json").write_text("no document")
+    assert main(["view", str(damaged), "--no-open"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "The page: http" in said
+    assert f"in 2 episodes {KINDS['cut'][1]}" in said
