@@ -1,0 +1,148 @@
+"""What a question found, as data. Commands make it, `analyze.render` shows it, and nothing reads a text back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+import polars as pl
+
+#: What the values of a column are. percent: a share, 0.5 is 50 %. factor: 1 is no change. signed: with its sign.
+#: points: a difference of shares, with its sign. p: a p-value or what it was adjusted to.
+Kind: TypeAlias = Literal["text", "count", "number", "percent", "factor", "signed", "points", "p"]
+#: The kinds of `analyze.render.figures`.
+FigureKind: TypeAlias = Literal["forest", "lines", "heat_map", "stacked", "distribution", "scatter", "pictures"]
+
+
+@dataclass(frozen=True)
+class Column:
+    """How a column of a frame is shown. Where the frame has NAME_low and NAME_high, they are its interval everywhere.
+
+    Attributes:
+        name: of the column.
+        kind: what its values are, see `Kind`.
+        header: above it; the name without underscores unless it is given.
+        meaning: what the values are, said once below the table.
+        screen: whether a terminal shows it too.
+    """
+
+    name: str
+    kind: Kind = "number"
+    header: str = ""
+    meaning: str = ""
+    screen: bool = True
+
+    @property
+    def title(self) -> str:
+        """What stands above the column."""
+        return self.header or self.name.replace("_", " ")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A frame, and what of it is shown. Files hold all of its rows and columns.
+
+    Attributes:
+        name: of the table and its file.
+        frame: the rows; lazy where they are those of thousands of episodes.
+        columns: those that texts show, in order; a table without any is in the files only.
+        title: above it.
+        where: the rows that texts show; all unless it is given.
+        rows: how many of them a terminal shows at most.
+    """
+
+    name: str
+    frame: pl.DataFrame | pl.LazyFrame
+    columns: Sequence[Column] = ()
+    title: str = ""
+    where: pl.Expr | None = None
+    rows: int = 12
+
+    @property
+    def shown(self) -> pl.DataFrame:
+        """The rows that texts show."""
+        rows = self.frame.lazy() if self.where is None else self.frame.lazy().filter(self.where)
+        return rows.collect()
+
+    @property
+    def names(self) -> list[str]:
+        """The columns of the frame."""
+        return self.frame.lazy().collect_schema().names()
+
+    @property
+    def legend(self) -> dict[str, str]:
+        """What the columns mean, by their titles."""
+        return {column.title: column.meaning for column in self.columns if column.meaning}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A sentence that may be quoted, and what it rests on.
+
+    Attributes:
+        sentence: the answer, with its estimate.
+        asks: the question that it answers, in a few words: "Does it listen?".
+        numbers: what the sentence says as numbers, by name: estimate, low, high, p, n and the like.
+        limit: what the data do not show, as a sentence: too few episodes, one scene.
+        next_step: a command line that shows more.
+    """
+
+    sentence: str
+    asks: str = ""
+    numbers: Mapping[str, float | int | str | None] = field(default_factory=dict)
+    limit: str = ""
+    next_step: str = ""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A picture of a frame.
+
+    Attributes:
+        name: of the picture's file.
+        kind: how it is drawn, see `analyze.render.figures`, which lists the options of each kind.
+        frame: what is drawn.
+        title: one line above it.
+        caption: what is drawn, over how much, and what the bars are: below it in print.
+        options: columns and looks.
+    """
+
+    name: str
+    kind: FigureKind
+    frame: pl.DataFrame
+    title: str
+    caption: str = ""
+    options: Mapping[str, object] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Result:
+    """The answer of a question.
+
+    Attributes:
+        title: the question.
+        about: what was run: policy, suite, episodes solved, and what was changed in the run.
+        findings: the answer first; the most important ones in front.
+        tables: the numbers, those that answer in front.
+        figures: pictures.
+        notes: what to know beside the numbers: site, layers, what was left out, what intervals are about.
+    """
+
+    title: str
+    about: Sequence[str]
+    findings: Sequence[Finding]
+    tables: Sequence[Table]
+    figures: Sequence[Figure] = ()
+    notes: Sequence[str] = ()
+
+    def __getitem__(self, name: str) -> pl.DataFrame:
+        """The frame of the table with this name, all its rows.
+
+        Raises:
+            KeyError: no table has it.
+        """
+        for table in self.tables:
+            if table.name == name:
+                return table.frame.lazy().collect()
+        raise KeyError(f"no table '{name}'; there are {', '.join(table.name for table in self.tables)}")
