@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Unpack, get_args
+from typing import TYPE_CHECKING, Any, Literal, Unpack, get_args
 
 import polars as pl
 
@@ -32,6 +32,8 @@ from vla_attention.schemas.stores.store_url import store_place
 
 if TYPE_CHECKING:
     import xarray
+
+    from vla_attention.analyze.render.answer import Answer
 
 LevelName = Literal["tasks", "episodes", "replans", "steps"]
 #: So many analyses are kept, so that asking for tasks after episodes does not read everything again.
@@ -243,19 +245,22 @@ class OpenStores:
 
         return _chosen(table, ("sinks", "heads"), lambda: search_sinks(self.ask(**settings)))
 
-    def words(
-        self, table: Literal["summary", "episodes"] = "summary", **settings: Unpack[SettingKeywords]
-    ) -> pl.DataFrame:
-        """Attention on the words: over all episodes with intervals ("summary"), or per episode and layer ("episodes").
+    def words(self, by: Sequence[str] = (), **settings: Unpack[SettingKeywords]) -> Answer:
+        """Which words of the instruction are read; tables "words", "words_scale", "words_episodes".
 
-        >>> words = va.open(store).words(tasks=0)
+        `by`: keep apart layer, head, denoise, replan, task, family or episode.
+
+        >>> words = va.open(store).words(tasks=0)["words"]
         >>> sorted(words.filter(kind="word")["item"].to_list())
         ['bowl', 'on', 'plate', 'put', 'the']
         """
-        from vla_attention.analyze.words.word_study import study_words
+        return self._answer("words", settings, by=tuple(by))
 
-        asked = settings_from_keywords(**settings)
-        return _chosen(table, ("summary", "episodes"), lambda: study_words(self.stores, asked))
+    def _answer(self, name: str, settings: SettingKeywords, **own: Any) -> Answer:
+        from vla_attention.analyze.ask import answer_to
+        from vla_attention.analyze.render.answer import Answer
+
+        return Answer.of(answer_to(name, self.stores, settings_from_keywords(**settings), own, self._known))
 
     def objects(
         self,

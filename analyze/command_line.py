@@ -10,7 +10,8 @@ from contextlib import AbstractContextManager, nullcontext
 from importlib import import_module
 from pathlib import Path
 
-from vla_attention.analyze.commands import COMMANDS, DEFAULT_COMMAND
+from vla_attention.analyze.ask import question_parser, run_question
+from vla_attention.analyze.registry import COMMANDS, DEFAULT_COMMAND
 from vla_attention.schemas.command_line import run_command
 from vla_attention.schemas.errors import BadArgument, UnknownName, UserError, did_you_mean, listing
 from vla_attention.schemas.former_commands import as_of_today
@@ -51,7 +52,6 @@ def _run(words: Sequence[str], program: str) -> int:
     arguments = words[1:] if name else words
     if not name:
         _refuse_misspelt_command(arguments)
-    command = import_module(f"vla_attention.analyze.{name or DEFAULT_COMMAND}.command")
     parser = build_parser(name)
     if program == "vla-attention":
         parser.prog = f"{program} {name or 'analyze'}"
@@ -61,21 +61,30 @@ def _run(words: Sequence[str], program: str) -> int:
     os.environ.update(dict.fromkeys(_ONE_THREAD_EACH, "1"))
     try:
         with _cache_of(parsed), _engine(parsed), _pictures(parsed):
-            code: int = command.run(parsed)
-        return code
+            return _answer(name or DEFAULT_COMMAND, parsed)
     except UserError as error:
         raise _with_way_out(error, can_skip=hasattr(parsed, "skip_corrupt")) from error.__cause__
 
 
+def _answer(name: str, parsed: argparse.Namespace) -> int:
+    if COMMANDS[name].folder:
+        code: int = import_module(f"vla_attention.analyze.{name}.command").run(parsed)
+        return code
+    return run_question(name, parsed)
+
+
 def build_parser(name: str) -> argparse.ArgumentParser:
     """The parser of one command with what all commands share; `""` is `vla-attention analyze STORE`."""
-    command = import_module(f"vla_attention.analyze.{name or DEFAULT_COMMAND}.command")
     parser: argparse.ArgumentParser
-    parser = (
-        command.build_parser(prog=f"vla-attention analyze {name}")
-        if name == DEFAULT_COMMAND
-        else command.build_parser()
-    )
+    if COMMANDS[name or DEFAULT_COMMAND].folder:
+        command = import_module(f"vla_attention.analyze.{name or DEFAULT_COMMAND}.command")
+        parser = (
+            command.build_parser(prog=f"vla-attention analyze {name}")
+            if name == DEFAULT_COMMAND
+            else command.build_parser()
+        )
+    else:
+        parser = question_parser(name)
     add_threads(
         parser,
         "threads that measure episodes, at most 4 (default: OMP_NUM_THREADS, else the cores of this process)",

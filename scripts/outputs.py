@@ -139,7 +139,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
 
 def _commands_of(stage: str) -> list[str]:
     assert stage == "analyze"
-    from vla_attention.analyze.commands import COMMANDS
+    from vla_attention.analyze.registry import COMMANDS
 
     return list(COMMANDS)
 

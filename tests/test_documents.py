@@ -16,7 +16,7 @@ from scripts.site_hooks import OUTSIDE
 from tests.kit.golden_tables import STORES
 from vla_attention.__main__ import COMMANDS as PROGRAM_COMMANDS
 from vla_attention.__main__ import main as vla_attention
-from vla_attention.analyze.commands import COMMANDS, DEFAULT_COMMAND
+from vla_attention.analyze.registry import COMMANDS, DEFAULT_COMMAND
 from vla_attention.capture.commands.arguments import build_parser
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -35,10 +35,13 @@ vla-attention COMMAND --help says more, --help-all everything. From Python: impo
 
 def usage() -> str:
     """The help text."""
-    from vla_attention.analyze.commands import DEFAULT_COMMAND, KEEPING, QUESTIONS
+    from vla_attention.analyze.registry import COMMANDS as ANALYSES
+    from vla_attention.analyze.registry import DEFAULT_COMMAND
 
-    questions = {"analyze" if name == DEFAULT_COMMAND else name: answer for name, answer in QUESTIONS.items()}
-    return _USAGE.format(questions=_lines(questions), keeping=_lines(KEEPING))
+    named = {"analyze" if name == DEFAULT_COMMAND else name: command for name, command in ANALYSES.items()}
+    questions = {name: command.answers for name, command in named.items() if not command.keeps}
+    keeping = {name: command.answers for name, command in named.items() if command.keeps}
+    return _USAGE.format(questions=_lines(questions), keeping=_lines(keeping))
 
 
 def _lines(commands: Mapping[str, str]) -> str:
@@ -59,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     command = COMMANDS.get(given[0])
     if command is not None:
         return command(given[1:])
-    from vla_attention.analyze.commands import COMMANDS as ANALYSES
+    from vla_attention.analyze.registry import COMMANDS as ANALYSES
     from vla_attention.schemas.former_commands import FORMER
 
     if given[0] in ANALYSES or given[0] in FORMER:

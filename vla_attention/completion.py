@@ -138,7 +138,7 @@ def commands_of_all_programs() -> Iterator[Command]:
 
 def _analyze_commands() -> Iterator[Command]:
     from vla_attention.analyze.command_line import build_parser
-    from vla_attention.analyze.commands import COMMANDS
+    from vla_attention.analyze.registry import COMMANDS
 
     without = _command("vla-analyze", build_parser(""))
     yield Command(without.words, tuple(COMMANDS), without.options, without.values)

@@ -14,7 +14,7 @@ from vla_attention.analyze.arguments import (
     sink_rule,
     stores_of,
 )
-from vla_attention.analyze.commands import list_of_commands
+from vla_attention.analyze.registry import list_of_commands
 from vla_attention.analyze.show.output_files import files_lines
 from vla_attention.schemas.command_line import command_parser
 

@@ -110,7 +110,7 @@ def _section_makers(
     if search is not None:
         makers += [
             lambda: sink_section(search),
-            lambda: word_section(question, folder),
+            lambda: word_section(question),
             lambda: object_section(question, folder),
         ]
     return [

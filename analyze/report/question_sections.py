@@ -7,8 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import polars as pl
-
+from vla_attention.analyze.ask import answer_to
 from vla_attention.analyze.deviation.deviation_study import has_dataset_actions, study_deviation
 from vla_attention.analyze.deviation.plot_deviation import plot_deviation
 from vla_attention.analyze.deviation.text import answer, correlation_sentence, dimension_table
@@ -30,15 +29,12 @@ from vla_attention.analyze.objects.plot_object_shares import plot_object_shares
 from vla_attention.analyze.objects.text import followed_sentence, over_all_cameras, share_table
 from vla_attention.analyze.ratios.analysis import Analysis
 from vla_attention.analyze.report.pictures import diagram_of, drawn
-from vla_attention.analyze.report.section_parts import PageTable, Paragraph, Part, Section
+from vla_attention.analyze.report.section_parts import PageTable, Paragraph, Part, ResultPart, Section
 from vla_attention.analyze.show.findings import few_families_note
 from vla_attention.analyze.show.numbers import format_number, format_percent
 from vla_attention.analyze.show.tables import INTERVAL
 from vla_attention.analyze.time.plot_time_course import plot_time_courses
 from vla_attention.analyze.time.time_courses import time_courses
-from vla_attention.analyze.words.plot_word_bars import plot_word_bars
-from vla_attention.analyze.words.text import leading_sentence, summary_table
-from vla_attention.analyze.words.word_study import study_words
 from vla_attention.schemas.errors import BadArgument, UserError
 
 #: Rows of the tables of sinks and objects; the rows after these are small, and the commands print them.
@@ -98,24 +94,14 @@ def sink_section(search: SinkSearch) -> Section:
     return Section("sinks", "Sinks", [explanation, Paragraph(sentence), PageTable(table)])
 
 
-def word_section(question: Question, folder: Path) -> Section:
+def word_section(question: Question) -> Section:
     """Which words are read: at the site that was chosen, or without a choice at the site that reads the instruction."""
     # Words need no groups, and another site may not have the keys of the question's groups.
     settings = replace(question.settings, grouping=None, groups=(), ratio=None)
     try:
-        study = study_words(question.stores, settings)
+        return Section("words", "Words", [ResultPart(answer_to("words", question.stores, settings))])
     except UserError as error:
         return Section("words", "Words", [Paragraph(str(error))])
-    of_words = study.summary.filter(pl.col("kind") == "word")
-    diagram = drawn(
-        lambda where: plot_word_bars(study.summary, where, study.layer),
-        folder,
-        f"Bars of the words' lifts, highest first: {_named(of_words.head(5).to_dicts(), 'lift') or 'none'}.",
-        f"Words by lift, site {study.question.site}: mass over what uniform attention gives; 1 is uniform attention.",
-    )
-    few = few_families_note(of_words, "item", study.question.units)
-    said = [Paragraph(leading_sentence(study)), *([Paragraph(few)] if few else [])]
-    return Section("words", "Words", [diagram, *said, PageTable(summary_table(study))])
 
 
 def object_section(question: Question, folder: Path) -> Section | None:

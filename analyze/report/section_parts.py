@@ -6,9 +6,13 @@ The templates escape every text, so nothing from a store can become markup.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Protocol
 
+from markupsafe import Markup
+
+from vla_attention.analyze.core.result import Result
+from vla_attention.analyze.render.page import fragment
 from vla_attention.analyze.show.tables import Cell, Table
 
 
@@ -34,6 +38,19 @@ class Paragraph:
     template: ClassVar[str] = "paragraph.html"
     text: str
     quiet: bool = False
+
+
+@dataclass(frozen=True)
+class ResultPart:
+    """A question's whole result."""
+
+    template: ClassVar[str] = "result_part.html"
+    result: Result
+
+    @property
+    def html(self) -> Markup:
+        """It as HTML, every text escaped."""
+        return Markup(fragment(replace(self.result, about=())))  # noqa: S704 - the templates of results escape
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from tests.kit.lazy_imports import HEAVY, help_without_libraries
-from vla_attention.analyze.commands import COMMANDS
+from vla_attention.analyze.registry import COMMANDS
 
 
 @pytest.mark.thorough

@@ -1,8 +1,8 @@
 """The golden tables: what every question gives on fixed stores, and what the published lines pass on.
 
 `tests/golden/tables/CASE/TABLE.parquet` holds a table of a command's results; `python -m tests.golden.make_tables` made
-them. A command of another form gives them in another way: then `tables_of` below reads the new results, and the kept
-tables stay as they are.
+them. A command of another form gives the same numbers in tables of another form: `FORMS` says how a kept table is found
+among them, and the kept tables stay as they are.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ import os
 import shlex
 import shutil
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +25,12 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
+from tests.kit.golden_stores import differences
 from tests.kit.paths import GOLDEN, ROOT
 from vla_attention.__main__ import main as vla_attention
 from vla_attention.analyze.parse.command import build_parser as parser_of_results
 from vla_attention.analyze.parse.command import main as parse_attention_ratio_results
+from vla_attention.analyze.render import style
 from vla_attention.analyze.show import plot_style
 from vla_attention.capture.commands.arguments import build_evaluate_parser, build_parser
 from vla_attention.capture.policies.families import policy_families
@@ -138,6 +141,7 @@ def _asked(program: Callable[[list[str]], int], words: list[str], folder: Path) 
         patch.chdir(folder)
         patch.setattr(Figure, "savefig", _leave_blank)
         patch.setattr(plot_style, "find_places", lambda _figure: None)
+        patch.setattr(style, "find_places", lambda _canvas, _dpi: None)
         assert program(words) == 0
     return dict(_read(folder / "results"))
 
@@ -211,6 +215,67 @@ def _options(arguments: argparse.Namespace) -> Iterator[tuple[str, str]]:
     for name, value in sorted(vars(arguments).items()):
         if not callable(value) and name != "family" and value not in (None, False, []):
             yield name, str(value)
+
+
+_EPISODE = ("suite", "task_id", "episode_index")
+
+
+@dataclass(frozen=True)
+class Form:
+    """How a kept table is found in today's results.
+
+    Attributes:
+        keys: the columns by which rows are matched.
+        rows: today's rows, in the kept columns, from all tables of the results.
+        gone: kept columns that are given no more.
+    """
+
+    keys: tuple[str, ...]
+    rows: Callable[[Mapping[str, pl.DataFrame]], pl.DataFrame]
+    gone: tuple[str, ...] = ()
+
+    def differences(self, tables: Mapping[str, pl.DataFrame], kept: pl.DataFrame) -> list[str]:
+        """Where today's rows differ from the kept ones."""
+        kept = kept.drop(self.gone)
+        found = self.rows(tables)
+        found, expected = (
+            table.select(kept.columns).sort(self.keys, nulls_last=True) for table in (found, kept)
+        )  # fmt: skip
+        return differences(found, expected, alike)
+
+
+def _renamed(table: pl.DataFrame, **names: str) -> pl.DataFrame:
+    """The table with further columns, each named after the kept one: kept=today's."""
+    return table.with_columns(pl.col(today).alias(kept) for kept, today in names.items())
+
+
+_SCALE = {
+    "first token": "bos", "fixed words of the prompt": "template", "other text": "text", "state digits": "state",
+    "image patches": "image",
+}  # fmt: skip
+_WORDS_GONE = ("density", "density_low", "density_high", "density_episodes", "mass_episodes", "lift_episodes",
+               "share_episodes")  # fmt: skip
+#: (Command, kept table) -> how it is found.
+FORMS: dict[tuple[str, str], Form] = {
+    ("words", "words_summary"): Form(
+        ("kind", "item"),
+        lambda tables: (
+            _renamed(tables["words"], pieces="keys")
+            .filter(pl.col("kind") != "place")
+            .with_columns(pl.col("item").replace(_SCALE))
+        ),
+        _WORDS_GONE,
+    ),
+    ("words", "words"): Form(
+        (*_EPISODE, "layer", "kind", "item", "place"),
+        lambda tables: (
+            _renamed(tables["words_episodes"], pieces="keys")
+            .filter(pl.col("kind") != "word")
+            .with_columns(pl.col("kind").replace("place", "word"), pl.col("item").replace(_SCALE))
+        ),
+        ("density",),
+    ),
+}
 
 
 def alike(one: object, other: object) -> bool:

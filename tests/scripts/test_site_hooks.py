@@ -7,7 +7,7 @@ import re
 import pytest
 
 from scripts.site_hooks import commands_of, help_texts, translate_links
-from vla_attention.analyze.commands import COMMANDS
+from vla_attention.analyze.registry import COMMANDS
 from vla_attention.capture.policies.families import policy_families
 
 

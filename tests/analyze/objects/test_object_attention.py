@@ -21,12 +21,12 @@ from tests.kit.bowl_scene import CAMERAS, bowl_coverage, bowl_tokens, write_bowl
 from tests.kit.examples import examples
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.commands.words import words
 from vla_attention.analyze.objects.object_attention import ObjectTables, object_tables
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_study import followed_objects, iou_summary, leading_finder, objects_summary
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.units import Estimand
-from vla_attention.analyze.words.word_study import words_table
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.testing.tokens import OBJECTS, random_rows
 
@@ -302,8 +302,8 @@ def test_a_block_that_has_two_numbers_counts_once_in_the_average(follower_store)
     for name in ("objects", "pointing", "iou"):
         averages = [getattr(tables, name).filter(pl.col("layer") == "layers_avg") for tables in (once, doubled)]
         assert_frame_equal(*averages)
-    words = [words_table(part) for part in (question, replace(question, selection=twice))]
-    assert_frame_equal(*(table.filter(pl.col("layer") == "layers_avg") for table in words))
+    both = [words(part)["words_episodes"] for part in (question, replace(question, selection=twice))]
+    assert_frame_equal(*(table.filter(pl.col("layer") == "layers_avg") for table in both))
 
 
 @pytest.mark.drawn

@@ -1,0 +1,101 @@
+"""Asking a question from a command line or from Python: its parser, its checked question, its result on a screen."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from vla_attention.analyze.options import (
+    add_output,
+    add_question,
+    results_folder,
+    settings_of,
+)
+from vla_attention.analyze.registry import COMMANDS, Command
+from vla_attention.schemas.command_line import OneSentenceParser, command_parser
+from vla_attention.schemas.stores.store_url import store_place
+
+if TYPE_CHECKING:
+    from vla_attention.analyze.core.result import Result
+    from vla_attention.analyze.measures.question import KnownEpisodes, Question
+    from vla_attention.analyze.measures.question_settings import AnalysisSettings
+    from vla_attention.schemas.stores.reader import Store
+
+
+def question_parser(name: str) -> OneSentenceParser:
+    """The parser of a question, made from its line in the registry."""
+    command = COMMANDS[name]
+    examples = "\n".join(["examples:", *(f"  vla-attention {line}" for line in command.examples)])
+    answers = f"{command.answers[0].upper()}{command.answers[1:]}."
+    parser = command_parser(f"vla-attention {name}", answers, f"{examples}\n" if command.examples else "")
+    parser.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses")
+    add_question(parser, command.options)
+    add_output(parser, name)
+    return parser
+
+
+def run_question(name: str, given: argparse.Namespace) -> int:
+    """Answer a question: files, and what fits a screen; returns the exit code."""
+    from vla_attention.analyze.render.answer import Answer
+    from vla_attention.analyze.render.terminal import screen
+    from vla_attention.schemas.stores.reader import open_store
+
+    own = {option: getattr(given, option) for option in COMMANDS[name].options if option not in _settings()}
+    stores = [open_store(place) for place in given.stores]
+    folder = given.output or results_folder(given.stores[0], name, given)
+    answer = Answer.of(answer_to(name, stores, settings_of(given), own))
+    formats = ("png", "pdf") if given.pdf else ()
+    files = answer.save(folder, given.csv, not given.no_plots, given.style, formats)
+    endings = sorted({file.suffix for file in files})
+    print(screen(answer, last=[f"{len(files)} files in {folder} ({', '.join(f'*{ending}' for ending in endings)})."]))
+    return 0
+
+
+def answer_to(
+    name: str,
+    stores: Sequence[Store],
+    settings: AnalysisSettings,
+    own: Mapping[str, Any] | None = None,
+    known: KnownEpisodes | None = None,
+) -> Result:
+    """Ask a question of stores.
+
+    Args:
+        name: of the question in the registry.
+        stores: of one policy and one kind of recording.
+        settings: what is selected.
+        own: the question's own options.
+        known: what earlier questions about the same stores have read.
+    """
+    command = COMMANDS[name]
+    function = getattr(import_module(f"vla_attention.analyze.commands.{name}"), name)
+    result: Result = function(_question(command, stores, settings, known), **(own or {}))
+    return result
+
+
+def _question(
+    command: Command, stores: Sequence[Store], settings: AnalysisSettings, known: KnownEpisodes | None
+) -> Question:
+    """The checked question, at the wanted site or the first one that the command can ask."""
+    from vla_attention.analyze.measures.question import ask
+    from vla_attention.analyze.stores.selection import site_that
+    from vla_attention.schemas.errors import BadArgument
+
+    if command.site:
+        root = stores[0].attributes
+        site = site_that(root, settings.site, lambda site: any(span.kind in command.site for span in site.spans))
+        if site is None:
+            raise BadArgument(f"Site '{settings.site or root.sites[0].name}': {command.needs}.")
+        settings = replace(settings, site=site)
+    return ask(stores, settings, known)
+
+
+def _settings() -> set[str]:
+    from dataclasses import fields
+
+    from vla_attention.analyze.measures.question_settings import AnalysisSettings
+
+    return {field.name for field in fields(AnalysisSettings)} | {"group"}

@@ -1,0 +1,47 @@
+"""What every result says of its run first, and what it notes beside its numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from vla_attention.analyze.measures.frames import layer_name
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.stores.run_notes import run_notes
+from vla_attention.schemas.errors import listing, plural
+
+#: What untrained weights mean for every number.
+UNTRAINED = "The weights are untrained (random): the numbers show that the pipeline works, and nothing about a policy."
+
+
+def about(question: Question) -> list[str]:
+    """Policy, suite and episodes solved in one line; then what was changed in the run, and untrained weights."""
+    policy = question.stores[0].attributes.policy
+    suites = listing(dict.fromkeys(store.suite for store in question.stores), 4)
+    outcomes = [item.episode.attributes.success for item in question.selected]
+    line = f"{policy.name} on {suites}: {solved(outcomes, question.num_tasks)}."
+    return [line, *run_notes(question.episodes), *([UNTRAINED] if question.untrained else [])]
+
+
+def solved(outcomes: Iterable[bool | None], num_tasks: int) -> str:
+    """`34 of 34 episodes of 17 tasks solved`; where no outcome is known, that; and how many are not known."""
+    given = list(outcomes)
+    known = [outcome for outcome in given if outcome is not None]
+    tasks = "" if num_tasks == 1 else f" of {num_tasks} tasks"
+    if not known:
+        return f"{plural(len(given), 'episode')}{tasks}, outcomes not known"
+    rest = len(given) - len(known)
+    text = f"{sum(known)} of {plural(len(known), 'episode')}{tasks} solved"
+    return f"{text}; of {rest} more the outcome is not known" if rest else text
+
+
+def notes(question: Question, layer: str = "") -> list[str]:
+    """Which attention the numbers are of, what was left out, and what intervals are about.
+
+    layer: the label of the layer that they are of in tables; "layers_avg" or nothing for all.
+    """
+    which = layer_name(layer) if layer else "all layers"
+    told = set(run_notes(question.episodes))
+    return [
+        f"Site '{question.site}', {which}. Intervals: 95%, about {question.units.words}.",
+        *(remark for remark in question.remarks_on_intervals if remark not in told),
+    ]

@@ -1,0 +1,235 @@
+"""Attention to any set of items in every episode: the one place where rows become numbers.
+
+An item is a named weight per key: a word, an object, a camera, a group of a grouping, a patch. What is measured of it
+are means over replans of numbers that follow, at each replan, from masses that were averaged over denoise steps and
+heads (and for "layers_avg" over layers), unless these axes are kept.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from vla_attention.analyze.core.lazy_frames import frame_of_episodes
+from vla_attention.analyze.measures.baselines import uniform_keys, uniform_masses
+from vla_attention.analyze.measures.frames import (
+    EPISODE_KEYS,
+    LAYERS_AVG,
+    LayerAxis,
+    denoise_axis,
+    head_axis,
+    long_table,
+)
+from vla_attention.analyze.measures.kept import measured_once
+from vla_attention.analyze.measures.masses import finite_mean, masses
+from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.measures.steps import segment_weights, selected_cells
+from vla_attention.analyze.stores.parallel import each_episode
+from vla_attention.analyze.stores.rows import layer_rows
+from vla_attention.analyze.stores.selection import Selection
+from vla_attention.schemas.groupings.resolve import counted_keys
+from vla_attention.schemas.progress_bar import progress_bar
+
+Array: TypeAlias = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Items:
+    """The items of one episode.
+
+    Attributes:
+        labels: column -> a value for each item, (item,) each.
+        weights: of each key in each item, (replan or 1, key, item) float32, 0..1.
+        whole: keys of whose mass an item's `share` is a part, (replan or 1, key); all valid keys unless given.
+        absent: whether a replan without keys of an item is in none of its means (a word that another prompt lacks), or
+            counts as 0 (an object out of sight).
+    """
+
+    labels: Mapping[str, pl.Series]
+    weights: NDArray[np.float32]
+    whole: NDArray[np.bool_] | None = None
+    absent: Literal["left out", "zero"] = "left out"
+
+    def with_totals(self, item: SelectedEpisode) -> NDArray[np.float32]:
+        """The weights, then those of `whole` and of all valid keys; keys that were taken out are in none."""
+        totals = [item.valid if self.whole is None else self.whole, item.valid]
+        replans = max(len(self.weights), *map(len, totals))
+        parts = [self.weights, *(part[:, :, None].astype(np.float32) for part in totals)]
+        weights = np.concatenate([np.broadcast_to(part, (replans, *part.shape[1:])) for part in parts], axis=2)
+        weights[:, list(item.without)] = 0.0
+        return weights
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The masses of the items of one episode; all numbers follow from these arrays.
+
+    Attributes:
+        item: the episode.
+        selection: the layers, and the denoise steps and heads where they were kept.
+        labels: as in `Items`, and `absent` too.
+        mass: (replan, layer, denoise or 1, head or 1, item), mean over the stored queries.
+        whole, valid: the masses of `Items.whole` and of all valid keys, (replan, layer, denoise or 1, head or 1).
+        keys: number of keys, (replan or 1, item).
+        uniform, uniform_valid: `mass` and `valid` of uniform attention; axes along which nothing changes have length 1.
+        env_step: environment step of each replan, (replan,).
+    """
+
+    item: SelectedEpisode
+    selection: Selection
+    labels: Mapping[str, pl.Series]
+    absent: str
+    mass: Array
+    whole: Array
+    valid: Array
+    keys: Array
+    uniform: Array
+    uniform_valid: Array
+    env_step: NDArray[np.int64]
+
+
+def measure(
+    question: Question, items_of: Callable[[SelectedEpisode], Items], what: str, keep: Collection[str] = ()
+) -> Sequence[Measured]:
+    """Measure the items of every selected episode; a terminal sees the progress.
+
+    The arrays are kept on disk, and read when an episode is asked for. What the cache holds of them is not measured
+    again; its key has a digest of the weights.
+
+    Args:
+        question: stores, selection and site.
+        items_of: gives the items of an episode; a function of a module, or a `functools.partial` of one.
+        what: the items in a word or two, for the cache.
+        keep: "denoise" and "head" are kept apart where they are here, see `axes.OF_ROWS`.
+    """
+    chosen, selection = question.selected, replace(question.selection, per_head="head" in keep)
+    with progress_bar(len(chosen), "episodes") as advance:
+        described = list(each_episode(partial(_described, items_of=items_of), chosen))
+
+        def scan(positions: Sequence[int]) -> Iterator[dict[str, NDArray[Any]]]:
+            each = partial(
+                _measured, items_of=items_of, selection=selection, site=question.site, denoise="denoise" in keep
+            )
+            return each_episode(each, [chosen[i] for i in positions], advance)
+
+        digests = [digest for _, _, digest in described]
+        arrays = measured_once(
+            "items", f"masses of {what}", chosen, selection, question.site, scan, {"denoise": "denoise" in keep},
+            digests, advance,
+        )  # fmt: skip
+        kept = OnDisk(arrays)
+
+    def made(i: int) -> Measured:
+        return Measured(chosen[i], selection, described[i][0], described[i][1], **kept[i])
+
+    return MadeWhenAsked(made, range(len(chosen)))
+
+
+def _described(
+    item: SelectedEpisode, items_of: Callable[[SelectedEpisode], Items]
+) -> tuple[Mapping[str, pl.Series], str, str]:
+    """Labels, what absent items count, and a digest of the weights."""
+    items = items_of(item)
+    weights = items.with_totals(item)
+    digest = hashlib.sha256(f"{weights.shape}".encode())
+    digest.update(np.ascontiguousarray(weights).data)
+    return items.labels, items.absent, digest.hexdigest()
+
+
+def _measured(
+    item: SelectedEpisode,
+    items_of: Callable[[SelectedEpisode], Items],
+    selection: Selection,
+    site: str,
+    denoise: bool,
+) -> dict[str, NDArray[Any]]:
+    """The arrays of a `Measured` by name."""
+    weights = items_of(item).with_totals(item)
+    replans, steps = item.tokens.num_replans, len(selection.denoise)
+    heads = len(selection.heads) if selection.per_head else 1
+    of_segments = segment_weights(item, weights, site)
+    if of_segments is not None:
+        atoms = selected_cells(item.episode.read(f"{site}/atoms"), selection).mean(axis=-2)
+        mass = masses(atoms if selection.per_head else atoms.mean(axis=3, keepdims=True), of_segments)
+        mass = mass if denoise else mass.mean(axis=2, keepdims=True)
+    else:
+        mass = np.zeros((replans, len(selection.layers), steps if denoise else 1, heads, weights.shape[2]))
+        for part in layer_rows(item.store.attributes, item.episode, selection, site):
+            found = masses(part.rows, weights)
+            mass[:, part.layer, part.denoise if denoise else 0] += found if denoise else found / steps
+    uniform = uniform_masses(uniform_keys(item, selection), weights)
+    uniform = uniform if denoise else uniform.mean(axis=2, keepdims=True)
+    arrays = {
+        "mass": mass[..., :-2],
+        "whole": mass[..., -2],
+        "valid": mass[..., -1],
+        "keys": counted_keys(weights, item.tokens.existing)[:, :-2],
+        "uniform": uniform[..., :-2],
+        "uniform_valid": uniform[..., -1],
+        "env_step": item.episode.read("env_step").astype(np.int64),
+    }
+    # In C order, as they come from the cache and from other processes: numpy's sums depend on the order in memory.
+    return {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+
+
+def means(measured: Measured, by: Collection[str] = ()) -> pl.DataFrame:
+    """Means over an episode's replans, or with "replan" the numbers of each.
+
+    Returns:
+        One row per item and cell of the axes in `by`: `EPISODE_KEYS`, replan and env_step, layer, layer_number and
+        block (the selected layers, then "layers_avg"; without "layer" the latter alone), denoise_step, head, the items'
+        labels, and
+            keys   number of keys
+            mass   part of the row, 0..1
+            lift   (mass / what uniform attention gives) / (the same of all valid keys): 1 is uniform attention
+            share  mass / mass of `Items.whole`
+        Null where a number does not exist.
+    """
+    one, layers = measured, LayerAxis.of(measured.selection, average_one=False)
+    averaged = tuple(axis for axis, name in ((2, "denoise"), (3, "head")) if name not in by)
+    several = layers.num_layers > 1
+
+    def of_layers(values: Array) -> Array:
+        values = values.mean(axis=averaged, keepdims=True)
+        if values.shape[1] == 1 or not several:
+            return values
+        return layers.with_average(values) if "layer" in by else values[:, layers.once].mean(axis=1, keepdims=True)
+
+    mass, uniform = of_layers(one.mass), of_layers(one.uniform)
+    whole, valid, of_valid = (of_layers(part)[..., None] for part in (one.whole, one.valid, one.uniform_valid))
+    keys = np.broadcast_to(one.keys[:, None, None, None], mass.shape)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        lift = np.where(uniform > 0, mass / uniform, np.nan) / (valid / of_valid)
+        share = np.where(whole > 0, mass / whole, np.nan)
+    values = {"keys": keys, "mass": mass, "lift": lift, "share": share}
+    if one.absent == "left out":
+        values = {name: np.where(keys > 0, array, np.nan) for name, array in values.items()}
+    axes: list[Any] = []
+    if "replan" in by:
+        axes.append({"replan": range(len(one.env_step)), "env_step": one.env_step})
+    else:
+        values = {name: finite_mean(array) for name, array in values.items()}
+    place = slice(None) if "layer" in by or not several else slice(-1, None)
+    axes.append({name: list(labels)[place] for name, labels in layers.columns.items()})
+    axes.append(denoise_axis(one.selection) if "denoise" in by else {"denoise_step": pl.Series([None], dtype=pl.Int64)})
+    axes.append(head_axis(replace(one.selection, per_head="head" in by)))
+    return long_table(one.item, [*axes, one.labels], values, EPISODE_KEYS)
+
+
+def table_of(measured: Sequence[Measured], by: Collection[str] = ()) -> pl.LazyFrame:
+    """`means` of all episodes, made whenever rows are asked for."""
+    return frame_of_episodes(measured, partial(means, by=frozenset(by)))
+
+
+def layer_of(selection: Selection) -> str:
+    """The label of the layer that a summary is of: "layers_avg", or the only layer."""
+    return LAYERS_AVG if len(selection.layers) > 1 else str(selection.layer_labels[0])

@@ -1,0 +1,129 @@
+"""The options of questions, once, and what was given as settings. Imports nothing heavy."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.options import Numbers, add_task, number_range
+from vla_attention.schemas.safe_text import file_part
+
+if TYPE_CHECKING:
+    from vla_attention.analyze.measures.question_settings import AnalysisSettings
+    from vla_attention.schemas.stores.store_url import StorePlace
+
+#: Characters of a folder's name; file systems take 255 bytes.
+_LONGEST_NAME = 100
+_NUMBERS: dict[str, Any] = {"type": number_range, "nargs": "+", "action": Numbers, "metavar": "N"}
+#: What a table may keep apart.
+AXES = ("layer", "head", "denoise", "replan", "time", "task", "family", "episode", "camera")
+#: Option -> what argparse takes. Those of `AnalysisSettings` have its names; the others are arguments of the command.
+OPTIONS: dict[str, dict[str, Any]] = {
+    "layers": {**_NUMBERS, "help": "layers, or ranges as 0-2 (default: all recorded)"},
+    "denoise": {
+        "nargs": "+", "metavar": "STEP", "help": "denoise steps, first, last or all (default: all recorded)",
+    },
+    "heads": {**_NUMBERS, "help": "heads, or ranges as 0-2 (default: all recorded)"},
+    "site": {"metavar": "NAME", "help": "softmax family: joint (pi), self or cross (Cosmos) (default: the first)"},
+    "grouping": {
+        "metavar": "NAME|FILE",
+        "help": "default, instruction, cameras, objects, reference[:N], or a TOML file (default: default)",
+    },
+    "group": {
+        "action": "append", "default": [], "metavar": "NAME=SELECTOR", "help": "one more group; may be repeated",
+    },
+    "ratio": {"metavar": "A,B/C", "help": "groups of the ratio's numerator and denominator"},
+    "intervals": {
+        "choices": ("tasks-like-these", "these-tasks"), "default": "tasks-like-these",
+        "help": "what intervals over several tasks are about (default: %(default)s; see docs/statistics.md)",
+    },
+    "by": {
+        "type": lambda text: tuple(part for part in text.split(",") if part), "default": (), "metavar": "AXIS,...",
+        "help": f"keep apart: one or several of {', '.join(AXES)}",
+    },
+}  # fmt: skip
+#: Settings whose option has another name.
+_OPTION_OF = {"groups": "group"}
+
+
+def output_place(text: str) -> Path:
+    """The type of `--output`: a folder that is in no store. It is looked at before hours of reading."""
+    from vla_attention.schemas.stores.store_place import refuse_in_store
+
+    try:
+        refuse_in_store(Path(text), "write to")
+    except BadArgument as error:
+        raise argparse.ArgumentTypeError(str(error).removesuffix(".")) from None
+    return Path(text)
+
+
+def add_workers(parser: argparse.ArgumentParser) -> None:
+    """--workers and --scheduler."""
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument("--workers", type=int, metavar="N", help="read episodes in N processes (default: threads)")
+    where.add_argument("--scheduler", metavar="ADDRESS", help="or in the workers of a dask scheduler, tcp://HOST:8786")
+
+
+def add_question(parser: argparse.ArgumentParser, names: tuple[str, ...]) -> None:
+    """--task, the named options and --skip-corrupt."""
+    add_task(parser, "tasks", "tasks")
+    for name in names:
+        parser.add_argument(f"--{name.replace('_', '-')}", **OPTIONS[name])
+    parser.add_argument(
+        "--skip-corrupt", action="store_true", help="leave out episodes that are damaged or empty, by name"
+    )
+    add_workers(parser)
+
+
+def add_output(parser: argparse.ArgumentParser, command: str) -> None:
+    """--output, --csv, --no-plots, --pdf and --style."""
+    parser.add_argument(
+        "--output", type=output_place, metavar="FOLDER", help=f"folder (default: results/PATH OF STORE/{command})"
+    )
+    parser.add_argument("--csv", action="store_true", help="tables as CSV instead of Parquet")
+    pictures = parser.add_mutually_exclusive_group()
+    pictures.add_argument("--no-plots", action="store_true", help="numbers only")
+    pictures.add_argument("--pdf", action="store_true", help="pictures as PDF too")
+    parser.add_argument(
+        "--style", choices=("screen", "paper"), default="screen",
+        help="paper: pictures for print, without titles, with caption files (default: %(default)s)",
+    )  # fmt: skip
+
+
+def settings_of(given: argparse.Namespace) -> AnalysisSettings:
+    """The settings among the given options; those that a command does not take keep their defaults."""
+    from dataclasses import fields
+
+    from vla_attention.analyze.measures.question_settings import AnalysisSettings
+
+    values: dict[str, Any] = {}
+    for field in fields(AnalysisSettings):
+        name = _OPTION_OF.get(field.name, field.name)
+        if hasattr(given, name):
+            value = getattr(given, name)
+            values[field.name] = tuple(value) if isinstance(value, list) else value
+    return AnalysisSettings(**values)
+
+
+def results_folder(store: StorePlace, command: str, given: argparse.Namespace) -> Path:
+    """`results/PATH OF STORE/COMMAND`, with the options that change the answer in its name.
+
+    A store outside of the working folder is named by its whole path: results of stores of one name lie apart.
+    """
+    if isinstance(store, Path):
+        path = store.absolute()
+        path = path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path.relative_to(path.anchor)
+    else:
+        path = Path(*str(store).split("://", 1)[1].split("/"))
+    said = [
+        f"{name}-{'-'.join(map(str, value)) if isinstance(value, list | tuple) else value}"
+        for name in ("tasks", *OPTIONS)
+        if (value := getattr(given, name, None)) and value != OPTIONS.get(name, {}).get("default")
+    ]
+    name = file_part("_".join([command, *said]))
+    if len(name) > _LONGEST_NAME:
+        name = f"{name[:_LONGEST_NAME]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    return Path("results", *path.with_suffix("").parts, name)

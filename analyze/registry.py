@@ -1,0 +1,69 @@
+"""The commands on stores: a line each. Imports nothing heavy, so that `--help` is fast."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command.
+
+    Attributes:
+        answers: what it answers or does, for the list of commands and its help.
+        options: what a question takes besides stores, tasks and output; names of `analyze.options.OPTIONS`.
+        site: kinds of spans of which the site that is asked must have one; any site if there are none.
+        needs: what is said of a store without such a site.
+        examples: command lines behind `vla-attention`, for the help of a question.
+        folder: whether it is `analyze.NAME.command`, with a parser of its own, instead of a question.
+        keeps: whether it keeps stores instead of asking them.
+    """
+
+    answers: str
+    options: tuple[str, ...] = ()
+    site: tuple[str, ...] = ()
+    needs: str = ""
+    examples: tuple[str, ...] = ()
+    folder: bool = False
+    keeps: bool = False
+
+
+_ROWS = ("layers", "denoise", "heads", "site", "intervals")
+_NO_WORDS = "its keys spell no words; choose a site with text by --site (Cosmos: cross)"
+
+#: Name -> command. The function NAME of `analyze.commands.NAME` answers a question.
+COMMANDS: dict[str, Command] = {
+    "ratios": Command("look or read: masses, fractions and ratios, with intervals", folder=True),
+    "words": Command(
+        "which words of the instruction are read",
+        (*_ROWS, "by"),
+        ("text",),
+        _NO_WORDS,
+        ("words runs/libero_10.zarr", "words runs/libero_10.zarr --task 3", "words runs/cosmos.zarr --by layer"),
+    ),
+    "objects": Command("which objects are looked at", folder=True),
+    "effects": Command("what the action depends on: without a word, a picture, an object", folder=True),
+    "time": Command("over the course of an episode; success against failure", folder=True),
+    "compare": Command("two or more runs, paired where they share initial states and seeds", folder=True),
+    "heads": Command("which heads and layers look, which read; entropy, sinks, depth", folder=True),
+    "overlay": Command("attention on the stored pictures: strips, GIF or MP4", folder=True),
+    "deviation": Command("how far actions are from the data set's, beside attention", folder=True),
+    "report": Command("all of it in one HTML file", folder=True),
+    "view": Command("a page on which to explore: episodes, words, patches, heads, groups", folder=True),
+    "groups": Command("what a store holds, and what a grouping takes of it", folder=True, keeps=True),
+    "export": Command("tables as CSV or Parquet, masses or rows as NetCDF", folder=True, keeps=True),
+    "copy": Command(
+        "a copy of a store: smaller, packed, from or to elsewhere; or one store of several", folder=True, keeps=True
+    ),
+    "verify": Command(
+        "read everything back and check it; --repair moves damaged episodes aside", folder=True, keeps=True
+    ),
+    "cache": Command("what is kept of earlier analyses: where, how much; --clear removes it", folder=True, keeps=True),
+}
+#: The command of `vla-attention analyze STORE`.
+DEFAULT_COMMAND = "ratios"
+
+
+def list_of_commands() -> str:
+    """The commands as lines for a help text."""
+    return "\n".join(f"  {name:<9} {command.answers}" for name, command in COMMANDS.items())

@@ -1,0 +1,63 @@
+"""Results as one self-contained HTML page. A report is the page of several results."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from io import BytesIO
+
+import jinja2
+
+from vla_attention.analyze.core.result import Column, Figure, Result
+from vla_attention.analyze.render.figures import draw
+from vla_attention.analyze.render.numbers import cell
+from vla_attention.analyze.render.style import Style, find_places
+from vla_attention.schemas.safe_text import visible
+
+#: Rows of a table on the page; the files have all.
+_MOST_ROWS = 100
+
+
+def fragment(result: Result) -> str:
+    """One result as HTML without a page around it, for notebooks."""
+    with _environment() as environment:
+        return environment.get_template("result.html").render(result=result)
+
+
+def page(title: str, results: Sequence[Result], version: str = "") -> str:
+    """The page. It needs no network and nothing beside it."""
+    with _environment() as environment:
+        return environment.get_template("page.html").render(title=title, results=results, version=version)
+
+
+@contextmanager
+def _environment() -> Iterator[jinja2.Environment]:
+    """The folder `templates/`. Every text is escaped and `visible`; an unknown name in a template is an error."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("vla_attention.analyze.render"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=lambda value: visible(value) if type(value) is str else value,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.globals.update(cell=cell, picture=_picture, most=_MOST_ROWS, sort_key=_sort_key)
+    yield environment
+
+
+def _picture(figure: Figure) -> str:
+    """The address of a picture that stands in the page itself."""
+    style = Style()
+    canvas = draw(figure, style)
+    find_places(canvas, style.dpi)
+    content = BytesIO()
+    with style.settings():
+        canvas.savefig(content, format="png", dpi=style.dpi)
+    return f"data:image/png;base64,{base64.b64encode(content.getvalue()).decode()}"
+
+
+def _sort_key(row: dict[str, object], column: Column) -> str:
+    """What a cell is sorted by."""
+    value = row[column.name]
+    return "" if value is None else str(value)

@@ -1,0 +1,99 @@
+"""A result on a screen: what was run, the findings, then tables as far as they fit; what is left out is named."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Collection, Iterable, Sequence
+
+from vla_attention.analyze.core.result import Result, Table
+from vla_attention.analyze.render.numbers import cell
+
+#: Columns and lines of a screen.
+WIDTH, LINES = 100, 40
+#: A table of which fewer rows would fit is left out.
+_FEWEST_ROWS = 3
+
+
+def screen(result: Result, lines: int = LINES, last: Sequence[str] = ()) -> str:
+    """At most so many lines of `WIDTH` columns, unless about, findings and notes alone are more.
+
+    last: lines that stand below everything, for instance where the files are.
+    """
+    top = wrapped(result.about)
+    for finding in result.findings:
+        asks = f"{finding.asks} " if finding.asks else ""
+        top += ["", *wrapped([f"{asks}{finding.sentence}"])]
+        top += wrapped([finding.limit] if finding.limit else [], "  ")
+        top += [f"  {finding.next_step}"] if finding.next_step else []  # to be copied: it is not wrapped
+    below = wrapped(f"note: {note}" for note in result.notes)
+    end = wrapped(last)
+    room = lines - sum(len(part) + 1 for part in (top, below, end) if part)
+    tables: list[list[str]] = []
+    left, said = [], set[str]()
+    for table in (one for one in result.tables if one.columns):
+        rows = table.shown
+        if rows.is_empty():
+            continue
+        legend = wrapped(_legend(table, said), "  ")
+        head = 1 + bool(table.title) + len(legend)
+        fit = min(table.rows, rows.height, room - head - 2 if rows.height > room - head - 1 else rows.height)
+        if fit < min(_FEWEST_ROWS, rows.height):
+            left.append(table.title or table.name)
+            continue
+        block = [*([table.title] if table.title else []), *_laid_out(table, fit)]
+        if rows.height > fit:
+            block.append(f"... {rows.height - fit} more rows in {table.name}")
+        block += legend
+        said |= {column.meaning for column in table.columns}
+        tables.append(block)
+        room -= len(block) + 1
+    more = wrapped([f"Also in the files: {'; '.join(left)}."] if left else [])
+    return "\n\n".join("\n".join(part) for part in (top, *tables, [*below, *more], end) if part)
+
+
+def table_text(table: Table) -> str:
+    """All rows of a table, with what its columns mean."""
+    head = [table.title] if table.title else []
+    return "\n".join([*head, *_laid_out(table, table.shown.height), *wrapped(_legend(table, ()), "  ")])
+
+
+def wrapped(texts: Iterable[str], first: str = "") -> list[str]:
+    """Each text in lines of at most `WIDTH` columns; `first` indents its first line, and the others by two more."""
+    return [
+        line
+        for text in texts
+        for line in textwrap.wrap(
+            text, WIDTH, initial_indent=first, subsequent_indent=f"{first}  ", break_long_words=False,
+            break_on_hyphens=False,
+        )
+    ]  # fmt: skip
+
+
+def _legend(table: Table, said: Collection[str]) -> list[str]:
+    """What the columns mean that a terminal shows, but for what was said below an earlier table."""
+    parts = [f"{one.title}: {one.meaning}" for one in table.columns if one.screen and one.meaning not in ("", *said)]
+    return [f"{'. '.join(parts)}."] if parts else []
+
+
+def _laid_out(table: Table, rows: int) -> list[str]:
+    """The header and the first rows, aligned; numbers to the right. The last columns give way to the width."""
+    columns = [column for column in table.columns if column.screen]
+    cells = [[column.title for column in columns]]
+    cells += [[cell(row, column) for column in columns] for row in table.shown.head(rows).iter_rows(named=True)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(columns))]
+    while len(widths) > 2 and sum(widths) + 2 * (len(widths) - 1) > WIDTH and columns[-1].kind != "text":
+        columns, widths = columns[:-1], widths[:-1]
+    if columns[-1].kind == "text":  # what runs over is cut: the files have it whole
+        widths[-1] = max(8, min(widths[-1], WIDTH - sum(widths[:-1]) - 2 * (len(widths) - 1)))
+    lines = []
+    for row in cells:
+        parts = [
+            _cut(text, width).ljust(width) if column.kind == "text" else text.rjust(width)
+            for text, width, column in zip(row, widths, columns, strict=False)
+        ]
+        lines.append("  ".join(parts).rstrip())
+    return lines
+
+
+def _cut(text: str, width: int) -> str:
+    return text if len(text) <= width else f"{text[: width - 1]}…"

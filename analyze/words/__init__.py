@@ -1,1 +1,0 @@
-"""`vla-attention words`: which words of the instruction are read."""
