@@ -12,7 +12,8 @@ from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE, SHAR
 from vla_attention.analyze.statistics.many_looks import adjusted_p_values
 
 #: positive: masses, lifts, ratios; the interval is symmetric on the log scale. share: 0..1, log odds. plain: as it is.
-Scale: TypeAlias = Literal["positive", "share", "plain"]
+#: geometric: a column of ratios, of which the mean of logarithms is taken.
+Scale: TypeAlias = Literal["positive", "share", "plain", "geometric"]
 _LIMITS = {"positive": POSITIVE, "share": SHARE, "plain": NO_LIMITS}
 
 
@@ -23,6 +24,7 @@ def estimate(
     sampling: Sampling,
     nulls: Mapping[str, float] | None = None,
     family: Collection[str] = (),
+    quotients: Mapping[str, tuple[str, str]] | None = None,
 ) -> pl.DataFrame:
     """Mean of each value for every item of `by`, with its interval.
 
@@ -33,6 +35,7 @@ def estimate(
         sampling: what the intervals are about, and which tasks are related.
         nulls: for some values, what they would be if nothing were there.
         family: of `by`, the columns inside of whose values the looks are counted; all rows are one look's unless given.
+        quotients: further columns, each the mean of one column / the mean of another.
 
     Returns:
         One row per item in order of first appearance: `by`, num_episodes, num_tasks, num_families, intervals; per value
@@ -40,9 +43,13 @@ def estimate(
         rows (Benjamini-Hochberg).
     """
     nulls = nulls or {}
-    limits = {name: _LIMITS[scale] for name, scale in values.items()}
-    found = means_with_intervals(table, by, limits, sampling, nulls=nulls)
-    found = found.drop(f"{name}_episodes" for name in values)
+    limits = {name: _LIMITS[scale] for name, scale in values.items() if scale != "geometric"}
+    geometric = {name: f"_log_{name}" for name, scale in values.items() if scale == "geometric"}
+    logs = table.with_columns(pl.col(name).log().alias(log) for name, log in geometric.items())
+    found = means_with_intervals(
+        logs, by, limits, sampling, nulls=nulls, quotients=quotients, geometric=geometric
+    )  # fmt: skip
+    found = found.drop(f"{name}_episodes" for name in (*values, *(quotients or {})))
     for name in nulls:
         found = with_q(found, name, family)
     return found

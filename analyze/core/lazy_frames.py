@@ -13,18 +13,24 @@ Measured = TypeVar("Measured")
 _ROWS_AT_ONCE = 20_000
 
 
-def frame_of_episodes(measured: Sequence[Measured], make: Callable[[Measured], pl.DataFrame]) -> pl.LazyFrame:
+def frame_of_episodes(
+    measured: Sequence[Measured],
+    make: Callable[[Measured], pl.DataFrame],
+    then: Callable[[pl.DataFrame], pl.DataFrame] = lambda rows: rows,
+) -> pl.LazyFrame:
     """The rows that `make` gives of each member, in order; the same columns of each. They are made at each collect.
 
-    `make` reads no store: polars would wrap the error of a damaged one into its own.
+    `then` makes other rows of those of some whole episodes. Neither reads a store: polars would wrap the error of a
+    damaged one into its own.
     """
-    schema = make(measured[0]).schema
+    schema = then(make(measured[0])).schema
 
     def source(
         columns: list[str] | None, predicate: pl.Expr | None, most: int | None, _batch: int | None
     ) -> Iterator[pl.DataFrame]:
         left = most
-        for part in _in_batches(make(one) for one in measured):
+        for batch in _in_batches(make(one) for one in measured):
+            part = then(batch)
             rows = part if predicate is None else part.filter(predicate)
             rows = rows if columns is None else rows.select(columns)
             yield rows if left is None else rows.head(left)

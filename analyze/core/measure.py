@@ -23,7 +23,6 @@ from vla_attention.analyze.measures.frames import (
     EPISODE_KEYS,
     LAYERS_AVG,
     LayerAxis,
-    denoise_axis,
     head_axis,
     long_table,
 )
@@ -32,7 +31,7 @@ from vla_attention.analyze.measures.masses import finite_mean, masses
 from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.measures.steps import segment_weights, selected_cells
+from vla_attention.analyze.measures.steps import row_sums, segment_weights, selected_cells
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
@@ -49,14 +48,15 @@ class Items:
     Attributes:
         labels: column -> a value for each item, (item,) each.
         weights: of each key in each item, (replan or 1, key, item) float32, 0..1.
-        whole: keys of whose mass an item's `share` is a part, (replan or 1, key); all valid keys unless given.
+        whole: weights of the keys of whose mass an item's `share` is a part, (replan or 1, key); all valid keys unless
+            given.
         absent: whether a replan without keys of an item is in none of its means (a word that another prompt lacks), or
             counts as 0 (an object out of sight).
     """
 
     labels: Mapping[str, pl.Series]
     weights: NDArray[np.float32]
-    whole: NDArray[np.bool_] | None = None
+    whole: NDArray[np.bool_] | NDArray[np.float32] | None = None
     absent: Literal["left out", "zero"] = "left out"
 
     def with_totals(self, item: SelectedEpisode) -> NDArray[np.float32]:
@@ -81,7 +81,9 @@ class Measured:
         whole, valid: the masses of `Items.whole` and of all valid keys, (replan, layer, denoise or 1, head or 1).
         keys: number of keys, (replan or 1, item).
         uniform, uniform_valid: `mass` and `valid` of uniform attention; axes along which nothing changes have length 1.
-        env_step: environment step of each replan, (replan,).
+        row_sum: sums of the rows before storage rounded them, as `valid`.
+        num_valid: number of valid keys, (replan or 1,).
+        env_step, denoise_time: of each replan, (replan,), and of each selected denoise step, (denoise,).
     """
 
     item: SelectedEpisode
@@ -94,11 +96,18 @@ class Measured:
     keys: Array
     uniform: Array
     uniform_valid: Array
+    row_sum: Array
+    num_valid: NDArray[np.int64]
     env_step: NDArray[np.int64]
+    denoise_time: Array
 
 
 def measure(
-    question: Question, items_of: Callable[[SelectedEpisode], Items], what: str, keep: Collection[str] = ()
+    question: Question,
+    items_of: Callable[[SelectedEpisode], Items],
+    what: str,
+    keep: Collection[str] = (),
+    check: Callable[[Sequence[Array]], None] = lambda num_keys: None,
 ) -> Sequence[Measured]:
     """Measure the items of every selected episode; a terminal sees the progress.
 
@@ -110,10 +119,12 @@ def measure(
         items_of: gives the items of an episode; a function of a module, or a `functools.partial` of one.
         what: the items in a word or two, for the cache.
         keep: "denoise" and "head" are kept apart where they are here, see `axes.OF_ROWS`.
+        check: called before anything is measured with the most keys of the items at a replan, (1, item) per episode.
     """
     chosen, selection = question.selected, replace(question.selection, per_head="head" in keep)
     with progress_bar(len(chosen), "episodes") as advance:
         described = list(each_episode(partial(_described, items_of=items_of), chosen))
+        check([one.keys for one in described])
 
         def scan(positions: Sequence[int]) -> Iterator[dict[str, NDArray[Any]]]:
             each = partial(
@@ -121,7 +132,7 @@ def measure(
             )
             return each_episode(each, [chosen[i] for i in positions], advance)
 
-        digests = [digest for _, _, digest in described]
+        digests = [one.digest for one in described]
         arrays = measured_once(
             "items", f"masses of {what}", chosen, selection, question.site, scan, {"denoise": "denoise" in keep},
             digests, advance,
@@ -129,20 +140,28 @@ def measure(
         kept = OnDisk(arrays)
 
     def made(i: int) -> Measured:
-        return Measured(chosen[i], selection, described[i][0], described[i][1], **kept[i])
+        return Measured(chosen[i], selection, described[i].labels, described[i].absent, **kept[i])
 
     return MadeWhenAsked(made, range(len(chosen)))
 
 
-def _described(
-    item: SelectedEpisode, items_of: Callable[[SelectedEpisode], Items]
-) -> tuple[Mapping[str, pl.Series], str, str]:
-    """Labels, what absent items count, and a digest of the weights."""
+@dataclass(frozen=True)
+class _Described:
+    """What is known of an episode's items before they are measured: for `check`, and for the key of the cache."""
+
+    labels: Mapping[str, pl.Series]
+    absent: str
+    keys: Array
+    digest: str
+
+
+def _described(item: SelectedEpisode, items_of: Callable[[SelectedEpisode], Items]) -> _Described:
     items = items_of(item)
     weights = items.with_totals(item)
     digest = hashlib.sha256(f"{weights.shape}".encode())
     digest.update(np.ascontiguousarray(weights).data)
-    return items.labels, items.absent, digest.hexdigest()
+    keys = counted_keys(weights, item.tokens.existing)[:, :-2].max(axis=0, keepdims=True)
+    return _Described(items.labels, items.absent, keys, digest.hexdigest())
 
 
 def _measured(
@@ -175,14 +194,22 @@ def _measured(
         "keys": counted_keys(weights, item.tokens.existing)[:, :-2],
         "uniform": uniform[..., :-2],
         "uniform_valid": uniform[..., -1],
+        "row_sum": row_sums(item, selection, site)
+        if denoise
+        else row_sums(item, selection, site).mean(2, keepdims=True),
+        "num_valid": item.num_valid,
         "env_step": item.episode.read("env_step").astype(np.int64),
+        "denoise_time": item.episode.read("denoise_time")[list(selection.denoise)].astype(np.float64),
     }
     # In C order, as they come from the cache and from other processes: numpy's sums depend on the order in memory.
     return {name: np.ascontiguousarray(array) for name, array in arrays.items()}
 
 
-def means(measured: Measured, by: Collection[str] = ()) -> pl.DataFrame:
+def means(measured: Measured, by: Collection[str] = (), more: Collection[str] = ()) -> pl.DataFrame:
     """Means over an episode's replans, or with "replan" the numbers of each.
+
+    more: further columns, of the whole row: "row_sum", "valid", "whole" (masses) and "num_valid", "num_replans"; and
+    "uniform", "mass_std", "share_std" of the items.
 
     Returns:
         One row per item and cell of the axes in `by`: `EPISODE_KEYS`, replan and env_step, layer, layer_number and
@@ -190,6 +217,7 @@ def means(measured: Measured, by: Collection[str] = ()) -> pl.DataFrame:
         labels, and
             keys   number of keys
             mass   part of the row, 0..1
+            density  mass / keys
             lift   (mass / what uniform attention gives) / (the same of all valid keys): 1 is uniform attention
             share  mass / mass of `Items.whole`
         Null where a number does not exist.
@@ -205,29 +233,51 @@ def means(measured: Measured, by: Collection[str] = ()) -> pl.DataFrame:
         return layers.with_average(values) if "layer" in by else values[:, layers.once].mean(axis=1, keepdims=True)
 
     mass, uniform = of_layers(one.mass), of_layers(one.uniform)
-    whole, valid, of_valid = (of_layers(part)[..., None] for part in (one.whole, one.valid, one.uniform_valid))
+    whole, valid, row_sum, of_valid = (
+        of_layers(part)[..., None] for part in (one.whole, one.valid, one.row_sum, one.uniform_valid)
+    )
     keys = np.broadcast_to(one.keys[:, None, None, None], mass.shape)
     with np.errstate(divide="ignore", invalid="ignore"):
         lift = np.where(uniform > 0, mass / uniform, np.nan) / (valid / of_valid)
         share = np.where(whole > 0, mass / whole, np.nan)
-    values = {"keys": keys, "mass": mass, "lift": lift, "share": share}
+        density = np.where(keys > 0, mass / keys, np.nan)
+    values = {"keys": keys, "mass": mass, "density": density, "lift": lift, "share": share}
+    replans = np.full((1, 1, 1, 1, 1), len(one.env_step) if "replan" not in by else 1.0)
+    further = {
+        "row_sum": row_sum,
+        "valid": valid,
+        "whole": whole,
+        "num_valid": one.num_valid[:, None, None, None, None].astype(np.float64),
+        "num_replans": replans,
+        "uniform": uniform,
+    }
+    values |= {name: array for name, array in further.items() if name in more}
     if one.absent == "left out":
         values = {name: np.where(keys > 0, array, np.nan) for name, array in values.items()}
+    spread = {name: values[name] for name in ("mass", "share") if f"{name}_std" in more}
     axes: list[Any] = []
     if "replan" in by:
         axes.append({"replan": range(len(one.env_step)), "env_step": one.env_step})
     else:
         values = {name: finite_mean(array) for name, array in values.items()}
+        for name, array in spread.items():
+            values[f"{name}_std"] = np.sqrt(finite_mean((array - values[name]) ** 2))
     place = slice(None) if "layer" in by or not several else slice(-1, None)
     axes.append({name: list(labels)[place] for name, labels in layers.columns.items()})
-    axes.append(denoise_axis(one.selection) if "denoise" in by else {"denoise_step": pl.Series([None], dtype=pl.Int64)})
+    steps = one.selection.denoise_steps if "denoise" in by else [None]
+    axes.append({"denoise_step": pl.Series(steps, dtype=pl.Int64)})
     axes.append(head_axis(replace(one.selection, per_head="head" in by)))
     return long_table(one.item, [*axes, one.labels], values, EPISODE_KEYS)
 
 
-def table_of(measured: Sequence[Measured], by: Collection[str] = ()) -> pl.LazyFrame:
-    """`means` of all episodes, made whenever rows are asked for."""
-    return frame_of_episodes(measured, partial(means, by=frozenset(by)))
+def table_of(
+    measured: Sequence[Measured],
+    by: Collection[str] = (),
+    more: Collection[str] = (),
+    then: Callable[[pl.DataFrame], pl.DataFrame] = lambda rows: rows,
+) -> pl.LazyFrame:
+    """`means` of all episodes, and what `then` makes of them, made whenever rows are asked for."""
+    return frame_of_episodes(measured, partial(means, by=frozenset(by), more=frozenset(more)), then)
 
 
 def layer_of(selection: Selection) -> str:

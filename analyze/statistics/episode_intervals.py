@@ -15,6 +15,7 @@ import polars as pl
 from vla_attention.analyze.statistics.intervals import (
     DEFAULT_LEVEL,
     estimates,
+    geometric_mean_over_episodes,
     mean_over_episodes,
     named_interval,
     ratio_of_means_over_episodes,
@@ -67,6 +68,7 @@ def means_with_intervals(
     level: float = DEFAULT_LEVEL,
     quotients: Mapping[str, tuple[str, str]] | None = None,
     nulls: Mapping[str, float] | None = None,
+    geometric: Mapping[str, str] | None = None,
 ) -> pl.DataFrame:
     """Mean of each value for every item, over tasks of the tasks' means, with its interval (see `intervals`).
 
@@ -81,41 +83,54 @@ def means_with_intervals(
         level: level of the intervals.
         quotients: further columns, each the mean of one column / the mean of another over the episodes that have both.
         nulls: for some of the values or quotients, what they would be if nothing were there.
+        geometric: further columns, each exp of the mean of a column of natural logarithms.
 
     Returns:
         One row per item in order of first appearance: `by`, `num_episodes`, `num_tasks`, `ABOUT_COLUMNS`, and per value
         or quotient `V`, `V_low`, `V_high` (null where there is none) and `V_episodes`, the number of episodes with a
         finite value; for those in `nulls` also `V_p`, the p-value of that null, not adjusted for the number of items.
     """
-    nulls = nulls or {}
-    rows = []
-    needed = dict.fromkeys([*by, *values, *(name for pair in (quotients or {}).values() for name in pair)])
-    whole = sampling.units(table)
-    numbered = table.select(*needed, pl.Series(_TASK, whole.tasks))
-    for key, part in numbered.group_by(by, maintain_order=True):
-        given = whole.of_tasks(part[_TASK].to_numpy())
-        units = given.decided()
-        statistics = {
-            name: mean_over_episodes(part[name].cast(pl.Float64).to_numpy(), limits) for name, limits in values.items()
-        }
-        for name, (above, below) in (quotients or {}).items():
-            pair = (part[column].cast(pl.Float64).to_numpy() for column in (above, below))
-            statistics[name] = ratio_of_means_over_episodes(*pair)
-        row: dict[str, Any] = dict(zip(by, key, strict=True))
-        row |= {"num_episodes": part.height, "num_tasks": given.num_tasks}
-        row |= about_row(given)
-        found = dict(zip(statistics, estimates(list(statistics.values()), units), strict=True))
-        for name, one in found.items():
-            row |= named_interval(name, one.value, one.interval(level))
-        row |= {f"{name}_p": found[name].p_value(null) for name, null in nulls.items()}
-        row |= {f"{name}_episodes": int(statistic.used.sum()) for name, statistic in statistics.items()}
-        rows.append(row)
+    quotients, nulls, geometric = quotients or {}, nulls or {}, geometric or {}
+    names = (*values, *quotients, *geometric)
     schema: dict[str, Any] = {name: table.schema[name] for name in by}
     schema |= {"num_episodes": pl.Int64, "num_tasks": pl.Int64, **ABOUT_COLUMNS}
-    for name in (*values, *(quotients or {})):
+    for name in names:
         schema |= dict.fromkeys((name, f"{name}_low", f"{name}_high"), pl.Float64) | {f"{name}_episodes": pl.Int64}
     schema |= dict.fromkeys((f"{name}_p" for name in nulls), pl.Float64)
-    return pl.DataFrame(rows, schema=schema)
+    if table.is_empty():
+        return pl.DataFrame(schema=schema)
+    whole = sampling.units(table)
+    needed = dict.fromkeys([*values, *(name for pair in quotients.values() for name in pair), *geometric.values()])
+    columns = {name: table[name].cast(pl.Float64).fill_null(float("nan")).to_numpy() for name in needed}
+    items = table.select(by).with_row_index("_row").group_by(by, maintain_order=True).agg("_row")
+    # Items whose episodes are of the same tasks, one by one, are computed together: there can be thousands.
+    alike: dict[bytes, list[int]] = {}
+    members = [rows.to_numpy().astype(np.intp) for rows in items["_row"]]
+    for i, rows in enumerate(members):
+        alike.setdefault(whole.tasks[rows].tobytes(), []).append(i)
+    found: dict[int, dict[str, Any]] = {}
+    for numbers in alike.values():
+        at = np.stack([members[i] for i in numbers])  # (item, episode)
+        given = whole.of_tasks(whole.tasks[at[0]])
+        statistics = {name: mean_over_episodes(columns[name][at], limits) for name, limits in values.items()}
+        for name, (above, below) in quotients.items():
+            statistics[name] = ratio_of_means_over_episodes(columns[above][at], columns[below][at])
+        for name, logs in geometric.items():
+            statistics[name] = geometric_mean_over_episodes(columns[logs][at])
+        each = iter(estimates(list(statistics.values()), given.decided()))
+        about = {"num_episodes": at.shape[1], "num_tasks": given.num_tasks, **about_row(given)}
+        rows_of = {i: dict(about) for i in numbers}
+        for name, statistic in statistics.items():
+            for i, used in zip(numbers, statistic.used.sum(axis=1).tolist(), strict=True):
+                one = next(each)
+                rows_of[i] |= named_interval(name, one.value, one.interval(level)) | {f"{name}_episodes": used}
+                if name in nulls:
+                    rows_of[i][f"{name}_p"] = one.p_value(nulls[name])
+        found |= rows_of
+    made = pl.DataFrame(
+        [found[i] for i in range(items.height)], schema={k: v for k, v in schema.items() if k not in by}
+    )
+    return pl.concat([items.drop("_row"), made], how="horizontal").select(*schema)
 
 
 def means_of_all_and_of_tasks(
