@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from vla_attention.analyze.core.about import about, notes
 from vla_attention.analyze.core.axes import OF_ROWS, check_axes, columns_of, with_families
 from vla_attention.analyze.core.estimate import Scale, estimate
-from vla_attention.analyze.core.measure import Items, layer_of, measure, table_of
+from vla_attention.analyze.core.measure import Items, measure, table_of
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
@@ -107,7 +107,7 @@ def words(question: Question, by: Collection[str] = ()) -> Result:
             Table("words_episodes", _without_shares(table_of(measured, {"layer", *axes}))),
         ],
         [] if by else [Figure("word_bars", "forest", bars, _TITLE, _CAPTION, _BARS)],
-        notes(question, layer_of(question.selection)),
+        notes(question),
     )
 
 

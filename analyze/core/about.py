@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from vla_attention.analyze.measures.frames import layer_name
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.schemas.errors import listing, plural
@@ -34,12 +33,12 @@ def solved(outcomes: Iterable[bool | None], num_tasks: int) -> str:
     return f"{text}; of {rest} more the outcome is not known" if rest else text
 
 
-def notes(question: Question, layer: str = "") -> list[str]:
-    """Which attention the numbers are of, what was left out, and what intervals are about.
-
-    layer: the label of the layer that they are of in tables; "layers_avg" or nothing for all.
-    """
-    which = layer_name(layer) if layer else "all layers"
+def notes(question: Question) -> list[str]:
+    """Which attention the numbers are of, what was left out, and what intervals are about."""
+    labels = question.selection.layer_labels
+    recorded = question.stores[0].attributes.recording_of(question.site).layers
+    every = len(set(question.selection.blocks)) == len(recorded)
+    which = "mean over all layers" if every else f"layer{'s' * (len(labels) > 1)} {listing(labels, 40)}"
     told = set(run_notes(question.episodes))
     return [
         f"Site '{question.site}', {which}. Intervals: 95%, about {question.units.words}.",

@@ -21,7 +21,6 @@ from vla_attention.analyze.core.lazy_frames import frame_of_episodes
 from vla_attention.analyze.measures.baselines import uniform_keys, uniform_masses
 from vla_attention.analyze.measures.frames import (
     EPISODE_KEYS,
-    LAYERS_AVG,
     LayerAxis,
     head_axis,
     long_table,
@@ -48,20 +47,20 @@ class Items:
     Attributes:
         labels: column -> a value for each item, (item,) each.
         weights: of each key in each item, (replan or 1, key, item) float32, 0..1.
-        whole: weights of the keys of whose mass an item's `share` is a part, (replan or 1, key); all valid keys unless
-            given.
+        whole: of whose mass an item's `share` is a part: keys (replan or 1, key), or the first so many items together;
+            all valid keys unless given.
         absent: whether a replan without keys of an item is in none of its means (a word that another prompt lacks), or
             counts as 0 (an object out of sight).
     """
 
     labels: Mapping[str, pl.Series]
     weights: NDArray[np.float32]
-    whole: NDArray[np.bool_] | NDArray[np.float32] | None = None
+    whole: NDArray[np.bool_] | int | None = None
     absent: Literal["left out", "zero"] = "left out"
 
     def with_totals(self, item: SelectedEpisode) -> NDArray[np.float32]:
         """The weights, then those of `whole` and of all valid keys; keys that were taken out are in none."""
-        totals = [item.valid if self.whole is None else self.whole, item.valid]
+        totals = [self.whole if isinstance(self.whole, np.ndarray) else item.valid, item.valid]
         replans = max(len(self.weights), *map(len, totals))
         parts = [self.weights, *(part[:, :, None].astype(np.float32) for part in totals)]
         weights = np.concatenate([np.broadcast_to(part, (replans, *part.shape[1:])) for part in parts], axis=2)
@@ -172,7 +171,8 @@ def _measured(
     denoise: bool,
 ) -> dict[str, NDArray[Any]]:
     """The arrays of a `Measured` by name."""
-    weights = items_of(item).with_totals(item)
+    items = items_of(item)
+    weights = items.with_totals(item)
     replans, steps = item.tokens.num_replans, len(selection.denoise)
     heads = len(selection.heads) if selection.per_head else 1
     of_segments = segment_weights(item, weights, site)
@@ -189,7 +189,7 @@ def _measured(
     uniform = uniform if denoise else uniform.mean(axis=2, keepdims=True)
     arrays = {
         "mass": mass[..., :-2],
-        "whole": mass[..., -2],
+        "whole": mass[..., : items.whole].sum(axis=-1) if isinstance(items.whole, int) else mass[..., -2],
         "valid": mass[..., -1],
         "keys": counted_keys(weights, item.tokens.existing)[:, :-2],
         "uniform": uniform[..., :-2],
@@ -222,13 +222,15 @@ def means(measured: Measured, by: Collection[str] = (), more: Collection[str] = 
             share  mass / mass of `Items.whole`
         Null where a number does not exist.
     """
-    one, layers = measured, LayerAxis.of(measured.selection, average_one=False)
+    one, layers = measured, LayerAxis.of(measured.selection)
+    for axis, name, labels in ((2, "denoise", one.selection.denoise), (3, "head", one.selection.heads)):
+        if name in by and one.mass.shape[axis] < len(labels):
+            raise ValueError(f"the axis '{name}' was not kept when the items were measured")
     averaged = tuple(axis for axis, name in ((2, "denoise"), (3, "head")) if name not in by)
-    several = layers.num_layers > 1
 
     def of_layers(values: Array) -> Array:
         values = values.mean(axis=averaged, keepdims=True)
-        if values.shape[1] == 1 or not several:
+        if values.shape[1] == 1 and layers.num_layers > 1:  # the same in all layers
             return values
         return layers.with_average(values) if "layer" in by else values[:, layers.once].mean(axis=1, keepdims=True)
 
@@ -262,7 +264,7 @@ def means(measured: Measured, by: Collection[str] = (), more: Collection[str] = 
         values = {name: finite_mean(array) for name, array in values.items()}
         for name, array in spread.items():
             values[f"{name}_std"] = np.sqrt(finite_mean((array - values[name]) ** 2))
-    place = slice(None) if "layer" in by or not several else slice(-1, None)
+    place = slice(None) if "layer" in by else slice(-1, None)
     axes.append({name: list(labels)[place] for name, labels in layers.columns.items()})
     steps = one.selection.denoise_steps if "denoise" in by else [None]
     axes.append({"denoise_step": pl.Series(steps, dtype=pl.Int64)})
@@ -278,8 +280,3 @@ def table_of(
 ) -> pl.LazyFrame:
     """`means` of all episodes, and what `then` makes of them, made whenever rows are asked for."""
     return frame_of_episodes(measured, partial(means, by=frozenset(by), more=frozenset(more)), then)
-
-
-def layer_of(selection: Selection) -> str:
-    """The label of the layer that a summary is of: "layers_avg", or the only layer."""
-    return LAYERS_AVG if len(selection.layers) > 1 else str(selection.layer_labels[0])

@@ -1,0 +1,354 @@
+"""The groups of a grouping and their ratio at every level: steps, replans, episodes, tasks.
+
+    level      a row of its cells is                                     of groups also
+    steps      (episode, replan, layer, denoise step[, head])            group
+    replans    (episode, replan, layer or "layers_avg")                  group
+    episodes   (episode, layer or "layers_avg")                          group
+    tasks      (task, all tasks or all suites; layer or "layers_avg")    group
+
+Masses are averaged over denoise steps and heads first; fractions, lifts and ratios follow from these means. In
+"layers_avg", as the published scripts define it, masses are means over the layers, fractions and lifts of groups follow
+from these means. `ratio` is the one ratio of a replan that texts, pictures and the page show: the geometric mean of the
+layers' finite positive ratios (the inverse ratio has the inverse mean), `ratio_mean` the mean of the layers' finite
+ratios, which the published scripts take. Ratios that are not finite are never dropped silently: each table counts them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from vla_attention.analyze.core.estimate import estimate
+from vla_attention.analyze.core.measure import Items, Measured, measure, table_of
+from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.selected import SelectedEpisode, check_not_empty, resolve_episode
+from vla_attention.analyze.statistics.episode_intervals import Sampling
+from vla_attention.schemas.groupings.grouping import Grouping
+from vla_attention.schemas.groupings.resolve import check_names
+
+LAYER = ("layer", "layer_number", "block")
+SIDES = ("numerator", "denominator")
+_TASK = ("scope", "suite", "task_id", "instruction")
+_FRACTIONS = ("numerator_fraction", "denominator_fraction")
+
+
+@dataclass(frozen=True)
+class Levels:
+    """A grouping measured on the selected episodes.
+
+    Attributes:
+        question: stores, selection and grouping.
+        measured: the masses of the groups and of both sides of the ratio.
+        heads: whether heads were kept apart.
+    """
+
+    question: Question
+    measured: Sequence[Measured]
+    heads: bool = False
+
+    @property
+    def grouping(self) -> Grouping:
+        """The groups of keys and the ratio that the tables are about."""
+        return self.question.grouping
+
+    def steps(self) -> pl.LazyFrame:
+        """`EPISODE_KEYS`, replan, env_step, layer, block, denoise_step, denoise_time, head, row_sum, valid_mass,
+        num_valid; with a ratio numerator_mass, denominator_mass, ratio, uniform_ratio, ratio_lift (ratio /
+        uniform_ratio), log2_ratio.
+        """
+        times = self.measured[0].denoise_time.tolist()
+        named = dict(zip(self.question.selection.denoise_steps, times, strict=True))
+
+        def then(rows: pl.DataFrame) -> pl.DataFrame:
+            cells = cells_of(rows.filter(pl.col("layer") != LAYERS_AVG), self.grouping).drop(_FRACTIONS, strict=False)
+            return cells.with_columns(
+                pl.col("layer_number").alias("layer"),
+                denoise_time=pl.col("denoise_step").replace_strict(named, return_dtype=pl.Float64),
+            ).drop("layer_number")
+
+        return table_of(self.measured, self._of_steps, ("row_sum", "valid", "num_valid", "uniform"), then)
+
+    @property
+    def _of_steps(self) -> tuple[str, ...]:
+        return ("replan", "layer", "denoise", *(("head",) if self.heads else ()))
+
+    def steps_groups(self) -> pl.LazyFrame:
+        """`groups` of every step; `layer` is a number."""
+        single = self.groups(*self._of_steps).filter(pl.col("layer") != LAYERS_AVG)
+        return single.with_columns(layer="layer_number").drop("layer_number")
+
+    def replans(self) -> pl.LazyFrame:
+        """`EPISODE_KEYS`, replan, env_step, layer, layer_number, block, row_sum, valid_mass, num_valid; with a ratio
+        numerator_mass, denominator_mass, uniform_ratio, ratio, ratio_mean, nonfinite_layers (1 where the ratio is not
+        finite; in "layers_avg" the number of layers left out), ratio_lift, log2_ratio.
+        """
+        more = ("row_sum", "valid", "num_valid", "uniform")
+        return table_of(self.measured, ("replan", "layer"), more, partial(replan_cells, grouping=self.grouping))
+
+    def groups(self, *by: str) -> pl.LazyFrame:
+        """Keys, mass, density, lift and fraction of each group, kept apart by some of replan, layer, denoise, head."""
+        return table_of(self.measured, by, (), _of_groups)
+
+    def episodes(self) -> pl.DataFrame:
+        """Over the episode's replans (see `over_replans`), sorted by suite, task, episode and layer."""
+        more = ("row_sum", "valid", "num_valid", "uniform")
+
+        def then(rows: pl.DataFrame) -> pl.DataFrame:
+            return over_replans(replan_cells(rows, self.grouping))
+
+        return _sorted(table_of(self.measured, ("replan", "layer"), more, then).collect())
+
+    def episodes_groups(self) -> pl.DataFrame:
+        """`EPISODE_ID`, layer, layer_number, block, group; mass, mass_std, fraction, fraction_std, keys, density, lift:
+        means over the replans where they are finite, standard deviations with ddof 0.
+        """
+        frame = table_of(self.measured, ("layer",), ("mass_std", "share_std"), _of_groups).collect()
+        return _sorted(frame)
+
+
+def levels_of(question: Question, heads: bool = False) -> Levels:
+    """Measure the question's grouping; heads are kept apart where `heads` says so.
+
+    Raises:
+        SelectorError, EmptyGroup: a group names what no episode has, or has no key in any.
+    """
+    grouping = question.grouping
+    check_names(grouping, question.vocabulary, question.selected[0].tokens.layout)
+    names = len(grouping.names)
+    keep = ("denoise", "head") if heads else ("denoise",)
+
+    def check(num_keys: Sequence[NDArray[np.float64]]) -> None:
+        check_not_empty(grouping, [keys[:, :names] for keys in num_keys])
+
+    measured = measure(question, partial(items_of, grouping=grouping), f"grouping {grouping.name}", keep, check)
+    return Levels(question, measured, heads)
+
+
+def items_of(item: SelectedEpisode, grouping: Grouping) -> Items:
+    """The groups, then with a ratio the sums of the groups on each side; a share is of the groups' summed mass."""
+    weights = resolve_episode(grouping, item).weights
+    kinds, names, parts = ["group"] * len(grouping.names), list(grouping.names), [weights]
+    if grouping.ratio is not None:
+        for kind, side in zip(SIDES, (grouping.ratio.numerator, grouping.ratio.denominator), strict=True):
+            kinds.append(kind)
+            names.append(kind)
+            parts.append(weights[..., [grouping.names.index(name) for name in side]].sum(axis=-1, keepdims=True))
+    labels = {"kind": pl.Series(kinds, dtype=pl.String), "group": pl.Series(names, dtype=pl.String)}
+    # A group without a key at a replan has mass 0 there: fractions of all groups add up to 1.
+    return Items(labels, np.concatenate(parts, axis=-1), len(grouping.names), absent="zero")
+
+
+def _of_groups(rows: pl.DataFrame) -> pl.DataFrame:
+    names = {name: name.replace("share", "fraction") for name in ("share", "share_std") if name in rows.columns}
+    return rows.filter(pl.col("kind") == "group").drop("kind").rename(names)
+
+
+def cells_of(rows: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
+    """The rows of `means` once a cell, with masses and fractions of both sides of the ratio, and the ratio."""
+    first = pl.col("kind") == SIDES[0] if grouping.ratio else pl.col("group") == grouping.names[0]
+    items = ("kind", "group", "keys", "mass", "density", "lift", "share", "uniform")
+    cells = rows.filter(first).rename({"valid": "valid_mass"})
+    if grouping.ratio is None:
+        return cells.drop(items)
+    below = rows.filter(pl.col("kind") == SIDES[1])
+    above_mass, below_mass = cells["mass"], below["mass"]
+    return (
+        cells.drop(items)
+        .with_columns(
+            numerator_mass=above_mass,
+            denominator_mass=below_mass,
+            numerator_fraction=cells["share"],
+            denominator_fraction=below["share"],
+            ratio=(above_mass / below_mass).fill_nan(None),
+            uniform_ratio=(cells["uniform"] / below["uniform"]).fill_nan(None),
+        )
+        .with_columns(*_relative())
+    )
+
+
+def _relative() -> list[pl.Expr]:
+    """`ratio_lift`, the ratio / the uniform ratio, and `log2_ratio`."""
+    lift = (pl.col("ratio") / pl.col("uniform_ratio")).fill_nan(None).alias("ratio_lift")
+    return [lift, pl.col("ratio").log(2.0).fill_nan(None).alias("log2_ratio")]
+
+
+def _finite(name: str) -> pl.Expr:
+    return pl.col(name).filter(pl.col(name).is_finite())
+
+
+def _geometric(name: str) -> pl.Expr:
+    """exp of the mean of logarithms over the finite positive values; null without any."""
+    return pl.col(name).filter(pl.col(name).is_finite() & (pl.col(name) > 0)).log().mean().exp()
+
+
+def replan_cells(rows: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
+    """`Levels.replans` from the rows of `means` by replan and layer, of whole replans."""
+    cells = cells_of(rows, grouping).drop("denoise_step", "head", *_FRACTIONS, strict=False)
+    if grouping.ratio is None:
+        return cells
+    known = pl.col("ratio").is_finite().fill_null(False)
+    cells = cells.with_columns(
+        ratio_mean="ratio", nonfinite_layers=(~known).cast(pl.Int64)
+    )  # fmt: skip
+    layers = cells.filter(pl.col("layer") != LAYERS_AVG)
+    # A block that two layer numbers name counts once.
+    once = layers.unique([*EPISODE_ID, "replan", "block"], keep="first", maintain_order=True)
+    has_log = known & (pl.col("ratio") > 0)
+    counted = pl.col("uniform_ratio").filter(has_log | ~has_log.any())
+    same = pl.col("uniform_ratio").n_unique() == 1
+    average = once.group_by(*EPISODE_ID, "replan", maintain_order=True).agg(
+        _geometric("ratio").alias("ratio"),
+        _finite("ratio").mean().alias("ratio_mean"),
+        (~known).sum().cast(pl.Int64).alias("nonfinite_layers"),
+        pl.when(same)
+        .then(pl.col("uniform_ratio").first())
+        .otherwise(counted.filter(counted.is_finite() & (counted > 0)).log().mean().exp())
+        .alias("uniform_ratio"),
+    )
+    whole = (
+        cells.filter(pl.col("layer") == LAYERS_AVG)
+        .drop("ratio", "ratio_mean", "nonfinite_layers", "uniform_ratio")
+        .join(average, on=[*EPISODE_ID, "replan"], how="left", maintain_order="left")
+    )
+    joined = pl.concat([layers, whole.with_columns(*_relative()).select(layers.columns)])
+    return joined.sort(*EPISODE_ID, "replan", "layer_number", nulls_last=True, maintain_order=True)
+
+
+def over_replans(replans: pl.DataFrame) -> pl.DataFrame:
+    """Every (episode, layer), from the cells of replans; standard deviations with ddof 0.
+
+    Returns:
+        `EPISODE_KEYS`, layer, layer_number, block, num_replans, row_sum and num_valid (means); with a ratio
+            numerator_mass, denominator_mass  means
+            ratio_mean, ratio_std, ratio_median, ratio_min, ratio_max   over the replans' finite `ratio_mean`
+            ratio_of_means      mean numerator mass / mean denominator mass
+            log_ratio_mean      mean over the replans of the logarithm of `ratio`, where it is finite and positive
+            num_nonfinite       replans whose ratio is infinite or undefined
+            geometric_left_out  replans whose ratio has no finite logarithm (not finite, or 0)
+            nonfinite_layers    sum over replans of the layers left out of "layers_avg"
+            uniform_ratio       geometric mean of the ratios that uniform attention would give
+            ratio_lift          geometric mean over replans of ratio / uniform_ratio, finite positive ones
+            geometric_mean      exp(log_ratio_mean)
+    """
+    plain = [pl.len().cast(pl.Int64).alias("num_replans"), pl.col("row_sum", "num_valid").mean()]
+    grouped = replans.group_by(*EPISODE_KEYS, *LAYER, maintain_order=True)
+    if "ratio" not in replans.columns:
+        return grouped.agg(plain)
+    spread = _finite("ratio_mean")
+    found = grouped.agg(
+        *plain,
+        pl.col("numerator_mass", "denominator_mass").mean(),
+        spread.mean().alias("ratio_mean"),
+        spread.std(ddof=0).alias("ratio_std"),
+        spread.median().alias("ratio_median"),
+        spread.min().alias("ratio_min"),
+        spread.max().alias("ratio_max"),
+        (pl.col("numerator_mass").mean() / pl.col("denominator_mass").mean()).fill_nan(None).alias("ratio_of_means"),
+        (_finite("log2_ratio").mean() * np.log(2.0)).alias("log_ratio_mean"),
+        (~pl.col("ratio_mean").is_finite().fill_null(False)).sum().cast(pl.Int64).alias("num_nonfinite"),
+        (~pl.col("log2_ratio").is_finite().fill_null(False)).sum().cast(pl.Int64).alias("geometric_left_out"),
+        pl.col("nonfinite_layers").sum(),
+        _geometric("uniform_ratio").alias("uniform_ratio"),
+        _geometric("ratio_lift").alias("ratio_lift"),
+    )
+    return found.with_columns(geometric_mean=pl.col("log_ratio_mean").exp())
+
+
+def task_cells(episodes: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
+    """Every (task, layer) and, over tasks, rows with `task_id` null: means over tasks of the tasks' means.
+
+    `scope` is "task", "all" (every task of one suite) or "combined" (every suite; only when there are several).
+    `X_low` and `X_high` bound the interval of X (see `statistics.intervals`): over episodes inside a task, else about
+    what the row's `intervals` says; null where there is none.
+
+    Returns:
+        scope, suite, task_id, instruction, layer, layer_number, block, num_tasks, num_families, intervals,
+        num_episodes, num_replans, success_rate; with a ratio ratio_std, ratio_median, ratio_min, ratio_max (over the
+        episodes' mean ratios), episodes_with_ratio and tasks_with_ratio (of how many the geometric means are),
+        episodes_without_ratio (without a finite ratio), num_nonfinite, geometric_left_out, nonfinite_layers (sums),
+        numerator_mass, denominator_mass (means), uniform_ratio (geometric mean), and with bounds geometric_mean and
+        ratio_lift (geometric means), ratio_mean, ratio_of_means.
+    """
+    has_ratio = "ratio_mean" in episodes.columns
+    rows = episodes.with_columns(success_rate=pl.col("success").cast(pl.Float64))
+    counts = [pl.col("num_replans").sum()]
+    if has_ratio:
+        has_log = pl.col("log_ratio_mean").is_finite().fill_null(False)
+        # With the mean and the episodes of the headline, so that ratio / uniform ratio is the lift.
+        none = ~has_log.any().over("suite", "task_id", "layer")
+        rows = rows.with_columns(uniform_ratio=pl.when(has_log | none).then("uniform_ratio"))
+        spread = _finite("ratio_mean")
+        counts += [
+            spread.std(ddof=0).alias("ratio_std"),
+            spread.median().alias("ratio_median"),
+            spread.min().alias("ratio_min"),
+            spread.max().alias("ratio_max"),
+            (~pl.col("ratio_mean").is_finite().fill_null(False)).sum().cast(pl.Int64).alias("episodes_without_ratio"),
+            has_log.sum().cast(pl.Int64).alias("episodes_with_ratio"),
+            pl.struct("suite", "task_id").filter(has_log).n_unique().cast(pl.Int64).alias("tasks_with_ratio"),
+            pl.col("num_nonfinite", "geometric_left_out", "nonfinite_layers").sum(),
+        ]
+    found = []
+    for scope, names in _scopes(rows):
+        by = [*names, *LAYER]
+        part = estimate(rows, by, _VALUES if has_ratio else _PLAIN, sampling, quotients=_QUOTIENTS if has_ratio else {})
+        part = part.join(rows.group_by(by).agg(counts), on=by, how="left", nulls_equal=True, maintain_order="left")
+        found.append(_scoped(part, scope))
+    bounds = [f"{name}_{end}" for name in _UNBOUNDED for end in ("low", "high")]
+    return (
+        pl.concat(found, how="diagonal").drop(bounds, strict=False).select(*_TASK, *LAYER, pl.exclude(*_TASK, *LAYER))
+    )
+
+
+_PLAIN: dict[str, Any] = {"success_rate": "plain"}
+_VALUES: dict[str, Any] = {
+    "success_rate": "plain",
+    "numerator_mass": "plain",
+    "denominator_mass": "plain",
+    "uniform_ratio": "geometric",
+    "ratio_mean": "positive",
+    "geometric_mean": "geometric",
+    "ratio_lift": "geometric",
+}
+_QUOTIENTS = {"ratio_of_means": ("numerator_mass", "denominator_mass")}
+#: Of these no interval is given.
+_UNBOUNDED = ("success_rate", "numerator_mass", "denominator_mass", "uniform_ratio")
+
+
+def task_groups(groups: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
+    """`scope`, suite, task_id, instruction, layer, layer_number, block, group as in `task_cells`; mass, keys, density,
+    lift (means over tasks); fraction, fraction_low, fraction_high.
+    """
+    found = []
+    values: dict[str, Any] = dict.fromkeys(("mass", "keys", "density", "lift"), "plain") | {"fraction": "share"}
+    for scope, names in _scopes(groups):
+        found.append(_scoped(estimate(groups, [*names, *LAYER, "group"], values, sampling), scope))
+    kept = ["mass", "keys", "density", "lift", "fraction", "fraction_low", "fraction_high"]
+    return pl.concat(found, how="diagonal").select(*_TASK, *LAYER, "group", *kept)
+
+
+def _scopes(rows: pl.DataFrame) -> list[tuple[str, list[str]]]:
+    several = rows["suite"].n_unique() > 1
+    return [("task", ["suite", "task_id", "instruction"]), ("all", ["suite"]), *([("combined", [])] if several else [])]
+
+
+def _scoped(rows: pl.DataFrame, scope: str) -> pl.DataFrame:
+    return rows.with_columns(scope=pl.lit(scope))
+
+
+def overall(tasks: pl.DataFrame) -> pl.DataFrame:
+    """The rows of `task_cells` or `task_groups` over everything: all suites when there are several, else the suite."""
+    scope = "combined" if (tasks["scope"] == "combined").any() else "all"
+    return tasks.filter(pl.col("scope") == scope)
+
+
+def _sorted(table: pl.DataFrame) -> pl.DataFrame:
+    """By episode and layer, "layers_avg" last: results do not depend on the order in which episodes were read."""
+    return table.sort(*EPISODE_ID, "layer_number", nulls_last=True, maintain_order=True)
