@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.task_families import units_of, unknown_families
+from vla_attention.analyze.statistics.units import FEWEST_FAMILIES
 from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.schemas.errors import listing, plural
 
@@ -42,5 +44,25 @@ def notes(question: Question) -> list[str]:
     told = set(run_notes(question.episodes))
     return [
         f"Site '{question.site}', {which}. Intervals: 95%, about {question.units.words}.",
-        *(remark for remark in question.remarks_on_intervals if remark not in told),
+        *(remark for remark in question.remarks if remark not in told),
+        *filter(None, [unknown_families(question.sampling, question.selected)]),
     ]
+
+
+def enough(question: Question, what: str = "the numbers") -> str:
+    """Whether the data suffice to say something about other episodes and tasks, as a sentence; empty where they do."""
+    episodes, tasks = len(question.selected), question.num_tasks
+    if episodes == 1:
+        return "One episode shows nothing about others: there is no interval."
+    if tasks == 1:
+        return f"One task of {episodes} episodes: {what} show nothing about other tasks."
+    units = question.units
+    if units.estimand.of_other_tasks:
+        return ""
+    families = units_of(question.sampling, question.selected).num_families
+    if families is None or families >= FEWEST_FAMILIES:
+        return ""
+    kinds = "one kind" if families == 1 else f"{families} kinds"
+    return (
+        f"The {tasks} tasks are of {kinds} (sentences of one template): {what} are about these tasks, not about others."
+    )

@@ -10,7 +10,7 @@ import polars as pl
 
 from vla_attention.analyze.core.axes import OF_ROWS
 from vla_attention.analyze.core.lazy_frames import frame_of_episodes
-from vla_attention.analyze.core.levels import Levels, cells_of
+from vla_attention.analyze.core.levels import MORE, Levels, cells_of
 from vla_attention.analyze.core.measure import Measured, means
 from vla_attention.analyze.measures.alignment import episode_timing
 from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG
@@ -48,7 +48,7 @@ def ratios_by(levels: Levels, by: Collection[str]) -> pl.DataFrame:
             (~logs["ratio"].is_finite().fill_null(False)).sum().cast(pl.Int64).alias("num_nonfinite"),
         )
 
-    made = partial(means, by=frozenset(inner), more=frozenset({"row_sum", "valid", "num_valid", "uniform"}))
+    made = partial(means, by=frozenset(inner), more=frozenset(MORE))
     return frame_of_episodes(levels.measured, made, then).collect()
 
 

@@ -36,6 +36,8 @@ from vla_attention.schemas.groupings.resolve import check_names
 LAYER = ("layer", "layer_number", "block")
 SIDES = ("numerator", "denominator")
 _TASK = ("scope", "suite", "task_id", "instruction")
+#: What `measure.means` is asked for beside the items' numbers.
+MORE = ("row_sum", "valid", "num_valid", "uniform")
 _FRACTIONS = ("numerator_fraction", "denominator_fraction")
 
 
@@ -73,7 +75,7 @@ class Levels:
                 denoise_time=pl.col("denoise_step").replace_strict(named, return_dtype=pl.Float64),
             ).drop("layer_number")
 
-        return table_of(self.measured, self._of_steps, ("row_sum", "valid", "num_valid", "uniform"), then)
+        return table_of(self.measured, self._of_steps, MORE, then)
 
     @property
     def _of_steps(self) -> tuple[str, ...]:
@@ -89,8 +91,7 @@ class Levels:
         numerator_mass, denominator_mass, uniform_ratio, ratio, ratio_mean, nonfinite_layers (1 where the ratio is not
         finite; in "layers_avg" the number of layers left out), ratio_lift, log2_ratio.
         """
-        more = ("row_sum", "valid", "num_valid", "uniform")
-        return table_of(self.measured, ("replan", "layer"), more, partial(replan_cells, grouping=self.grouping))
+        return table_of(self.measured, ("replan", "layer"), MORE, partial(replan_cells, grouping=self.grouping))
 
     def groups(self, *by: str) -> pl.LazyFrame:
         """Keys, mass, density, lift and fraction of each group, kept apart by some of replan, layer, denoise, head."""
@@ -98,12 +99,11 @@ class Levels:
 
     def episodes(self) -> pl.DataFrame:
         """Over the episode's replans (see `over_replans`), sorted by suite, task, episode and layer."""
-        more = ("row_sum", "valid", "num_valid", "uniform")
 
         def then(rows: pl.DataFrame) -> pl.DataFrame:
             return over_replans(replan_cells(rows, self.grouping))
 
-        return _sorted(table_of(self.measured, ("replan", "layer"), more, then).collect())
+        return _sorted(table_of(self.measured, ("replan", "layer"), MORE, then).collect())
 
     def episodes_groups(self) -> pl.DataFrame:
         """`EPISODE_ID`, layer, layer_number, block, group; mass, mass_std, fraction, fraction_std, keys, density, lift:
@@ -146,21 +146,23 @@ def items_of(item: SelectedEpisode, grouping: Grouping) -> Items:
 
 
 def _of_groups(rows: pl.DataFrame) -> pl.DataFrame:
-    names = {name: name.replace("share", "fraction") for name in ("share", "share_std") if name in rows.columns}
+    names: dict[str, str] = {"share": "fraction"}
+    if "share_std" in rows.columns:
+        names["share_std"] = "fraction_std"
     return rows.filter(pl.col("kind") == "group").drop("kind").rename(names)
 
 
 def cells_of(rows: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
     """The rows of `means` once a cell, with masses and fractions of both sides of the ratio, and the ratio."""
     first = pl.col("kind") == SIDES[0] if grouping.ratio else pl.col("group") == grouping.names[0]
-    items = ("kind", "group", "keys", "mass", "density", "lift", "share", "uniform")
+    items = ("kind", "group", "keys", "mass", "density", "lift", "share", "uniform", "whole")
     cells = rows.filter(first).rename({"valid": "valid_mass"})
     if grouping.ratio is None:
-        return cells.drop(items)
+        return cells.drop(items, strict=False)
     below = rows.filter(pl.col("kind") == SIDES[1])
     above_mass, below_mass = cells["mass"], below["mass"]
     return (
-        cells.drop(items)
+        cells.drop(items, strict=False)
         .with_columns(
             numerator_mass=above_mass,
             denominator_mass=below_mass,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal, TypeAlias
 
 import polars as pl
@@ -12,7 +13,9 @@ import polars as pl
 #: points: a difference of shares, with its sign. p: a p-value or what it was adjusted to.
 Kind: TypeAlias = Literal["text", "count", "number", "percent", "factor", "signed", "points", "p"]
 #: The kinds of `analyze.render.figures`.
-FigureKind: TypeAlias = Literal["forest", "lines", "heat_map", "stacked", "distribution", "scatter", "pictures"]
+FigureKind: TypeAlias = Literal[
+    "forest", "lines", "heat_map", "stacked", "distribution", "scatter", "pictures", "evolution"
+]
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,7 @@ class Table:
         title: above it.
         where: the rows that texts show; all unless it is given.
         rows: how many of them a terminal shows at most.
+        of: name of the table whose file has these rows; without one the table has a file of its own.
     """
 
     name: str
@@ -58,6 +62,7 @@ class Table:
     title: str = ""
     where: pl.Expr | None = None
     rows: int = 12
+    of: str = ""
 
     @property
     def shown(self) -> pl.DataFrame:
@@ -127,6 +132,8 @@ class Result:
         tables: the numbers, those that answer in front.
         figures: pictures.
         notes: what to know beside the numbers: site, layers, what was left out, what intervals are about.
+        files: what is written besides tables and pictures, by name: results files of the published scripts, videos.
+            Each writes itself to a path.
     """
 
     title: str
@@ -135,6 +142,7 @@ class Result:
     tables: Sequence[Table]
     figures: Sequence[Figure] = ()
     notes: Sequence[str] = ()
+    files: Mapping[str, Callable[[Path], object]] = field(default_factory=dict)
 
     def __getitem__(self, name: str) -> pl.DataFrame:
         """The frame of the table with this name, all its rows.

@@ -1,21 +1,20 @@
-"""Write the results file: from the table of replans to `attention_ratio_results_<suite>.json`."""
+"""Write the results file of the published scripts, `attention_ratio_results_<suite>.json`."""
 
 from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.frames import EPISODE_KEYS, LAYERS_AVG, Tables, float_values
-from vla_attention.analyze.measures.masses import ratio, sides
-from vla_attention.analyze.show.output_files import replacing
+from vla_attention.analyze.core.levels import MORE, SIDES, Levels, replan_cells
+from vla_attention.analyze.core.measure import means
+from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.selector_parser import Atom, parse_selector
 from vla_attention.schemas.layout import SiteLayout
@@ -31,20 +30,47 @@ _KEYS = ("num_visual_tokens", "num_text_tokens")
 _COUNTS = ("total_mass", *_KEYS)
 
 
+def results_files(levels: Levels) -> dict[str, Callable[[Path], None]]:
+    """The results file of every suite by its name; each writes itself to a path. The grouping has a ratio."""
+    question, grouping = levels.question, levels.grouping
+    proxy = frame_proxy(question.stores[0].attributes, question.selected[0].tokens.layout, grouping)
+    first = len(grouping.names)  # behind the groups, both sides of the ratio
+    whole = [
+        name
+        for i, name in enumerate(_KEYS)
+        if all((one.keys[:, first + i] == np.floor(one.keys[:, first + i])).all() for one in levels.measured)
+    ]
+    steps = question.selection.denoise_steps
+
+    def write(path: Path, suite: str) -> None:
+        ordered = sorted(
+            (one for one in levels.measured if one.item.store.suite == suite),
+            key=lambda one: (one.item.episode.attributes.task_id, one.item.episode.attributes.episode_index),
+        )
+        rows = (means(one, ("replan", "layer"), (*MORE, "whole")) for one in ordered)
+        write_results(path, episode_documents(rows, grouping, steps, proxy, whole))
+
+    suites = dict.fromkeys(item.store.suite for item in question.selected)
+    return {results_file_name(suite): partial(write, suite=suite) for suite in suites}
+
+
 def episode_documents(
-    replans: Tables,
+    episodes: Iterable[pl.DataFrame],
     grouping: Grouping,
     denoise_steps: Sequence[int],
     proxy: FrameProxy | None = None,
-    num_keys: Iterable[NDArray[np.float64]] | None = None,
-) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Episodes of one or more suites from `aggregate.replan_tables`, in their order: suite and JSON document.
+    whole: Collection[str] = _KEYS,
+) -> Iterator[dict[str, Any]]:
+    """The JSON document of each episode.
 
     visual is the sum of the ratio's numerator groups, linguistic that of its denominator groups; the fraction of either
     is its mass / sum of all groups' masses. `denoise_steps` are those that the masses are means over. With a `proxy`
     the numbers are those of the published Cosmos scripts instead: masses are sums over the queries (ours are means),
-    and fractions are of visual + linguistic only. `num_keys` (..., group) are the groups' numbers of keys in all
-    episodes, taken from the tables unless they are given.
+    and fractions are of visual + linguistic only. `whole`: which numbers of keys are whole in all episodes.
+
+    Args:
+        episodes: the rows of `core.measure.means` of one episode each, by replan and layer, with `levels.MORE` and the
+            mass of all groups.
 
     The documents follow `vla_attention.schemas.results.EpisodeResult`. They are plain dictionaries, because a suite has
     a hundred thousand steps.
@@ -57,92 +83,57 @@ def episode_documents(
     sides = [*_SIDES, _ACTION] if _ACTION in grouping.names and proxy is None else list(_SIDES)
     kinds = [f"{side}_{kind}" for side in sides for kind in ("mass", "fraction")]
     columns = ("layer", "replan", "step", _RATIO, *kinds, *_COUNTS)
-    # Numbers of keys are whole numbers in all episodes or in none.
-    counts = (part.values("keys") for part in replans.parts) if num_keys is None else num_keys
-    whole = _whole(counts, grouping)
     extra = {} if proxy is None else proxy.fields()
-    # A few episodes at a time: tables of groups, and the documents, are several times as large as the cells.
-    tables = (_with_sides(part, grouping, proxy).select(*EPISODE_KEYS, *columns) for part in replans.parts)
-    counted = (table.with_columns(pl.col(whole).cast(pl.Int64)) for table in tables)
-    of_episodes = (table.partition_by("suite", "task_id", "episode_index", maintain_order=True) for table in counted)
-    for part in itertools.chain.from_iterable(of_episodes):
+    for rows in episodes:
+        part = _with_sides(rows, grouping, proxy).select(*EPISODE_KEYS, *columns)
+        part = part.with_columns(pl.col(name).cast(pl.Int64) for name in whole)
         identity = part.select(EPISODE_KEYS).row(0, named=True)
         summaries = {row["layer"]: row for row in _summaries(part, kinds).iter_rows(named=True)}
         in_time = part.sort("replan", maintain_order=True).drop(*EPISODE_KEYS, "replan")
         layers = in_time.partition_by("layer", as_dict=True, maintain_order=True, include_key=False)
         steps = {str(layer): rows for (layer,), rows in layers.items()}
-        yield (
-            identity["suite"],
-            {
-                "task_id": identity["task_id"],
-                "episode_idx": identity["episode_index"],
-                "task_description": identity["instruction"],
-                "success": identity["success"],
-                # The first replan comes after the last waiting step.
-                "num_steps": loop_counter(
-                    int(part["step"].to_numpy().min()), identity["num_steps"], identity["success"]
-                ),
-                "num_steps_definition": "loop_counter",
-                "grouping": grouping.name,
-                "grouping_description": grouping.description,
-                "denoise_steps": list(denoise_steps),
-                "summary": {_field_of_layer(layer): _summary_document(summaries[layer], kinds) for layer in steps},
-                "per_step_ratios": {
-                    _field_of_layer(layer): [step | extra for step in rows.to_dicts()] if extra else rows.to_dicts()
-                    for layer, rows in steps.items()
-                },
+        yield {
+            "task_id": identity["task_id"],
+            "episode_idx": identity["episode_index"],
+            "task_description": identity["instruction"],
+            "success": identity["success"],
+            # The first replan comes after the last waiting step.
+            "num_steps": loop_counter(int(part["step"].to_numpy().min()), identity["num_steps"], identity["success"]),
+            "num_steps_definition": "loop_counter",
+            "grouping": grouping.name,
+            "grouping_description": grouping.description,
+            "denoise_steps": list(denoise_steps),
+            "summary": {_field_of_layer(layer): _summary_document(summaries[layer], kinds) for layer in steps},
+            "per_step_ratios": {
+                _field_of_layer(layer): [step | extra for step in rows.to_dicts()] if extra else rows.to_dicts()
+                for layer, rows in steps.items()
             },
-        )
+        }
 
 
-def _whole(num_keys: Iterable[NDArray[np.float64]], grouping: Grouping) -> list[str]:
-    """Of which sides all numbers of keys are whole."""
-    of_sides = zip(_KEYS, zip(*(sides(keys, grouping) for keys in num_keys), strict=True), strict=True)
-    return [name for name, arrays in of_sides if all((array == np.floor(array)).all() for array in arrays)]
-
-
-@contextmanager
-def results_file(path: Path) -> Iterator[Callable[[dict[str, Any]], object]]:
-    """Yield a function that adds an episode to a results file: strict JSON, an episode a line, written atomically."""
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+def write_results(path: Path, documents: Iterable[dict[str, Any]]) -> None:
+    """Write a results file: strict JSON, an episode a line."""
+    with path.open("w", encoding="utf-8") as file:
         separators = itertools.chain(["[\n"], itertools.repeat(",\n"))
-        yield lambda episode: file.write(next(separators) + json.dumps(episode, allow_nan=False, ensure_ascii=False))
+        for document in documents:
+            file.write(next(separators) + json.dumps(document, allow_nan=False, ensure_ascii=False))
         file.write("\n]\n" if next(separators) == ",\n" else "[]\n")
 
 
-def write_results_of_suites(
-    folder: Path,
-    replans: Tables,
-    grouping: Grouping,
-    denoise_steps: Sequence[int],
-    proxy: FrameProxy | None = None,
-    num_keys: Iterable[NDArray[np.float64]] | None = None,
-) -> list[Path]:
-    """Write `attention_ratio_results_<suite>.json` for every suite of the tables and return the paths.
-
-    The arguments are those of `episode_documents`; `folder` is where the files go.
-    """
-    files: dict[str, Callable[[dict[str, Any]], object]] = {}
-    with ExitStack() as opened:
-        for suite, document in episode_documents(replans, grouping, denoise_steps, proxy, num_keys):
-            if suite not in files:
-                files[suite] = opened.enter_context(results_file(folder / results_file_name(suite)))
-            files[suite](document)
-    return [folder / results_file_name(suite) for suite in files]
-
-
-def _with_sides(replans: Tables, grouping: Grouping, proxy: FrameProxy | None) -> pl.DataFrame:
+def _with_sides(rows: pl.DataFrame, grouping: Grouping, proxy: FrameProxy | None) -> pl.DataFrame:
     """Add step, ratio (null where it is not finite), masses, fractions and numbers of keys of the two sides."""
-    replans = replans.kept()
-    cells = replans.cells
-    visual, linguistic = cells["numerator_mass"], cells["denominator_mass"]
+    on = [*EPISODE_ID, "replan", "layer"]
+    cells = replan_cells(rows, grouping)
+    for kind, name in zip(SIDES, _KEYS, strict=True):
+        of_side = rows.filter(pl.col("kind") == kind).select(*on, "whole", pl.col("keys").alias(name))
+        cells = cells.join(of_side.drop("whole") if "whole" in cells.columns else of_side, on=on, maintain_order="left")
     queries = 1 if proxy is None else proxy.num_queries
-    total = visual + linguistic if proxy else pl.Series(replans.values("mass").sum(axis=1))
-    above, below = sides(replans.values("keys"), grouping)
+    visual, linguistic = pl.col("numerator_mass"), pl.col("denominator_mass")
+    total = visual + linguistic if proxy else pl.col("whole")
     # Their quotient is read as the ratio of uniform attention, which it is where all queries see the same keys.
-    uniform = float_values(cells["uniform_ratio"])
-    same = ~np.isfinite(uniform) | np.isclose(uniform, ratio(above, below), rtol=1e-5)
-    above, below = (np.where(same, keys, np.nan) for keys in (above, below))
+    of_keys, uniform = pl.col(_KEYS[0]) / pl.col(_KEYS[1]), pl.col("uniform_ratio")
+    close = (uniform - of_keys).abs() <= 1e-8 + 1e-5 * of_keys.abs()
+    same = ~uniform.is_finite().fill_null(False) | close.fill_null(False)
     table = cells.with_columns(
         pl.col("env_step").alias("step"),
         # Over layers the published mean of ratios.
@@ -152,13 +143,12 @@ def _with_sides(replans: Tables, grouping: Grouping, proxy: FrameProxy | None) -
         (visual / total).fill_nan(None).alias("visual_fraction"),
         (linguistic / total).fill_nan(None).alias("linguistic_fraction"),
         (total * queries).alias("total_mass"),
-        *(pl.Series(name, keys).fill_nan(None) for name, keys in zip(_KEYS, (above, below), strict=True)),
+        *(pl.when(same).then(pl.col(name)).alias(name) for name in _KEYS),
     )
     if _ACTION in grouping.names:
-        of_action = replans.of_group(_ACTION)
-        table = table.with_columns(
-            of_action["mass"].alias(f"{_ACTION}_mass"), of_action["fraction"].alias(f"{_ACTION}_fraction")
-        )
+        of_action = rows.filter(pl.col("kind") == "group", pl.col("group") == _ACTION)
+        named = of_action.select(*on, pl.col("mass").alias("action_mass"), pl.col("share").alias("action_fraction"))
+        table = table.join(named, on=on, maintain_order="left")
     return table
 
 

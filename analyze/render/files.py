@@ -25,17 +25,22 @@ def write_result(result: Result, folder: Path, csv: bool = False) -> list[Path]:
         BadArgument: the folder cannot be made or written to.
     """
     ending = "csv" if csv else "parquet"
+    tables = [table for table in result.tables if not table.of]
     about = {"title": result.title, "about": " ".join(result.about)}
     with writing("results", folder):
         folder.mkdir(parents=True, exist_ok=True)
-        for table in result.tables:
+        for table in tables:
             with replacing(folder / f"{table.name}.{ending}") as temporary:
                 if csv:
                     table.frame.lazy().sink_csv(temporary, engine="streaming")
                 else:
                     write_parquet(table.frame, temporary, about)
         write_text(folder / "result.json", json.dumps(document(result, ending), indent=1, ensure_ascii=False) + "\n")
-    return [folder / "result.json", *(folder / f"{table.name}.{ending}" for table in result.tables)]
+        for name, write in result.files.items():
+            with replacing(folder / name) as temporary:
+                write(temporary)
+    names = ["result.json", *(f"{table.name}.{ending}" for table in tables), *result.files]
+    return [folder / name for name in names]
 
 
 def document(result: Result, ending: str = "parquet") -> dict[str, object]:
@@ -47,7 +52,7 @@ def document(result: Result, ending: str = "parquet") -> dict[str, object]:
         "notes": list(result.notes),
         "tables": {
             table.name: {
-                "file": f"{table.name}.{ending}",
+                "file": f"{table.of or table.name}.{ending}",
                 "title": table.title,
                 "columns": {column.name: {"kind": column.kind, "meaning": column.meaning} for column in table.columns},
             }

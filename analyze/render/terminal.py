@@ -42,7 +42,7 @@ def screen(result: Result, lines: int = LINES, last: Sequence[str] = ()) -> str:
             continue
         block = [*([table.title] if table.title else []), *_laid_out(table, fit)]
         if rows.height > fit:
-            block.append(f"... {rows.height - fit} more rows in {table.name}")
+            block.append(f"... {rows.height - fit} more rows in {table.of or table.name}")
         block += legend
         said |= {column.meaning for column in table.columns}
         tables.append(block)
