@@ -1,16 +1,15 @@
-"""Make the small stores that come with the package, and the reruns and the second run beside them.
+"""Make the small stores that come with the package: a run, another policy's on the same tasks, and a rerun.
 
 Usage: python scripts/make_example_stores.py [--folder vla_attention/example_stores] [--keep FOLDER]
 
-`cubes.zarr`              the shipped policy pi05_cubes, "touch the red (green, blue) cube", two episodes each
-`cubes_one_colour.zarr`   the same tasks, initial states and noise with a copy of that policy to which the three colour
-                          words are the same: their embeddings are replaced by their mean
-`cubes_reruns/`           the first episode of each task of cubes.zarr again: with other noise, without the pictures' or
-                          the instruction's keys, with these alone, without as many random keys, and without any
-                          query that reads the instruction. Actions and attention of the same layers, without pictures
-                          and steps
+`cubes.zarr`             the shipped policy pi05_cubes, "touch the red (green, blue) cube", two episodes each, with
+                         effects of words and cameras for all four readers
+`cubes_one_colour.zarr`  the same tasks, initial states, noise and effects, of a copy of that policy to which the three
+                         colour words are the same: their embeddings are replaced by their mean
+`cubes_noise.zarr`       the first episode of each task of cubes.zarr again, with other noise. Actions and attention of
+                         the same layers, without pictures and steps
 
-Takes about two minutes on two cores. The same machine, libraries and number of threads give the same stores, but for
+Takes about a minute on two cores. The same machine, libraries and number of threads give the same stores, but for
 the times and versions in their provenance. `tests/package/test_example_stores.py` reads what is there.
 """
 
@@ -32,15 +31,12 @@ POLICY = ROOT / "capture/policies/pi/pi05_cubes"
 TASKS = ("0", "1", "2")
 #: Enough for every episode of the shipped policy; the other one would search until the end.
 MOST_STEPS = "25"
+#: How the action changes without each word, part and picture, for all queries and for some.
+EFFECTS = ("--effects", "text,cameras", "--effects-readers", "all", "action", "pictures", "text")
+#: Of the rerun; the rollouts have 7.
+NOISE_SEED = "8"
 EMBEDDINGS = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
 COLOURS = ("red", "green", "blue")
-#: The two groups whose reruns are made.
-GROUPING = """\
-name = "see-read"
-[groups]
-visual = "role:image"
-linguistic = "role:instruction"
-"""
 
 
 def main() -> int:
@@ -60,31 +56,16 @@ def main() -> int:
 
 def make(folder: Path) -> None:
     """Record here, and put packed copies into `folder`."""
-    store, other, reruns = Path("cubes.zarr"), Path("cubes_one_colour.zarr"), Path("cubes_reruns")
+    store, other, noise = Path("cubes.zarr"), Path("cubes_one_colour.zarr"), Path("cubes_noise.zarr")
     rollouts = ("--task-suite", "cubes", "--task-id", *TASKS, "--num-episodes", "2", "--max-steps", MOST_STEPS)
-    must(capture, "pi", *rollouts, "--output", store)
-    must(capture, "pi", "--checkpoint", one_colour(Path("one_colour")), *rollouts, "--output", other)
-    grouping = Path("see-read.toml")
-    grouping.write_text(GROUPING)
+    must(capture, "pi", *rollouts, *EFFECTS, "--output", store)
+    must(capture, "pi", "--checkpoint", one_colour(Path("one_colour")), *rollouts, *EFFECTS, "--output", other)
     # The layers, heads and denoise steps of the base: the viewer compares what both recorded.
-    recorded = ("--no-frames", "--no-contributions", "--precision", "7")
-    must(capture, "rerun", store, "--series", grouping, "--num-episodes", "1", *recorded, "--output-dir", reruns)
-    unread = ("--knockout", "role:instruction", "--knockout-queries", "all", "--name", "unread_linguistic")
-    must(
-        capture,
-        "rerun",
-        store,
-        *unread,
-        "--num-episodes",
-        "1",
-        *recorded,
-        "--output",
-        reruns / "unread_linguistic.zarr",
-    )
+    recorded = ("--num-episodes", "1", "--no-frames", "--no-contributions", "--precision", "7")
+    must(capture, "rerun", store, "--noise-seed", NOISE_SEED, *recorded, "--output", noise)
     pack(store, folder / store.name)
     pack(other, folder / other.name, "--without", "contributions")
-    for condition in sorted(reruns.glob("*.zarr")):
-        pack(condition, folder / reruns.name / condition.name, "--without", "objects", "steps")
+    pack(noise, folder / noise.name, "--without", "objects", "steps")
 
 
 def one_colour(folder: Path) -> Path:

@@ -3,6 +3,9 @@
 Tables that are there stay as they are. With --column the named columns are replaced, and no others: a change that means
 to alter numbers names them. The stores in tests/golden/tables/stores were captured once, with one thread:
 
+    cubes, cubes_one_colour: as scripts/make_example_stores.py has them, but with two threads and without effects
+    cubes_reruns: capture rerun cubes.zarr --series (role:image, role:instruction) --num-episodes 1 --no-frames
+        --no-contributions --precision 7
     vla-attention capture pi --task-suite cubes --task-id 0 1 5 6 10 13 --num-episodes 1 --max-steps 25 --no-frames
         --no-contributions --precision 7 --effects text,cameras --effects-readers all action pictures text
     vla-attention capture pi --checkpoint untrained-tiny --task-suite libero_spatial --task-id 0 1 3 --num-episodes 1

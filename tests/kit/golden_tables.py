@@ -40,14 +40,14 @@ FOLDER = GOLDEN / "tables"
 PUBLISHED_LINES = [
     shlex.split(line) for line in (GOLDEN / "published_lines.txt").read_text(encoding="utf-8").splitlines()
 ]
-#: Name below which a question sees a store -> where it lies. effects: pi05_cubes with recorded effects of words and
-#: cameras, for all four readers. libero, cosmos, replay: policies of test size.
+#: Name below which a question sees a store -> where it lies. cubes, one_colour: earlier recordings of the example
+#: stores, without effects. effects: pi05_cubes with recorded effects of words and cameras, for all four readers.
+#: libero, cosmos, replay: policies of test size.
 STORES = {
-    "cubes": ROOT / "vla_attention/example_stores/cubes.zarr",
-    "one_colour": ROOT / "vla_attention/example_stores/cubes_one_colour.zarr",
-    **{name: FOLDER / "stores" / f"{name}.zarr" for name in ("effects", "libero", "cosmos", "replay")},
+    "one_colour": FOLDER / "stores" / "cubes_one_colour.zarr",
+    **{name: FOLDER / "stores" / f"{name}.zarr" for name in ("cubes", "effects", "libero", "cosmos", "replay")},
 }
-RERUNS = ROOT / "vla_attention/example_stores/cubes_reruns"
+RERUNS = FOLDER / "stores" / "cubes_reruns"
 
 _EXPORT = ("--parquet", *(word for name in ("steps", "replans", "episodes", "tasks") for word in ("--table", name)))
 _STEPS = ("--group", "thing=word:cube", "--group", "seen=role:image", "--ratio", "seen/thing")

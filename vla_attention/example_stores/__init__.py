@@ -9,10 +9,9 @@ from __future__ import annotations
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
-#: "touch the red (green, blue) cube", two episodes each, with pictures.
+#: "touch the red (green, blue) cube", two episodes each, with pictures, and effects of words and cameras.
 CUBES = FOLDER / "cubes.zarr"
 #: The same initial states and noise, by a copy of the policy to which the three colour words are the same.
 ONE_COLOUR = FOLDER / "cubes_one_colour.zarr"
-#: The first episode of each task of `CUBES` again: with other noise, without the keys of the pictures or the
-#: instruction, and with these alone.
-RERUNS = FOLDER / "cubes_reruns"
+#: A rerun: the first episode of each task of `CUBES` again, with other noise.
+NOISE = FOLDER / "cubes_noise.zarr"

@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from vla_attention.example_stores import CUBES, ONE_COLOUR, RERUNS
+from vla_attention.example_stores import CUBES, NOISE, ONE_COLOUR
 from vla_attention.schemas.command_line import command_parser, run_command
 from vla_attention.schemas.errors import BadArgument
 
@@ -18,14 +18,14 @@ _EXAMPLES = """examples:
 _QUESTIONS = """\
 {cubes}: 6 episodes of 'touch the red (green, blue) cube' by pi05_cubes, a small trained pi0.5
 {one_colour}: the same by a copy of it to which the three colours are one word
-{reruns}: its policy calls again, with other noise, without pictures or words, and with these alone
+{noise}: the first policy calls of {cubes} again, with other noise
 
 Try:
   vla-attention analyze {cubes}
-  vla-attention analyze words {cubes}
-  vla-attention analyze report {cubes}
-  vla-attention analyze compare {cubes} {one_colour}
-  vla-attention analyze effects {cubes} {reruns} --dimensions 0 1 2
+  vla-attention words {cubes}
+  vla-attention effects {cubes} --dimensions 0 1 2
+  vla-attention compare {cubes} {one_colour}
+  vla-attention report {cubes}
   vla-attention view {cubes}
 """
 
@@ -39,7 +39,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _copy(folder: Path) -> int:
-    copies = {"cubes": CUBES, "one_colour": ONE_COLOUR, "reruns": RERUNS}
+    copies = {"cubes": CUBES, "one_colour": ONE_COLOUR, "noise": NOISE}
     there = [folder / store.name for store in copies.values() if (folder / store.name).exists()]
     if there:
         raise BadArgument(f"{there[0]} exists; remove it, or name another folder: vla-attention example FOLDER.")
