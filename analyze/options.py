@@ -44,6 +44,13 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "type": lambda text: tuple(part for part in text.split(",") if part), "default": (), "metavar": "AXIS,...",
         "help": f"keep apart: one or several of {', '.join(AXES)}",
     },
+    "without_sinks": {
+        "nargs": "?", "const": "", "metavar": "RULE",
+        "help": "take out keys that take far more than their share in most heads, and list them; a rule as "
+        "factor=10,share=0.5,mass=0.3,heads=0.25 (these) says which",
+    },
+    "save_viz": {"action": "store_true", "help": "also a picture per episode and layer"},
+    "list": {"action": "store_true", "help": "what the stores hold, and what the grouping takes of it"},
 }  # fmt: skip
 #: Settings whose option has another name.
 _OPTION_OF = {"groups": "group"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,9 +12,12 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables, float_values, layer_name
+from vla_attention.analyze.core.levels import MORE, Levels, replan_cells
+from vla_attention.analyze.core.measure import Measured, means
+from vla_attention.analyze.measures.frames import LAYERS_AVG, float_values, layer_name
 from vla_attention.analyze.measures.masses import ratio
-from vla_attention.analyze.show.numbers import format_number, outcome_word, plural
+from vla_attention.analyze.render.numbers import format_number
+from vla_attention.analyze.render.style import Style, new_canvas
 from vla_attention.analyze.show.plot_axes import (
     BASELINE_LABEL,
     legend_above,
@@ -23,10 +27,11 @@ from vla_attention.analyze.show.plot_axes import (
     whole_numbers,
 )
 from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, LINE_OF_HATCH, NOTE_COLOR, group_styles
-from vla_attention.analyze.show.plot_style import drawn_in_our_style, new_figure, save_figure
 from vla_attention.analyze.show.plot_text import explain, ratio_name, title, wrapped
 from vla_attention.analyze.statistics.summaries import geometric_mean, summarize
+from vla_attention.schemas.errors import plural
 from vla_attention.schemas.groupings.grouping import Grouping
+from vla_attention.schemas.safe_text import file_part
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,22 +50,47 @@ def evolution_stem(task_id: int, instruction: str, episode_index: int, layer: st
     return f"task{task_id}_{slug}_ep{episode_index}_{of_layer}_ratio_evolution"
 
 
-@drawn_in_our_style
-def plot_ratio_evolution(
-    level: Tables, grouping: Grouping, folder: Path, formats: Sequence[str] | None = None
-) -> list[Path]:
-    """Draw one episode in one layer; returns the paths of png, pdf and csv.
+def evolution_files(levels: Levels) -> dict[str, Callable[[Path], None]]:
+    """A picture of every (episode, layer), by the name of its file; each draws itself when it is written.
 
-    `level`: the rows of `aggregate.replan_tables` of this episode and layer. Groups without mass in the episode are
-    left out of the legend.
+    They are in the folder `episodes`, with a folder for each suite where there are several.
     """
-    episode = level.cells.sort("replan")
-    groups = {name: level.of_group(name).sort("replan") for name in grouping.names}
+    several = len({one.item.store.suite for one in levels.measured}) > 1
+    layers = [*map(str, levels.question.selection.layer_labels), LAYERS_AVG]
+    files: dict[str, Callable[[Path], None]] = {}
+    for one in levels.measured:
+        about = one.item.episode.attributes
+        folder = f"episodes/{file_part(one.item.store.suite)}" if several else "episodes"
+        for layer in dict.fromkeys(layers):
+            stem = evolution_stem(about.task_id, about.instruction, about.episode_index, layer)
+            files[f"{folder}/{stem}.png"] = partial(_write, one=one, grouping=levels.grouping, layer=layer)
+    return files
+
+
+def _write(path: Path, one: Measured, grouping: Grouping, layer: str) -> None:
+    rows = means(one, ("replan", "layer"), MORE)
+    cells = replan_cells(rows, grouping).filter(layer=layer)
+    groups = rows.filter(kind="group", layer=layer).rename({"share": "fraction"})
+    with Style().settings():
+        figure = draw_evolution(cells, groups, grouping)
+        figure.savefig(path, format="png", dpi=Style().dpi)
+
+
+def draw_evolution(cells: pl.DataFrame, rows: pl.DataFrame, grouping: Grouping) -> Figure:
+    """Four panels of one episode in one layer: ratio, masses, fractions, statistics.
+
+    Args:
+        cells: `levels.replan_cells` of the episode and layer, a row per replan.
+        rows: replan, group, mass and fraction of the groups.
+        grouping: the groups and the ratio. Groups without mass in the episode are left out of the legend.
+    """
+    episode = cells.sort("replan")
+    groups = {name: rows.filter(group=name).sort("replan") for name in grouping.names}
     first = episode.row(0, named=True)
     layer = first["layer"]
-    figure = new_figure(10, 6.8)
+    figure = new_canvas(10, 6.8)
     of_layer = layer_name(layer, "mean over layers") + (f" (block {first['block']})" if layer != LAYERS_AVG else "")
-    outcome = outcome_word(first["success"])
+    outcome = {None: "outcome not known", True: "success", False: "failure"}[first["success"]]
     note = (
         f"{of_layer}; {outcome} after {first['num_steps']} steps; {plural(episode.height, 'replan')}; "
         f"grouping '{grouping.name}'"
@@ -70,7 +100,7 @@ def plot_ratio_evolution(
     ((ratio_axes, mass_axes), (fraction_axes, statistics_axes)) = figure.subplots(2, 2)
     steps = episode["env_step"].to_numpy()
     styles = group_styles(grouping.names)
-    drawn = level.groups_with_mass()
+    drawn = [name for name in grouping.names if (groups[name]["mass"] > 0).any()]
     _ratio_panel(ratio_axes, episode, steps, grouping)
     _mass_panel(mass_axes, groups, steps, drawn, styles)
     _fraction_panel(fraction_axes, groups, steps, drawn, styles)
@@ -83,38 +113,7 @@ def plot_ratio_evolution(
             axes.set_xlabel("environment step")
             whole_numbers(axes.xaxis)
     _group_legend(figure, drawn, styles)
-    columns = ["suite", "task_id", "episode_index", "layer", "replan", "env_step"]
-    measures = ["group", "mass", "fraction", "lift"]
-    ratios = ["ratio", "uniform_ratio", "ratio_lift"] if grouping.ratio else []
-    data = {
-        "": episode.select(*columns, *ratios),
-        "_groups": level.groups.sort("replan", maintain_order=True).select(*columns, *measures),
-    }
-    stem = evolution_stem(first["task_id"], first["instruction"], first["episode_index"], layer)
-    return save_figure(figure, folder, stem, data, formats)
-
-
-def plot_all_evolutions(
-    replans: Tables,
-    grouping: Grouping,
-    folder: Path,
-    formats: Sequence[str] | None = None,
-    progress: Callable[[int], object] | None = None,
-) -> list[Path]:
-    """Draw every (episode, layer) of the table of replans; into a folder per suite when there are several.
-
-    A third of a second each, and as much again for a pdf; `progress` is called with 1 after each.
-    """
-    paths = []
-    several = replans.cells["suite"].n_unique() > 1
-    keys = (*EPISODE_ID, "layer")
-    groups = replans.groups.partition_by(keys, as_dict=True)
-    for key, cells in replans.cells.partition_by(keys, as_dict=True, maintain_order=True).items():
-        where = folder / str(key[0]) if several else folder
-        paths += plot_ratio_evolution(Tables(cells, groups[key]), grouping, where, formats)
-        if progress is not None:
-            progress(1)
-    return paths
+    return figure
 
 
 def _ratio_panel(axes: Axes, episode: pl.DataFrame, steps: NDArray[np.int64], grouping: Grouping) -> None:
