@@ -17,6 +17,7 @@ class Command:
         examples: command lines behind `vla-attention`, for the help of a question.
         folder: whether it is `analyze.NAME.command`, with a parser of its own, instead of a question.
         keeps: whether it keeps stores instead of asking them.
+        page: whether its function gives several results, which are one HTML file.
     """
 
     answers: str
@@ -26,6 +27,7 @@ class Command:
     examples: tuple[str, ...] = ()
     folder: bool = False
     keeps: bool = False
+    page: bool = False
 
 
 _ROWS = ("layers", "denoise", "heads", "site", "intervals")
@@ -40,7 +42,7 @@ COMMANDS: dict[str, Command] = {
         examples=(
             "analyze runs/libero_10.zarr",
             "analyze runs/libero_10.zarr --by layer,head",
-            "analyze runs/libero_10.zarr --group bowl='object:akita_black_bowl_1' --group noun=word:bowl --ratio bowl/noun",
+            "analyze runs/libero_10.zarr --group bowl=object:bowl_1 --group noun=word:bowl --ratio bowl/noun",
             "analyze runs/libero_10.zarr --list",
         ),
     ),
@@ -56,7 +58,12 @@ COMMANDS: dict[str, Command] = {
     "compare": Command("two or more runs, paired where they share initial states and seeds", folder=True),
     "overlay": Command("attention on the stored pictures: strips, GIF or MP4", folder=True),
     "deviation": Command("how far actions are from the data set's, beside attention", folder=True),
-    "report": Command("all of it in one HTML file", folder=True),
+    "report": Command(
+        "all of it in one HTML file",
+        (*_ROWS, *_GROUPING, "num_episodes", "num_replans", "open"),
+        examples=("report runs/libero_10.zarr --open", "report runs/libero_10.zarr --output paper/report.html"),
+        page=True,
+    ),
     "view": Command("a page on which to explore: episodes, words, patches, heads, groups", folder=True),
     "copy": Command(
         "a copy of a store: smaller, packed, from or to elsewhere; or one store of several", folder=True, keeps=True

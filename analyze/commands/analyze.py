@@ -205,23 +205,27 @@ def _figures(
     of_layers = overall(groups).filter(pl.col("group").is_in([*shown]))
     of_layers = of_layers.with_columns(pl.col("layer").replace(LAYERS_AVG, "all"))
     n = f"Means over {plural(len(levels.question.selected), 'episode')}, every task weighing the same."
-    bars = {"x": "layer", "value": "fraction", "color": "group", "ylabel": "part of the attention"}
-    found = [Figure("attention_fractions", "stacked", of_layers, "How attention is divided, by layer", n, bars)]
+    stacked = {"x": "layer", "value": "fraction", "color": "group", "ylabel": "part of the attention"}
+    found = [Figure("attention_fractions", "stacked", of_layers, "How attention is divided, by layer", n, stacked)]
     if levels.grouping.ratio is None:
         return found
     name = " / ".join("+".join(side) for side in sides(levels.grouping))
     look = {"log": True, "uniform": "uniform_ratio", "value": "geometric_mean", "baseline_name": "if spread evenly"}
-    label = pl.format("{}: {}", "task_id", "instruction").alias("task")
-    of_tasks = tasks.filter(AVERAGE, scope="task").with_columns(label)
+    label = pl.coalesce(pl.format("{}: {}", "task_id", "instruction"), "suite", pl.lit("all suites")).alias("task")
+    of_tasks = tasks.filter(AVERAGE).with_columns(label)
     dots = episodes.filter(AVERAGE).with_columns(label)
-    found.append(Figure("ratio_per_task", "forest", of_tasks, f"Ratio {name} of every task", f"{n} Bars: 95% intervals; "
-                 "small dots: episodes.", {**look, "label": "task", "dots": dots, "xlabel": f"{name} (logarithmic)"}))  # fmt: skip
+    title, bars = f"Ratio {name} of every task", f"{n} Bars: 95% intervals; small dots: episodes."
+    axis = f"{name} (logarithmic)"
+    found.append(Figure("ratio_per_task", "forest", of_tasks, title, bars, {**look, "label": "task", "dots": dots,
+                        "xlabel": axis}))  # fmt: skip
+    along = {**look, "xlabel": "layer", "ylabel": axis}
     if len(levels.question.selection.layers) > 1:
-        profile = overall(tasks).filter(~AVERAGE).sort("layer_number")
-        found.append(Figure("layer_profile", "lines", profile, f"Ratio {name} by layer", f"{n} Bands: 95% intervals.",
-                     {**look, "x": "layer_number", "xlabel": "layer", "ylabel": f"{name} (logarithmic)"}))  # fmt: skip
+        profile, bands = overall(tasks).filter(~AVERAGE).sort("layer_number"), f"{n} Bands: 95% intervals."
+        options = {**along, "x": "layer_number"}
+        found.append(Figure("layer_profile", "lines", profile, f"Ratio {name} by layer", bands, options))
     spread = episodes.sort("layer_number", nulls_last=True).with_columns(pl.col("layer").replace(LAYERS_AVG, "all"))
-    found.append(Figure("ratio_distribution", "distribution", spread, f"Ratio {name} of single episodes, by layer",
-                 "Dots: episodes. Boxes: quartiles, with the median; whiskers: 5% to 95%.",
-                 {**look, "x": "layer", "ylabel": f"{name} (logarithmic)"}))  # fmt: skip
-    return found
+    title, boxes = (
+        f"Ratio {name} of single episodes, by layer",
+        "Dots: episodes. Boxes: quartiles; whiskers: 5% to 95%.",
+    )
+    return [*found, Figure("ratio_distribution", "distribution", spread, title, boxes, {**along, "x": "layer"})]

@@ -20,8 +20,13 @@ _RATIOS: dict[str, Scale] = {"ratio": "geometric", "uniform_ratio": "geometric",
                              "numerator_fraction": "share", "denominator_fraction": "share"}  # fmt: skip
 _GROUPS: dict[str, Scale] = {"fraction": "share", "lift": "positive", "keys": "plain"}
 #: How an axis is drawn along x: its column, and its name.
-_ALONG = {"time": ("phase", "time (0: first replan, 1: end)"), "layer": ("layer_number", "layer"),
-          "head": ("head", "head"), "denoise": ("denoise_step", "denoise step"), "replan": ("replan", "replan")}  # fmt: skip
+_ALONG = {
+    "time": ("phase", "time (0: first replan, 1: end)"),
+    "layer": ("layer_number", "layer"),
+    "head": ("head", "head"),
+    "denoise": ("denoise_step", "denoise step"),
+    "replan": ("replan", "replan"),
+}
 
 
 def kept_apart(levels: Levels, by: Collection[str], more: Sequence[Table] = ()) -> Result:
@@ -35,7 +40,7 @@ def kept_apart(levels: Levels, by: Collection[str], more: Sequence[Table] = ()) 
     question, sampling = levels.question, levels.question.sampling
     axes = [axis for axis in by if axis != "camera"]
     columns = columns_of(axes)
-    order = [*(["layer_number"] if "layer" in axes else []), *(column.name for column in columns)]
+    order = [*(["layer_number", "block"] if "layer" in axes else []), *(column.name for column in columns)]
     title, tables = f"By {' and '.join(by)}", []
     if levels.grouping.ratio is not None:
         rows = with_families(ratios_by(levels, axes), sampling)
@@ -62,10 +67,17 @@ def kept_apart(levels: Levels, by: Collection[str], more: Sequence[Table] = ()) 
         f"Where attention goes, by {' and '.join(by)}",
         about(question),
         [_finding(levels, [*tables, of_groups], columns, by)],
-        [*tables, of_groups, *more],
+        [*tables, of_groups, *_steps(levels), *more],
         _figures(levels, [*tables, of_groups], axes),
         notes(question),
     )
+
+
+def _steps(levels: Levels) -> list[Table]:
+    """Every step with its heads apart, where they are."""
+    if not levels.heads:
+        return []
+    return [Table("steps", levels.steps()), Table("steps_groups", levels.steps_groups())]
 
 
 def _finding(levels: Levels, tables: Sequence[Table], columns: Sequence[Column], by: Collection[str]) -> Finding:
@@ -108,17 +120,13 @@ def _figures(levels: Levels, tables: Sequence[Table], axes: Sequence[str]) -> li
         options = {"x": x, "y": rest[0][0], "value": "ratio_lift", "xlabel": xlabel, "ylabel": rest[0][1],
                    "label": f"{name}, over even"}  # fmt: skip
         ratios = tables[0].shown.sort(x, rest[0][0])
-        return [
-            Figure(stem, "heat_map", ratios, f"Ratio {name} over an even spread's, by {' and '.join(axes)}", n, options)
-        ]
+        title = f"Ratio {name} over an even spread's, by {' and '.join(axes)}"
+        return [Figure(stem, "heat_map", ratios, title, n, options)]
     lines = {"x": x, "value": "fraction", "color": "group", "xlabel": xlabel, "ylabel": "part of the attention"}
     found = [Figure(f"{stem}_groups", "lines", groups, f"How attention is divided, by {axes[0]}", n, lines)]
     if tables[0].name == "by":
         name = " / ".join("+".join(side) for side in sides(levels.grouping))
-        options = {"x": x, "value": "ratio", "uniform": "uniform_ratio", "log": True, "xlabel": xlabel,
-                   "ylabel": f"{name} (logarithmic)"}  # fmt: skip
-        ratios = tables[0].shown
-        found.insert(
-            0, Figure(stem, "lines", ratios, f"Ratio {name} by {axes[0]}", f"{n} Bands: 95% intervals.", options)
-        )
+        drawn = {"x": x, "value": "ratio", "uniform": "uniform_ratio", "log": True, "xlabel": xlabel, "ylabel": name}
+        title, caption = f"Ratio {name} by {axes[0]}", f"{n} Bands: 95% intervals."
+        found.insert(0, Figure(stem, "lines", tables[0].shown, title, caption, drawn))
     return found

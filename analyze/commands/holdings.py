@@ -76,7 +76,8 @@ def holdings(question: Question) -> Result:
         [_finding(question, groups, overlaps)],
         [
             Table("stores", stores, (Column("what", "text", "of the store"), Column("held", "prose", "")), rows=1000),
-            Table("groups", groups, (Column("group", "text"), *_OF_KEYS, Column("selector", "prose")), "Groups", total, 200),
+            Table("groups", groups, (Column("group", "text"), *_OF_KEYS, Column("selector", "prose")), "Groups", total,
+                  200),
             Table("parts", groups, (Column("group", "text"), Column("span", "text"), Column("role", "text"), *_OF_KEYS,
                   Column("span_keys", "count", "of the span's")), "Of which", ~total, 200, of="groups"),
             Table("group_words", words, (Column("group", "text"), Column("word", "text"), Column("pieces", "text"),
@@ -124,7 +125,7 @@ def _groups(question: Question, names: Sequence[str], resolved: Sequence[Resolve
         # A number that is the same at all replans of an episode counts once per replan.
         counts.append(np.broadcast_to(keys, (item.tokens.num_replans, *keys.shape[1:])))
     every = np.concatenate(counts).astype(np.float64)
-    rows = []
+    rows: list[tuple[object, ...]] = []
     for i, name in enumerate(names):
         if name == UNTAKEN and every[:, i].max(initial=0.0) < _NEGLIGIBLE:
             continue

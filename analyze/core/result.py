@@ -9,8 +9,9 @@ from typing import Literal, TypeAlias
 
 import polars as pl
 
-#: What the values of a column are. prose: text of any length, in the last column. percent: a share, 0.5 is 50 %. factor: 1 is no change. signed: with its sign.
-#: points: a difference of shares, with its sign. p: a p-value or what it was adjusted to.
+#: What the values of a column are. prose: text of any length, in the last column. percent: a share, 0.5 is 50 %.
+#: factor: 1 is no change. signed: with its sign. points: a difference of shares, with its sign. p: a p-value or what it
+#: was adjusted to.
 Kind: TypeAlias = Literal["text", "prose", "count", "number", "percent", "factor", "signed", "points", "p"]
 #: The kinds of `analyze.render.figures`.
 FigureKind: TypeAlias = Literal[

@@ -405,7 +405,8 @@ def cannot_fire(num_valid: float, rule: SinkRule) -> str:
         return ""
     return (
         f"With {num_valid:.3g} valid keys none can take more than {rule.factor:g} x its uniform share, which is all of "
-        f"the row: keys are judged by their mass alone, and a smaller factor (--without-sinks factor=2) judges by multiples too."
+        "the row: keys are judged by their mass alone; a smaller factor (--without-sinks factor=2) judges by multiples "
+        "too."
     )
 
 
