@@ -177,10 +177,7 @@ def with_families(
     generator = np.random.default_rng([seed, len(sizes), sum(sizes), int(100 * correlation), skewed])
     families = np.repeat(np.arange(len(sizes)), sizes)
     tasks = np.repeat(np.arange(len(families)), EPISODES)
-    units = {
-        name: Units.of(tasks, estimand, families[tasks].astype(str))
-        for name, estimand in (("families", Estimand.TASKS_LIKE_THESE), ("tasks", Estimand.INDEPENDENT_TASKS))
-    }
+    units = {"families": Units.of(tasks, families=families[tasks].astype(str)), "tasks": Units.of(tasks)}
     held: dict[str, list[bool]] = {name: [] for name in units}
     widths: dict[str, list[float]] = {name: [] for name in units}
     for _ in range(num_stores):
@@ -260,9 +257,10 @@ def power(num_tasks: int, num_episodes: int, num_stores: int, seed: int, effect:
 
 def through_files(case: Case, num_stores: int, seed: int) -> dict[str, float]:
     """The same with stores on disk: written by the real writer, read back and analysed."""
+    from vla_attention.analyze.ratios.analysis import analyse
+
     from vla_attention.analyze.measures.question import ask
     from vla_attention.analyze.measures.question_settings import AnalysisSettings
-    from vla_attention.analyze.ratios.analysis import analyse
     from vla_attention.schemas.layout import Role
     from vla_attention.schemas.stores.reader import open_store
     from vla_attention.testing.stores import StoreSpec, write_store

@@ -246,7 +246,12 @@ class Form:
         """Where today's rows differ from the kept ones."""
         floats = [pl.col(name).round(9) for name in self.keys if kept.schema[name].is_float()]
         kept = kept.drop(self.gone, strict=False).with_columns(floats)
-        rows = self.rows(tables).select(kept.columns).with_columns(floats).join(kept, on=self.keys, how="semi", nulls_equal=True)
+        rows = (
+            self.rows(tables)
+            .select(kept.columns)
+            .with_columns(floats)
+            .join(kept, on=self.keys, how="semi", nulls_equal=True)
+        )
         found, expected = (table.sort(self.keys, nulls_last=True) for table in (rows, kept))
         return differences(found, expected, alike)
 
