@@ -229,13 +229,13 @@ def print_store(path: Path) -> None:
     """How related the tasks of a store are in their log ratios, and its three intervals."""
     run = va.open(path)
     families = dict(run.episodes.select("task_id", "task_family").iter_rows())
-    ratios = run.ratios("episodes").filter(layer="layers_avg")
+    ratios = run.analyze()["episodes"].filter(layer="layers_avg")
     means = ratios.group_by("task_id").agg(pl.col("log_ratio_mean").mean()).sort("task_id")
     names = np.unique([families[task] for task in means["task_id"]], return_inverse=True)[1]
     found = intraclass_correlation(means["log_ratio_mean"].to_numpy(), names)
     print(f"{path}: {means.height} tasks of {names.max() + 1} families, intraclass correlation {found:.2f}")
     for estimand in Estimand:
-        row = run.ratios(intervals=estimand).filter(scope="all", layer="layers_avg").row(0, named=True)
+        row = run.analyze(intervals=estimand)["tasks"].filter(scope="all", layer="layers_avg").row(0, named=True)
         numbers = [row[f"geometric_mean{end}"] for end in ("", "_low", "_high")]
         print("  {:18} {:.3f} [{:.3f}, {:.3f}]".format(estimand.value, *numbers))
 

@@ -31,12 +31,12 @@ def store(tmp_path_factory):
 
 
 def headline(path, **settings):
-    return va.open(path).ratios(**settings).filter(scope="all", layer="layers_avg").row(0, named=True)
+    return va.open(path).analyze(**settings)["tasks"].filter(scope="all", layer="layers_avg").row(0, named=True)
 
 
 def test_the_interval_over_tasks_is_by_families(store):
     row = headline(store)
-    episodes = va.open(store).ratios("episodes").filter(layer="layers_avg")
+    episodes = va.open(store).analyze()["episodes"].filter(layer="layers_avg")
     means = (
         episodes.group_by("task_id").agg(pl.col("log_ratio_mean").mean()).sort("task_id")["log_ratio_mean"].to_numpy()
     )

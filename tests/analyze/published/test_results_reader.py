@@ -198,7 +198,7 @@ def test_tables_are_those_of_numpy(tmp_path):
             means[key] = finite.mean() if finite.size else None
     for row in tables.episodes.iter_rows(named=True):
         assert row["ratio_mean"] == pytest.approx(means[row["task_id"], row["episode_index"], row["layer"]])
-    for row in tables.tasks.cells.filter(scope="task").iter_rows(named=True):
+    for row in tables.tasks.filter(scope="task").iter_rows(named=True):
         own = [v for (task, _, layer), v in means.items() if (task, layer) == (row["task_id"], row["layer"]) and v]
         assert row["ratio_mean"] == pytest.approx(np.mean(own))
         assert row["num_episodes"] == 4
