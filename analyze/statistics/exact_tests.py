@@ -1,0 +1,76 @@
+"""Exact tests of counts: instructions that are shuffled over episodes, and pairs that differ. Pure functions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from math import comb, factorial, prod
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Shuffled:
+    """How often told and did agree, beside what they would if the told were shuffled among the episodes.
+
+    Attributes:
+        matches: episodes that did what they were told.
+        expected: mean number of matches over all ways to shuffle.
+        p_value: share of the ways to shuffle with at least as many matches (one-sided, exact).
+        least_p: the p-value if every episode had done what it was told: what the data could show at most.
+    """
+
+    matches: int
+    expected: float
+    p_value: float
+    least_p: float
+
+
+def shuffled(told: Sequence[str], did: Sequence[str | None], strata: Sequence[str]) -> Shuffled:
+    """Whether what is done goes with what is told, by shuffling the told among the episodes of each stratum.
+
+    Of a policy that does not hear what it is told, every way to deal the instructions out among episodes that could all
+    have been given them is as likely as the one that was used. The number of ways with k matches is counted by rook
+    polynomials (Riordan 1958, "An introduction to combinatorial analysis", chapter 7): the cells (episode, instruction)
+    that match are one rectangle for each instruction. So nothing is drawn, and neither order nor names matter.
+
+    Args:
+        told: (episode,) what each was told.
+        did: (episode,) what each did; None: nothing that anybody was told.
+        strata: (episode,) within which instructions are shuffled.
+    """
+    chances, expected, least = np.ones(1), 0.0, 1.0
+    for stratum in sorted(set(strata)):
+        members = [(t, d) for t, d, s in zip(told, did, strata, strict=True) if s == stratum]
+        names = sorted({t for t, _ in members})
+        counts = [(sum(t == name for t, _ in members), sum(d == name for _, d in members)) for name in names]
+        chances = np.convolve(chances, _chances_of_matches(counts, len(members)))
+        expected += sum(of_told * of_did for of_told, of_did in counts) / len(members)
+        least *= prod(factorial(of_told) for of_told, _ in counts) / factorial(len(members))
+    matches = sum(t == d for t, d in zip(told, did, strict=True))
+    # Rounding of the convolution must not make a certain event less than certain.
+    p_value = min(1.0, float(chances[matches:].sum()) / float(chances.sum()))
+    return Shuffled(matches, expected, p_value, least)
+
+
+def _chances_of_matches(counts: Iterable[tuple[int, int]], number: int) -> NDArray[np.float64]:
+    """Probability (matches,) of 0, 1, ... matches, from how many of `number` episodes were told and did each thing."""
+    rooks = [1]
+    for told, did in counts:
+        own = [comb(told, j) * comb(did, j) * factorial(j) for j in range(min(told, did) + 1)]
+        product = [0] * (len(rooks) + len(own) - 1)
+        for i, ways in enumerate(rooks):
+            for j, more in enumerate(own):
+                product[i + j] += ways * more
+        rooks = product
+    # Ways in which j chosen matches hold, whatever else does; by inclusion and exclusion those with exactly k.
+    chosen = [ways * factorial(number - j) for j, ways in enumerate(rooks)]
+    exactly = [sum((-1) ** (j - k) * comb(j, k) * chosen[j] for j in range(k, len(chosen))) for k in range(len(chosen))]
+    return np.array([ways / factorial(number) for ways in exactly])
+
+
+def mcnemar(won: int, lost: int) -> float:
+    """Two-sided exact p of pairs that differ being won as often as lost (McNemar 1947); 1 where no pair differs."""
+    number = won + lost
+    return min(1.0, 2 * sum(comb(number, k) for k in range(min(won, lost) + 1)) / 2**number)
