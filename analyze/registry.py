@@ -46,6 +46,13 @@ COMMANDS: dict[str, Command] = {
             "analyze runs/libero_10.zarr --list",
         ),
     ),
+    "language": Command(
+        "does it listen: what it was told and did, which words decide, and which are read",
+        _ROWS,
+        ("text",),
+        _NO_WORDS,
+        ("language runs/cubes.zarr", "language runs/cubes.zarr --task 'touch the red cube' 'touch the blue cube'"),
+    ),
     "words": Command(
         "which words of the instruction are read",
         (*_ROWS, "by"),

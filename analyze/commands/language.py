@@ -12,7 +12,7 @@ import polars as pl
 
 from vla_attention.analyze.commands.words import words
 from vla_attention.analyze.core.about import about, notes
-from vla_attention.analyze.core.behaviour import behaviour, tested
+from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
 from vla_attention.analyze.effects.effect_study import recorded_study
 from vla_attention.analyze.effects.item_rows import ItemRow, item_rows
@@ -33,7 +33,7 @@ def language(question: Question) -> Result:
     Raises:
         BadArgument: the store is damaged, see `measure`.
     """
-    asked = tested(behaviour(question.episodes))
+    asked = with_choices(behaviour(question.episodes))
     behaved = listens(asked)
     if not asked.is_empty():
         failures = f"vla-attention failures {_paths(question)}" if (~asked["outcome"]).any() else ""
@@ -54,7 +54,7 @@ def language(question: Question) -> Result:
 
 
 def listens(asked: pl.DataFrame) -> Finding:
-    """Whether it did what it was told more often than with shuffled instructions, of the rows of `tested`."""
+    """Whether it did what it was told more often than with shuffled instructions, of the rows of `with_choices`."""
     if asked.is_empty():
         return Finding(
             "Nobody knows what it did: the store holds no steps (positions, touches, goals), which our simulators "
@@ -62,17 +62,17 @@ def listens(asked: pl.DataFrame) -> Finding:
             _LISTENS,
             next_step="vla-attention capture --help",
         )
-    shown = asked.filter(pl.col("left_out").is_null())
-    rest = asked.drop_nulls("left_out")["left_out"].value_counts(sort=True)
-    left = [f"{plural(count, 'episode')} left out: {why}." for why, count in rest.iter_rows()]
+    shown, n = asked.filter(pl.col("left_out").is_null()), asked.height
+    rest = [*asked.drop_nulls("left_out")["left_out"].value_counts(sort=True).sort("left_out").iter_rows()]
+    left = [f"{plural(count, 'episode')} left out: {why}." for why, count in rest]
     if shown.is_empty():
         done = asked.filter(pl.col("did") == pl.col("told")).height
+        whys = "; ".join(f"in {count} of {plural(n, 'episode')}, {why}" for why, count in rest)
         return Finding(
-            f"These episodes cannot show whether it listens: it was told one thing only in each scene (and did it in "
-            f"{done} of {asked.height} episodes). Tell two tasks of one scene.",
+            f"These episodes cannot show whether it listens: {whys}. It did what it was told in {done} of {n}.",
             _LISTENS,
-            {"right": done, "n": asked.height},
-            " ".join(left),
+            {"right": done, "n": n},
+            "Tell two tasks in one scene, best from the same initial states.",
         )
     found = shuffled(shown["told_goal"].to_list(), shown["first"].to_list(), shown["stratum"].to_list())
     right, n = found.matches, shown.height
@@ -95,8 +95,9 @@ def listens(asked: pl.DataFrame) -> Finding:
         limits.append("Each task has its own initial states here, so the pictures could say what to do.")
     if nothing := shown["first"].null_count():
         limits.append(f"In {plural(nothing, 'episode')} none of the told goals was reached.")
-    if others := shown.filter(pl.col("outcome") & (pl.col("first") != pl.col("told_goal"))).height:
-        limits.append(f"{plural(others, 'solved episode')} reached another told goal first, and count as not told.")
+    another = pl.col("before").is_not_null() | pl.col("first").ne_missing(pl.col("told_goal"))
+    if others := shown.filter(pl.col("outcome") & another).height:
+        limits.append(f"In {plural(others, 'solved episode')} another goal held before the told one.")
     numbers = {"right": right, "n": n, "expected": found.expected, "p": found.p_value, "nothing_reached": nothing}
     return Finding(f"{sentence} ({by_chance}).", _LISTENS, numbers, " ".join([*limits, *left]))
 
@@ -174,9 +175,9 @@ def _word_row(row: ItemRow) -> dict[str, object]:
     q, above = most["minus_noise_q"], (most["minus_noise"] or 0.0) > 0
     shown = _OPEN if q is None else _LESS if not above else _MORE if q <= NAMED_AT else "not shown to be more"
     parts = {
-        f"{reader}{end}": None if of is None else of[f"effect{end}"]
-        for reader in ("total", "direct")
-        for of in (row.by_reader.get(reader),)  # type: ignore[call-overload]
+        f"{reader}{end}": of[f"effect{end}"]
+        for reader, of in row.by_reader.items()
+        if reader in ("total", "direct")
         for end in ("", "_low", "_high")
     }
     return {"word": row.name, **parts, "noise": most["noise"], "episodes": most["num_episodes"], "than_noise": shown}
@@ -190,16 +191,16 @@ def _deciding(table: pl.DataFrame) -> Finding:
         return Finding("Not tested: the run recorded no effect of a single word.", _DECIDE, {}, limit)
     top, sure = tested_words.row(0, named=True), tested_words.filter(than_noise=_MORE)
     others = [f"{word}: {total:.2g}" for word, total in sure.select("word", "total").head(5).iter_rows()][1:]
-    by = f"{top['total']:.2g}, where another noise seed changes it by {top['noise'] or 0:.2g}"
     unit = "in standard deviations of the run's actions"
+    change = f"{top['total']:.2g} without {top['word']} (another noise seed: {top['noise'] or 0:.2g}; {unit})"
     if sure.is_empty():
-        sentence = "No word is shown to change the action by more than another noise seed does; most does"
-        sentence += f" {top['word']}: without it, it changes by"
-        limit = f"Only {plural(top['episodes'], 'episode')} with {top['word']}. {limit}".strip()
+        sentence = f"No word is shown to change the action by more than another noise seed does. Most: by {change}."
+        few = f"Only {plural(top['episodes'], 'episode')} with {top['word']}. " if top["than_noise"] == _OPEN else ""
+        limit = f"{few}{limit}".strip()
     else:
-        sentence = f"The action depends most on {top['word']}: without it, it changes by"
+        sentence = f"The action depends most on {top['word']}: it changes by {change}."
     also = f" Then {listing(others)}." if others else ""
-    return Finding(f"{sentence} {by} ({unit}).{also}", _DECIDE, {**top}, limit)
+    return Finding(f"{sentence}{also}", _DECIDE, {**top}, limit)
 
 
 _EFFECT_SCHEMA = {
@@ -214,7 +215,7 @@ _EFFECTS = [
     Column(
         "total", "number", "nobody reads it", "how far the action moves, in standard deviations of the run's actions"
     ),
-    Column("direct", "number", "the action does not", "the same if the action tokens alone do not read the word"),
+    Column("direct", "number", "action tokens do not", "the same if the action tokens alone do not read the word"),
     Column("noise", "number", "another noise", "how far another noise seed moves the action in the same episodes"),
     Column(
         "than_noise", "text", "than noise", "whether nobody reading it moves the action more than another noise seed"

@@ -41,10 +41,10 @@ SCHEMA: dict[str, Any] = {
     "goals": pl.List(_GOAL),
 }
 #: Why an episode cannot show whether the policy listens.
-_NO_GOAL = "told a sentence that names no goal of the scene"
-_AT_START = "told a goal that held at the beginning of an episode"
-_PART = "told a part of another told goal"
-_ALONE = "in whose scene nothing else of the kind was told"
+_NO_GOAL = "the told sentence names no goal of the scene"
+_AT_START = "the told goal held at the beginning of an episode"
+_PART = "the told goal is a part of another told goal"
+_ALONE = "nothing else was told in the scene"
 #: Between the conditions of a goal, in its key; no condition has one.
 _AND = "\x1f"
 
@@ -142,16 +142,16 @@ def _fits(instruction: str, family: str) -> bool:
     return bool(family) and re.fullmatch(pattern, instruction) is not None
 
 
-def tested(frame: pl.DataFrame) -> pl.DataFrame:
+def with_choices(frame: pl.DataFrame) -> pl.DataFrame:
     """The rows of `behaviour` with what tells listening from not.
 
-    Instructions are shuffled within a stratum: the episodes of one scene that were told sentences of one template; those
-    of templates told once share one. An episode ends when its task is done, so that what comes later
-    is not seen: what counts is which of the stratum's told goals held first, and that is the same whatever was told.
+    Instructions are shuffled within a stratum: the episodes of one scene that were told sentences of one template;
+    those of templates with one told goal share one. An episode ends when its task is done, so that what comes later is
+    not seen: what counts is which of the stratum's told goals held first, and that is the same whatever was told.
 
     Returns:
-        further columns: stratum; first (of the stratum's told goals, the one that held first; null: none, or several at
-        once); left_out (why the episode shows nothing; null: it does).
+        further columns: stratum; first (of the stratum's told goals, the one that held first; null: none, or several
+        at once); left_out (why the episode shows nothing; null: it does).
     """
     of_kind = pl.col("told_goal").n_unique().over("suite", "scene", "family")
     kind = pl.when((pl.col("family") != "") & (of_kind > 1)).then("family").otherwise(pl.lit(""))

@@ -73,4 +73,4 @@ def _chances_of_matches(counts: Iterable[tuple[int, int]], number: int) -> NDArr
 def mcnemar(won: int, lost: int) -> float:
     """Two-sided exact p of pairs that differ being won as often as lost (McNemar 1947); 1 where no pair differs."""
     number = won + lost
-    return min(1.0, 2 * sum(comb(number, k) for k in range(min(won, lost) + 1)) / 2**number)
+    return float(min(1.0, 2 * sum(comb(number, k) for k in range(min(won, lost) + 1)) / 2**number))
