@@ -38,8 +38,12 @@ SCHEMA: dict[str, Any] = {
     "did": pl.String,
     "did_at": pl.Int64,
     "before": pl.String,
+    "how": pl.String,
     "goals": pl.List(_GOAL),
 }
+OTHER_GOAL, OTHER_TOUCH, NO_TOUCH = "reached another goal", "touched something else first", "touched nothing"
+UNFINISHED = "touched what the task names, did not finish"
+INSTEAD = (OTHER_GOAL, OTHER_TOUCH, NO_TOUCH, UNFINISHED)
 #: Why an episode cannot show whether the policy listens.
 _NO_GOAL = "the told sentence names no goal of the scene"
 _AT_START = "the told goal held at the beginning of an episode"
@@ -62,6 +66,7 @@ def behaviour(episodes: Iterable[tuple[Store, StoredEpisode]]) -> pl.DataFrame:
         outcome, num_steps         success (null: not known) and executed actions
         touched, touched_at        the body that the gripper touched first, and the step; null: none
         did, did_at                instruction of the goal that it reached, see `_done`, and the step; null: none
+        how                        what it did instead of what it was told, if it did not: one of `INSTEAD`
         before                     a goal like the told one that held before the told one was reached; null: none
         goals                      of the scene: goal, instruction, held (step at which it first held; null: never)
     """
@@ -82,6 +87,11 @@ def row_of(suite: str, attributes: EpisodeAttributes, told: str, steps: EpisodeS
     aim = aim or next((goal for goal in steps.goals if same_words(goal.instruction, told)), None)
     done, before = _done(steps.goals, aim, attributes.task_family)
     touched = steps.touched[0] if steps.touched else None
+    touched_at = None if touched is None else steps.first_touch[steps.bodies.index(touched)]
+    named = touched in {thing.name for thing in attributes.objects if thing.of_interest}
+    # Who pushes what is named has touched it, and may have reached the goal of touching it.
+    elsewhere = done is not None and not (named and done.first_held == touched_at)
+    how = OTHER_GOAL if elsewhere else NO_TOUCH if touched is None else UNFINISHED if named else OTHER_TOUCH
     return {
         "suite": suite,
         "task_id": attributes.task_id,
@@ -96,9 +106,10 @@ def row_of(suite: str, attributes: EpisodeAttributes, told: str, steps: EpisodeS
         "outcome": attributes.success,
         "num_steps": attributes.num_steps,
         "touched": None if touched is None else visible(touched.replace("_", " ")),
-        "touched_at": None if touched is None else steps.first_touch[steps.bodies.index(touched)],
+        "touched_at": touched_at,
         "did": None if done is None else visible(done.instruction),
         "did_at": None if done is None else done.first_held,
+        "how": how,
         "before": None if before is None else visible(before.instruction),
         "goals": [
             {"goal": key_of(goal), "instruction": visible(goal.instruction), "held": goal.first_held}

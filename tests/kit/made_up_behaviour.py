@@ -34,11 +34,14 @@ def did(
     state: str | None = "s",
     suite: str = "made_up",
     told: str | None = None,
+    named: Mapping[int, int] | None = None,
+    touches: Mapping[int, int] | None = None,
 ) -> pl.DataFrame:
     """The rows of `behaviour` of rollouts: the task, and when the goal of which task would hold.
 
     A moment after the task's own is not seen. `state`: of all rollouts; None: each has its own. `told`: the sentence
-    that all are given in place of their task's.
+    that all are given in place of their task's. Each goal has a thing, which is touched when the goal is reached;
+    `named`: whose thing a task names, its own unless given; `touches`: further things that are touched, and when.
     """
     goals, rows = list(goals), []
     for number, (task, course) in enumerate(rollouts):
@@ -46,7 +49,8 @@ def did(
         seen = {other: moment for other, moment in course.items() if moment <= last}
         held = tuple(replace(goal, first_held=seen.get(goal.task_id)) for goal in goals)
         bodies = (HAND, *(f"thing_{goal.task_id}" for goal in goals))
-        steps = EpisodeSteps(bodies, (None, *(goal.first_held for goal in held)), held)
+        moments = {goal.task_id: goal.first_held for goal in held} | dict(touches or {})
+        steps = EpisodeSteps(bodies, (None, *moments.values()), held)
         sentence = next(goal.instruction for goal in goals if goal.task_id == task)
         attributes: Any = SimpleNamespace(
             task_id=task,
@@ -56,6 +60,7 @@ def did(
             initial_state=str(number) if state is None else state,
             success=task in seen,
             num_steps=last,
+            objects=(SimpleNamespace(name=f"thing_{(named or {}).get(task, task)}", of_interest=True),),
         )
         rows.append(row_of(suite, attributes, sentence if told is None else told, steps))
     return pl.DataFrame(rows, schema=SCHEMA)

@@ -28,6 +28,7 @@ KINDS = {
 COMMANDS = {
     "ratios": (),
     "language": (),
+    "failures": (),
     "words": (),
     "objects": (),
     "effects": (),
