@@ -7,6 +7,7 @@ doing what it was told.
 from __future__ import annotations
 
 import shlex
+from typing import TYPE_CHECKING
 
 import polars as pl
 
@@ -14,12 +15,14 @@ from vla_attention.analyze.commands.words import words
 from vla_attention.analyze.core.about import about, notes
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
-from vla_attention.analyze.effects.effect_study import recorded_study
-from vla_attention.analyze.effects.item_rows import ItemRow, item_rows
+from vla_attention.analyze.effects.reruns import recorded_conditions
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.statistics.exact_tests import shuffled
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.schemas.errors import BadArgument, listing, plural
+
+if TYPE_CHECKING:
+    from vla_attention.analyze.effects.item_rows import ItemRow
 
 _LISTENS = "Does it listen?"
 #: From this share of episodes on, what was done most is said.
@@ -152,14 +155,18 @@ _MORE, _LESS, _OPEN, _UNTESTED = "more", "less", "too few episodes", "not tested
 
 def _effects(question: Question) -> tuple[Finding, list[Table]]:
     """How the action changes without each word, where the run recorded it."""
-    try:
-        study = recorded_study(question.stores, question.settings)
-    except BadArgument as error:
-        return Finding(f"Not shown: {error}", _DECIDE), []
-    if study is None:
+    if len(question.stores) > 1 or not recorded_conditions(question.stores[0]):
         which = "" if len(question.stores) == 1 else " of one store; several stores are asked one at a time"
         rerun = f"vla-attention capture rerun {_paths(question, 1)} --effects text,cameras"
         return Finding(f"Not recorded: how the action changes without a word{which}.", _DECIDE, next_step=rerun), []
+    # Effects, as today's study reads them: one call, which takes a second to import.
+    from vla_attention.analyze.effects.effect_study import study_effects
+    from vla_attention.analyze.effects.item_rows import item_rows
+
+    try:
+        study = study_effects(question.stores[0].path, [], question.settings)
+    except BadArgument as error:
+        return Finding(f"Not shown: {error}", _DECIDE), []
     rows = [_word_row(row) for row in item_rows(study) if row.kind == "word"]
     spoken = {word.text.casefold() for item in question.selected for line in item.tokens.words for word in line}
     rows += [
