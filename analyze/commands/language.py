@@ -7,6 +7,7 @@ doing what it was told.
 from __future__ import annotations
 
 import shlex
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import polars as pl
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 _LISTENS = "Does it listen?"
 #: From this share of episodes on, what was done most is said.
 _MOSTLY = 0.8
+#: Of episodes or steps.
 _HALF = 0.5
 
 
@@ -34,13 +36,14 @@ def language(question: Question) -> Result:
     """What was told and what was done, effects of the words where they were recorded, attention to the words.
 
     Raises:
-        BadArgument: the store is damaged, see `measure`.
+        BadArgument: the keys of the site spell no words.
     """
     asked = with_choices(behaviour(question.episodes))
     behaved = listens(asked)
     if not asked.is_empty():
         failures = f"vla-attention failures {_paths(question)}" if (~asked["outcome"]).any() else ""
-        behaved = Finding(behaved.sentence, behaved.asks, behaved.numbers, behaved.limit, failures)
+        behaved = replace(behaved, next_step=failures)
+    done = _behaviour_tables(asked)
     decide, effects = _effects(question)
     # Attention to the words: one call.
     read = words(question)
@@ -50,7 +53,7 @@ def language(question: Question) -> Result:
         "Does it listen? What was told, and what was done",
         about(question),
         [behaved, decide, *read.findings[:1]],
-        [*_behaviour_tables(asked), *effects, *read.tables[:1]],
+        [*done[:1], *effects, *done[1:], *read.tables[:1]],
         read.figures[:1],
         [*left, *notes(question)],
     )
@@ -187,7 +190,8 @@ def _word_row(row: ItemRow) -> dict[str, object]:
         if reader in ("total", "direct")
         for end in ("", "_low", "_high")
     }
-    return {"word": row.name, **parts, "noise": most["noise"], "episodes": most["num_episodes"], "than_noise": shown}
+    sizes = {"turn": most["angle"], "grip": most["gripper_flips"], "noise": most["noise"]}
+    return {"word": row.name, **parts, **sizes, "episodes": most["num_episodes"], "than_noise": shown}
 
 
 def _deciding(table: pl.DataFrame) -> Finding:
@@ -207,13 +211,18 @@ def _deciding(table: pl.DataFrame) -> Finding:
     else:
         sentence = f"The action depends most on {top['word']}: it changes by {change}."
     also = f" Then {listing(others)}." if others else ""
+    if (top["grip"] or 0) >= _HALF:
+        turn = f", while the movement turns by {top['turn']:.0f} degrees" if top["turn"] is not None else ""
+        also = (
+            f" This is mostly the gripper, which closes or opens instead in {top['grip']:.0%} of the steps{turn}.{also}"
+        )
     return Finding(f"{sentence}{also}", _DECIDE, {**top}, limit)
 
 
 _EFFECT_SCHEMA = {
     "word": pl.String,
     **{f"{reader}{end}": pl.Float64 for reader in ("total", "direct") for end in ("", "_low", "_high")},
-    "noise": pl.Float64,
+    **dict.fromkeys(("turn", "grip", "noise"), pl.Float64),
     "episodes": pl.Int64,
     "than_noise": pl.String,
 }
@@ -223,6 +232,8 @@ _EFFECTS = [
         "total", "number", "nobody reads it", "how far the action moves, in standard deviations of the run's actions"
     ),
     Column("direct", "number", "action tokens do not", "the same if the action tokens alone do not read the word"),
+    Column("turn", "number", "turn", "how far the direction of the hand's movement turns, in degrees"),
+    Column("grip", "percent", "gripper", "steps in which the gripper is told the opposite"),
     Column("noise", "number", "another noise", "how far another noise seed moves the action in the same episodes"),
     Column(
         "than_noise", "text", "than noise", "whether nobody reading it moves the action more than another noise seed"
