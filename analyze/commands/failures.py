@@ -20,10 +20,11 @@ from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.objects.object_attention import object_tables
 from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.analyze.objects.object_views import ALL_CAMERAS
+from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.schemas.errors import BadArgument, listing, plural
 from vla_attention.schemas.safe_text import visible
 
-EPISODE = ["suite", "task_id", "episode_index"]
+_EPISODE = ["suite", "task_id", "episode_index"]
 _OUTCOME = ("suite", "task_id", "instruction", "solved", "num_steps")
 #: Columns that only `behaviour` and joins need.
 _KEYS = ("goals", "scene", "state", "told_goal", "own_goal", "twin_index", "twin_replan")
@@ -65,16 +66,16 @@ def failures(question: Question, twins: Question | None = None) -> Result:
             "solved episode there has the same task and initial state; give one of the same suite, tasks and seed."
         )
     places = _beside(question, twins or question, left)
-    rows = lost.join(places, on=EPISODE, how="left", maintain_order="left")
-    tables = [_instead(lost), Table("failures", rows.drop(_KEYS), _FAILURES, "Failure by failure")]
-    where = _where(places, twins is not None) if failed else []
+    rows = lost.join(places, on=_EPISODE, how="left", maintain_order="left").drop(_KEYS)
+    tables = [_instead(lost), Table("failures", rows, _FAILURES, "Failure by failure")]
+    where = _where(places, len(failed), twins is not None) if failed else []
     return Result(
         "Why did it fail? What was done instead",
         about(question),
         [*_why(question, failed, outcomes.height, lost), *where, *_foretold(outcomes)],
         [*(tables if lost.height else []), _by_task(outcomes)],
         _strip(left),
-        question.skipped,
+        [*question.skipped, *(run_notes(twins.episodes) if twins else ())],
     )
 
 
@@ -127,12 +128,11 @@ def _beside(question: Question, other: Question, left: Sequence[Leaving]) -> pl.
     rows = []
     for one in left:
         at = one.replan
-        row = dict(zip(EPISODE, (*one.item.task, one.item.episode.attributes.episode_index), strict=True))
+        row = dict(zip(_EPISODE, (*one.item.task, one.item.episode.attributes.episode_index), strict=True))
         row |= {"twin": one.twin.episode.name, "twin_index": one.twin.episode.attributes.episode_index, "replan": at}
         if at is not None:
-            row |= {"step": int(one.starts[at]), "apart": 100 * float(one.apart[at])}
-            row |= {"within": 100 * float(one.within[at])}
-            row["twin_replan"] = min(at, one.twin.episode.attributes.num_replans - 1)
+            row |= {"step": int(one.starts[at]), "twin_replan": min(at, one.twin.episode.attributes.num_replans - 1)}
+            row |= {"apart": 100 * float(one.apart[at]), "within": 100 * float(one.within[at])}
         rows.append(row)
     places = pl.DataFrame(rows, schema=_PLACES)
     gone = [one for one in left if one.replan is not None]
@@ -140,15 +140,15 @@ def _beside(question: Question, other: Question, left: Sequence[Leaving]) -> pl.
     theirs = _attention(other, [one.twin for one in gone]).rename(
         {"episode_index": "twin_index", "replan": "twin_replan", "looked": "twin_looked", "read": "twin_read"}
     )
-    places = places.join(mine, on=[*EPISODE, "replan"], how="left", maintain_order="left")
+    places = places.join(mine, on=[*_EPISODE, "replan"], how="left", maintain_order="left")
     return places.join(theirs, on=["suite", "task_id", "twin_index", "twin_replan"], how="left", maintain_order="left")
 
 
 def _attention(question: Question, items: Sequence[SelectedEpisode]) -> pl.DataFrame:
     """Per replan of these episodes: `looked` and `read`, the object and the word with most attention per token."""
-    place = [*EPISODE, "replan"]
+    place = [*_EPISODE, "replan"]
     found = pl.DataFrame(schema={**{name: _PLACES[name] for name in place}, "looked": pl.String, "read": pl.String})
-    chosen = {item.episode.name: item for item in items}
+    chosen = {(item.task, item.episode.name): item for item in items}
     if not chosen:
         return found
     part = replace(question, selected=tuple(chosen.values()))
@@ -165,7 +165,7 @@ def _attention(question: Question, items: Sequence[SelectedEpisode]) -> pl.DataF
     return looked.join(read, on=place, how="full", coalesce=True).select(found.columns)
 
 
-def _where(places: pl.DataFrame, given: bool) -> list[Finding]:
+def _where(places: pl.DataFrame, num_failed: int, given: bool) -> list[Finding]:
     if places.is_empty():
         said = "Not known: the tasks that failed have fewer than two solved episodes to compare with"
         return [Finding(f"{said}.", _WHERE, {}, "Give a store in which the same states are solved, as --twins.")]
@@ -174,14 +174,16 @@ def _where(places: pl.DataFrame, given: bool) -> list[Finding]:
     numbers = {"left": gone.height, "n": places.height}
     begin = f"{gone.height} of {places.height} failed episodes leave the solved ones {which}"
     if gone.is_empty():
-        return [Finding(f"{begin}: to the end they are no farther apart than solved ones are.", _WHERE, numbers)]
+        return [Finding(f"{begin}; to the end they are as near as those are.", _WHERE, numbers)]
     row = gone.row(0, named=True)
     than = "1 cm" if given else f"they are from each other ({row['within']:.1f} cm)"
     said = f"Episode {row['episode_index']} of task {row['task_id']} does at step {row['step']}: from there on its hand"
     said += f" is {row['apart']:.1f} cm from theirs, more than {than}"
     if row["looked"] and row["twin_looked"]:
         said += f". Most attention is then on the {row['looked']}, of the solved one on the {row['twin_looked']}"
-    limit = "Where an episode begins to differ is not yet what made it differ."
+    alone = num_failed - places.height
+    limit = f"{plural(alone, 'failed episode')} had none to compare with. " if alone else ""
+    limit += "Where an episode begins to differ is not yet what made it differ."
     return [Finding(f"{begin}. {said}.", _WHERE, numbers, limit)]
 
 

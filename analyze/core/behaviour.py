@@ -73,17 +73,25 @@ def behaviour(episodes: Iterable[tuple[Store, StoredEpisode]]) -> pl.DataFrame:
     pairs = [(store, episode) for store, episode in episodes if store.attributes.rerun_of is None]
     opened = read_one_by_one(episode for _, episode in pairs)
     rows = [
-        row_of(store.suite, one.attributes, told_instruction(store, one.attributes), one.attributes.steps)
+        row_of(store.suite, one.attributes, told_instruction(store, one.attributes), one.attributes.steps, _same(store))
         for (store, _), one in zip(pairs, opened, strict=True)
         if one.attributes.steps is not None
     ]
     return pl.DataFrame(rows, schema=SCHEMA)
 
 
-def row_of(suite: str, attributes: EpisodeAttributes, told: str, steps: EpisodeSteps) -> dict[str, object]:
-    """The row of `behaviour` of one episode that was told a sentence."""
+def _same(store: Store) -> bool:
+    """Whether other words were used for the task's own goal."""
+    change = store.attributes.interventions.prompt
+    return change is not None and change.kind == "synonyms"
+
+
+def row_of(
+    suite: str, attributes: EpisodeAttributes, told: str, steps: EpisodeSteps, same: bool = False
+) -> dict[str, object]:
+    """The row of `behaviour` of one episode that was told a sentence; `same`: with other words for its own goal."""
     own = steps.goal_of(attributes.task_id)
-    aim = own if same_words(told, attributes.instruction) else None
+    aim = own if same or same_words(told, attributes.instruction) else None
     aim = aim or next((goal for goal in steps.goals if same_words(goal.instruction, told)), None)
     done, before = _done(steps.goals, aim, attributes.task_family)
     touched = steps.touched[0] if steps.touched else None

@@ -83,23 +83,27 @@ def leavings(
     solved = [one for one in others if one.task in tasks and one.episode.attributes.success]
     for task in sorted(tasks):
         courses = [course for one in solved if one.task == task and (course := course_of(one)) is not None]
-        own = [_apart(one, _nearest(one, courses)) for one in courses] if len(courses) > 1 else [np.zeros(1)]
+        own = [_apart(one, near) for one in courses if (near := _nearest(one, courses))]
         for item in failed:
             course = course_of(item) if item.task == task else None
             if course is None:
                 continue
             state = item.episode.attributes.initial_state_digest
-            known = [one for one in courses if one.item.episode.attributes.initial_state_digest == state]
-            known = known if same_state else courses if len(courses) > 1 else []
-            if known:
-                near = _nearest(course, known)
+            alike = [one for one in courses if one.item.episode.attributes.initial_state_digest == state]
+            near = _nearest(course, alike if same_state else courses if own else [])
+            if near:
                 apart = _apart(course, near)
                 within = band([np.zeros(1)] if same_state else own, len(apart))
                 yield Leaving(item, near[0].item, course.starts, apart, within, leaves_at(apart, within))
 
 
 def _nearest(course: Course, others: Sequence[Course]) -> list[Course]:
-    other = [one for one in others if one is not course and one.start.shape == course.start.shape]
+    """The nearest others in whose scenes there are as many bodies and named things; with others no path compares."""
+
+    def shape(one: Course) -> tuple[int, int]:
+        return len(one.start), one.path.shape[1]
+
+    other = [one for one in others if one is not course and shape(one) == shape(course)]
     return sorted(other, key=lambda one: float(((one.start - course.start) ** 2).sum()))[:_TWINS]
 
 

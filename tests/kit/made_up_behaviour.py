@@ -34,14 +34,16 @@ def did(
     state: str | None = "s",
     suite: str = "made_up",
     told: str | None = None,
+    same: bool = False,
     named: Mapping[int, int] | None = None,
     touches: Mapping[int, int] | None = None,
 ) -> pl.DataFrame:
     """The rows of `behaviour` of rollouts: the task, and when the goal of which task would hold.
 
     A moment after the task's own is not seen. `state`: of all rollouts; None: each has its own. `told`: the sentence
-    that all are given in place of their task's. Each goal has a thing, which is touched when the goal is reached;
-    `named`: whose thing a task names, its own unless given; `touches`: further things that are touched, and when.
+    that all are given in place of their task's; `same`: it means the same. Each goal has a thing, which is touched when
+    the goal is reached; `named`: whose thing a task names, its own unless given; `touches`: further things that are
+    touched, and when.
     """
     goals, rows = list(goals), []
     for number, (task, course) in enumerate(rollouts):
@@ -62,5 +64,5 @@ def did(
             num_steps=last,
             objects=(SimpleNamespace(name=f"thing_{(named or {}).get(task, task)}", of_interest=True),),
         )
-        rows.append(row_of(suite, attributes, sentence if told is None else told, steps))
+        rows.append(row_of(suite, attributes, sentence if told is None else told, steps, same))
     return pl.DataFrame(rows, schema=SCHEMA)

@@ -185,6 +185,11 @@ def test_a_rerun_did_nothing_of_its_own(tmp_path):
     assert language(question_about(rerun)).findings[0].sentence.startswith("Nobody knows")
 
 
+def test_other_words_for_the_same_goal_are_a_test_of_it():
+    found = said([(task, {task: 9}) for task in EIGHT], told="poke the crimson one", same=True)
+    assert found.sentence.startswith("It listens")
+
+
 def test_another_prompt_is_told_first(tmp_path):
     change = Interventions("other", prompt=PromptChange("text", text="go"))
     plain, told = (
