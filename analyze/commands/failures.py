@@ -11,7 +11,7 @@ import polars as pl
 
 from vla_attention.analyze.commands.words import items_of
 from vla_attention.analyze.core.about import about
-from vla_attention.analyze.core.behaviour import OTHER_GOAL, UNFINISHED, behaviour
+from vla_attention.analyze.core.behaviour import OTHER_GOAL, TOLD_SO, UNFINISHED, behaviour
 from vla_attention.analyze.core.courses import Leaving, leavings, strip_of
 from vla_attention.analyze.core.measure import measure, table_of
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
@@ -47,8 +47,7 @@ def failures(question: Question, twins: Question | None = None) -> Result:
     for store in question.stores:
         if (source := store.attributes.rerun_of) is not None:
             raise BadArgument(
-                f"{store.path} is a rerun of stored calls: nothing was executed, so nothing failed; ask the store that "
-                f"it repeats ('{visible(source.name)}')."
+                f"{store.path} is a rerun of stored calls, nothing was executed; ask its base '{visible(source.name)}'."
             )
     known = [(*i.task, i.episode.attributes) for i in question.selected if i.episode.attributes.success is not None]
     outcomes = pl.DataFrame(
@@ -67,13 +66,13 @@ def failures(question: Question, twins: Question | None = None) -> Result:
         )
     places = _beside(question, twins or question, left)
     rows = lost.join(places, on=_EPISODE, how="left", maintain_order="left").drop(_KEYS)
-    tables = [_instead(lost), Table("failures", rows, _FAILURES, "Failure by failure")]
+    tables = [_instead(lost), Table("failures", rows, _FAILURES, "Failure by failure")] if lost.height else []
     where = _where(places, len(failed), twins is not None) if failed else []
     return Result(
         "Why did it fail? What was done instead",
         about(question),
         [*_why(question, failed, outcomes.height, lost), *where, *_foretold(outcomes)],
-        [*(tables if lost.height else []), _by_task(outcomes)],
+        [*tables, _by_task(outcomes)],
         _strip(left),
         [*question.skipped, *(run_notes(twins.episodes) if twins else ())],
     )
@@ -98,9 +97,7 @@ def _instead(lost: pl.DataFrame) -> Table:
 
 def _why(question: Question, failed: Sequence[SelectedEpisode], num_known: int, lost: pl.DataFrame) -> list[Finding]:
     if not failed:
-        said = (
-            f"Nothing failed: {num_known} of {num_known} episodes were solved." if num_known else "No outcome is known."
-        )
+        said = f"Nothing failed: all {num_known} episodes were solved." if num_known else "No outcome is known."
         return [Finding(said, _WHY, {"failed": 0, "n": num_known})]
     numbers = {"failed": len(failed), "n": num_known}
     begin = f"{len(failed)} of {plural(num_known, 'episode')} failed"
@@ -119,8 +116,10 @@ def _group(row: dict[str, Any]) -> str:
     """How many episodes did the same, and what; of a single one, when."""
     at = f" at step {row['touched_at']:.0f}" if row["episodes"] == 1 else ""
     first = "touched nothing" if row["touched"] is None else f"touched the {row['touched']} first{at}"
-    reached = {OTHER_GOAL: f" and reached the goal of '{row['did']}'", UNFINISHED: ", as told, and did not finish"}
-    return f"{row['episodes']} {first}{reached.get(row['how'], '')} (told {row['told']})"
+    told, reached = f" (told {row['told']})", f" and reached the goal of '{row['did']}'"
+    so, unfinished = f"{reached}, as it was told, which is not its task", f", as told, and did not finish{told}"
+    then = {OTHER_GOAL: reached + told, UNFINISHED: unfinished, TOLD_SO: so}.get(row["how"], told)
+    return f"{row['episodes']} {first}{then}"
 
 
 def _beside(question: Question, other: Question, left: Sequence[Leaving]) -> pl.DataFrame:
@@ -180,7 +179,8 @@ def _where(places: pl.DataFrame, num_failed: int, given: bool) -> list[Finding]:
     said = f"Episode {row['episode_index']} of task {row['task_id']} does at step {row['step']}: from there on its hand"
     said += f" is {row['apart']:.1f} cm from theirs, more than {than}"
     if row["looked"] and row["twin_looked"]:
-        said += f". Most attention is then on the {row['looked']}, of the solved one on the {row['twin_looked']}"
+        other = "in both" if row["looked"] == row["twin_looked"] else f"of the solved one on the {row['twin_looked']}"
+        said += f". Most attention is then on the {row['looked']}, {other}"
     alone = num_failed - places.height
     limit = f"{plural(alone, 'failed episode')} had none to compare with. " if alone else ""
     limit += "Where an episode begins to differ is not yet what made it differ."

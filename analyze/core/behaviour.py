@@ -42,8 +42,8 @@ SCHEMA: dict[str, Any] = {
     "goals": pl.List(_GOAL),
 }
 OTHER_GOAL, OTHER_TOUCH, NO_TOUCH = "reached another goal", "touched something else first", "touched nothing"
-UNFINISHED = "touched what the task names, did not finish"
-INSTEAD = (OTHER_GOAL, OTHER_TOUCH, NO_TOUCH, UNFINISHED)
+UNFINISHED, TOLD_SO = "touched what the task names, did not finish", "did what it was told, not its task"
+INSTEAD = (TOLD_SO, OTHER_GOAL, OTHER_TOUCH, NO_TOUCH, UNFINISHED)
 #: Why an episode cannot show whether the policy listens.
 _NO_GOAL = "the told sentence names no goal of the scene"
 _AT_START = "the told goal held at the beginning of an episode"
@@ -66,7 +66,7 @@ def behaviour(episodes: Iterable[tuple[Store, StoredEpisode]]) -> pl.DataFrame:
         outcome, num_steps         success (null: not known) and executed actions
         touched, touched_at        the body that the gripper touched first, and the step; null: none
         did, did_at                instruction of the goal that it reached, see `_done`, and the step; null: none
-        how                        what it did instead of what it was told, if it did not: one of `INSTEAD`
+        how                        what it did, if its task was not solved: one of `INSTEAD`
         before                     a goal like the told one that held before the told one was reached; null: none
         goals                      of the scene: goal, instruction, held (step at which it first held; null: never)
     """
@@ -99,7 +99,18 @@ def row_of(
     named = touched in {thing.name for thing in attributes.objects if thing.of_interest}
     # Who pushes what is named has touched it, and may have reached the goal of touching it.
     elsewhere = done is not None and not (named and done.first_held == touched_at)
-    how = OTHER_GOAL if elsewhere else NO_TOUCH if touched is None else UNFINISHED if named else OTHER_TOUCH
+    told_so = done is not None and aim is not None and key_of(done) == key_of(aim)
+    how = (
+        TOLD_SO
+        if told_so
+        else OTHER_GOAL
+        if elsewhere
+        else NO_TOUCH
+        if touched is None
+        else UNFINISHED
+        if named
+        else OTHER_TOUCH
+    )
     return {
         "suite": suite,
         "task_id": attributes.task_id,

@@ -16,7 +16,7 @@ from tests.kit.paths import ROOT
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.commands.failures import failures
-from vla_attention.analyze.core.behaviour import NO_TOUCH, OTHER_GOAL, OTHER_TOUCH, UNFINISHED
+from vla_attention.analyze.core.behaviour import NO_TOUCH, OTHER_GOAL, OTHER_TOUCH, TOLD_SO, UNFINISHED
 from vla_attention.analyze.render.figures import draw
 from vla_attention.analyze.show.patch_pictures import upright
 from vla_attention.analyze.statistics.leaving import TOGETHER, band, by_replan, distance, leaves_at, path_of
@@ -106,6 +106,8 @@ def test_what_it_did_instead():
     assert frame["how"].to_list()[:3] == [OTHER_GOAL, NO_TOUCH, UNFINISHED]
     assert frame["how"][4] == OTHER_GOAL
     assert frame["outcome"].to_list() == [False, False, False, True, False]
+    other = did([(0, {2: 5})], goals, "", named=bodies, told="touch the blue cube")
+    assert (other["how"][0], other["outcome"][0]) == (TOLD_SO, False)
     touched = did([(0, {})], goals, "", named=bodies, touches={1: 7})
     assert (touched["how"][0], touched["touched"][0], touched["touched_at"][0]) == (OTHER_TOUCH, "thing 1", 7)
 
