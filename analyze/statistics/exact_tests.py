@@ -58,16 +58,22 @@ def _chances_of_matches(counts: Iterable[tuple[int, int]], number: int) -> NDArr
     """Probability (matches,) of 0, 1, ... matches, from how many of `number` episodes were told and did each thing."""
     rooks = [1]
     for told, did in counts:
-        own = [comb(told, j) * comb(did, j) * factorial(j) for j in range(min(told, did) + 1)]
-        product = [0] * (len(rooks) + len(own) - 1)
-        for i, ways in enumerate(rooks):
-            for j, more in enumerate(own):
-                product[i + j] += ways * more
-        rooks = product
-    # Ways in which j chosen matches hold, whatever else does; by inclusion and exclusion those with exactly k.
-    chosen = [ways * factorial(number - j) for j, ways in enumerate(rooks)]
-    exactly = [sum((-1) ** (j - k) * comb(j, k) * chosen[j] for j in range(k, len(chosen))) for k in range(len(chosen))]
-    return np.array([ways / factorial(number) for ways in exactly])
+        rooks = _product(rooks, [comb(told, j) * comb(did, j) * factorial(j) for j in range(min(told, did) + 1)])
+    # sum over j of (ways in which j chosen matches hold, whatever else does) (x - 1)^j: the coefficient of x^k is the
+    # number of ways with exactly k. By Horner's scheme in whole numbers: in floats the signs cancel all digits.
+    ways = [chosen * factorial(number - j) for j, chosen in enumerate(rooks)]
+    for first in range(len(ways) - 1):
+        for k in range(len(ways) - 2, first - 1, -1):
+            ways[k] -= ways[k + 1]
+    return np.array([exactly / factorial(number) for exactly in ways])
+
+
+def _product(one: Sequence[int], other: Sequence[int]) -> list[int]:
+    """The product of polynomials with coefficients of 0 and more: as one product of the two numbers at x = 2^width."""
+    width = (max(one) * max(other) * min(len(one), len(other))).bit_length()
+    whole = sum(a << (width * i) for i, a in enumerate(one)) * sum(b << (width * i) for i, b in enumerate(other))
+    mask = (1 << width) - 1
+    return [(whole >> (width * i)) & mask for i in range(len(one) + len(other) - 1)]
 
 
 def mcnemar(won: int, lost: int) -> float:
