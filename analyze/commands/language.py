@@ -200,23 +200,20 @@ def _deciding(table: pl.DataFrame) -> Finding:
     limit = f"{plural(untested, 'word')} of the instructions not tested." if untested else ""
     if tested_words.is_empty():
         return Finding("Not tested: the run recorded no effect of a single word.", _DECIDE, {}, limit)
-    top, sure = tested_words.row(0, named=True), tested_words.filter(than_noise=_MORE)
-    others = [f"{word}: {total:.2g}" for word, total in sure.select("word", "total").head(5).iter_rows()][1:]
-    unit = "in standard deviations of the run's actions"
-    change = f"{top['total']:.2g} without {top['word']} (another noise seed: {top['noise'] or 0:.2g}; {unit})"
-    if sure.is_empty():
-        sentence = f"No word is shown to change the action by more than another noise seed does. Most: by {change}."
-        few = f"Only {plural(top['episodes'], 'episode')} with {top['word']}. " if top["than_noise"] == _OPEN else ""
-        limit = f"{few}{limit}".strip()
-    else:
-        sentence = f"The action depends most on {top['word']}: it changes by {change}."
-    also = f" Then {listing(others)}." if others else ""
+    top = tested_words.sort("total", descending=True).row(0, named=True)
+    said = (
+        f"Without {top['word']} the action changes most: by {top['total']:.2g} standard deviations of the run's "
+        f"actions (another noise seed: {top['noise'] or 0:.2g})."
+    )
     if (top["grip"] or 0) >= _HALF:
         turn = f", while the movement turns by {top['turn']:.0f} degrees" if top["turn"] is not None else ""
-        also = (
-            f" This is mostly the gripper, which closes or opens instead in {top['grip']:.0%} of the steps{turn}.{also}"
-        )
-    return Finding(f"{sentence}{also}", _DECIDE, {**top}, limit)
+        said += f" This is mostly the gripper, which closes or opens instead in {top['grip']:.0%} of the steps{turn}."
+    surely = table.filter(than_noise=_MORE)
+    sure = [f"{word} ({total:.2g})" for word, total in surely.select("word", "total").iter_rows()]
+    more = f"Shown to change it by more than another noise seed does: {listing(sure, 5)}."
+    few = f"Only {plural(top['episodes'], 'episode')} with {top['word']}. " if top["than_noise"] == _OPEN else ""
+    said += f" {more if sure else 'No word is shown to change it by more than another noise seed does.'}"
+    return Finding(said, _DECIDE, {**top}, f"{few}{limit}".strip())
 
 
 _EFFECT_SCHEMA = {

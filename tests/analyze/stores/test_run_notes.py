@@ -32,12 +32,8 @@ COMMANDS = {
     "words": (),
     "objects": (),
     "effects": (),
-    "time": (),
-    "heads": (),
     "overlay": ("--task", "0", "--episode", "0"),
     "report": (),
-    "groups": (),
-    "export": ("--csv",),
     "list": ("--list",),
     "view": ("--no-open",),
     "compare": (),
@@ -75,7 +71,7 @@ def stores(tmp_path_factory):
         *(("cut", command) for command in COMMANDS),
         *(("told", command) for command in ("language", "list", "view", "compare")),
         *(("replaced", command) for command in ("ratios", "list", "effects", "compare")),
-        *(("knocked out", command) for command in ("ratios", "words", "groups", "report")),
+        *(("knocked out", command) for command in ("ratios", "words", "report")),
         *(("neither", command) for command in ("ratios", "list")),
     ],
 )
@@ -83,7 +79,7 @@ def test_every_command_says_it(stores, tmp_path, monkeypatch, capsys, kind, comm
     monkeypatch.setattr("vla_attention.analyze.view.server.ViewerServer.serve_forever", lambda self: None)
     words = [] if command in ("ratios", "list") else [command]
     words += [str(stores[kind])] + [str(stores["other"])] * (command == "compare") + list(COMMANDS[command])
-    if command not in ("list", "view", "groups"):
+    if command not in ("list", "view"):
         output = tmp_path / ("a.html" if command == "report" else "results")
         words += ["--output", str(output)]
     assert main(words) == 0
