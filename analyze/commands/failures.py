@@ -29,6 +29,7 @@ _OUTCOME = ("suite", "task_id", "instruction", "solved", "num_steps")
 #: Columns that only `behaviour` and joins need.
 _KEYS = ("goals", "scene", "state", "told_goal", "own_goal", "twin_index", "twin_replan")
 _WHY = "Why did it fail?"
+_UNKNOWN = "An episode is solved or failed where a simulator or the recording code says so; a replay runs nothing."
 _WHERE = "Where did it leave the solved ones?"
 _BEFORE = "What tells beforehand?"
 #: With fewer failures they are described, one by one.
@@ -98,7 +99,7 @@ def _instead(lost: pl.DataFrame) -> Table:
 def _why(question: Question, failed: Sequence[SelectedEpisode], num_known: int, lost: pl.DataFrame) -> list[Finding]:
     if not failed:
         said = f"Nothing failed: all {num_known} episodes were solved." if num_known else "No outcome is known."
-        return [Finding(said, _WHY, {"failed": 0, "n": num_known})]
+        return [Finding(said, _WHY, {"failed": 0, "n": num_known}, "" if num_known else _UNKNOWN)]
     numbers = {"failed": len(failed), "n": num_known}
     begin = f"{len(failed)} of {plural(num_known, 'episode')} failed"
     few = f"Fewer than {_FEW} failures: this describes them and says nothing of others." if len(failed) < _FEW else ""
@@ -134,9 +135,8 @@ def _beside(question: Question, other: Question, left: Sequence[Leaving]) -> pl.
             row |= {"apart": 100 * float(one.apart[at]), "within": 100 * float(one.within[at])}
         rows.append(row)
     places = pl.DataFrame(rows, schema=_PLACES)
-    gone = [one for one in left if one.replan is not None]
-    mine = _attention(question, [one.item for one in gone])
-    theirs = _attention(other, [one.twin for one in gone]).rename(
+    mine = _attention(question, [one.item for one in left if one.replan is not None])
+    theirs = _attention(other, [one.twin for one in left if one.replan is not None]).rename(
         {"episode_index": "twin_index", "replan": "twin_replan", "looked": "twin_looked", "read": "twin_read"}
     )
     places = places.join(mine, on=[*_EPISODE, "replan"], how="left", maintain_order="left")
