@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 SLACK = 10
 #: Episodes nearer than 1 cm are together, however alike the others are.
 TOGETHER = 0.01
+#: An episode that is elsewhere in fewer replans than these, at its end, has not left.
+FEWEST = 3
 
 
 def path_of(hand: Array, things: Sequence[Array]) -> Array:
@@ -53,8 +55,11 @@ def band(distances: Sequence[Array], length: int) -> Array:
     return beside
 
 
-def leaves_at(apart: Array, within: Array) -> int | None:
-    """The replan from which on an episode is farther apart than `within`, each (replan,), to its end; None: never."""
+def leaves_at(apart: Array, within: Array, fewest: int = FEWEST) -> int | None:
+    """The replan from which on an episode is farther apart than `within`, each (replan,), to its end; None: never.
+
+    Being outside in fewer than `fewest` last replans is no leaving.
+    """
     inside = np.flatnonzero(apart <= within)
     first = int(inside[-1]) + 1 if len(inside) else 0
-    return first if first < len(apart) else None
+    return first if first + min(fewest, len(apart)) <= len(apart) else None

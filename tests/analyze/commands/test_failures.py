@@ -29,7 +29,7 @@ SPEC = StoreSpec(tasks=(0, 1), episodes=6, replans=REPLANS, layers=(0,), heads=(
 PAIR = [ROOT / f"vla_attention/example_stores/{name}.zarr" for name in ("cubes_one_colour", "cubes")]
 
 
-def turning(spec, task, episode, steps, turns=True):
+def turning(spec, task, episode, steps, turns=True, spread=0.001):
     """Hands that go straight to the first object; those of failed episodes (even ones) turn away at one replan."""
     made = small_steps(spec, task, episode, steps)
     generator = np.random.default_rng([task, episode, 3])
@@ -37,7 +37,7 @@ def turning(spec, task, episode, steps, turns=True):
     place = generator.uniform(-0.1, 0.1, 3)
     poses[:, 1:, :3] = (place + 0.1 * np.arange(1, made.poses.shape[1])[:, None])[None]
     away = np.linspace(0.3, 0.0, steps + 1)[:, None] * np.array([1.0, 0.0, 0.0])
-    poses[:, 0, :3] = poses[:, 1, :3] + away + generator.normal(0, 0.001, (steps + 1, 3))
+    poses[:, 0, :3] = poses[:, 1, :3] + away + generator.normal(0, spread, (steps + 1, 3))
     if turns and not spec.plant_success(task, episode):
         turn = TURN * steps // REPLANS
         poses[turn:, 0, 1] += 0.05 * np.arange(steps + 1 - turn)
@@ -64,7 +64,7 @@ def test_the_planted_moment_is_found(planted):
 
 
 def test_a_failed_episode_whose_hand_does_as_those_of_solved_ones_does_not_leave(tmp_path):
-    spec = replace(SPEC, plant_success=odd, plant_steps=partial(turning, turns=False))
+    spec = replace(SPEC, plant_success=odd, plant_steps=partial(turning, turns=False, spread=0.03))
     found = failures(question_about(write_store(tmp_path / "a.zarr", spec=spec)))
     assert found.findings[1].numbers == {"left": 0, "n": 6}
 
@@ -174,8 +174,15 @@ def test_pace_and_place_do_not_count(shift, seed):
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=20), st.floats(0.01, 0.9))
 def test_from_there_on_it_is_outside(values, height):
     found, within = np.array(values), np.full(len(values), height)
-    at = leaves_at(found, within)
+    at = leaves_at(found, within, fewest=1)
     assert values[-1] <= height if at is None else (found[at:] > height).all() and (at == 0 or values[at - 1] <= height)
+
+
+def test_the_last_replans_alone_are_no_leaving():
+    apart = np.array([0, 0.1, 0, 0, 0.1, 0.1, 0.1])
+    assert leaves_at(apart, np.full(7, 0.02)) == 4
+    assert leaves_at(apart[:-1], np.full(6, 0.02)) is None
+    assert leaves_at(np.full(2, 0.1), np.full(2, 0.02)) == 0
 
 
 def test_a_band_holds_where_an_episode_ended_and_looks_one_replan_aside():
