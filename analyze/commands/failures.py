@@ -32,8 +32,7 @@ _WHY = "Why did it fail?"
 _UNKNOWN = "An episode is solved or failed where a simulator or the recording code says so; a replay runs nothing."
 _WHERE = "Where did it leave the solved ones?"
 _BEFORE = "What tells beforehand?"
-#: With fewer failures they are described, one by one.
-_FEW = 10
+_FEW = 10  # failures; fewer are described, one by one
 
 
 def failures(question: Question, twins: Question | None = None) -> Result:
@@ -127,11 +126,12 @@ def _beside(question: Question, other: Question, left: Sequence[Leaving]) -> pl.
     """Where each failed episode left its twins, and what both had most attention on in that replan."""
     rows = []
     for one in left:
-        at = one.replan
-        row = dict(zip(_EPISODE, (*one.item.task, one.item.episode.attributes.episode_index), strict=True))
-        row |= {"twin": one.twin.episode.name, "twin_index": one.twin.episode.attributes.episode_index, "replan": at}
+        at, twin = one.replan, one.twin.episode
+        own = (*one.item.task, one.item.episode.attributes.episode_index, at, one.num_solved)
+        row: dict[str, object] = dict(zip((*_EPISODE, "replan", "num_solved"), own, strict=True))
+        row |= {"twin": twin.name, "twin_index": twin.attributes.episode_index}
         if at is not None:
-            row |= {"step": int(one.starts[at]), "twin_replan": min(at, one.twin.episode.attributes.num_replans - 1)}
+            row |= {"step": int(one.starts[at]), "twin_replan": min(at, twin.attributes.num_replans - 1)}
             row |= {"apart": 100 * float(one.apart[at]), "within": 100 * float(one.within[at])}
         rows.append(row)
     places = pl.DataFrame(rows, schema=_PLACES)
@@ -147,10 +147,9 @@ def _attention(question: Question, items: Sequence[SelectedEpisode]) -> pl.DataF
     """Per replan of these episodes: `looked` and `read`, the object and the word with most attention per token."""
     place = [*_EPISODE, "replan"]
     found = pl.DataFrame(schema={**{name: _PLACES[name] for name in place}, "looked": pl.String, "read": pl.String})
-    chosen = {(item.task, item.episode.name): item for item in items}
-    if not chosen:
+    if not items:
         return found
-    part = replace(question, selected=tuple(chosen.values()))
+    part = replace(question, selected=tuple({(item.task, item.episode.name): item for item in items}.values()))
     lifts = table_of(measure(part, items_of, "words"), {"replan"}).filter(pl.col("kind") == "word").collect()
     most = lifts.drop_nulls("lift").sort("lift", "item", descending=[True, False])
     read = most.group_by(place, maintain_order=True).agg(read=pl.first("item"))
@@ -183,6 +182,7 @@ def _where(places: pl.DataFrame, num_failed: int, given: bool) -> list[Finding]:
         said += f". Most attention is then on the {row['looked']}, {other}"
     alone = num_failed - places.height
     limit = f"{plural(alone, 'failed episode')} had none to compare with. " if alone else ""
+    limit += "" if given else f"By chance alone one of {row['num_solved'] + 1} episodes would be the farthest. "
     limit += "Where an episode begins to differ is not yet what made it differ."
     return [Finding(f"{begin}. {said}.", _WHERE, numbers, limit)]
 
@@ -233,7 +233,7 @@ def _strip(left: Sequence[Leaving]) -> list[Figure]:
 
 _PLACES: dict[str, Any] = {
     "suite": pl.String, **dict.fromkeys(("task_id", "episode_index"), pl.Int64), "twin": pl.String,
-    **dict.fromkeys(("twin_index", "replan", "twin_replan", "step"), pl.Int64),
+    **dict.fromkeys(("twin_index", "replan", "twin_replan", "step", "num_solved"), pl.Int64),
     "apart": pl.Float64, "within": pl.Float64,
 }  # fmt: skip
 _FAILURES = [

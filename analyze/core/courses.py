@@ -47,6 +47,7 @@ class Leaving:
         apart: (replan,) how far it is from its twins, in metres.
         within: (replan,) how far twins are from one another.
         replan: from which on it is farther apart than that, to its end; None: it never is.
+        num_solved: solved episodes that this is known from; 1 where the twin has the same state.
     """
 
     item: SelectedEpisode
@@ -55,6 +56,7 @@ class Leaving:
     apart: Array
     within: Array
     replan: int | None
+    num_solved: int
 
 
 def course_of(item: SelectedEpisode) -> Course | None:
@@ -94,7 +96,8 @@ def leavings(
             if near:
                 apart = _apart(course, near)
                 within = band([np.zeros(1)] if same_state else own, len(apart))
-                yield Leaving(item, near[0].item, course.starts, apart, within, leaves_at(apart, within))
+                number = 1 if same_state else len(own)
+                yield Leaving(item, near[0].item, course.starts, apart, within, leaves_at(apart, within), number)
 
 
 def _nearest(course: Course, others: Sequence[Course]) -> list[Course]:
