@@ -152,10 +152,10 @@ FAULTS = (
     ),
     Fault(
         "wrong unit in a table: radians for degrees",
-        "analyze/effects/action_changes.py",
+        "analyze/core/action_changes.py",
         "angle: Array = np.degrees(",
         "angle: Array = np.abs(",
-        ("tests/analyze/effects", GOLDEN),
+        ("tests/analyze/core/test_action_changes.py", GOLDEN),
     ),
     Fault(
         "ignored option: --denoise",
