@@ -9,12 +9,12 @@ from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.commands.words import items_of
 from vla_attention.analyze.core.about import about
 from vla_attention.analyze.core.behaviour import OTHER_GOAL, TOLD_SO, UNFINISHED, behaviour
 from vla_attention.analyze.core.courses import Leaving, leavings, strip_of
 from vla_attention.analyze.core.measure import measure, table_of
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
+from vla_attention.analyze.core.word_items import items_of
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.objects.object_attention import object_tables

@@ -130,10 +130,11 @@ def strip_of(one: Leaving) -> pl.DataFrame:
             own = min(replan, item.episode.attributes.num_replans - 1)
             label = f"{who}, step {int(one.starts[replan])}{mark}" if own == replan else f"{who}, at its end"
             rows.append((row, column, label, str(item.store.path), item.episode.name, own, camera))
-    return pl.DataFrame(rows, schema=_STRIP, orient="row")
+    return pl.DataFrame(rows, schema=PICTURES, orient="row")
 
 
-_STRIP = {
+#: Columns of a strip of stored pictures.
+PICTURES = {
     **dict.fromkeys(("row", "column"), pl.Int64),
     **dict.fromkeys(("label", "store", "episode"), pl.String),
     "replan": pl.Int64,

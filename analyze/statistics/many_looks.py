@@ -17,7 +17,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import ArrayLike, NDArray
 
-from vla_attention.analyze.statistics.effect_sizes import FEWEST_TASKS, mean_difference
+from vla_attention.analyze.statistics.two_samples import mean_difference
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.intervals import Estimate, estimates, mean_over_episodes
 from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Units
@@ -28,6 +28,7 @@ EPISODE_COLUMNS = ("suite", "task_id", "episode_index")
 NAMED_AT = 0.05
 #: Their estimates take ten times the memory of the values: a few of thousands of words and heads at a time.
 _ITEMS_TOGETHER = 64
+FEWEST_TASKS = 3
 
 
 def adjusted_p_values(p_values: Sequence[float | None]) -> list[float | None]:
@@ -188,4 +189,4 @@ def _one_above(difference: Estimate) -> float | None:
 
 def _between_episodes(first: NDArray[np.float64], other: NDArray[np.float64], units: Units) -> Estimate:
     is_first = np.repeat([True, False], len(first))
-    return mean_difference(np.concatenate([first, other]), is_first, units.repeated(2))
+    return mean_difference(np.concatenate([first, other]), is_first, units.repeated(2)).difference
