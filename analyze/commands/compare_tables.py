@@ -59,22 +59,35 @@ def _of_run(part: Compared, rows: pl.DataFrame) -> pl.DataFrame:
 def figures_of(part: Compared, told: Mapping[str, pl.DataFrame]) -> list[Figure]:
     """The ratio's differences by layer, the words', and pictures of a pair that ended otherwise."""
     first, name = part.first.run.name, part.name
-    found, groups = [], part.rows["groups"].filter(ALL)
+    groups, found = part.rows["groups"].filter(ALL), []
     main = groups["quantity"][0]
-    of_layers = groups.filter(quantity=main).with_columns(pl.col("layer").replace(LAYERS_AVG, "all"))
-    looks = {"value": "difference", "label": "layer", "baseline": 0.0, "baseline_name": "the same"}
-    title, axis = f"{main} of {name} minus {first}, by layer", f"difference of {main}"
-    found.append(Figure(f"layers_{name}", "forest", of_layers, title, _BARS, {**looks, "xlabel": axis}))
+    layer = pl.when(pl.col("layer") == LAYERS_AVG).then(pl.lit("all layers")).otherwise(pl.format("layer {}", "layer"))
+    of_layers = groups.filter(quantity=main).with_columns(layer)
+    if main == "log2_ratio":
+        title, looks = "The ratio", _TIMES | {"xlabel": "times the ratio (logarithmic)"}
+        of_layers = _as_factors(of_layers)
+    else:
+        title, looks = main.removesuffix("_fraction"), _POINTS
+    title = f"{title} by layer, {name} against {first}"
+    found.append(Figure(f"layers_{name}", "forest", of_layers, title, _BARS, {**looks, "label": "layer"}))
     if "words" in part.rows:
-        ends = ("difference", "difference_low", "difference_high")
-        words = part.rows["words"].filter(ALL).with_columns((2.0 ** pl.col(end)).alias(end) for end in ends)
-        looks = {**looks, "label": "item", "baseline": 1.0, "log": True, "xlabel": "times as much attention"}
-        found.append(Figure(f"words_{name}", "forest", words, f"Attention to words, {name} over {first}", _BARS, looks))
+        looks = {**_TIMES, "label": "item", "xlabel": "times the attention (logarithmic)"}
+        title = f"Attention to words, {name} against {first}"
+        words = _as_factors(part.rows["words"].filter(ALL))
+        found.append(Figure(f"words_{name}", "forest", words, title, _BARS, looks))
     if part.pairs.height and (strip := strip_of_pair(part, told[first], told[name])).height:
         found.append(Figure(f"pair_{name}", "pictures", strip, f"The same beginning: {first} and {name}"))
     return found
 
 
+def _as_factors(rows: pl.DataFrame) -> pl.DataFrame:
+    """Differences of logarithms to base 2 as factors."""
+    ends = ("difference", "difference_low", "difference_high")
+    return rows.with_columns((2.0 ** pl.col(end)).alias(end) for end in ends)
+
+
+_POINTS = {"value": "difference", "baseline": 0.0, "baseline_name": "the same", "xlabel": "difference of the shares"}
+_TIMES = {**_POINTS, "baseline": 1.0, "log": True}
 _BARS = "Points: means over episodes, every task weighing the same; bars: 95% intervals."
 _DID = [
     Column("told", "text"),
