@@ -262,29 +262,20 @@ class OpenStores:
 
         return Answer.of(answer_to(name, self.stores, settings_from_keywords(**settings), own, self._known))
 
-    def objects(
-        self,
-        table: Literal["objects", "summary", "times", "pointing", "iou"] = "objects",
-        **settings: Unpack[SettingKeywords],
-    ) -> pl.DataFrame:
-        """Attention on the objects: shares and enrichment, shares over time, pointing game, or IoU with their masks.
+    def objects(self, by: Sequence[str] = (), iou: bool = True, **settings: Unpack[SettingKeywords]) -> Answer:
+        """Which objects are looked at; tables "objects", "pointing", "iou", each of them with "_episodes" too.
 
-        "summary" has means over episodes with intervals, and the enrichment over the control.
+        `by`: keep apart layer, head, denoise, replan, time, task, family, episode or camera. `iou`: compare maps with
+        the objects' masks, which takes most of the time.
 
-        >>> objects = va.open(store).objects()
+        >>> objects = va.open(store).objects(iou=False)["objects"]
         >>> "akita_black_bowl_1" in objects["item"].to_list()
         True
 
         Raises:
             BadArgument: the stores hold no object masks.
         """
-        from vla_attention.analyze.objects.object_settings import ObjectSettings
-        from vla_attention.analyze.objects.object_study import study_objects
-
-        check_name("table", table, ("objects", "summary", "times", "pointing", "iou"))
-        options = ObjectSettings(spatial=table in ("pointing", "iou"))
-        study = study_objects(self.stores, settings_from_keywords(**settings), options)
-        return study.summary if table == "summary" else getattr(study.tables, table).whole
+        return self._answer("objects", settings, by=tuple(by), iou=iou)
 
     def time(
         self,

@@ -44,6 +44,10 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "type": lambda text: tuple(part for part in text.split(",") if part), "default": (), "metavar": "AXIS,...",
         "help": f"keep apart: one or several of {', '.join(AXES)}",
     },
+    "iou": {
+        "action": argparse.BooleanOptionalAction, "default": True,
+        "help": "pointing game and IoU of maps and objects, which take most of the time (default: yes)",
+    },
 }  # fmt: skip
 #: Settings whose option has another name.
 _OPTION_OF = {"groups": "group"}

@@ -30,6 +30,7 @@ class Command:
 
 _ROWS = ("layers", "denoise", "heads", "site", "intervals")
 _NO_WORDS = "its keys spell no words; choose a site with text by --site (Cosmos: cross)"
+_NO_PICTURES = "its keys are no patches of pictures; choose a site with cameras by --site (Cosmos: self)"
 
 #: Name -> command. The function NAME of `analyze.commands.NAME` answers a question.
 COMMANDS: dict[str, Command] = {
@@ -41,7 +42,13 @@ COMMANDS: dict[str, Command] = {
         _NO_WORDS,
         ("words runs/libero_10.zarr", "words runs/libero_10.zarr --task 3", "words runs/cosmos.zarr --by layer"),
     ),
-    "objects": Command("which objects are looked at", folder=True),
+    "objects": Command(
+        "which objects are looked at, over their area and over what their place explains; pointing game and IoU",
+        (*_ROWS, "by", "iou"),
+        ("image", "latent"),
+        _NO_PICTURES,
+        ("objects runs/libero_10.zarr", "objects runs/libero_10.zarr --by layer", "objects runs/cubes.zarr --no-iou"),
+    ),
     "effects": Command("what the action depends on: without a word, a picture, an object", folder=True),
     "time": Command("over the course of an episode; success against failure", folder=True),
     "compare": Command("two or more runs, paired where they share initial states and seeds", folder=True),

@@ -111,7 +111,7 @@ def _section_makers(
         makers += [
             lambda: sink_section(search),
             lambda: word_section(question),
-            lambda: object_section(question, folder),
+            lambda: object_section(question),
         ]
     return [
         *makers,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from vla_attention.analyze.ask import answer_to
 from vla_attention.analyze.deviation.deviation_study import has_dataset_actions, study_deviation
@@ -22,15 +21,9 @@ from vla_attention.analyze.heads.text import sink_table
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.sink_kinds import SMALL_VALUES
 from vla_attention.analyze.measures.sinks import SinkRule, SinkSearch, cannot_fire
-from vla_attention.analyze.objects.object_attention import object_tables
-from vla_attention.analyze.objects.object_settings import ObjectSettings
-from vla_attention.analyze.objects.object_study import ObjectStudy
-from vla_attention.analyze.objects.plot_object_shares import plot_object_shares
-from vla_attention.analyze.objects.text import followed_sentence, over_all_cameras, share_table
 from vla_attention.analyze.ratios.analysis import Analysis
 from vla_attention.analyze.report.pictures import diagram_of, drawn
 from vla_attention.analyze.report.section_parts import PageTable, Paragraph, Part, ResultPart, Section
-from vla_attention.analyze.show.findings import few_families_note
 from vla_attention.analyze.show.numbers import format_number, format_percent
 from vla_attention.analyze.show.tables import INTERVAL
 from vla_attention.analyze.time.plot_time_course import plot_time_courses
@@ -104,39 +97,16 @@ def word_section(question: Question) -> Section:
         return Section("words", "Words", [Paragraph(str(error))])
 
 
-def object_section(question: Question, folder: Path) -> Section | None:
+def object_section(question: Question) -> Section | None:
     """Which objects get the image attention; None where no object masks were stored for the site's cameras."""
     if not any(item.tokens.coverage for item in question.selected):
         return None
-    settings = ObjectSettings(spatial=False)
+    settings = replace(question.settings, grouping=None, groups=(), ratio=None)
     try:
-        study = ObjectStudy(question, settings, question.selected[0], object_tables(question, settings))
+        answer = answer_to("objects", question.stores, settings, {"iou": False})
     except UserError as error:
         return Section("objects", "Objects", [Paragraph(str(error))])
-    whole = over_all_cameras(study)
-    diagram = drawn(
-        lambda where: plot_object_shares(study, where),
-        folder,
-        "Shares of image attention over time, by object and by class. "
-        f"Enrichment of the classes: {_named(whole.filter(kind='class').to_dicts(), 'enrichment') or 'none'}.",
-        "Where image attention goes, by object in one episode and by class over all. Dashed: the area that is covered, "
-        "which is what uniform attention would give. Dotted: the control, the same maps on the objects' masks of other "
-        "episodes.",
-    )
-    more = f" (the first {_MOST_ROWS}; vla-attention objects has all)" if whole.height > _MOST_ROWS else ""
-    caption = (
-        f"Objects, all cameras together{more}. No value over control: there is none, or it cannot tell because the "
-        "object hardly moves. q: p of 1 over control, adjusted (Benjamini-Hochberg)"
-    )
-    few = few_families_note(whole, "item", study.question.units)
-    table = replace(share_table(study, caption), rows=whole.head(_MOST_ROWS).to_dicts())
-    said = [Paragraph(followed_sentence(study)), *([Paragraph(few)] if few else [])]
-    return Section("objects", "Objects", [diagram, *said, PageTable(table)])
-
-
-def _named(rows: Sequence[dict[str, Any]], measure: str) -> str:
-    """Names with a measure, for people who do not see the diagram."""
-    return ", ".join(f"{row['item']} {format_number(row[measure])}" for row in rows if row[measure] is not None)
+    return Section("objects", "Objects", [ResultPart(answer)])
 
 
 def effect_section(analysis: Analysis, given: Sequence[Path], folder: Path) -> Section | None:

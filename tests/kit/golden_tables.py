@@ -228,15 +228,17 @@ class Form:
         keys: the columns by which rows are matched.
         rows: today's rows, in the kept columns, from all tables of the results.
         gone: kept columns that are given no more.
+        still: the kept rows that are still given; all unless it is given.
     """
 
     keys: tuple[str, ...]
     rows: Callable[[Mapping[str, pl.DataFrame]], pl.DataFrame]
     gone: tuple[str, ...] = ()
+    still: pl.Expr | None = None
 
     def differences(self, tables: Mapping[str, pl.DataFrame], kept: pl.DataFrame) -> list[str]:
         """Where today's rows differ from the kept ones."""
-        kept = kept.drop(self.gone)
+        kept = (kept if self.still is None else kept.filter(self.still)).drop(self.gone)
         found = self.rows(tables)
         found, expected = (
             table.select(kept.columns).sort(self.keys, nulls_last=True) for table in (found, kept)
@@ -274,6 +276,53 @@ FORMS: dict[tuple[str, str], Form] = {
             .with_columns(pl.col("kind").replace("place", "word"), pl.col("item").replace(_SCALE))
         ),
         ("density",),
+    ),
+    ("objects", "objects"): Form(
+        (*_EPISODE, "layer", "camera", "kind", "item"),
+        lambda tables: tables["objects_episodes"],
+        ("control_enrichment", "control_balanced", "control_overlap"),
+    ),
+    ("objects", "object_times"): Form(
+        (*_EPISODE, "camera", "replan", "kind", "item"), lambda tables: tables["object_times"]
+    ),
+    ("objects", "objects_summary"): Form(
+        ("camera", "kind", "item"),
+        lambda tables: tables["objects"],
+        (
+            *(
+                f"{name}{end}"
+                for name in ("control_enrichment", "control_overlap", "enrichment_over_control")
+                for end in ("", "_low", "_high", "_episodes")
+            ),
+            "enrichment_over_control_q",
+            "share_episodes",
+            "area_share_episodes",
+            "enrichment_episodes",
+        ),
+    ),
+    ("objects", "pointing"): Form(
+        (*_EPISODE, "layer", "camera", "kind", "item"),
+        lambda tables: tables["pointing_episodes"],
+        ("centre_row_share", "centre_column_share"),
+    ),
+    ("objects", "pointing_summary"): Form(
+        ("camera", "kind", "item"),
+        lambda tables: tables["pointing"],
+        tuple(
+            f"{name}_episodes"
+            for name in ("mask_patches", "distance", "distance_uniform", "pointing", "pointing_chance")
+        ),
+    ),
+    ("objects", "iou"): Form(
+        (*_EPISODE, "layer", "camera", "threshold", "kind", "item"),
+        lambda tables: tables["iou_episodes"],
+        still=pl.col("threshold") != "otsu",
+    ),
+    ("objects", "iou_summary"): Form(
+        ("camera", "kind", "item", "threshold"),
+        lambda tables: tables["iou"],
+        ("iou_episodes", "iou_chance_episodes"),
+        pl.col("threshold") != "otsu",
     ),
 }
 

@@ -60,7 +60,7 @@ def test_every_question_has_the_same_answer_to_the_last_bit(on_cluster, store):
             run.contributions(),
             run.words(),
             run.row_metrics(),
-            run.objects("iou"),
+            run.objects()["iou"],
         ]
 
     there = tables()

@@ -39,7 +39,7 @@ QUESTIONS: dict[str, Callable[[OpenStores, Path], pl.DataFrame | list[pl.DataFra
     "heads": lambda run, other: [run.heads(), run.heads("denoise"), run.row_metrics()],
     "sinks": lambda run, other: run.sinks(),
     "words": lambda run, other: [run.words(), run.words("episodes")],
-    "objects": lambda run, other: [run.objects(), run.objects("iou")],
+    "objects": lambda run, other: run.objects(),
     "time": lambda run, other: [run.time("course"), run.time("closing")],
     "compare": lambda run, other: run.compare(other, allow_mismatch=["seed"]),
     "export": lambda run, other: pl.DataFrame(run.to_xarray(rows=True)["rows"].to_series().reset_index()),

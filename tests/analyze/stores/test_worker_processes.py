@@ -56,7 +56,7 @@ def tables(path, rerun):
     yield from (run.heads(table) for table in ("heads", "depth", "denoise"))
     yield run.row_metrics()
     yield run.sinks()
-    yield from (run.objects(table) for table in ("objects", "pointing", "iou"))
+    yield from (run.objects()[f"{table}_episodes"] for table in ("objects", "pointing", "iou"))
     yield run.time()
     yield run.effects(rerun, "episodes")
 
