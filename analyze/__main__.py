@@ -39,7 +39,7 @@ def parse_attention_ratio_results() -> NoReturn:
     """The console script `parse-attention-ratio-results`."""
 
     def run() -> int:
-        from vla_attention.analyze.parse.command import main as parse
+        from vla_attention.analyze.published.parse_results import main as parse
 
         return parse()
 

@@ -6,24 +6,16 @@ The examples run as tests, with `store` and `other` being paths of small stores,
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Unpack, get_args
+from typing import TYPE_CHECKING, Any, Literal, Unpack, overload
 
 import polars as pl
 
-from vla_attention.analyze.measures.frames import TableInParts, Tables
+from vla_attention.analyze.measures.frames import TableInParts
 from vla_attention.analyze.measures.question import KnownEpisodes, Question, ask
-from vla_attention.analyze.measures.question_settings import (
-    AnalysisSettings,
-    SettingKeywords,
-    check_name,
-    given_only,
-    settings_from_keywords,
-)
-from vla_attention.analyze.ratios.analysis import Analysis, analyse
-from vla_attention.analyze.stores.contents import describe_store, episodes_table, header_lines, one_line
+from vla_attention.analyze.measures.question_settings import SettingKeywords, check_name, settings_from_keywords
+from vla_attention.analyze.stores.contents import episodes_table, header_lines, one_line
 from vla_attention.analyze.stores.selection import check_combinable
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.reader import Store, open_store
@@ -34,10 +26,6 @@ if TYPE_CHECKING:
     import xarray
 
     from vla_attention.analyze.render.answer import Answer
-
-LevelName = Literal["tasks", "episodes", "replans", "steps"]
-#: So many analyses are kept, so that asking for tasks after episodes does not read everything again.
-_KEPT = 4
 
 
 def open_stores(stores: str | Path | Sequence[str | Path]) -> OpenStores:
@@ -70,7 +58,6 @@ class OpenStores:
 
     def __init__(self, stores: Sequence[Store]) -> None:
         self.stores = tuple(stores)
-        self._analyses: OrderedDict[AnalysisSettings, Analysis] = OrderedDict()
         self._known: KnownEpisodes = {}
 
     @property
@@ -95,155 +82,55 @@ class OpenStores:
         """
         return ask(self.stores, settings_from_keywords(**settings), self._known)
 
-    def analysis(self, **settings: Unpack[SettingKeywords]) -> Analysis:
-        """All tables and the summary of one grouping, as `vla-analyze STORE` computes them; the last few are kept."""
-        wanted = settings_from_keywords(**settings)
-        if wanted not in self._analyses:
-            self._analyses[wanted] = analyse(ask(self.stores, wanted, self._known))
-        self._analyses.move_to_end(wanted)
-        while len(self._analyses) > _KEPT:
-            self._analyses.popitem(last=False)
-        return self._analyses[wanted]
+    def analyze(
+        self,
+        by: Sequence[str] = (),
+        without_sinks: str | None = None,
+        list: bool = False,
+        **settings: Unpack[SettingKeywords],
+    ) -> Answer:
+        """Looks or reads? Tables "tasks_groups", "tasks", "episodes", "replans", "steps" and more, see docs/python.md.
 
-    def ratios(self, level: LevelName = "tasks", **settings: Unpack[SettingKeywords]) -> pl.DataFrame:
-        """Ratios as `vla-attention ratios` gives them: one row per cell. Masses of the groups are in `masses`.
-
-        `level`: "tasks" (per task and over all, with intervals), "episodes", "replans" or "steps" (every replan, layer
-        and denoise step). docs/python.md lists the columns.
+        `by`: keep apart some of layer, head, denoise, replan, time, task, family, episode, outcome, camera: tables
+        "by" and "by_groups". `without_sinks`: without keys that take far more than their share, "" for the usual rule;
+        table "sinks". `list`: what the stores hold, and what the grouping takes of it.
 
         >>> run = va.open(store)
-        >>> run.ratios("steps", groups={"bowl": "word:bowl", "rest": "*"}, layers=2, denoise="last").height
+        >>> run.analyze(groups={"bowl": "word:bowl", "rest": "*"}, layers=2, denoise="last")["steps"].height
         12
-        >>> run.ratios("episodes", grouping="cameras", tasks=0).select("task_id", "layer").unique().height
-        3
-        """
-        return self._level(level, settings).cells
-
-    def masses(self, level: LevelName = "steps", **settings: Unpack[SettingKeywords]) -> pl.DataFrame:
-        """Masses, fractions, densities and lifts of the groups: one row per cell of `ratios` and group.
-
-        `level`: as in `ratios`. `pivot` of polars makes a column per group of it; docs/python.md has an example.
-
-        >>> masses = va.open(store).masses(grouping="instruction", per_head=True)
+        >>> run.analyze(by=["head"], grouping="cameras")["by_groups"]["head"].unique().sort().to_list()
+        [0, 1]
+        >>> masses = run.analyze(grouping="instruction")["steps_groups"]
         >>> masses.group_by("group").agg(pl.col("keys").mean()).filter(group="linguistic")["keys"].to_list()
         [5.0]
         """
-        return self._level(level, settings).groups
+        return self._answer("analyze", settings, by=tuple(by), without_sinks=without_sinks, list=list)
 
-    def _level(self, level: LevelName, settings: SettingKeywords) -> Tables:
-        check_name("level", level, get_args(LevelName))
-        tables: Tables = getattr(self.analysis(**settings), level)
-        return tables
+    @overload
+    def to_xarray(self, rows: Literal[False] = False, **settings: Unpack[SettingKeywords]) -> xarray.Dataset: ...
 
-    def summary(self, **settings: Unpack[SettingKeywords]) -> str:
-        """The text that `vla-attention analyze STORE` prints.
-
-        >>> va.open(store).summary().splitlines()[0]
-        'ATTENTION SUMMARY'
-        """
-        return self.analysis(**settings).summary
-
-    def describe(self) -> str:
-        """What the stores hold: run, layout, words, objects, tasks; the text of `vla-attention analyze STORE --list`.
-
-        >>> "akita_black_bowl_1" in va.open(store).describe()
-        True
-        """
-        return "\n\n".join(describe_store(store) for store in self.stores)
-
-    def contributions(self, **settings: Unpack[SettingKeywords]) -> pl.DataFrame:
-        """Norms of what visual and linguistic keys add to the residual stream (`measures.contributions`).
-
-        >>> va.open(store).contributions(layers=0)["contribution_ratio"].is_finite().all()
-        True
-
-        Raises:
-            BadArgument: the stores hold no contributions.
-        """
-        from vla_attention.analyze.export.tables import chosen_tables
-
-        return chosen_tables(self.analysis(**settings), ["contributions"])["contributions"].whole
+    @overload
+    def to_xarray(self, rows: Literal[True], **settings: Unpack[SettingKeywords]) -> Iterator[xarray.Dataset]: ...
 
     def to_xarray(
-        self, rows: bool = False, most_gigabytes: float = 4.0, **settings: Unpack[SettingKeywords]
-    ) -> xarray.Dataset:
-        """Masses of every head as labelled arrays, or with `rows` the rows themselves. Needs the extra `xarray`.
+        self, rows: bool = False, **settings: Unpack[SettingKeywords]
+    ) -> xarray.Dataset | Iterator[xarray.Dataset]:
+        """Masses of every head as labelled arrays; with `rows` the rows of one episode after the other.
 
-        (episode, replan) is one axis `sample`; see `vla_attention.analyze.export.labelled_arrays`.
+        Needs the extra `xarray`. (episode, replan) is one axis `sample`; see `vla_attention.analyze.core.labelled_arrays`.
 
         >>> va.open(store).to_xarray(grouping="cameras")["mass"].dims
         ('sample', 'layer', 'denoise', 'head', 'group')
-        >>> va.open(store).to_xarray(rows=True, layers=2)["rows"].shape
-        (12, 1, 2, 2, 39)
+        >>> [episode["rows"].shape for episode in va.open(store).to_xarray(rows=True, layers=2)][0]
+        (3, 1, 2, 2, 39)
 
         Raises:
             MissingDependency: xarray is not installed.
-            BadArgument: the rows would take more memory than `most_gigabytes`.
         """
-        from vla_attention.analyze.export.labelled_arrays import masses_array, rows_array
+        from vla_attention.analyze.core.labelled_arrays import masses_array, rows_of_episodes
 
         question = self.ask(**settings)
-        return rows_array(question, int(most_gigabytes * 1e9)) if rows else masses_array(question)
-
-    def groups(
-        self, table: Literal["groups", "words", "overlaps"] = "groups", **settings: Unpack[SettingKeywords]
-    ) -> pl.DataFrame:
-        """The keys of every group: their numbers by span and role, words with their pieces, keys that groups share.
-
-        >>> found = va.open(store).groups(groups={"bowl": "word:bowl", "rest": "*"})
-        >>> found.filter(pl.col("span").is_null(), group="bowl")["keys_max"].to_list()
-        [1.0]
-        """
-        from vla_attention.analyze.groups.group_preview import preview_groups
-
-        return _chosen(table, ("groups", "words", "overlaps"), lambda: preview_groups(self.ask(**settings)))
-
-    def heads(
-        self,
-        table: Literal["heads", "heads_groups", "dispersion", "depth", "denoise", "denoise_groups"] = "heads",
-        **settings: Unpack[SettingKeywords],
-    ) -> pl.DataFrame:
-        """Every head, how much the heads of a layer differ, depth (centres over layers) and denoise steps.
-
-        "heads" and "denoise" hold ratios, "heads_groups" and "denoise_groups" the groups' fractions and lifts.
-
-        >>> va.open(store).heads()["head"].unique().sort().to_list()
-        [0, 1]
-        """
-        from vla_attention.analyze.heads.head_study import study_heads
-
-        tables = study_heads(self.ask(**settings)).tables()
-        check_name("table", table, tables)
-        return tables[table]
-
-    def row_metrics(
-        self, table: Literal["rows", "groups"] = "rows", **settings: Unpack[SettingKeywords]
-    ) -> pl.DataFrame:
-        """Entropy, effective number of keys and top-k mass of every row. Reads all rows.
-
-        "groups": entropy and effective keys inside each group; its column `row` is that of "rows". Columns:
-        `row_tables` in `vla_attention.analyze.heads.row_metrics`.
-
-        >>> va.open(store).row_metrics(layers=0, denoise="first", heads=1).height
-        12
-        """
-        from vla_attention.analyze.heads.row_metrics import row_metrics
-
-        check_name("table", table, ("rows", "groups"))
-        level = row_metrics(self.ask(**settings))
-        return level.cells if table == "rows" else level.groups
-
-    def sinks(self, table: Literal["sinks", "heads"] = "sinks", **settings: Unpack[SettingKeywords]) -> pl.DataFrame:
-        """Keys of each task that take far more than their share in a head (`measures.sinks`). Reads all rows.
-
-        "heads" has a row for every head of a layer in which a key is a sink.
-
-        >>> va.open(store).sinks().columns[:3]
-        ['suite', 'task_id', 'num_episodes']
-        """
-        from vla_attention.analyze.measures.sinks import search_sinks
-
-        return _chosen(table, ("sinks", "heads"), lambda: search_sinks(self.ask(**settings)))
+        return rows_of_episodes(question) if rows else masses_array(question)
 
     def words(self, by: Sequence[str] = (), **settings: Unpack[SettingKeywords]) -> Answer:
         """Which words of the instruction are read; tables "words", "words_scale", "words_episodes".
@@ -276,27 +163,6 @@ class OpenStores:
             BadArgument: the stores hold no object masks.
         """
         return self._answer("objects", settings, by=tuple(by), iou=iou)
-
-    def time(
-        self,
-        table: Literal["course", "closing", "change", "outcomes", "autocorrelation"] = "course",
-        bins: int | None = None,
-        window: int | None = None,
-        **settings: Unpack[SettingKeywords],
-    ) -> pl.DataFrame:
-        """Over the course of an episode: means at equal phases, the gripper's closing, success against failure.
-
-        `bins` and `window`: as `TimeSettings` in `vla_attention.analyze.time.time_courses`.
-
-        >>> course = va.open(store).time(bins=3)
-        >>> course["quantity"].unique().sort().to_list()[-1]
-        'visual'
-        """
-        from vla_attention.analyze.time.time_courses import TimeSettings, time_courses
-
-        known = ("course", "closing", "change", "outcomes", "autocorrelation")
-        options = TimeSettings(**given_only(num_bins=bins, window=window))
-        return _chosen(table, known, lambda: time_courses(self.ask(**settings), options))
 
     def compare(
         self,
@@ -418,27 +284,21 @@ class OpenStores:
         return study.table
 
     def report(
-        self,
-        path: str | Path,
-        episodes: int | None = None,
-        replans: int | None = None,
-        **settings: Unpack[SettingKeywords],
+        self, path: str | Path, num_episodes: int = 2, num_replans: int = 8, **settings: Unpack[SettingKeywords]
     ) -> Path:
         """Write the self-contained HTML page of `vla-attention report`; returns its path.
 
-        `path`: a folder, in which `report.html` is written, or a file that ends with .html.
-        `episodes`: how many are shown with pictures; `replans`: how many of each.
+        `path`: a folder, in which `report.html` is written, or a file that ends with .html. `num_episodes`: how many
+        are shown with pictures; `num_replans`: how many of each.
 
-        >>> page = va.open(store).report(folder / "report.html", episodes=1, replans=2)
+        >>> page = va.open(store).report(folder / "report.html", num_episodes=1, num_replans=2)
         >>> page.read_text(encoding="utf-8")[:15].lower()
         '<!doctype html>'
         """
-        from vla_attention.analyze.report.page import report_file, write_report
-        from vla_attention.analyze.report.report_settings import ReportSettings
+        from vla_attention.analyze.ask import write_page
 
-        file = report_file(Path(path))
-        write_report(self.ask(**settings), file, ReportSettings(**given_only(episodes=episodes, replans=replans)))
-        return file
+        own = {"num_episodes": num_episodes, "num_replans": num_replans}
+        return write_page("report", self.stores, settings_from_keywords(**settings), own, Path(path))
 
     def __str__(self) -> str:
         return f"OpenStores of {one_line(self.stores)}"
@@ -446,8 +306,8 @@ class OpenStores:
     def __repr__(self) -> str:
         lines = [
             *header_lines(self.stores),
-            "ask with .ratios() .masses() .summary() .groups() .heads() .words() .objects() .time() .compare(other)",
-            "         .effects(reruns) .deviation() .overlay() .report(path) .to_xarray()",
+            "ask with .analyze() .words() .objects() .compare(other) .effects(reruns) .deviation() .overlay()",
+            "         .report(path) .to_xarray()",
         ]
         return "\n  ".join([str(self), *lines])
 

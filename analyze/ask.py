@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_attention.analyze.options import (
@@ -33,25 +34,67 @@ def question_parser(name: str) -> OneSentenceParser:
     parser = command_parser(f"vla-attention {name}", answers, f"{examples}\n" if command.examples else "")
     parser.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses")
     add_question(parser, command.options)
-    add_output(parser, name)
+    add_output(parser, name, command.page)
     return parser
 
 
 def run_question(name: str, given: argparse.Namespace) -> int:
     """Answer a question: files, and what fits a screen; returns the exit code."""
-    from vla_attention.analyze.render.answer import Answer
-    from vla_attention.analyze.render.terminal import screen
     from vla_attention.schemas.stores.reader import open_store
 
-    own = {option: getattr(given, option) for option in COMMANDS[name].options if option not in _settings()}
+    own = {option: getattr(given, option) for option in COMMANDS[name].options if option not in (*_settings(), "open")}
     stores = [open_store(place) for place in given.stores]
     folder = given.output or results_folder(given.stores[0], name, given)
+    if COMMANDS[name].page:
+        return _write_page(name, stores, settings_of(given), own, folder, given.open)
+    from vla_attention.analyze.render.answer import Answer
+    from vla_attention.analyze.render.terminal import screen
+
     answer = Answer.of(answer_to(name, stores, settings_of(given), own))
     formats = ("png", "pdf") if given.pdf else ()
     files = answer.save(folder, given.csv, not given.no_plots, given.style, formats)
     endings = sorted({file.suffix for file in files})
     print(screen(answer, last=[f"{len(files)} files in {folder} ({', '.join(f'*{ending}' for ending in endings)})."]))
     return 0
+
+
+def _write_page(
+    name: str, stores: Sequence[Store], settings: AnalysisSettings, own: Mapping[str, Any], place: Path, opens: bool
+) -> int:
+    from vla_attention.analyze.show.browser import open_page
+
+    path = write_page(name, stores, settings, own, place)
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB.{'' if opens else ' Open it in a browser.'}")
+    if opens and (refused := open_page(path)):
+        print(refused)
+    return 0
+
+
+def write_page(
+    name: str, stores: Sequence[Store], settings: AnalysisSettings, own: Mapping[str, Any], place: Path
+) -> Path:
+    """Write the page of several results; returns its path.
+
+    place: a file that ends with .html, or a folder, in which NAME.html is written.
+    """
+    from vla_attention import __version__
+    from vla_attention.analyze.render.page import page
+    from vla_attention.analyze.show.output_files import write_text, writing
+    from vla_attention.schemas.errors import BadArgument
+
+    is_page = place.suffix.lower() in (".html", ".htm")
+    if place.is_file() and not is_page:
+        raise BadArgument(f"Cannot write the page to the file {place}; expected a folder, or a file FILE.html.")
+    path = place if is_page and not place.is_dir() else place / f"{name}.html"
+    results: list[Result] = _function(name)(_question(COMMANDS[name], stores, settings, None), **own)
+    text = page(results[0].about[0], results, __version__)
+    with writing("the page", path, "another path"):
+        write_text(path, text)
+    return path
+
+
+def _function(name: str) -> Any:
+    return getattr(import_module(f"vla_attention.analyze.commands.{name}"), name)
 
 
 def answer_to(
@@ -70,9 +113,7 @@ def answer_to(
         own: the question's own options.
         known: what earlier questions about the same stores have read.
     """
-    command = COMMANDS[name]
-    function = getattr(import_module(f"vla_attention.analyze.commands.{name}"), name)
-    result: Result = function(_question(command, stores, settings, known), **(own or {}))
+    result: Result = _function(name)(_question(COMMANDS[name], stores, settings, known), **(own or {}))
     return result
 
 

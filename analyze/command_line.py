@@ -13,8 +13,7 @@ from pathlib import Path
 from vla_attention.analyze.ask import question_parser, run_question
 from vla_attention.analyze.registry import COMMANDS, DEFAULT_COMMAND
 from vla_attention.schemas.command_line import run_command
-from vla_attention.schemas.errors import BadArgument, UnknownName, UserError, did_you_mean, listing
-from vla_attention.schemas.former_commands import as_of_today
+from vla_attention.schemas.errors import UnknownName, UserError, did_you_mean, listing
 from vla_attention.schemas.threads import add_threads, use_threads
 
 #: Episodes are measured in threads (`stores.parallel`); matrix products that start threads too make them slower.
@@ -27,9 +26,8 @@ _OBJECTS_BETWEEN_COLLECTIONS = 5_000_000
 def run_command_line(given: Sequence[str], if_stopped: str, program: str = "vla-analyze") -> int:
     """Run the command that the arguments name; returns the exit code. if_stopped: what is said after a stop."""
     gc.set_threshold(_OBJECTS_BETWEEN_COLLECTIONS)
-    name = given[0] if given[:1] and given[0] in COMMANDS else ""
-    prog = f"{program} {name}" if name else "vla-attention analyze" if program == "vla-attention" else program
-    return run_command(prog, lambda: _run(_words(given), program), if_stopped)
+    name, rest = _command(given)
+    return run_command(f"{program} {name}", lambda: _run(name, rest, program), if_stopped)
 
 
 def is_store(word: str) -> bool:
@@ -37,52 +35,40 @@ def is_store(word: str) -> bool:
     return word.rstrip("/").endswith(".zarr") or "://" in word
 
 
-def _words(given: Sequence[str]) -> list[str]:
-    """What was typed, with the words of today and the command first."""
-    words = as_of_today(given)
-    if words[:1] and words[0] not in COMMANDS and is_store(words[0]) and words[1:2] and words[1] in COMMANDS:
-        return [words[1], words[0], *words[2:]]  # STORE words
-    return words
+def _command(given: Sequence[str]) -> tuple[str, list[str]]:
+    """The command and its arguments: `words STORE`, `STORE words`, or `STORE`, of which the default one is asked."""
+    words = list(given)
+    if words[:1] and words[0] in COMMANDS:
+        return words[0], words[1:]
+    if words[:1] and is_store(words[0]) and words[1:2] and words[1] in COMMANDS:
+        return words[1], [words[0], *words[2:]]
+    return DEFAULT_COMMAND, words
 
 
-def _run(words: Sequence[str], program: str) -> int:
-    if any(word.partition("=")[0] == "--seed" for word in words):
-        raise BadArgument("Intervals have no random draws any more: leave --seed out.")
-    name = words[0] if words[:1] and words[0] in COMMANDS else ""
-    arguments = words[1:] if name else words
-    if not name:
+def _run(name: str, arguments: Sequence[str], program: str) -> int:
+    if name == DEFAULT_COMMAND:
         _refuse_misspelt_command(arguments)
     parser = build_parser(name)
-    if program == "vla-attention":
-        parser.prog = f"{program} {name or 'analyze'}"
+    parser.prog = f"{program} {name}"
     parsed = parser.parse_args(arguments)
     # The libraries read the numbers when they are imported, which the command does.
     use_threads(parsed.threads)
     os.environ.update(dict.fromkeys(_ONE_THREAD_EACH, "1"))
     try:
         with _cache_of(parsed), _engine(parsed), _pictures(parsed):
-            return _answer(name or DEFAULT_COMMAND, parsed)
+            if not COMMANDS[name].folder:
+                return run_question(name, parsed)
+            code: int = import_module(f"vla_attention.analyze.{name}.command").run(parsed)
+            return code
     except UserError as error:
         raise _with_way_out(error, can_skip=hasattr(parsed, "skip_corrupt")) from error.__cause__
 
 
-def _answer(name: str, parsed: argparse.Namespace) -> int:
-    if COMMANDS[name].folder:
-        code: int = import_module(f"vla_attention.analyze.{name}.command").run(parsed)
-        return code
-    return run_question(name, parsed)
-
-
 def build_parser(name: str) -> argparse.ArgumentParser:
-    """The parser of one command with what all commands share; `""` is `vla-attention analyze STORE`."""
+    """The parser of one command with what all commands share."""
     parser: argparse.ArgumentParser
-    if COMMANDS[name or DEFAULT_COMMAND].folder:
-        command = import_module(f"vla_attention.analyze.{name or DEFAULT_COMMAND}.command")
-        parser = (
-            command.build_parser(prog=f"vla-attention analyze {name}")
-            if name == DEFAULT_COMMAND
-            else command.build_parser()
-        )
+    if COMMANDS[name].folder:
+        parser = import_module(f"vla_attention.analyze.{name}.command").build_parser()
     else:
         parser = question_parser(name)
     add_threads(

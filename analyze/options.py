@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _LONGEST_NAME = 100
 _NUMBERS: dict[str, Any] = {"type": number_range, "nargs": "+", "action": Numbers, "metavar": "N"}
 #: What a table may keep apart.
-AXES = ("layer", "head", "denoise", "replan", "time", "task", "family", "episode", "camera")
+AXES = ("layer", "head", "denoise", "replan", "time", "task", "family", "episode", "outcome", "camera")
 #: Option -> what argparse takes. Those of `AnalysisSettings` have its names; the others are arguments of the command.
 OPTIONS: dict[str, dict[str, Any]] = {
     "layers": {**_NUMBERS, "help": "layers, or ranges as 0-2 (default: all recorded)"},
@@ -48,6 +48,16 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "action": argparse.BooleanOptionalAction, "default": True,
         "help": "pointing game and IoU of maps and objects, which take most of the time (default: yes)",
     },
+    "without_sinks": {
+        "nargs": "?", "const": "", "metavar": "RULE",
+        "help": "take out keys that take far more than their share in most heads, and list them; a rule as "
+        "factor=10,share=0.5,mass=0.3,heads=0.25 (these) says which",
+    },
+    "save_viz": {"action": "store_true", "help": "also a picture per episode and layer"},
+    "num_episodes": {"type": int, "default": 2, "metavar": "N", "help": "with pictures (default: %(default)s)"},
+    "num_replans": {"type": int, "default": 8, "metavar": "N", "help": "of each, at most (default: %(default)s)"},
+    "open": {"action": "store_true", "help": "show the page in the browser"},
+    "list": {"action": "store_true", "help": "what the stores hold, and what the grouping takes of it"},
 }  # fmt: skip
 #: Settings whose option has another name.
 _OPTION_OF = {"groups": "group"}
@@ -82,8 +92,12 @@ def add_question(parser: argparse.ArgumentParser, names: tuple[str, ...]) -> Non
     add_workers(parser)
 
 
-def add_output(parser: argparse.ArgumentParser, command: str) -> None:
-    """--output, --csv, --no-plots, --pdf and --style."""
+def add_output(parser: argparse.ArgumentParser, command: str, page: bool = False) -> None:
+    """--output; of a question, whose answer is no page, also --csv, --no-plots, --pdf and --style."""
+    if page:
+        where = f"folder, or a file FILE.html (default: results/PATH OF STORE/{command})"
+        parser.add_argument("--output", type=output_place, metavar="PATH", help=where)
+        return
     parser.add_argument(
         "--output", type=output_place, metavar="FOLDER", help=f"folder (default: results/PATH OF STORE/{command})"
     )

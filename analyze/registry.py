@@ -17,6 +17,7 @@ class Command:
         examples: command lines behind `vla-attention`, for the help of a question.
         folder: whether it is `analyze.NAME.command`, with a parser of its own, instead of a question.
         keeps: whether it keeps stores instead of asking them.
+        page: whether its function gives several results, which are one HTML file.
     """
 
     answers: str
@@ -26,15 +27,26 @@ class Command:
     examples: tuple[str, ...] = ()
     folder: bool = False
     keeps: bool = False
+    page: bool = False
 
 
 _ROWS = ("layers", "denoise", "heads", "site", "intervals")
+_GROUPING = ("grouping", "group", "ratio")
 _NO_WORDS = "its keys spell no words; choose a site with text by --site (Cosmos: cross)"
 _NO_PICTURES = "its keys are no patches of pictures; choose a site with cameras by --site (Cosmos: self)"
 
 #: Name -> command. The function NAME of `analyze.commands.NAME` answers a question.
 COMMANDS: dict[str, Command] = {
-    "ratios": Command("look or read: masses, fractions and ratios, with intervals", folder=True),
+    "analyze": Command(
+        "looks or reads? how attention is divided; --by layer, head, time ...",
+        (*_ROWS, *_GROUPING, "by", "without_sinks", "list", "save_viz"),
+        examples=(
+            "analyze runs/libero_10.zarr",
+            "analyze runs/libero_10.zarr --by layer,head",
+            "analyze runs/libero_10.zarr --group bowl=object:bowl_1 --group noun=word:bowl --ratio bowl/noun",
+            "analyze runs/libero_10.zarr --list",
+        ),
+    ),
     "words": Command(
         "which words of the instruction are read",
         (*_ROWS, "by"),
@@ -50,15 +62,16 @@ COMMANDS: dict[str, Command] = {
         ("objects runs/libero_10.zarr", "objects runs/libero_10.zarr --by layer", "objects runs/cubes.zarr --no-iou"),
     ),
     "effects": Command("what the action depends on: without a word, a picture, an object", folder=True),
-    "time": Command("over the course of an episode; success against failure", folder=True),
     "compare": Command("two or more runs, paired where they share initial states and seeds", folder=True),
-    "heads": Command("which heads and layers look, which read; entropy, sinks, depth", folder=True),
     "overlay": Command("attention on the stored pictures: strips, GIF or MP4", folder=True),
     "deviation": Command("how far actions are from the data set's, beside attention", folder=True),
-    "report": Command("all of it in one HTML file", folder=True),
+    "report": Command(
+        "all of it in one HTML file",
+        (*_ROWS, *_GROUPING, "num_episodes", "num_replans", "open"),
+        examples=("report runs/libero_10.zarr --open", "report runs/libero_10.zarr --output paper/report.html"),
+        page=True,
+    ),
     "view": Command("a page on which to explore: episodes, words, patches, heads, groups", folder=True),
-    "groups": Command("what a store holds, and what a grouping takes of it", folder=True, keeps=True),
-    "export": Command("tables as CSV or Parquet, masses or rows as NetCDF", folder=True, keeps=True),
     "copy": Command(
         "a copy of a store: smaller, packed, from or to elsewhere; or one store of several", folder=True, keeps=True
     ),
@@ -68,7 +81,7 @@ COMMANDS: dict[str, Command] = {
     "cache": Command("what is kept of earlier analyses: where, how much; --clear removes it", folder=True, keeps=True),
 }
 #: The command of `vla-attention analyze STORE`.
-DEFAULT_COMMAND = "ratios"
+DEFAULT_COMMAND = "analyze"
 
 
 def list_of_commands() -> str:

@@ -146,10 +146,11 @@ class OneByOne:
 
 def parts_rows(store: Path, rounds: int) -> Table:
     """What one episode costs the process that asks and a worker, for three questions; they take turns."""
+    from vla_attention.analyze.ratios.analysis import analyse
+
     from vla_attention.analyze.commands.words import words as ask_words
     from vla_attention.analyze.measures.question import ask
     from vla_attention.analyze.measures.question_settings import AnalysisSettings
-    from vla_attention.analyze.ratios.analysis import analyse
     from vla_attention.analyze.stores.parallel import episodes_with
     from vla_attention.schemas.stores.reader import open_store
 

@@ -42,11 +42,9 @@ def main(argv: Sequence[str] | None = None, program: str = "vla-capture") -> int
 def _run(given: Sequence[str], program: str, termination: Termination) -> int:
     from vla_attention.capture.commands.arguments import build_parser
     from vla_attention.capture.commands.mistakes import refuse_other_tools_words
-    from vla_attention.schemas.former_commands import as_of_today
 
-    words = as_of_today(given)
-    refuse_other_tools_words(words)
-    arguments = build_parser(words, program).parse_args(words)
+    refuse_other_tools_words(given)
+    arguments = build_parser(given, program).parse_args(given)
     exit_code: int = arguments.command(arguments, termination)
     return exit_code
 

@@ -6,7 +6,7 @@ import polars as pl
 import pytest
 
 from tests.kit.golden_stores import differences
-from tests.kit.golden_tables import CASES, FOLDER, FORMS, alike, link_stores, published_arguments, tables_of
+from tests.kit.golden_tables import CASES, FOLDER, alike, form_of, link_stores, published_arguments, tables_of
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def hold(case: str, tables: dict[str, pl.DataFrame]) -> None:
     assert kept
     wrong = []
     for name, table in kept.items():
-        form = FORMS.get((CASES.get(case, ("",))[0], name))
+        form = form_of(case, name)
         if form is None and name not in tables:
             wrong.append(f"no table {name}")
             continue

@@ -63,9 +63,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if command is not None:
         return command(given[1:])
     from vla_attention.analyze.registry import COMMANDS as ANALYSES
-    from vla_attention.schemas.former_commands import FORMER
 
-    if given[0] in ANALYSES or given[0] in FORMER:
+    if given[0] in ANALYSES:
         return _analyses(given)
     from vla_attention.analyze.command_line import is_store
     from vla_attention.schemas.errors import did_you_mean, listing

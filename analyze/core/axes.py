@@ -16,9 +16,10 @@ COLUMNS: Mapping[str, tuple[Column, ...]] = {
     "head": (Column("head", "count"),),
     "denoise": (Column("denoise_step", "count", "denoise step"),),
     "replan": (Column("replan", "count"),),
-    "time": (Column("phase", "text", "time", "part of the episode, from its first replan (0) to its end (1)"),),
+    "time": (Column("phase", "number", "time", "part of the episode, from its first replan (0) to its end (1)"),),
     "task": (Column("suite", "text", screen=False), Column("task_id", "count", "task"), Column("instruction", "text")),
     "family": (Column("family", "text", "task family", "tasks of one sentence template"),),
+    "outcome": (Column("success", "text", "solved"),),
     "episode": (
         Column("suite", "text", screen=False),
         Column("task_id", "count", "task"),

@@ -104,7 +104,11 @@ def with_time(rows: pl.DataFrame, measured: Sequence[Measured]) -> pl.DataFrame:
         identity = dict(zip(EPISODE_ID, key, strict=True))
         parts.append(
             pl.DataFrame(
-                {"replan": replan, "phase": ((edges[:-1] + edges[1:]) / 2)[part], "weight": shares[part, replan]}
+                {
+                    "replan": replan,
+                    "phase": ((edges[:-1] + edges[1:]) / 2).round(6)[part],
+                    "weight": shares[part, replan],
+                }
             ).with_columns(pl.lit(value).alias(name) for name, value in identity.items())
         )
     weights = pl.concat(parts).with_columns(

@@ -9,9 +9,10 @@ from typing import Literal, TypeAlias
 
 import polars as pl
 
-#: What the values of a column are. percent: a share, 0.5 is 50 %. factor: 1 is no change. signed: with its sign.
-#: points: a difference of shares, with its sign. p: a p-value or what it was adjusted to.
-Kind: TypeAlias = Literal["text", "count", "number", "percent", "factor", "signed", "points", "p"]
+#: What the values of a column are. prose: text of any length, in the last column. percent: a share, 0.5 is 50 %.
+#: factor: 1 is no change. signed: with its sign. points: a difference of shares, with its sign. p: a p-value or what it
+#: was adjusted to.
+Kind: TypeAlias = Literal["text", "prose", "count", "number", "percent", "factor", "signed", "points", "p"]
 #: The kinds of `analyze.render.figures`.
 FigureKind: TypeAlias = Literal[
     "forest", "lines", "heat_map", "stacked", "distribution", "scatter", "pictures", "evolution"
@@ -134,6 +135,7 @@ class Result:
         notes: what to know beside the numbers: site, layers, what was left out, what intervals are about.
         files: what is written besides tables and pictures, by name: results files of the published scripts, videos.
             Each writes itself to a path.
+        whole: whether a terminal shows all rows, however many: what was asked for is a list.
     """
 
     title: str
@@ -143,6 +145,7 @@ class Result:
     figures: Sequence[Figure] = ()
     notes: Sequence[str] = ()
     files: Mapping[str, Callable[[Path], object]] = field(default_factory=dict)
+    whole: bool = False
 
     def __getitem__(self, name: str) -> pl.DataFrame:
         """The frame of the table with this name, all its rows.

@@ -13,7 +13,6 @@ from vla_attention.analyze.effects.group_rows import GroupRow, group_rows, reade
 from vla_attention.analyze.effects.item_rows import MODALITIES, ItemRow, item_rows, ratio_of_effects
 from vla_attention.analyze.effects.over_time import shares_of_dimensions
 from vla_attention.analyze.measures.alignment import GRIPPER
-from vla_attention.analyze.ratios.answer import ratio_sentence
 from vla_attention.analyze.show.findings import findings
 from vla_attention.analyze.show.numbers import format_interval, format_number, row_interval
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
@@ -203,14 +202,7 @@ def _shown(row: dict[str, Any], floor: str) -> bool:
 
 def attention_line(study: EffectStudy) -> list[str]:
     """The ratio of the base's attention, to stand beside the effects."""
-    if study.analysis.headline is None:
-        return []
-    measured, every = study.measured[0], study.analysis.overall["num_episodes"]
-    where = "the same replans"
-    if measured < every:
-        where = f"all {every} episodes of the base, of which effects were measured in {measured}"
-    sentence = ratio_sentence(study.analysis.headline)
-    return [f"Attention in {where}: {sentence[:1].lower()}{sentence[1:]}"]
+    return []
 
 
 def noise_sentence(study: EffectStudy) -> str:

@@ -21,6 +21,7 @@ from vla_attention.analyze.effects.action_changes import (
     noise_of,
     with_noise,
 )
+from vla_attention.analyze.effects.base_attention import Analysis
 from vla_attention.analyze.effects.conditions import Condition, Kind
 from vla_attention.analyze.effects.floors import NAMES, summary_of, with_floors
 from vla_attention.analyze.effects.group_attention import MEASURES, GroupAttention, group_attention
@@ -43,7 +44,6 @@ from vla_attention.analyze.effects.sums import sums_of_groups
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens
-from vla_attention.analyze.ratios.analysis import Analysis, analyse
 from vla_attention.analyze.show.numbers import format_number
 from vla_attention.analyze.stores.parallel import map_episodes
 from vla_attention.analyze.stores.run_notes import run_notes
@@ -152,7 +152,7 @@ def study_effects(
         UserError: see `open_reruns`, `question.ask` and `paired_replans.pair_episodes`.
     """
     opened = open_reruns(open_store(base), given)
-    return study_of(analyse(ask([opened.base], settings)), opened, dimensions)
+    return study_of(Analysis(ask([opened.base], settings)), opened, dimensions)
 
 
 def recorded_study(stores: Sequence[Store], settings: AnalysisSettings) -> EffectStudy | None:

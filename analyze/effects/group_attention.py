@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.analyze.core.contributions import joint_norm, selected_gram, whole_segments
 from vla_attention.analyze.effects.conditions import GroupOfKeys
-from vla_attention.analyze.measures.contribution_ratios import joint_norm, selected_gram
-from vla_attention.analyze.measures.group_contributions import whole_segments
 from vla_attention.analyze.measures.masses import group_measures
 from vla_attention.analyze.measures.question import Question, select_again
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, resolve_all, vocabulary_of

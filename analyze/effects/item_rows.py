@@ -11,8 +11,7 @@ import polars as pl
 from vla_attention.analyze.effects.conditions import Condition, Kind, Reader, item_name, reader_of, selector_kind
 from vla_attention.analyze.effects.effect_study import EffectStudy
 from vla_attention.analyze.effects.paired_replans import ALL
-from vla_attention.analyze.measures.aggregate import overall_layer
-from vla_attention.analyze.measures.frames import EPISODE_ID
+from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
 from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE
 from vla_attention.schemas.safe_text import visible
@@ -91,9 +90,9 @@ def ratios_by_family(study: EffectStudy) -> list[dict[str, Any]]:
     families = [sampling.families.get((row["suite"], row["task_id"]), "") for row in table.iter_rows(named=True)]
     named = table.with_columns(family=pl.Series([visible(name) for name in families], dtype=pl.String))
     episodes = study.analysis.episodes
-    layer = overall_layer(episodes.parts[0].cells)
+    layer = LAYERS_AVG
     if study.analysis.grouping.ratio is not None:
-        of_layer = episodes.cells.filter(layer=layer).select(*EPISODE_ID, pl.col("log_ratio_mean").alias("attention"))
+        of_layer = episodes.filter(layer=layer).select(*EPISODE_ID, pl.col("log_ratio_mean").alias("attention"))
         named = named.join(of_layer, on=EPISODE_ID, how="left", maintain_order="left")
     else:
         named = named.with_columns(attention=pl.lit(None, pl.Float64))

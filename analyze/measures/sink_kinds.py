@@ -19,7 +19,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.contribution_ratios import has_all_heads, joint_norm, segment_masses, selected_gram
+from vla_attention.analyze.core.contributions import has_all_heads, joint_norm, segment_masses, selected_gram
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.schemas.layout import INVALID_ROLES, Role

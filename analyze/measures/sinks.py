@@ -46,7 +46,7 @@ from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
-from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.groupings.resolve import describe_key
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.progress_bar import progress_bar
@@ -81,6 +81,20 @@ class SinkRule:
         for name, value, of in shares:
             if not 0.0 < value <= 1.0:
                 raise BadArgument(f"The sink {name} {value:g} is no share of {of}; expected more than 0 and at most 1.")
+
+    @classmethod
+    def parse(cls, text: str) -> SinkRule:
+        """The rule that `factor=10,share=0.5` gives; parts that are not named keep their defaults."""
+        given: dict[str, float] = {}
+        for part in filter(None, text.split(",")):
+            name, _, value = part.partition("=")
+            if name.strip() not in cls.__dataclass_fields__:
+                raise unknown_name("part of a sink rule", name.strip(), cls.__dataclass_fields__)
+            try:
+                given[name.strip()] = float(value)
+            except ValueError:
+                raise BadArgument(f"Cannot read '{part}' of a sink rule; expected NAME=NUMBER, as factor=10.") from None
+        return cls(**given)
 
     def __str__(self) -> str:
         return (
@@ -342,7 +356,7 @@ def without_sinks(question: Question, sinks: pl.DataFrame, rule: SinkRule) -> Qu
         if not item.valid.any():
             raise BadArgument(
                 f"Every valid key of task {item.task[1]} is a sink by this rule, so that nothing is left without "
-                "sinks; give a larger --sink-factor, --sink-mass or --sink-heads."
+                "sinks; give a rule that takes fewer, as --without-sinks factor=20,heads=0.5."
             )
     grouping = replace(question.grouping, name=f"{question.grouping.name}-without-sinks")
     num_valid = max(float(item.num_valid.mean()) for item in question.selected)
@@ -391,7 +405,8 @@ def cannot_fire(num_valid: float, rule: SinkRule) -> str:
         return ""
     return (
         f"With {num_valid:.3g} valid keys none can take more than {rule.factor:g} x its uniform share, which is all of "
-        f"the row: keys are judged by their mass alone, and a smaller --sink-factor judges by multiples too."
+        "the row: keys are judged by their mass alone; a smaller factor (--without-sinks factor=2) judges by multiples "
+        "too."
     )
 
 

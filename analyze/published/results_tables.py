@@ -1,4 +1,4 @@
-"""Results files as the tables of `measures.aggregate`, so that pictures and intervals are those of stores.
+"""Results files as the tables of `core.levels`, so that pictures and intervals are those of stores.
 
 A results file holds masses and fractions, but no row sums, and only the numbers of keys of the two sides of the ratio.
 The other columns are null, and so are the lifts of groups. The uniform baseline is null where a file has no numbers of
@@ -14,9 +14,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.aggregate import episode_tables, layer_order, task_tables
-from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, Tables, float_values
-from vla_attention.analyze.measures.masses import GROUP_MEASURES
+from vla_attention.analyze.core.levels import over_replans, task_cells, task_groups
+from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG, float_values
 from vla_attention.analyze.published.results_reader import ResultsFile, ResultsKind, SummaryNumber
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.summaries import SampleSummary, summarize
@@ -30,16 +29,25 @@ _NO_REST = 1e-4
 _TOLERANCE = 1e-5
 _STATISTICS = ("mean", "std", "median", "min", "max")
 _UNKNOWN = pl.lit(None, dtype=pl.Float64)
+_OF_GROUPS = ("mass", "fraction", "keys", "density", "lift")
 
 
 @dataclass(frozen=True)
 class ResultsTables:
-    """Tables of one or several results files; `suite` holds the files' labels, which keep equal task ids apart."""
+    """Tables of one or several results files; `suite` holds the files' labels, which keep equal task ids apart.
+
+    Attributes:
+        grouping: the sides, and what is left.
+        replans: as `levels.Levels.replans`.
+        episodes, tasks: as `levels.over_replans` and `levels.task_cells`.
+        groups: as `levels.task_groups`.
+    """
 
     grouping: Grouping
-    replans: Tables
-    episodes: Tables
-    tasks: Tables
+    replans: pl.DataFrame
+    episodes: pl.DataFrame
+    tasks: pl.DataFrame
+    groups: pl.DataFrame
 
 
 @dataclass(frozen=True)
@@ -87,9 +95,18 @@ def results_tables(files: Sequence[ResultsFile], labels: Sequence[str]) -> Resul
     """Tables over files of one kind; `labels` stand in the column `suite`."""
     rows = pl.concat([_rows(file, label) for file, label in zip(files, labels, strict=True)])
     grouping = _grouping(files[0].kind, rows)
-    replans = _replans(rows, grouping)
-    episodes = episode_tables(replans, grouping)
-    return ResultsTables(grouping, replans, episodes, task_tables(episodes, grouping, Sampling()))
+    replans, of_groups = _replans(rows, grouping)
+    order = [*EPISODE_ID, "layer_number"]
+    episodes = over_replans(replans).sort(order, nulls_last=True, maintain_order=True)
+    names = [*EPISODE_KEYS, "layer", "layer_number", "block", "group"]
+    finite = [pl.col(name).filter(pl.col(name).is_finite()).mean() for name in _OF_GROUPS]
+    of_episodes = (
+        of_groups.group_by(names, maintain_order=True).agg(finite).sort(order, nulls_last=True, maintain_order=True)
+    )
+    sampling = Sampling()
+    return ResultsTables(
+        grouping, replans, episodes, task_cells(episodes, sampling), task_groups(of_episodes, sampling)
+    )
 
 
 def _rows(file: ResultsFile, label: str) -> pl.DataFrame:
@@ -112,7 +129,8 @@ def _defined(names: Sequence[str]) -> pl.Expr:
     return pl.all_horizontal(pl.col(f"{name}_fraction").is_not_null() for name in names)
 
 
-def _replans(rows: pl.DataFrame, grouping: Grouping) -> Tables:
+def _replans(rows: pl.DataFrame, grouping: Grouping) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """The cells of replans, and their groups."""
     names = [name for name in grouping.names if name != REST]
     if REST in grouping.names:
         rest = pl.when(_defined(names)).then(1 - pl.sum_horizontal(f"{name}_fraction" for name in names)).clip(0, 1)
@@ -150,17 +168,17 @@ def _replans(rows: pl.DataFrame, grouping: Grouping) -> Tables:
     measures = [f"{name}_{kind}" for name in grouping.names for kind in ("mass", "fraction")]
     groups = pl.concat(
         table.select(
-            *EPISODE_ID, "replan", "env_step", "layer", "layer_number", "block",
+            *EPISODE_KEYS, "replan", "env_step", "layer", "layer_number", "block",
             pl.lit(name).alias("group"),
             pl.col(f"{name}_mass").cast(pl.Float64).alias("mass"),
             pl.col(f"{name}_fraction").cast(pl.Float64).alias("fraction"),
             (pl.col(f"{name}_keys") if f"{name}_keys" in table.columns else _UNKNOWN).alias("keys"),
-            *(_UNKNOWN.alias(name) for name in GROUP_MEASURES if name not in ("mass", "fraction", "keys")),
+            *(_UNKNOWN.alias(name) for name in _OF_GROUPS if name not in ("mass", "fraction", "keys")),
             pl.int_range(pl.len()).alias("_cell"),
         )
         for name in grouping.names
     ).sort("_cell", maintain_order=True)  # fmt: skip
-    return Tables(table.drop(measures, "total_mass", "visual_keys", "linguistic_keys"), groups.drop("_cell"))
+    return table.drop(measures, "total_mass", "visual_keys", "linguistic_keys"), groups.drop("_cell")
 
 
 def uniform_ratios() -> pl.Expr:
@@ -170,7 +188,14 @@ def uniform_ratios() -> pl.Expr:
 
 def layers_of(file: ResultsFile) -> list[str]:
     """Layers by number, "layers_avg" last."""
-    return layer_order(file.steps)
+    layers = file.steps.select("layer", "layer_number").unique().sort("layer_number", "layer", nulls_last=True)
+    return layers["layer"].to_list()
+
+
+def overall_layer(file: ResultsFile) -> str:
+    """The layer that a summary in one number is about: "layers_avg" where there is one, else the first layer."""
+    layers = layers_of(file)
+    return LAYERS_AVG if LAYERS_AVG in layers else layers[0]
 
 
 @dataclass(frozen=True)

@@ -106,7 +106,7 @@ def _forest(figure: Figure, style: Style) -> Canvas:
     axes.set_ylim(rows.height - 0.4, -0.6)
     axes.set_xlabel(str(o.get("xlabel", o["value"])))
     axes.grid(axis="x")
-    _say_counts(axes, rows)
+    _say_counts(axes, rows, style)
     _legend(axes, rows, o)
     return canvas
 
@@ -141,13 +141,15 @@ def _colors_of(rows: pl.DataFrame, o: Any) -> list[str]:
     return [of[kind] for kind in rows[o["color"]]]
 
 
-def _say_counts(axes: Axes, rows: pl.DataFrame) -> None:
-    """How many episodes: once where all rows have as many, else beside each row."""
+def _say_counts(axes: Axes, rows: pl.DataFrame, style: Style) -> None:
+    """How many episodes: once where all rows have as many (in a paper the caption says it), else beside each row."""
     if "num_episodes" not in rows.columns:
         return
     counts = rows["num_episodes"].to_list()
     small: Any = {"color": NOTE_COLOR, "size": 7}
     if len(set(counts)) == 1:
+        if style.paper:
+            return
         axes.text(1.0, 1.01, f"n = {counts[0]} episodes", transform=axes.transAxes, ha="right", **small)
         return
     axes.text(1.01, -0.75, "n", transform=axes.get_yaxis_transform(), va="center", **small)
@@ -203,7 +205,8 @@ def _lines(figure: Figure, style: Style) -> Canvas:
     axes.set_xlabel(str(o.get("xlabel", o["x"])))
     axes.set_ylabel(str(o.get("ylabel", o["value"])))
     axes.grid(axis="y")
-    _say_counts(axes, rows.unique("num_episodes") if "num_episodes" in rows.columns else rows.select(o["x"]))
+    if "num_episodes" in rows.columns and rows["num_episodes"].n_unique() == 1:
+        _say_counts(axes, rows, style)
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         _legend_above(axes, handles, labels)
@@ -213,7 +216,7 @@ def _lines(figure: Figure, style: Style) -> Canvas:
 def _stacked(figure: Figure, style: Style) -> Canvas:
     o: Any = figure.options
     rows = figure.frame.filter(pl.col(o["value"]).is_not_null())
-    names = rows[o["color"]].unique(maintain_order=True).to_list()
+    names = rows.filter(pl.col(o["value"]) > 0)[o["color"]].unique(maintain_order=True).to_list()
     places = rows[o["x"]].unique(maintain_order=True).to_list()
     canvas = new_canvas(style.width(wide=False), style.scaled(3.8))
     _titled(canvas, figure, style)

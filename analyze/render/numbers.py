@@ -30,7 +30,7 @@ def cell(row: Mapping[str, Any], column: Column) -> str:
     value = row[column.name]
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return "-"
-    if column.kind in ("text", "count"):
+    if column.kind in ("text", "prose", "count"):
         return str(value)
     if column.kind == "p":
         return "<0.001" if value < 0.001 else f"{value:.3f}"

@@ -12,6 +12,7 @@ from vla_attention.analyze.render.numbers import cell
 WIDTH, LINES = 100, 40
 #: A table of which fewer rows would fit is left out.
 _FEWEST_ROWS = 3
+_NO_END = 1_000_000
 
 
 def screen(result: Result, lines: int = LINES, last: Sequence[str] = ()) -> str:
@@ -28,6 +29,7 @@ def screen(result: Result, lines: int = LINES, last: Sequence[str] = ()) -> str:
     below = wrapped(f"note: {note}" for note in result.notes)
     end = wrapped(last)
     room = lines - sum(len(part) + 1 for part in (top, below, end) if part)
+    room = _NO_END if result.whole else room
     tables: list[list[str]] = []
     left, said = [], set[str]()
     for table in (one for one in result.tables if one.columns):
@@ -81,17 +83,22 @@ def _laid_out(table: Table, rows: int) -> list[str]:
     cells = [[column.title for column in columns]]
     cells += [[cell(row, column) for column in columns] for row in table.shown.head(rows).iter_rows(named=True)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(columns))]
-    while len(widths) > 2 and sum(widths) + 2 * (len(widths) - 1) > WIDTH and columns[-1].kind != "text":
+    if columns[-1].kind == "prose":
+        widths[-1] = max(20, WIDTH - sum(widths[:-1]) - 2 * (len(widths) - 1))
+    while len(widths) > 2 and sum(widths) + 2 * (len(widths) - 1) > WIDTH and columns[-1].kind not in ("text", "prose"):
         columns, widths = columns[:-1], widths[:-1]
+    rest = max(20, WIDTH - sum(widths[:-1]) - 2 * (len(widths) - 1))
     if columns[-1].kind == "text":  # what runs over is cut: the files have it whole
-        widths[-1] = max(8, min(widths[-1], WIDTH - sum(widths[:-1]) - 2 * (len(widths) - 1)))
+        widths[-1] = min(widths[-1], rest)
     lines = []
     for row in cells:
+        last = textwrap.wrap(row[len(columns) - 1], rest) if columns[-1].kind == "prose" else [row[len(columns) - 1]]
         parts = [
-            _cut(text, width).ljust(width) if column.kind == "text" else text.rjust(width)
-            for text, width, column in zip(row, widths, columns, strict=False)
+            _cut(text, width).ljust(width) if column.kind in ("text", "prose") else text.rjust(width)
+            for text, width, column in zip([*row[: len(columns) - 1], (last or [""])[0]], widths, columns, strict=True)
         ]
         lines.append("  ".join(parts).rstrip())
+        lines += [" " * (sum(widths[:-1]) + 2 * (len(widths) - 1)) + line for line in last[1:]]
     return lines
 
 

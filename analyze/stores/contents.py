@@ -1,4 +1,4 @@
-"""What stores hold: the text of `--list`, a few lines, a table of episodes."""
+"""What stores hold: as names and texts, in a few lines, as a table of episodes."""
 
 from __future__ import annotations
 
@@ -8,10 +8,8 @@ from dataclasses import dataclass, field, replace
 
 import polars as pl
 
-from vla_attention.analyze.show.headings import wrap
 from vla_attention.analyze.show.numbers import of_tasks, plural, solved_text
 from vla_attention.analyze.stores.read_ahead import read_ahead
-from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.analyze.stores.selection import select_episodes
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS
@@ -36,8 +34,6 @@ _EPISODE_COLUMNS = (
     "num_steps",
     "num_replans",
 )
-#: Column in which the texts of `describe_store` begin.
-_TEXT_COLUMN = 13
 
 
 def episodes_table(stores: Sequence[Store]) -> pl.DataFrame:
@@ -88,55 +84,45 @@ def header_lines(stores: Sequence[Store]) -> list[str]:
     ]
 
 
-def describe_store(store: Store, tasks: Sequence[int | str] | None = None) -> str:
-    """Describe a store: run, recorded axes, spans and roles of every site, tasks with their words, objects."""
+def lines_of_store(store: Store, tasks: Sequence[int | str] | None = None) -> Iterator[tuple[str, str]]:
+    """What a store holds, as names and texts: run, recorded axes, spans and roles of every site, tasks, objects."""
     episodes = select_episodes(store, tasks)
-    # Texts stand in columns: what continues on a further line stands below its own.
-    return "\n".join(part for line in _lines(store, episodes) for part in wrap(line, rest=" " * _TEXT_COLUMN))
-
-
-def _lines(store: Store, episodes: Sequence[StoredEpisode]) -> Iterator[str]:
     root = store.attributes
-    policy, recording = root.policy, root.recording
-    yield f"Store {store.path}"
-    yield f"  policy     {policy.name} ({policy.family}), {policy.checkpoint_format}: {policy.checkpoint}"
-    yield f"  weights    {policy.digest[:16]}{'  UNTRAINED random weights' if policy.untrained else ''}"
-    protocol = root.protocol
-    yield f"  run        suite {protocol.suite}, protocol {protocol_text(protocol)}"
+    policy, recording, protocol = root.policy, root.recording, root.protocol
+    yield "store", str(store.path)
+    yield "policy", f"{policy.name} ({policy.family}), {policy.checkpoint_format}: {policy.checkpoint}"
+    yield "weights", f"{policy.digest[:16]}{'  UNTRAINED random weights' if policy.untrained else ''}"
+    yield "run", f"suite {protocol.suite}, protocol {protocol_text(protocol)}"
     if root.data_set is not None:
-        yield f"  data set   {root.data_set.describe()}"
-    for note in run_notes([(store, episode) for episode in episodes]):
-        yield f"  note       {note}"
+        yield "data set", root.data_set.describe()
     summary = _EpisodeSummary.of(root, episodes)
-    yield f"  episodes   {len(episodes)} ({solved_text(summary.success)}), tasks {listing(store.task_ids, 100)}"
+    yield "episodes", f"{len(episodes)} ({solved_text(summary.success)}), tasks {listing(store.task_ids, 100)}"
     labels = [
         f"{label} (block {block})" if label != block else str(block)
         for label, block in zip(
             recording.layer_labels, block_of_labels(recording.layer_labels, policy.num_layers), strict=True
         )
     ]
-    yield f"  layers     {listing(labels, 40)} of {policy.num_layers}"
-    yield f"  denoise    steps {listing(recording.denoise_steps, 40)} of {policy.num_denoise_steps}"
-    yield f"  heads      {listing(recording.heads, 40)}"
-    yield f"  queries    {recording.queries} over {recording.num_action_queries} action queries"
+    yield "layers", f"{listing(labels, 40)} of {policy.num_layers}"
+    yield "denoise", f"steps {listing(recording.denoise_steps, 40)} of {policy.num_denoise_steps}"
+    yield "heads", listing(recording.heads, 40)
+    yield "queries", f"{recording.queries} over {recording.num_action_queries} action queries"
     exact = recording.mantissa_bits == FLOAT32_MANTISSA_BITS
     error = "exact" if exact else f"masses within {mass_error_bound(recording.mantissa_bits):.1e} (relative)"
-    yield f"  precision  {recording.mantissa_bits} mantissa bits: {error}"
+    yield "precision", f"{recording.mantissa_bits} mantissa bits: {error}"
     for site in root.sites:
         note = f" ({own_parts(root, site.name)})" if site.layers or site.heads or site.num_action_queries else ""
-        yield f"Site '{site.name}'{note}: {site.num_keys} keys; span, keys, roles (number of keys, of the first replan)"
+        yield f"site {site.name}", f"{site.num_keys} keys{note}; span, keys, roles (their number at the first replan)"
         for span in site.spans:
-            yield f"  {_describe_span(span, summary.first[site.name])}"
+            yield "  span", _describe_span(span, summary.first[site.name])
         vocabulary = summary.names[site.name].vocabulary()
-        yield f"  words      {listing(vocabulary.words, 200)}"
-        yield f"  objects    {listing(vocabulary.objects, 200)}"
-    yield "Tasks"
+        yield "  words", listing(vocabulary.words, 200)
+        yield "  objects", listing(vocabulary.objects, 200)
     for task, (instruction, interest) in summary.tasks.items():
-        held = f"({summary.num_episodes[task]} episodes; objects of interest: {interest})"
-        yield f"  {task:>3}  {instruction}  {held}"
-    yield "Selectors"
+        held = f"({plural(summary.num_episodes[task], 'episode')}; objects of interest: {interest})"
+        yield f"task {task}", f"{instruction}  {held}"
     for name, kind in SELECTOR_KINDS.items():
-        yield f"  {name + ':':<10} {kind.takes}"
+        yield f"{name}:", f"takes {kind.takes}"
 
 
 @dataclass

@@ -17,13 +17,12 @@ from typing import Any
 
 import polars as pl
 
+from vla_attention.analyze.core.levels import levels_of
+from vla_attention.analyze.core.words_of_numbers import sides
 from vla_attention.analyze.effects.effect_study import units_of_recorded
-from vla_attention.analyze.measures.aggregate import HEADLINE, overall_layer
-from vla_attention.analyze.measures.episodes import episode_tables_of
+from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
-from vla_attention.analyze.measures.steps import measure_episodes
-from vla_attention.analyze.ratios.summary_text import ratio_definition
 from vla_attention.analyze.view.summaries import empty_row
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
@@ -95,14 +94,13 @@ def _described(episode: StoredEpisode) -> dict[str, Any]:
 def _measured(store: Store, batch: Sequence[StoredEpisode]) -> dict[str, Any]:
     """The entries of some episodes with their ratios over all layers and their lifts."""
     question = ask([replace(store, episodes=tuple(batch))], AnalysisSettings())
-    cells = episode_tables_of(measure_episodes(question, progress=lambda _: None), question.grouping).cells
-    cells = cells.filter(pl.col("layer") == overall_layer(cells))
+    cells = levels_of(question).episodes().filter(pl.col("layer") == LAYERS_AVG)
     by_episode = {(row["task_id"], row["episode_index"]): row for row in cells.iter_rows(named=True)}
     rows = []
     for episode in batch:
         row = _described(episode)
         numbers = by_episode[row["task"], row["episode"]]
-        rows.append(row | {"ratio": _finite(numbers.get(HEADLINE)), "lift": _finite(numbers.get("ratio_lift"))})
+        rows.append(row | {"ratio": _finite(numbers.get("geometric_mean")), "lift": _finite(numbers.get("ratio_lift"))})
     return {"episodes": rows, **_about(question)}
 
 
@@ -111,8 +109,12 @@ def _about(question: Question) -> dict[str, Any]:
     return {
         "site": question.site,
         "grouping": question.grouping.name,
-        "ratio": ratio_definition(question.grouping) if has_ratio else None,
+        "ratio": " / ".join(map(_joined, sides(question.grouping))) if has_ratio else None,
     }
+
+
+def _joined(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"({' + '.join(names)})"
 
 
 def _finite(value: float | None) -> float | None:

@@ -15,7 +15,7 @@ import pytest
 
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.analyze.parse.command import main as parse
+from vla_attention.analyze.published.parse_results import main as parse
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.interventions import Interventions, PromptChange
 from vla_attention.schemas.jsonable import to_json

@@ -77,7 +77,7 @@ def differences(
 
     Columns that were added since are left out.
     """
-    found = found.select(name for name in found.columns if name in expected.columns)
+    found = found.select(name for name in expected.columns if name in found.columns)
     if found.columns != expected.columns or found.height != expected.height:
         return [f"{found.shape} with {found.columns}; expected {expected.shape} with {expected.columns}"]
     return [

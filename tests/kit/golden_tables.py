@@ -28,8 +28,8 @@ from PIL import Image
 from tests.kit.golden_stores import differences
 from tests.kit.paths import GOLDEN, ROOT
 from vla_attention.__main__ import main as vla_attention
-from vla_attention.analyze.parse.command import build_parser as parser_of_results
-from vla_attention.analyze.parse.command import main as parse_attention_ratio_results
+from vla_attention.analyze.published.parse_results import build_parser as parser_of_results
+from vla_attention.analyze.published.parse_results import main as parse_attention_ratio_results
 from vla_attention.analyze.render import style
 from vla_attention.analyze.show import plot_style
 from vla_attention.capture.commands.arguments import build_evaluate_parser, build_parser
@@ -49,41 +49,40 @@ STORES = {
 }
 RERUNS = FOLDER / "stores" / "cubes_reruns"
 
-_EXPORT = ("--parquet", *(word for name in ("steps", "replans", "episodes", "tasks") for word in ("--table", name)))
 _STEPS = ("--group", "thing=word:cube", "--group", "seen=role:image", "--ratio", "seen/thing")
-#: Case -> the words after `vla-attention`.
-CASES: dict[str, tuple[str, ...]] = {
-    "cubes_analyze": ("analyze", "cubes.zarr"),
-    "cubes_cameras": ("analyze", "cubes.zarr", "--grouping", "cameras", "--layers", "0", "2"),
-    "cubes_own_groups": ("analyze", "cubes.zarr", *_STEPS),
-    "cubes_words": ("words", "cubes.zarr"),
-    "cubes_objects": ("objects", "cubes.zarr"),
-    "cubes_heads": ("heads", "cubes.zarr"),
-    "cubes_time": ("time", "cubes.zarr"),
-    "cubes_groups": ("groups", "cubes.zarr"),
-    "cubes_export": ("export", "cubes.zarr", *_EXPORT, "--table", "contributions"),
-    "cubes_per_head": ("export", "cubes.zarr", "--parquet", "--table", "steps", "--per-head", "--tasks", "0"),
-    "pair_compare": ("compare", "cubes.zarr", "one_colour.zarr"),
-    "reruns_effects": ("effects", "cubes.zarr", "RERUNS"),
-    "noise_compare": ("compare", "cubes.zarr", "RERUN"),
-    "effects_effects": ("effects", "effects.zarr"),
-    "effects_export": ("export", "effects.zarr", "--parquet", "--table", "effects"),
-    "effects_analyze": ("analyze", "effects.zarr"),
-    "effects_words": ("words", "effects.zarr"),
-    "libero_analyze": ("analyze", "libero.zarr"),
-    "libero_reference": ("analyze", "libero.zarr", "--grouping", "reference"),
-    "libero_words": ("words", "libero.zarr"),
-    "libero_objects": ("objects", "libero.zarr"),
-    "libero_heads": ("heads", "libero.zarr"),
-    "libero_time": ("time", "libero.zarr"),
-    "libero_groups": ("groups", "libero.zarr"),
-    "cosmos_analyze": ("analyze", "cosmos.zarr"),
-    "cosmos_cross": ("analyze", "cosmos.zarr", "--site", "cross"),
-    "cosmos_heads": ("heads", "cosmos.zarr"),
-    "cosmos_groups": ("groups", "cosmos.zarr"),
-    "replay_deviation": ("deviation", "replay.zarr"),
-    "published_results": ("parse", "cubes.zarr"),
-    "published_comparison": ("parse", "cubes.zarr", "libero.zarr"),
+_HEADS = (("--by", "layer,head"), ("--by", "denoise"), ("--without-sinks",))
+#: Case -> what is asked, the words after `vla-attention` of each question.
+CASES: dict[str, tuple[tuple[str, ...], ...]] = {
+    "cubes_analyze": (("analyze", "cubes.zarr"),),
+    "cubes_cameras": (("analyze", "cubes.zarr", "--grouping", "cameras", "--layers", "0", "2"),),
+    "cubes_own_groups": (("analyze", "cubes.zarr", *_STEPS),),
+    "cubes_words": (("words", "cubes.zarr"),),
+    "cubes_objects": (("objects", "cubes.zarr"),),
+    "cubes_heads": tuple(("analyze", "cubes.zarr", *more) for more in _HEADS),
+    "cubes_time": (("analyze", "cubes.zarr", "--by", "time"),),
+    "cubes_groups": (("analyze", "cubes.zarr", "--list"),),
+    "cubes_export": (("analyze", "cubes.zarr"),),
+    "cubes_per_head": (("analyze", "cubes.zarr", "--by", "head", "--task", "0"),),
+    "pair_compare": (("compare", "cubes.zarr", "one_colour.zarr"),),
+    "reruns_effects": (("effects", "cubes.zarr", "RERUNS"),),
+    "noise_compare": (("compare", "cubes.zarr", "RERUN"),),
+    "effects_effects": (("effects", "effects.zarr"),),
+    "effects_analyze": (("analyze", "effects.zarr"),),
+    "effects_words": (("words", "effects.zarr"),),
+    "libero_analyze": (("analyze", "libero.zarr"),),
+    "libero_reference": (("analyze", "libero.zarr", "--grouping", "reference"),),
+    "libero_words": (("words", "libero.zarr"),),
+    "libero_objects": (("objects", "libero.zarr"),),
+    "libero_heads": tuple(("analyze", "libero.zarr", *more) for more in _HEADS),
+    "libero_time": (("analyze", "libero.zarr", "--by", "time"),),
+    "libero_groups": (("analyze", "libero.zarr", "--list"),),
+    "cosmos_analyze": (("analyze", "cosmos.zarr"),),
+    "cosmos_cross": (("analyze", "cosmos.zarr", "--site", "cross"),),
+    "cosmos_heads": tuple(("analyze", "cosmos.zarr", *more) for more in _HEADS),
+    "cosmos_groups": (("analyze", "cosmos.zarr", "--list"),),
+    "replay_deviation": (("deviation", "replay.zarr"),),
+    "published_results": (("parse", "cubes.zarr"),),
+    "published_comparison": (("parse", "cubes.zarr", "libero.zarr"),),
 }
 #: Variables of the batch scripts, which one at a time and together say everything that can be said.
 VARIABLES: dict[str, dict[str, dict[str, str]]] = {
@@ -118,12 +117,21 @@ def link_stores(folder: Path) -> None:
 
 
 def tables_of(case: str, folder: Path) -> dict[str, pl.DataFrame]:
-    """Ask the question of a case in a folder with the stores, and read all tables of its results.
+    """Ask the questions of a case in a folder with the stores, and read all tables of their results.
 
-    Plotted data (CSV) and results files (JSON: a row for each value) are tables too.
+    Plotted data (CSV) and results files (JSON: a row for each value) are tables too. Those of the second question of a
+    case are named 1/NAME, and so on.
     """
+    tables: dict[str, pl.DataFrame] = {}
+    for number, given in enumerate(CASES[case]):
+        found = _tables_of(given, folder)
+        tables |= found if number == 0 else {f"{number}/{name}": table for name, table in found.items()}
+    return tables
+
+
+def _tables_of(given: tuple[str, ...], folder: Path) -> dict[str, pl.DataFrame]:
     reruns = sorted(path.name for path in folder.glob("rerun_*.zarr"))
-    words = [word for given in CASES[case] for word in {"RERUNS": reruns, "RERUN": reruns[:1]}.get(given, [given])]
+    words = [word for one in given for word in {"RERUNS": reruns, "RERUN": reruns[:1]}.get(one, [one])]
     if words[0] != "parse":
         return _asked(vla_attention, [*words, "--output", "results"], folder)
     files = []
@@ -158,7 +166,7 @@ def _read(folder: Path) -> Iterator[tuple[str, pl.DataFrame]]:
             yield file.stem, pl.read_parquet(file)
         elif file.suffix == ".csv" and not file.with_suffix(".parquet").exists():
             yield f"{file.stem}_plotted", pl.read_csv(file, infer_schema_length=None)
-        elif file.suffix == ".json":
+        elif file.suffix == ".json" and file.name != "result.json":
             values = dict(_values(json.loads(file.read_text(encoding="utf-8"))))
             kept = [(name, value) for name, value in values.items() if not name.startswith(("provenance", "software"))]
             yield f"{file.stem}_values", pl.DataFrame(kept, schema={"name": str, "value": str}, orient="row")
@@ -238,11 +246,11 @@ class Form:
 
     def differences(self, tables: Mapping[str, pl.DataFrame], kept: pl.DataFrame) -> list[str]:
         """Where today's rows differ from the kept ones."""
-        kept = (kept if self.still is None else kept.filter(self.still)).drop(self.gone)
-        found = self.rows(tables)
-        found, expected = (
-            table.select(kept.columns).sort(self.keys, nulls_last=True) for table in (found, kept)
-        )  # fmt: skip
+        floats = [pl.col(name).round(9) for name in self.keys if kept.schema[name].is_float()]
+        kept = kept if self.still is None else kept.filter(self.still)
+        kept = kept.drop(self.gone, strict=False).with_columns(floats)
+        rows = self.rows(tables).select(kept.columns).with_columns(floats).join(kept, on=self.keys, how="semi", nulls_equal=True)
+        found, expected = (table.sort(self.keys, nulls_last=True) for table in (rows, kept))
         return differences(found, expected, alike)
 
 
@@ -257,7 +265,44 @@ _SCALE = {
 }  # fmt: skip
 _WORDS_GONE = ("density", "density_low", "density_high", "density_episodes", "mass_episodes", "lift_episodes",
                "share_episodes")  # fmt: skip
-#: (Command, kept table) -> how it is found.
+
+
+def _sided(table: pl.DataFrame, of: str) -> pl.DataFrame:
+    """A ratio with its interval as log2."""
+    return table.with_columns(pl.col(f"{of}{end}").log(2.0).alias(f"log2_{of}{end}") for end in ("", "_low", "_high"))
+
+
+def _heads(tables: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
+    by = tables["by"].drop("layer").rename({"layer_number": "layer"})
+    named = by.rename({name: name.replace("ratio_lift", "lift") for name in by.columns if "ratio_lift" in name})
+    return _sided(_sided(named, "ratio"), "lift")
+
+
+def _time_course(tables: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
+    columns = {"phase": "position", "": "value", "_low": "low", "_high": "high"}
+    parts = []
+    if "by" in tables:
+        of_ratio = tables["by"].select(
+            pl.lit("ratio").alias("quantity"), pl.col("phase").alias("position"), "num_episodes", "num_tasks",
+            *(pl.col(f"ratio{end}").alias(columns[end]) for end in ("", "_low", "_high")),
+            uniform="uniform_ratio",
+        )  # fmt: skip
+        parts.append(of_ratio)
+    of_groups = tables["by_groups"].select(
+        pl.col("group").alias("quantity"), pl.col("phase").alias("position"), "num_episodes", "num_tasks",
+        *(pl.col(f"fraction{end}").alias(columns[end]) for end in ("", "_low", "_high")),
+    )  # fmt: skip
+    return pl.concat([*parts, of_groups], how="diagonal")
+
+
+_COURSE = ("alignment", "outcome", "position_low", "position_high", "curve_low", "curve_high")
+_OF_DENOISE = (
+    "denoise_time", "scope", "suite", "task_id", "instruction", "layer", "layer_number", "block", "num_replans",
+    "success_rate", "ratio_std", "ratio_median", "ratio_min", "ratio_max", "episodes_without_ratio", "num_nonfinite",
+    "geometric_left_out", "nonfinite_layers", "numerator_mass", "denominator_mass", "ratio_mean", "ratio_mean_low",
+    "ratio_mean_high", "ratio_of_means_low", "ratio_of_means_high",
+)  # fmt: skip
+#: (Command, or the end of a case's name; kept table) -> how it is found.
 FORMS: dict[tuple[str, str], Form] = {
     ("words", "words_summary"): Form(
         ("kind", "item"),
@@ -275,7 +320,6 @@ FORMS: dict[tuple[str, str], Form] = {
             .filter(pl.col("kind") != "word")
             .with_columns(pl.col("kind").replace("place", "word"), pl.col("item").replace(_SCALE))
         ),
-        ("density",),
     ),
     ("objects", "objects"): Form(
         (*_EPISODE, "layer", "camera", "kind", "item"),
@@ -324,7 +368,41 @@ FORMS: dict[tuple[str, str], Form] = {
         ("iou_episodes", "iou_chance_episodes"),
         pl.col("threshold") != "otsu",
     ),
+    ("analyze", "contributions"): Form(
+        (*_EPISODE, "replan", "layer", "block", "denoise_step"), lambda tables: tables["contributions_steps"]
+    ),
+    ("heads", "heads"): Form(
+        ("layer", "head"),
+        _heads,
+        ("log2_ratio_episodes", "log2_lift_episodes", "numerator_fraction_episodes"),
+    ),
+    ("heads", "heads_groups"): Form(
+        ("layer", "head", "group"),
+        lambda tables: tables["by_groups"].drop("layer").rename({"layer_number": "layer"}),
+        ("fraction_episodes", "lift_episodes"),
+    ),
+    ("heads", "denoise"): Form(
+        ("denoise_step",),
+        lambda tables: _renamed(
+            tables["1/by"], geometric_mean="ratio", geometric_mean_low="ratio_low", geometric_mean_high="ratio_high"
+        ),
+        _OF_DENOISE,
+    ),
+    ("heads", "denoise_groups"): Form(
+        ("denoise_step", "group"),
+        lambda tables: tables["1/by_groups"],
+        (*_OF_DENOISE[:8], "mass", "density"),
+    ),
+    ("heads", "sinks"): Form((*_EPISODE[:2], "key"), lambda tables: tables["2/sinks"]),
+    ("heads", "sink_heads"): Form((*_EPISODE[:2], "key", "layer", "head"), lambda tables: tables["2/sink_heads"]),
+    ("time", "time_course"): Form(("quantity", "position"), _time_course, _COURSE),
 }
+
+
+def form_of(case: str, table: str) -> Form | None:
+    """How a kept table of a case is found; None where today's has its name and form."""
+    kind = case.rsplit("_", 1)[1]
+    return FORMS.get((kind, table)) or FORMS.get((CASES[case][0][0], table))
 
 
 def alike(one: object, other: object) -> bool:

@@ -90,7 +90,8 @@ def test_a_planted_reader_is_found_where_it_is(reader_store):
     result = words(question_about(reader_store, intervals="these-tasks"))
     assert (result.findings[0].numbers["word"], result["words"]["item"][0]) == ("bowl", "bowl")
     assert result["words"].filter(kind="word")["lift_low"][0] > 1.5
-    heads = words(question_about(reader_store, intervals="these-tasks"), by=("layer", "head"))["words"].filter(kind="word")
+    question = question_about(reader_store, intervals="these-tasks")
+    heads = words(question, by=("layer", "head"))["words"].filter(kind="word")
     top = heads.sort("lift", descending=True).row(0, named=True)
     assert (top["item"], top["layer"], top["head"]) == ("bowl", "3", 1)
     assert top["lift"] > 15

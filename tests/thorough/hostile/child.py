@@ -40,7 +40,7 @@ def forget_peak() -> None:
 def run(program: str, words: list[str]) -> dict[str, object]:
     """Run one command; code 99 is a traceback."""
     from vla_attention.analyze.__main__ import main as analyze
-    from vla_attention.analyze.parse.command import main as parse
+    from vla_attention.analyze.published.parse_results import main as parse
     from vla_attention.capture.__main__ import main as capture
 
     printed = io.StringIO()

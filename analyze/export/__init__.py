@@ -1,1 +1,0 @@
-"""`vla-attention export`: tables as CSV or Parquet, masses and rows as NetCDF."""

@@ -1,1 +1,0 @@
-"""`vla-attention groups`: what a grouping takes, before any number."""

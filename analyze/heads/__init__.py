@@ -1,1 +1,0 @@
-"""`vla-attention heads`: heads, layers, depth and denoise steps; entropy, largest keys and sinks of single rows."""

@@ -1,1 +1,0 @@
-"""`vla-attention report`: one self-contained HTML file."""
