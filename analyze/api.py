@@ -248,40 +248,27 @@ class OpenStores:
 
     def overlay(
         self,
-        task: int | None = None,
         episode: int | None = None,
         replans: int | Sequence[int] | None = None,
         cameras: str | Sequence[str] | None = None,
-        folder: str | Path | None = None,
-        measure: Literal["lift", "share"] = "lift",
-        smooth: bool = False,
+        outline: Sequence[str] = (),
+        video: Literal["gif", "mp4"] | None = None,
         **settings: Unpack[SettingKeywords],
-    ) -> pl.DataFrame:
-        """Attention on the pictures of one episode: one row per (replan, camera, patch).
+    ) -> Answer:
+        """Attention on the pictures of some episodes; tables "overlay" (a row per picture) and "overlay_patches".
 
-        With `folder`, a strip of pictures is drawn there, with outlines around `groups`. Without `task`, `episode` and
-        `replans`: the first episode, every replan. `vla-attention overlay` can also make videos.
+        Without `episode` and `replans`: two episodes, up to eight policy calls of each. `outline`: groups around whose
+        patches lines are drawn, as "bowl=object:akita_black_bowl_1". `video`: with `.save(folder)` also a film.
 
-        >>> patches = va.open(store).overlay(task=1, replans=0, folder=folder)
-        >>> patches.height, sorted(file.suffix for file in folder.iterdir())
-        (16, ['.csv', '.pdf', '.png'])
+        >>> va.open(store).overlay(tasks=1, replans=0)["overlay_patches"].height
+        16
         """
-        from vla_attention.analyze.overlay.overlay_study import study_overlay
-
-        check_name("measure", measure, ("lift", "share"))
-        study = study_overlay(
-            self.stores,
-            settings_from_keywords(**settings),
-            task=task,
-            episode=episode,
-            cameras=[cameras] if isinstance(cameras, str) else cameras,
-            replans=[replans] if isinstance(replans, int) else replans,
-        )
-        if folder is not None:
-            from vla_attention.analyze.overlay.plot_strip import plot_overlay_strip
-
-            plot_overlay_strip(study, Path(folder), measure=measure, smooth=smooth)
-        return study.table
+        own = {
+            "episode": episode,
+            "replans": [replans] if isinstance(replans, int) else replans,
+            "cameras": [cameras] if isinstance(cameras, str) else cameras,
+        }
+        return self._answer("overlay", settings, **own, outline=tuple(outline), video=video)
 
     def report(
         self, path: str | Path, num_episodes: int = 2, num_replans: int = 8, **settings: Unpack[SettingKeywords]

@@ -63,7 +63,19 @@ COMMANDS: dict[str, Command] = {
     ),
     "effects": Command("what the action depends on: without a word, a picture, an object", folder=True),
     "compare": Command("two or more runs, paired where they share initial states and seeds", folder=True),
-    "overlay": Command("attention on the stored pictures: strips, GIF or MP4", folder=True),
+    "overlay": Command(
+        "attention on the stored pictures: strips, GIF or MP4",
+        (*_ROWS, *_GROUPING, "episode", "replans", "cameras", "outline", "smooth", "video", "fps", "num_episodes",
+         "num_replans"),
+        ("image", "latent"),
+        _NO_PICTURES,
+        (
+            "overlay runs/libero_10.zarr",
+            "overlay runs/libero_10.zarr --task 3 --episode 1 --layers 13 --heads 5",
+            "overlay runs/libero_10.zarr --outline bowl=object:akita_black_bowl_1 --video gif",
+            "overlay runs/libero_10.zarr --replans 0 5 10 --cameras base_0_rgb",
+        ),
+    ),
     "deviation": Command("how far actions are from the data set's, beside attention", folder=True),
     "report": Command(
         "all of it in one HTML file",

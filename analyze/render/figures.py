@@ -11,6 +11,8 @@ The options of a figure, by kind:
     heat_map      x, y, value: factors around 1. xlabel, ylabel, label.
     scatter       x, y, label: points with names, NAME_low and NAME_high as bars. log, xlabel, ylabel.
 
+    pictures      see `render.pictures`.
+
 NAME_low and NAME_high of a value are its interval; `num_episodes`, if the frame has it, is said.
 """
 
@@ -25,6 +27,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.result import Figure
+from vla_attention.analyze.render.pictures import pictures
 from vla_attention.analyze.render.style import Style, new_canvas, save_canvas
 from vla_attention.analyze.show.plot_axes import label_positions, ratio_axis, scattered, share_ticks, whole_numbers
 from vla_attention.analyze.show.plot_colours import (
@@ -325,4 +328,5 @@ _KINDS: dict[str, Callable[[Figure, Style], Canvas]] = {
     "distribution": _distribution,
     "heat_map": _heat_map,
     "scatter": _scatter,
+    "pictures": pictures,
 }

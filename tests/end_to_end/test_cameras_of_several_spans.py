@@ -184,10 +184,9 @@ def test_masses_and_overlay_of_a_store_are_of_all_keys(made, tmp_path, capsys):
     masses = va.open(path).masses("episodes", grouping="cameras").filter(pl.col("episode_index") == 0)
     own = masses.filter((pl.col("group") == "front") & (pl.col("layer") == "layers_avg"))
     np.testing.assert_allclose(own["mass"], rows[:, keys].sum(axis=1).mean(), rtol=1e-4)
-    assert (
-        main(["overlay", str(path), "--output", str(tmp_path), "--replans", "0", "2", "--group", "f=camera:front"]) == 0
-    )
-    table = pl.read_csv(next(tmp_path.glob("*.csv"))).filter(pl.col("camera") == "front")
+    words = "--replans 0 2 --outline f=camera:front".split()
+    assert main(["overlay", str(path), "--output", str(tmp_path), *words]) == 0
+    table = pl.read_parquet(tmp_path / "overlay_patches.parquet").filter(pl.col("camera") == "front")
     placed = [
         key for span in layout.spans if span.camera == "front" and span.grid for key in range(span.start, span.stop)
     ]
@@ -195,7 +194,7 @@ def test_masses_and_overlay_of_a_store_are_of_all_keys(made, tmp_path, capsys):
         own = table.filter(pl.col("replan") == replan)
         np.testing.assert_allclose(own["mass"].sum(), rows[replan, placed].sum(), rtol=1e-5)
         image = rows[replan, [*keys, *keys_of(layout, "wrist")]].sum()
-        np.testing.assert_allclose(own["share_percent"].sum(), 100 * rows[replan, placed].sum() / image, rtol=1e-5)
+        np.testing.assert_allclose(own["share"].sum(), rows[replan, placed].sum() / image, rtol=1e-5)
     printed = " ".join(capsys.readouterr().out.split())
     beside = [key for key in keys if key not in placed]
     names = [span.name for span in layout.camera_spans("front") if span.grid is not None]
