@@ -117,7 +117,7 @@ class OpenStores:
     ) -> xarray.Dataset | Iterator[xarray.Dataset]:
         """Masses of every head as labelled arrays; with `rows` the rows of one episode after the other.
 
-        Needs the extra `xarray`. (episode, replan) is one axis `sample`; see `vla_attention.analyze.core.labelled_arrays`.
+        Needs the extra `xarray`. (episode, replan) is one axis `sample`; see `analyze/core/labelled_arrays.py`.
 
         >>> va.open(store).to_xarray(grouping="cameras")["mass"].dims
         ('sample', 'layer', 'denoise', 'head', 'group')

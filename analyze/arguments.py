@@ -131,10 +131,10 @@ def add_intervals(parser: argparse.ArgumentParser) -> None:
     """--intervals; its values are those of `statistics.intervals.Estimand`."""
     parser.add_argument(
         "--intervals",
-        choices=("tasks-like-these", "independent-tasks", "these-tasks"),
+        choices=("tasks-like-these", "these-tasks"),
         default="tasks-like-these",
         help="what intervals over several tasks are about: tasks like these, with families of related tasks as units; "
-        "the same as if no two tasks were related; these tasks (default: %(default)s; see docs/statistics.md)",
+        "these tasks (default: %(default)s; see docs/statistics.md)",
     )
 
 

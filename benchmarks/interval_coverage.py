@@ -177,10 +177,7 @@ def with_families(
     generator = np.random.default_rng([seed, len(sizes), sum(sizes), int(100 * correlation), skewed])
     families = np.repeat(np.arange(len(sizes)), sizes)
     tasks = np.repeat(np.arange(len(families)), EPISODES)
-    units = {
-        name: Units.of(tasks, estimand, families[tasks].astype(str))
-        for name, estimand in (("families", Estimand.TASKS_LIKE_THESE), ("tasks", Estimand.INDEPENDENT_TASKS))
-    }
+    units = {"families": Units.of(tasks, families=families[tasks].astype(str)), "tasks": Units.of(tasks)}
     held: dict[str, list[bool]] = {name: [] for name in units}
     widths: dict[str, list[float]] = {name: [] for name in units}
     for _ in range(num_stores):
@@ -232,13 +229,13 @@ def print_store(path: Path) -> None:
     """How related the tasks of a store are in their log ratios, and its three intervals."""
     run = va.open(path)
     families = dict(run.episodes.select("task_id", "task_family").iter_rows())
-    ratios = run.ratios("episodes").filter(layer="layers_avg")
+    ratios = run.analyze()["episodes"].filter(layer="layers_avg")
     means = ratios.group_by("task_id").agg(pl.col("log_ratio_mean").mean()).sort("task_id")
     names = np.unique([families[task] for task in means["task_id"]], return_inverse=True)[1]
     found = intraclass_correlation(means["log_ratio_mean"].to_numpy(), names)
     print(f"{path}: {means.height} tasks of {names.max() + 1} families, intraclass correlation {found:.2f}")
     for estimand in Estimand:
-        row = run.ratios(intervals=estimand).filter(scope="all", layer="layers_avg").row(0, named=True)
+        row = run.analyze(intervals=estimand)["tasks"].filter(scope="all", layer="layers_avg").row(0, named=True)
         numbers = [row[f"geometric_mean{end}"] for end in ("", "_low", "_high")]
         print("  {:18} {:.3f} [{:.3f}, {:.3f}]".format(estimand.value, *numbers))
 
@@ -260,9 +257,10 @@ def power(num_tasks: int, num_episodes: int, num_stores: int, seed: int, effect:
 
 def through_files(case: Case, num_stores: int, seed: int) -> dict[str, float]:
     """The same with stores on disk: written by the real writer, read back and analysed."""
+    from vla_attention.analyze.ratios.analysis import analyse
+
     from vla_attention.analyze.measures.question import ask
     from vla_attention.analyze.measures.question_settings import AnalysisSettings
-    from vla_attention.analyze.ratios.analysis import analyse
     from vla_attention.schemas.layout import Role
     from vla_attention.schemas.stores.reader import open_store
     from vla_attention.testing.stores import StoreSpec, write_store

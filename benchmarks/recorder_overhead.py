@@ -169,7 +169,7 @@ def milliseconds(seconds: list[float]) -> str:
 
 def times(seconds: list[float], plain: list[float]) -> str:
     """The median, lowest and highest of the ratios within the rounds."""
-    found = measurement.measured(measurement.ratios(seconds, plain))
+    found = measurement.measured(measurement.analyze(seconds, plain)["tasks"])
     return f"{found.median:.3f} ({found.lowest:.3f}, {found.highest:.3f})"
 
 

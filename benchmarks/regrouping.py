@@ -59,7 +59,7 @@ def open_store_table(stores: dict[int, Path], rounds: int, cache: Path) -> Table
     runs = {}
     for number, path in stores.items():
         runs[number] = va.open(path)
-        runs[number].ratios(grouping=GROUPINGS[0])
+        runs[number].analyze(grouping=GROUPINGS[0])["tasks"]
     for turn in range(rounds):
         for number, run in runs.items():
             grouping = GROUPINGS[1 + turn % 2]
@@ -67,7 +67,7 @@ def open_store_table(stores: dict[int, Path], rounds: int, cache: Path) -> Table
             for kind in ("cold", "warm"):
                 run._analyses.clear()  # what is kept in memory answers at once
                 began = time.perf_counter()
-                run.ratios(grouping=grouping)
+                run.analyze(grouping=grouping)["tasks"]
                 seconds.setdefault((number, kind), []).append(time.perf_counter() - began)
     names = {"cold": "nobody asked before", "warm": "in the cache"}
     rows = [

@@ -3,7 +3,7 @@
     import vla_attention as va
 
     run = va.open("runs/libero_10.zarr")    # a store, or several that are analysed as one
-    run.ratios()                            # a polars frame; docs/python.md lists the other methods
+    run.analyze()["tasks"]                            # a polars frame; docs/python.md lists the other methods
 
     with va.record("run.zarr", policy, layout=va.layouts.smolvla(policy)) as run:    # docs/your-policy.md
         ...
@@ -71,7 +71,7 @@ def open(stores: str | Path | Sequence[str | Path]) -> OpenStores:
 
     >>> import vla_attention as va
     >>> run = va.open(store)
-    >>> run.ratios().filter(layer="layers_avg")["scope"].to_list()
+    >>> run.analyze()["tasks"].filter(layer="layers_avg")["scope"].to_list()
     ['task', 'task', 'all']
 
     Raises:
@@ -90,8 +90,8 @@ def workers(where: int | str) -> AbstractContextManager[None]:
     processes do not run a script again that has no `if __name__ == "__main__":`.
 
     >>> with va.workers(2):
-    ...     elsewhere = va.open(store).ratios()
-    >>> elsewhere.equals(va.open(store).ratios())
+    ...     elsewhere = va.open(store).analyze()["tasks"]
+    >>> elsewhere.equals(va.open(store).analyze()["tasks"])
     True
 
     Raises:

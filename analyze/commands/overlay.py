@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -34,6 +33,7 @@ from vla_attention.schemas.groupings.grouping import Grouping, parse_group_argum
 from vla_attention.schemas.groupings.resolve import check_names, resolve
 from vla_attention.schemas.safe_text import file_part, visible
 
+_TINY = float(np.finfo(float).tiny)
 #: A group's patches are those of which it takes at least this share.
 _OUTLINE_WEIGHT = 0.5
 #: Lines are drawn around what gets so many times even attention; the second is the highest that fits the scale.
@@ -99,22 +99,17 @@ def overlay(question: Question, episode: int | None = None, replans: Sequence[in
         figure = _figure(question, maps, frame.filter(pl.col("replan").is_in(list(which))), options, levels)
         figures.append(figure)
         if video:
-            film = replace(figure, frame=frame)
-            files[f"{figure.name}.{video}"] = partial(_write, film=film, fps=fps, kind=video)
+            film = _figure(question, maps, frame, options, levels)
+            files[f"{figure.name}.{video}"] = partial(write_film, figure=film, fps=fps, kind=video)
     of_shown = [part.filter(pl.col("replan").is_in(list(which))) for part, which in zip(parts, shown, strict=True)]
     table = pl.concat(of_shown).select(*_KEPT)
     held = [column for column in _COLUMNS if table[column.name].null_count() < table.height]
     patches = pl.concat(patch_table(maps, which) for maps, which in zip(every, shown, strict=True))
-    said = dict.fromkeys(note for maps in every for note in orientation_notes(maps))
     return Result(
         "Where it looks", about(question), [_finding(question, every[0], table)],
         [Table("overlay", table, held, "Pictures"), Table("overlay_patches", patches)],
-        figures, [*notes(question), *said], files,
+        figures, [*notes(question), *orientation_notes(every)], files,
     )  # fmt: skip
-
-
-def _write(path: Path, film: Figure, fps: float, kind: Literal["gif", "mp4"]) -> None:
-    write_film(path, film, fps, kind)
 
 
 def _outlines(question: Question, texts: Sequence[str]) -> Grouping | None:
@@ -166,7 +161,7 @@ def _frame(
         for replan in replans:
             lift = upright(one.lift[replan], one.view)
             row, column = np.unravel_index(int(np.nan_to_num(lift).argmax()), lift.shape)
-            share = float(np.nansum(one.share[replan]) + np.nan_to_num(one.outside[replan]))
+            share = float((one.mass[replan].sum() + one.outside[replan]) / max(maps.image_mass[replan], _TINY))
             ratio = known.get(replan)
             step = int(maps.env_step[replan])
             place = _place(int(row), int(column), lift.shape)
@@ -206,8 +201,10 @@ def _object(maps: EpisodeMaps, camera: str, covering: NDArray[np.float32], repla
     return visible(maps.item.tokens.objects[thing].name)
 
 
-def _picture(row: Mapping[str, Any], maps: EpisodeMaps) -> NDArray[np.uint8] | None:
-    return maps.frame(row["camera"], row["replan"])
+def _picture(
+    row: Mapping[str, Any], read: Mapping[tuple[str, int], NDArray[np.uint8] | None]
+) -> NDArray[np.uint8] | None:
+    return read[row["camera"], row["replan"]]
 
 
 def _named(maps: EpisodeMaps) -> str:
@@ -223,14 +220,16 @@ def _figure(
 ) -> Figure:
     several = len(question.stores) > 1
     name = f"overlay_{file_part(maps.item.store.suite) + '_' if several else ''}{maps.item.episode.name}"
+    # Read now: a damaged picture ends the command before anything is written.
+    read = {place: maps.frame(*place) for place in frame.select("camera", "replan").iter_rows()}
     lines = " and ".join(f"{level:g}" for level in levels)
     caption = (
         "Attention of the action queries on the pictures that the policy saw, mean over the selected layers, denoise "
         "steps and heads. Pale: no more than evenly spread attention would give; the more a patch gets, the more of "
-        f"its colour is kept (all of it from {options['high']:g} times on); lines: at {lines} times. Words: the darker, "
-        "the more attention per token."
+        f"its colour is kept (all of it from {options['high']:g} times on); lines: at {lines} times. Words: the darker,"
+        " the more attention per token."
     )
-    return Figure(name, "pictures", frame, _named(maps), caption, {**options, "picture": partial(_picture, maps=maps)})
+    return Figure(name, "pictures", frame, _named(maps), caption, {**options, "picture": partial(_picture, read=read)})
 
 
 def _finding(question: Question, maps: EpisodeMaps, table: pl.DataFrame) -> Finding:

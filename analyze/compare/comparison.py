@@ -38,7 +38,7 @@ from vla_attention.analyze.measures.aggregate import (
 from vla_attention.analyze.measures.frames import LAYERS_AVG, Tables, concat_tables, float_values
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.steps import measure_episodes
-from vla_attention.analyze.measures.task_families import relation_remarks, sampling_of, units_of
+from vla_attention.analyze.measures.task_families import sampling_of, units_of
 from vla_attention.analyze.statistics.episode_intervals import ABOUT_COLUMNS, Sampling, about_row
 from vla_attention.analyze.statistics.intervals import (
     SHARE,
@@ -180,7 +180,7 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
         differences=with_adjusted(pl.concat(differences)),
         pairs=pl.concat(pairs),
         unpaired=pl.concat(unpaired),
-        notes=(*notes, *notes_on_effects, *relation_remarks(sampling, selected)),
+        notes=(*notes, *notes_on_effects),
         units=units_of(sampling, selected).decided(),
         ignores_seed="seed" in allowed and len({run.stores[0].attributes.protocol.seed for run in runs}) > 1,
     )

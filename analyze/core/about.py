@@ -9,6 +9,7 @@ from vla_attention.analyze.measures.task_families import units_of, unknown_famil
 from vla_attention.analyze.statistics.units import FEWEST_FAMILIES
 from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.schemas.errors import listing, plural
+from vla_attention.schemas.stores.store_format import RootAttributes
 
 #: What untrained weights mean for every number.
 UNTRAINED = "The weights are untrained (random): the numbers show that the pipeline works, and nothing about a policy."
@@ -41,12 +42,28 @@ def notes(question: Question) -> list[str]:
     recorded = question.stores[0].attributes.recording_of(question.site).layers
     every = len(set(question.selection.blocks)) == len(recorded)
     which = "mean over all layers" if every else f"layer{'s' * (len(labels) > 1)} {listing(labels, 40)}"
-    told = set(run_notes(question.episodes))
+    told, root = set(run_notes(question.episodes)), question.stores[0].attributes
+    others = [other.name for other in root.sites if other.name != question.site]
     return [
         f"Site '{question.site}', {which}. Intervals: 95%, about {question.units.words}.",
         *(remark for remark in question.remarks if remark not in told),
-        *filter(None, [unknown_families(question.sampling, question.selected)]),
-    ]
+        *filter(None, [question.selection.note, without_a_side(root, question.site), unknown_families(
+            question.sampling, question.selected)]),
+        *([f"Of site '{question.site}' only; {listing(others)} are softmaxes of their own: choose by --site, and never "
+           "divide a mass of one by a mass of another."] if others else []),
+    ]  # fmt: skip
+
+
+def without_a_side(root: RootAttributes, site: str) -> str:
+    """That a site of some of the blocks has no image keys or no text keys, as a sentence; empty where it has both."""
+    kinds = {span.kind for span in root.site(site).spans}
+    missing = [name for name, has in (("image", {"image", "latent"}), ("text", {"text"})) if not kinds & has]
+    if not missing or not root.site(site).layers:
+        return ""
+    return (
+        f"Site '{site}' has no {' and no '.join(missing)} keys: a ratio of visual to linguistic attention is not "
+        "defined inside of it. Compare norms of contributions, which sites of different blocks share."
+    )
 
 
 def enough(question: Question, what: str = "the numbers") -> str:

@@ -35,7 +35,7 @@ class CameraMap:
         mass: of every cell, (replan, row, column): mean over layers, denoise steps and heads.
         lift: mass / what uniform attention gives the cell, (replan, row, column); NaN where that is 0.
         share: mass / mass of all image keys of all cameras, (replan, row, column); NaN where there is none.
-        outside: part of all image attention on the camera's keys that lie nowhere in the picture, (replan,).
+        outside: mass of the camera's keys that lie nowhere in the picture, (replan,).
     """
 
     picture: PictureMap
@@ -54,12 +54,14 @@ class EpisodeMaps:
         item: the episode.
         env_step: environment step of each replan, (replan,).
         cameras: by name, in key order.
+        image_mass: of all image keys of all cameras, (replan,).
         words: for each replan the instruction's words, each with its lift; empty where the site spells none.
     """
 
     item: SelectedEpisode
     env_step: NDArray[np.int64]
     cameras: Mapping[str, CameraMap]
+    image_mass: Array
     words: Sequence[Sequence[tuple[str, float]]]
 
     def has_frames(self, camera: str) -> bool:
@@ -113,13 +115,13 @@ def episode_maps(question: Question, item: SelectedEpisode, cameras: Sequence[st
             outside = sum((mean[:, span.start : span.stop].sum(axis=1) for span in beside), np.zeros(len(mean)))
             view = by_name.get(camera, PolicyCameraView(camera, camera, True, False))
             share = mass / whole[:, None, None]
-            maps[camera] = CameraMap(picture, view, mass, mass / even, share, outside / whole)
+            maps[camera] = CameraMap(picture, view, mass, mass / even, share, outside)
         words = [
             [(word.text, float(mean[replan, list(word.keys)].sum() / uniform[replan, list(word.keys)].sum()))
              for word in tokens.words[prompt]]
             for replan, prompt in enumerate(tokens.prompt_index)
         ] if tokens.prompt_index is not None and tokens.words else []  # fmt: skip
-    return EpisodeMaps(item, item.episode.read("env_step").astype(np.int64), maps, words)
+    return EpisodeMaps(item, item.episode.read("env_step").astype(np.int64), maps, whole, words)
 
 
 def scale_end(values: NDArray[np.floating]) -> float:
@@ -159,26 +161,25 @@ def patch_table(maps: EpisodeMaps, replans: Sequence[int]) -> pl.DataFrame:
     return pl.concat(frames)
 
 
-def orientation_notes(maps: EpisodeMaps) -> list[str]:
-    """How the pictures were turned for display, and what their maps add up and leave out."""
+def orientation_notes(episodes: Sequence[EpisodeMaps]) -> list[str]:
+    """How the pictures of episodes of one run were turned for display, and what their maps add up and leave out."""
+    cameras = episodes[0].cameras
+    mirrored = [camera for camera, one in cameras.items() if one.view.mirrored]
+    turned = [camera for camera, one in cameras.items() if not one.view.upright]
     notes = []
-    for said, turned in (
-        (
-            "shown as the scene is; the model sees left and right exchanged",
-            [n for n, o in maps.cameras.items() if o.view.mirrored],
-        ),
-        (
-            "shown right way up; the model sees them upside down",
-            [n for n, o in maps.cameras.items() if not o.view.upright],
-        ),
+    for which, said in (
+        (mirrored, "shown as the scene is; the model sees left and right exchanged"),
+        (turned, "shown right way up; the model sees them upside down"),
     ):
-        if turned:
-            which = "Pictures are" if len(turned) == len(maps.cameras) else f"{listing(turned)}:"
-            notes.append(f"{which} {said}.")
-    for camera, one in maps.cameras.items():
-        beside, placed = np.nansum(one.outside), np.nansum(one.share)
-        notes.append(map_note(maps.item.tokens.layout, camera, float(beside / max(beside + placed, 1e-300))))
-    missing = [camera for camera in maps.cameras if not maps.has_frames(camera)]
+        if which:
+            notes.append(f"{'Pictures are' if len(which) == len(cameras) else f'{listing(which)}:'} {said}.")
+    for camera in cameras:
+        beside, placed = (
+            float(sum(getattr(maps.cameras[camera], name).sum() for maps in episodes)) for name in ("outside", "mass")
+        )
+        of_camera = beside / max(beside + placed, np.finfo(float).tiny)
+        notes.append(map_note(episodes[0].item.tokens.layout, camera, of_camera))
+    missing = [camera for camera in cameras if not all(maps.has_frames(camera) for maps in episodes)]
     if missing:
         notes.append(f"No pictures were stored of {listing(missing)}: attention alone, on grey.")
     return [note for note in notes if note]

@@ -280,12 +280,11 @@ def task_cells(episodes: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
     """
     has_ratio = "ratio_mean" in episodes.columns
     rows = episodes.with_columns(success_rate=pl.col("success").cast(pl.Float64))
+    if has_ratio:
+        rows = rows.with_columns(_uniform="uniform_ratio")
     counts = [pl.col("num_replans").sum()]
     if has_ratio:
         has_log = pl.col("log_ratio_mean").is_finite().fill_null(False)
-        # With the mean and the episodes of the headline, so that ratio / uniform ratio is the lift.
-        none = ~has_log.any().over("suite", "task_id", "layer")
-        rows = rows.with_columns(uniform_ratio=pl.when(has_log | none).then("uniform_ratio"))
         spread = _finite("ratio_mean")
         counts += [
             spread.std(ddof=0).alias("ratio_std"),
@@ -300,6 +299,10 @@ def task_cells(episodes: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
     found = []
     for scope, names in _scopes(rows):
         by = [*names, *LAYER]
+        if has_ratio:
+            # With the mean and the episodes of the headline, so that ratio / uniform ratio is the lift.
+            none = ~has_log.any().over(by)
+            rows = rows.with_columns(uniform_ratio=pl.when(has_log | none).then("_uniform"))
         part = estimate(rows, by, _VALUES if has_ratio else _PLAIN, sampling, quotients=_QUOTIENTS if has_ratio else {})
         part = part.join(rows.group_by(by).agg(counts), on=by, how="left", nulls_equal=True, maintain_order="left")
         found.append(_scoped(part, scope))

@@ -12,7 +12,7 @@ from vla_attention.analyze.measures.baselines import baseline_notes, contributio
 from vla_attention.analyze.measures.frames import layer_name
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
-from vla_attention.analyze.measures.task_families import relation_remarks, sampling_of, units_of
+from vla_attention.analyze.measures.task_families import sampling_of, units_of
 from vla_attention.analyze.show.headings import run_header
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.units import Units
@@ -78,8 +78,8 @@ class Question:
 
     @property
     def remarks_on_intervals(self) -> tuple[str, ...]:
-        """`remarks` and, above the notes, how the tasks are related: the lines of every result with intervals."""
-        return (*self._remarks_on_numbers, *relation_remarks(self.sampling, self.selected), *self.notes)
+        """`remarks`, for results of before."""
+        return self.remarks
 
     @property
     def _remarks_on_numbers(self) -> tuple[str, ...]:

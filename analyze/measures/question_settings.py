@@ -48,7 +48,7 @@ class SettingKeywords(TypedDict, total=False):
         denoise: "first", "last", "all", a number or several.
         per_head: whether heads are kept apart.
         site: the softmax family.
-        intervals: what intervals are about: "tasks-like-these", "independent-tasks" or "these-tasks".
+        intervals: what intervals are about: "tasks-like-these" or "these-tasks".
         skip_corrupt: whether damaged and empty episodes are left out.
     """
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.statistics.episode_intervals import Sampling, TaskName
-from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Estimand, Units
+from vla_attention.analyze.statistics.units import Estimand, Units
 from vla_attention.schemas.errors import UserError, listing
 from vla_attention.schemas.safe_text import visible
 
@@ -34,7 +34,7 @@ def sampling_of(estimand: Estimand, selected: Iterable[SelectedEpisode]) -> Samp
             raise MixedFamilies(
                 f"Episodes of task {task[1]} of {task[0]} are of the task families '{visible(known)}' and "
                 f"'{visible(family)}' (the latter: {item.episode.name} of {item.store.path}); a task has one family. "
-                "Record them again with one, or choose --intervals independent-tasks or these-tasks."
+                "Record them again with one, or choose --intervals these-tasks."
             )
     return Sampling(estimand, families)
 
@@ -45,34 +45,6 @@ def units_of(sampling: Sampling, selected: Sequence[SelectedEpisode]) -> Units:
     number = {task: i for i, task in enumerate(dict.fromkeys(tasks))}
     families = [sampling.families.get(task, "") for task in tasks]
     return Units.of(np.array([number[task] for task in tasks]), sampling.estimand, families)
-
-
-def relation_remarks(sampling: Sampling, selected: Sequence[SelectedEpisode]) -> list[str]:
-    """The lines on how tasks are related that stand above printed numbers."""
-    warning = unknown_families(sampling, selected)
-    return [*([f"WARNING: {warning}"] if warning else []), *family_notes(sampling, selected)]
-
-
-def family_notes(sampling: Sampling, selected: Sequence[SelectedEpisode]) -> tuple[str, ...]:
-    """What intervals over these episodes' tasks are about where it is not what was asked, or assumes something."""
-    tasks = dict.fromkeys(item.task for item in selected)
-    families = dict.fromkeys(visible(sampling.families[task]) for task in tasks if task in sampling.families)
-    if len(tasks) < 2:
-        return ()
-    if sampling.estimand == Estimand.INDEPENDENT_TASKS:
-        known = f", though they are of {_families(len(families))}" if families else ""
-        return (
-            f"Intervals assume that no two of the {len(tasks)} tasks are related{known}, as --intervals "
-            "independent-tasks asks; where tasks are, such intervals are too narrow.",
-        )
-    units = units_of(sampling, selected)
-    if units.has_enough_families:
-        return ()
-    return (
-        f"Intervals are about these tasks: the {len(tasks)} tasks are of {_families(units.num_families)} "
-        f"({_quoted(families)}), and fewer than {FEWEST_FAMILIES} show nothing about tasks like these. --intervals "
-        "independent-tasks counts tasks as if no two were related.",
-    )
 
 
 def unknown_families(sampling: Sampling, selected: Sequence[SelectedEpisode]) -> str:
@@ -98,10 +70,6 @@ def related_instructions(instructions: Sequence[str]) -> str:
 
 def _quoted(texts: Iterable[str]) -> str:
     return listing([f"'{text}'" for text in texts], 4)
-
-
-def _families(number: int | None) -> str:
-    return "1 family" if number == 1 else f"{number} families"
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 
 from vla_attention.analyze.core.levels import MORE, SIDES, Levels, replan_cells
-from vla_attention.analyze.core.measure import means
+from vla_attention.analyze.core.measure import Measured, means
 from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.selector_parser import Atom, parse_selector
@@ -34,24 +34,31 @@ def results_files(levels: Levels) -> dict[str, Callable[[Path], None]]:
     """The results file of every suite by its name; each writes itself to a path. The grouping has a ratio."""
     question, grouping = levels.question, levels.grouping
     proxy = frame_proxy(question.stores[0].attributes, question.selected[0].tokens.layout, grouping)
+
+    def write(path: Path, suite: str) -> None:
+        of_suite = [one for one in levels.measured if one.item.store.suite == suite]
+        write_results(path, documents_of(of_suite, grouping, question.selection.denoise_steps, proxy))
+
+    suites = dict.fromkeys(item.store.suite for item in question.selected)
+    return {results_file_name(suite): partial(write, suite=suite) for suite in suites}
+
+
+def documents_of(
+    measured: Sequence[Measured], grouping: Grouping, denoise_steps: Sequence[int], proxy: FrameProxy | None = None
+) -> Iterator[dict[str, Any]]:
+    """`episode_documents` of the episodes of a suite, by task and number."""
     first = len(grouping.names)  # behind the groups, both sides of the ratio
     whole = [
         name
         for i, name in enumerate(_KEYS)
-        if all((one.keys[:, first + i] == np.floor(one.keys[:, first + i])).all() for one in levels.measured)
+        if all((one.keys[:, first + i] == np.floor(one.keys[:, first + i])).all() for one in measured)
     ]
-    steps = question.selection.denoise_steps
-
-    def write(path: Path, suite: str) -> None:
-        ordered = sorted(
-            (one for one in levels.measured if one.item.store.suite == suite),
-            key=lambda one: (one.item.episode.attributes.task_id, one.item.episode.attributes.episode_index),
-        )
-        rows = (means(one, ("replan", "layer"), (*MORE, "whole")) for one in ordered)
-        write_results(path, episode_documents(rows, grouping, steps, proxy, whole))
-
-    suites = dict.fromkeys(item.store.suite for item in question.selected)
-    return {results_file_name(suite): partial(write, suite=suite) for suite in suites}
+    order = sorted(
+        range(len(measured)),
+        key=lambda i: (measured[i].item.episode.attributes.task_id, measured[i].item.episode.attributes.episode_index),
+    )
+    rows = (means(measured[i], ("replan", "layer"), (*MORE, "whole")) for i in order)
+    return episode_documents(rows, grouping, denoise_steps, proxy, whole)
 
 
 def episode_documents(

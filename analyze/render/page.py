@@ -10,9 +10,10 @@ from io import BytesIO
 import jinja2
 
 from vla_attention.analyze.core.result import Column, Figure, Result
+from vla_attention.analyze.render import style as style_module
 from vla_attention.analyze.render.figures import draw
 from vla_attention.analyze.render.numbers import cell
-from vla_attention.analyze.render.style import Style, find_places
+from vla_attention.analyze.render.style import Style
 from vla_attention.schemas.safe_text import visible
 
 #: Rows of a table on the page; the files have all.
@@ -47,10 +48,10 @@ def _environment() -> Iterator[jinja2.Environment]:
 
 
 def _picture(figure: Figure) -> str:
-    """The address of a picture that stands in the page itself; photographs as WebP, a fifth of the bytes of PNG."""
+    """The address of a picture that stands in the page itself; photographs as WebP, half the bytes of PNG."""
     style = Style()
     canvas = draw(figure, style)
-    find_places(canvas, style.dpi)
+    style_module.find_places(canvas, style.dpi)
     content = BytesIO()
     kind, options = ("webp", {"quality": 85}) if figure.kind == "pictures" else ("png", {})
     with style.settings():

@@ -14,6 +14,8 @@ import polars as pl
 
 from vla_attention.analyze.statistics.intervals import (
     DEFAULT_LEVEL,
+    EpisodeStatistic,
+    Estimate,
     estimates,
     geometric_mean_over_episodes,
     mean_over_episodes,
@@ -121,8 +123,10 @@ def means_with_intervals(
         about = {"num_episodes": at.shape[1], "num_tasks": given.num_tasks, **about_row(given)}
         rows_of = {i: dict(about) for i in numbers}
         for name, statistic in statistics.items():
-            for i, used in zip(numbers, statistic.used.sum(axis=1).tolist(), strict=True):
+            for row, (i, used) in enumerate(zip(numbers, statistic.used.sum(axis=1).tolist(), strict=True)):
                 one = next(each)
+                if 0 < used < at.shape[1]:  # families are counted of the episodes that are left
+                    one = _of_what_is_left(statistic, row, given) or one
                 rows_of[i] |= named_interval(name, one.value, one.interval(level)) | {f"{name}_episodes": used}
                 if name in nulls:
                     rows_of[i][f"{name}_p"] = one.p_value(nulls[name])
@@ -131,6 +135,19 @@ def means_with_intervals(
         [found[i] for i in range(items.height)], schema={k: v for k, v in schema.items() if k not in by}
     )
     return pl.concat([items.drop("_row"), made], how="horizontal").select(*schema)
+
+
+def _of_what_is_left(statistic: EpisodeStatistic, row: int, given: Units) -> Estimate | None:
+    """The estimate about these tasks, where episodes that have a value are of fewer families than all; else None."""
+    used = statistic.used[row]
+    left = given.part(used)
+    if left.decided().estimand == given.decided().estimand:
+        return None
+    part = EpisodeStatistic(
+        statistic.numerator[row, used], statistic.denominator[row, used], used[used], statistic.exponentiate,
+        statistic.limits,
+    )  # fmt: skip
+    return estimates([part], left.decided())[0]
 
 
 def means_of_all_and_of_tasks(

@@ -12,8 +12,8 @@ An interval is about one of these (`Estimand`):
                        count them once more, as a bootstrap of tasks and then of episodes does, makes the interval too
                        wide (Field & Welsh 2007, "Bootstrapping clustered data", Journal of the Royal Statistical
                        Society B 69).
-    independent tasks  the same, as if no two tasks were related, and what is done where no family is known. The units
-                       are the tasks: t = (mean - truth) / (s / sqrt(T)) has T - 1 degrees of freedom.
+                       Where no family is known, the units are the tasks: t = (mean - truth) / (s / sqrt(T)) has T - 1
+                       degrees of freedom.
     these tasks        the mean over exactly these tasks, with endless episodes of each. Tasks are strata: the variance
                        is the sum over tasks of s_t^2 / n_t, divided by T^2, with the degrees of freedom of Welch 1947
                        (Biometrika 34; the approximation with n_t + 1 and - 2, which is unbiased for equal variances),

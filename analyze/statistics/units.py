@@ -17,14 +17,12 @@ class Estimand(StrEnum):
     """What an interval over several tasks is about; see `intervals`."""
 
     TASKS_LIKE_THESE = "tasks-like-these"
-    INDEPENDENT_TASKS = "independent-tasks"
     THESE_TASKS = "these-tasks"
 
     @property
     def words(self) -> str:
         """The name in running text."""
-        names = {self.INDEPENDENT_TASKS: "tasks like these, as if no two of them were related"}
-        return names.get(self, self.value.replace("-", " "))
+        return self.value.replace("-", " ")
 
     @property
     def of_other_tasks(self) -> bool:

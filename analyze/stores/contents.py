@@ -109,6 +109,7 @@ def lines_of_store(store: Store, tasks: Sequence[int | str] | None = None) -> It
     yield "queries", f"{recording.queries} over {recording.num_action_queries} action queries"
     exact = recording.mantissa_bits == FLOAT32_MANTISSA_BITS
     error = "exact" if exact else f"masses within {mass_error_bound(recording.mantissa_bits):.1e} (relative)"
+    yield "computed in", str(policy.config.get("dtype", "not stated"))
     yield "precision", f"{recording.mantissa_bits} mantissa bits: {error}"
     for site in root.sites:
         note = f" ({own_parts(root, site.name)})" if site.layers or site.heads or site.num_action_queries else ""

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import polars as pl
+from vla_attention.analyze.ratios.analysis import analyse
 
 import vla_attention as va
 from benchmarks.validation.calls import NOTHING, changed_episodes
@@ -18,7 +19,6 @@ from benchmarks.validation.policies import KnownPolicy
 from benchmarks.validation.tables import SCALES, means
 from vla_attention.analyze.effects.action_changes import ActionSpread
 from vla_attention.analyze.measures.sinks import SinkRule
-from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import Store
 
@@ -99,21 +99,21 @@ def attention_numbers(store: Store) -> Iterator[pl.DataFrame]:
         chosen = table.select(*_ID, pl.lit(number).alias("number"), pl.col(value).cast(pl.Float64).alias("value"))
         return chosen.with_columns(pl.col("task_id").cast(pl.Int64), pl.col("episode_index").cast(pl.Int64))
 
-    ratios = run.ratios("episodes").filter(overall)
+    ratios = run.analyze()["episodes"].filter(overall)
     yield of(ratios, "ratio", "geometric_mean")
     yield of(ratios, "ratio_lift", "ratio_lift")
     own = {"grouping": "instruction"}
-    yield of(run.ratios("episodes", **own).filter(overall), "ratio_lift_instruction", "ratio_lift")
-    words = run.masses("episodes", **own).filter(overall, group="linguistic")
+    yield of(run.analyze(**own)["episodes"].filter(overall), "ratio_lift_instruction", "ratio_lift")
+    words = run.analyze(**own)["episodes_groups"].filter(overall, group="linguistic")
     yield of(words, "instruction_mass", "mass")
     yield of(words, "instruction_lift", "lift")
     cleaned = analyse(run.ask(), SinkRule()).episodes.cells.filter(overall)
     yield of(cleaned, "ratio_lift_without_sinks", "ratio_lift")
-    norms = run.contributions().with_columns(pl.col("contribution_ratio", "ratio_lift").log())
+    norms = run.analyze()["contributions_steps"].with_columns(pl.col("contribution_ratio", "ratio_lift").log())
     episodes = norms.group_by(_ID, maintain_order=True).agg(pl.col("contribution_ratio", "ratio_lift").mean().exp())
     yield of(episodes, "contribution_ratio", "contribution_ratio")
     yield of(episodes, "contribution_lift", "ratio_lift")
-    wrist = run.masses("episodes", grouping="cameras").filter(overall, group=WRIST_CAMERA)
+    wrist = run.analyze(grouping="cameras")["episodes_groups"].filter(overall, group=WRIST_CAMERA)
     yield of(wrist, "wrist_mass", "mass")
     yield of(wrist, "wrist_lift", "lift")
     wanted = pl.DataFrame(

@@ -10,7 +10,6 @@ import polars as pl
 
 from vla_attention.analyze.statistics.episode_intervals import Sampling, means_with_intervals
 from vla_attention.analyze.statistics.intervals import NO_LIMITS
-from vla_attention.analyze.statistics.units import Estimand
 
 #: Scale on which a number is averaged and compared, and the way back.
 SCALES = {"log": (np.log, np.exp), "plain": (lambda x: x, lambda x: x)}
@@ -29,7 +28,7 @@ def means(table: pl.DataFrame, by: Sequence[str], value: str = "value", scale: s
     chosen = table.with_columns(pl.Series(value, transformed)).filter(pl.Series(there))
     if not chosen.height:
         return []
-    found = means_with_intervals(chosen, by, {value: NO_LIMITS}, Sampling(Estimand.INDEPENDENT_TASKS))
+    found = means_with_intervals(chosen, by, {value: NO_LIMITS}, Sampling())
     rows = []
     for row in found.iter_rows(named=True):
         numbers = {

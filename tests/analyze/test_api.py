@@ -72,31 +72,28 @@ def test_examples(test, store, other, rerun, replayed, tmp_path):
     assert result.attempted > 0
 
 
-@pytest.mark.parametrize("level", ["tasks", "episodes", "steps"])
-def test_ratios_are_those_of_the_command(run, store, tmp_path, level):
-    assert (
-        main(
-            [
-                "ratios",
-                str(store),
-                "--no-plots",
-                "--output",
-                str(tmp_path),
-                "--layers",
-                "2",
-                "--intervals",
-                "these-tasks",
-            ]
-        )
-        == 0
-    )
-    assert_frame_equal(
-        run.ratios(level, layers=[2], intervals="these-tasks"), pl.read_parquet(tmp_path / f"{level}.parquet")
-    )
+def test_tables_are_those_of_the_command(run, store, tmp_path):
+    words = [str(store), "--no-plots", "--output", str(tmp_path), "--layers", "2", "--intervals", "these-tasks"]
+    assert main(words) == 0
+    answer = run.analyze(layers=[2], intervals="these-tasks")
+    written = {file.stem: pl.read_parquet(file) for file in tmp_path.glob("*.parquet")}
+    assert set(written) == {table.name for table in answer.tables if not table.of}
+    for name, table in written.items():
+        assert_frame_equal(answer[name], table)
+
+
+def test_an_answer_shows_saves_and_draws_itself(run, tmp_path):
+    answer = run.words()
+    assert str(answer).splitlines()[0] == answer.about[0]
+    assert "<table" in answer._repr_html_()
+    assert answer.plot().get_axes()
+    assert {"result.json", "words.csv", "word_bars.png"} <= {file.name for file in answer.save(tmp_path, csv=True)}
+    with pytest.raises(va.UserError, match="word_bars"):
+        answer.plot("word_bar")
 
 
 def test_masses_in_long_form_are_sums_over_the_raw_rows(run, store):
-    masses = run.masses(grouping="cameras", per_head=True, tasks=1)
+    masses = run.analyze(grouping="cameras", per_head=True, tasks=1)["steps_groups"]
     span = small_layout().span("base_0_rgb")
     names = [f"task001_episode00{i}" for i in range(2)]
     group = zarr.open_group(store, mode="r")["episodes"]
@@ -133,13 +130,11 @@ def test_keywords_become_settings(given, expected):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda run: run.ratios(layer=3), r"Unknown setting 'layer'\. Did you mean 'layers'"),
-        (lambda run: run.ratios("task"), r"Unknown level 'task'\. Did you mean 'tasks'"),
-        (lambda run: run.heads(table="head"), r"Unknown table 'head'\. Did you mean 'heads'"),
-        (lambda run: run.ratios(layers="two"), r"Cannot use 'two' as numbers"),
-        (lambda run: run.ratios(ratio=("a", "b", "c")), r"expected 'A,B/C' or a pair"),
-        (lambda run: run.ratios(layers=1), r"were not recorded"),
-        (lambda run: run.to_xarray(rows=True, most_gigabytes=1e-6), r"more than the 1 kB"),
+        (lambda run: run.analyze(layer=3)["tasks"], r"Unknown setting 'layer'\. Did you mean 'layers'"),
+        (lambda run: run.analyze(by=["heads"]), r"Unknown axis for --by 'heads'\. Did you mean 'head'"),
+        (lambda run: run.analyze(layers="two")["tasks"], r"Cannot use 'two' as numbers"),
+        (lambda run: run.analyze(ratio=("a", "b", "c"))["tasks"], r"expected 'A,B/C' or a pair"),
+        (lambda run: run.analyze(layers=1)["tasks"], r"were not recorded"),
         (lambda run: va.open([]), r"No store was given"),
     ],
 )
@@ -153,7 +148,7 @@ def test_stores_are_opened_by_path_text_or_several(store, other, tmp_path):
     second = write_store(tmp_path / "second.zarr", suite="second", contributions=True)
     both = va.open([store, second])
     assert both.episodes["suite"].unique().sort().to_list() == ["made_up", "second"]
-    assert both.ratios()["scope"].unique().sort().to_list() == ["all", "combined", "task"]
+    assert both.analyze()["tasks"]["scope"].unique().sort().to_list() == ["all", "combined", "task"]
     with pytest.raises(StoreNotFound):
         va.open(tmp_path / "absent.zarr")
     with pytest.raises(StoreError, match="both hold"):
@@ -165,7 +160,7 @@ def test_an_empty_store_can_be_opened_and_says_that_it_is_empty(tmp_path):
     assert run.episodes.height == 0
     assert "0 episodes" in repr(run)
     with pytest.raises(StoreError, match="no complete episode"):
-        run.ratios()
+        run.analyze()["tasks"]
 
 
 def test_a_group_inside_of_a_store_leads_to_the_store(store, capsys):

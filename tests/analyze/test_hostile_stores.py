@@ -122,19 +122,17 @@ class Tags(HTMLParser):
 
 #: Further arguments of each command; OUT is its folder of output.
 WORDS: dict[str, tuple[str, ...]] = {
-    "ratios": ("STORE", "--output", "OUT", "--save-viz", "--layers", "0"),
-    "groups": ("STORE", "--output", "OUT"),
-    "heads": ("STORE", "--output", "OUT", "--no-plots"),
+    "analyze": ("STORE", "--output", "OUT", "--save-viz", "--layers", "0"),
+    "analyze list": ("STORE", "--list", "--output", "OUT"),
+    "analyze by": ("STORE", "--by", "head,time", "--csv", "--output", "OUT"),
     "words": ("STORE", "--output", "OUT", "--task", "0"),
     "objects": ("STORE", "--output", "OUT"),
-    "time": ("STORE", "--output", "OUT", "--no-plots"),
     "compare": ("STORE", "OTHER", "--output", "OUT", "--no-plots"),
     "effects": ("STORE", "OTHER", "--output", "OUT"),
     "deviation": ("STORE", "--output", "OUT"),
     "overlay": ("STORE", "OTHER", "--output", "OUT"),
     "report": ("STORE", "--output", "OUT", "--num-episodes", "1", "--task", "0", "--layers", "0"),
     "view": ("STORE", "--output", "OUT"),
-    "export": ("STORE", "--csv", "--output", "OUT"),
     "copy": ("STORE", "OUT/copy.zarr", "--without", "frames"),
     "verify": ("STORE",),
     "cache": (),
@@ -143,7 +141,7 @@ WORDS: dict[str, tuple[str, ...]] = {
 
 @pytest.mark.drawn
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("command", thorough_except(("ratios", "report"), WORDS))
+@pytest.mark.parametrize("command", thorough_except(("analyze", "report"), WORDS))
 def test_hostile_texts_are_printed_visibly_and_nothing_is_written_elsewhere(
     store, tmp_path, monkeypatch, capsys, command
 ):
@@ -182,9 +180,8 @@ def test_hostile_texts_are_printed_visibly_and_nothing_is_written_elsewhere(
             for line in path.read_text(encoding="utf-8").split("\n"):
                 assert line.isprintable(), (path.name, line)
                 assert not line.strip().startswith(FORGED), (path.name, line)
-    if command == "ratios":
-        for text in ((out / "summary.txt").read_text(), printed):
-            assert r"put\x1b[2J the\u202e" in text
+    if command == "analyze":
+        assert r"put\x1b[2J the\u202e" in printed
         assert (out / "attention_ratio_results_%24x%5E%7B%24 %3Cb%3E%252E.json").is_file()
         assert parse(["--results", str(out), "--output", str(out / "parsed.txt")]) == 0
         assert r"put\x1b[2J the\u202e" in check_output(capsys)
@@ -208,7 +205,7 @@ def test_no_command_writes_into_a_store(original, store, tmp_path, capsys, comma
     out = tmp_path / "link" / inside
     words = [word.replace("STORE", str(store)).replace("OTHER", str(other)) for word in WORDS[command]]
     try:
-        code: object = analyze([command, *(word.replace("OUT", str(out)) for word in words)])
+        code: object = analyze([command.split()[0], *(word.replace("OUT", str(out)) for word in words)])
     except SystemExit as end:  # of a mistake in the arguments
         code = end.code
     assert code == 2
@@ -250,13 +247,16 @@ class HostileSites(SiteStoreSpec):
 @pytest.mark.thorough
 @pytest.mark.drawn
 @pytest.mark.parametrize(
-    "command", thorough_except(("ratios",), sorted(set(WORDS) - {"effects", "objects", "compare", "merge"}))
+    "command", thorough_except(("analyze",), sorted(set(WORDS) - {"effects", "objects", "compare", "merge"}))
 )
 def test_hostile_names_of_sites_are_printed_visibly_and_nothing_is_written_elsewhere(tmp_path, capsys, command):
     store = write_site_store(tmp_path / "a.zarr", HostileSites(kind="split", dataset_actions=0.5, outcome="some"))
     out, before = tmp_path / "out", files_under(tmp_path)
     words = [word for word in WORDS[command] if word != "OTHER"]
-    assert analyze([command, *(word.replace("STORE", str(store)).replace("OUT", str(out)) for word in words)]) == 0
+    assert (
+        analyze([command.split()[0], *(word.replace("STORE", str(store)).replace("OUT", str(out)) for word in words)])
+        == 0
+    )
     check_output(capsys)
     assert analyze([str(store), "--list"]) == 0
     assert FORMULA in check_output(capsys)
@@ -327,7 +327,7 @@ CONTROL, PATH = "a\x1b[2J\u202e", "../../../x"
 def test_a_run_whose_names_are_paths_or_control_a_terminal_is_refused(store, tmp_path, capsys, make, name):
     change(store / "zarr.json", lambda attributes: make(attributes, name))
     before = files_under(tmp_path)
-    for command in ((), ("verify",), ("heads",), ("report",)):
+    for command in ((), ("verify",), ("words",), ("report",)):
         more = () if command == ("verify",) else ("--output", str(tmp_path / "out" / "report.html"))
         assert analyze([*command, str(store), *more]) == 2
         assert "cannot be read" in check_output(capsys)

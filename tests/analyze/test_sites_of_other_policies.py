@@ -12,9 +12,9 @@ import pytest
 from tests.kit.questions import question_about
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.analyze.measures.contributions import contribution_table
-from vla_attention.analyze.measures.steps import measure_episodes, step_tables
-from vla_attention.analyze.ratios.analysis import analyse
+from vla_attention.analyze.commands.analyze import analyze as ask_analyze
+from vla_attention.analyze.core.contributions import side_norms
+from vla_attention.analyze.core.levels import levels_of
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions, KeyKnockout
 from vla_attention.testing.site_stores import write_site_store
@@ -39,22 +39,21 @@ def test_uniform_attention_has_the_lift_one(tmp_path, queries, grouping):
     replans = 1 if queries == "all" else 4  # with all queries, every replan has as many
     path = write_site_store(tmp_path / "a.zarr", kind="growing", spread=0, queries=queries, replans=replans)
     question = question_about(path, grouping)
-    tables = step_tables(measure_episodes(question), question.grouping)
-    groups = tables.groups.filter(pl.col("mass") > 0)
+    levels = levels_of(question)
+    groups, cells = levels.steps_groups().filter(pl.col("mass") > 0).collect(), levels.steps().collect()
     np.testing.assert_allclose(groups["lift"].to_numpy(), 1.0, rtol=2e-3)
     assert {"action", "linguistic"} <= set(groups["group"])
-    np.testing.assert_allclose(tables.cells["ratio"].to_numpy(), tables.cells["uniform_ratio"].to_numpy(), rtol=2e-3)
+    np.testing.assert_allclose(cells["ratio"].to_numpy(), cells["uniform_ratio"].to_numpy(), rtol=2e-3)
     assert (groups["keys"] % 1 == 0).all(), "keys are counted, whoever sees them"
     generated = groups.filter(group="action")["keys"].to_numpy()
     assert set(generated) == ({6.0} if queries == "all" else {4.0, 5.0, 6.0}), "absent keys count for nothing"
 
 
 def test_absent_keys_are_never_called_padding(stores, capsys):
-    question = question_about(stores["growing"])
-    groups = step_tables(measure_episodes(question), question.grouping).groups
+    groups = levels_of(question_about(stores["growing"])).steps_groups().collect()
     assert (groups.filter(group="padding")["keys"] == 0).all()
-    analyze(["report", str(stores["growing"]), "--quick", "--out", str(stores["growing"].parent / "report")])
-    assert "Padding" not in (stores["growing"].parent / "report" / "report.html").read_text()
+    analyze(["analyze", str(stores["growing"]), "--no-plots", "--output", str(stores["growing"].parent / "out")])
+    assert "padding" not in capsys.readouterr().out
 
 
 def test_layers_that_a_site_lacks(stores):
@@ -69,7 +68,7 @@ def test_layers_that_a_site_lacks(stores):
 
 def test_masses_of_a_site_are_those_of_its_own_rows(stores):
     question = question_about(stores["alternating"], site="cross", layers=(3,))
-    for measured in measure_episodes(question):
+    for measured in levels_of(question).measured:
         rows = measured.item.episode.read("cross/rows")[:, 1]  # block 3 is the second of the site
         image = rows[..., :16].sum(axis=-1, dtype=np.float64).mean(axis=(2, 3))  # (replan, denoise)
         np.testing.assert_allclose(measured.mass[:, 0, :, 0, 0], image, rtol=1e-3)
@@ -77,7 +76,9 @@ def test_masses_of_a_site_are_those_of_its_own_rows(stores):
 
 def test_contributions_of_sites_in_different_blocks(stores):
     question = question_about(stores["split"])
-    table = contribution_table(question.selected, question.selection).whole
+    norms = side_norms(question)
+    assert norms is not None
+    table = norms.cells().collect()
     assert table["block"].unique().sort().to_list() == [0, 1, 2, 3]
     assert table["contribution_ratio"].is_null().all()
     of_image = table.filter(pl.col("block").is_in([1, 3]))
@@ -86,8 +87,8 @@ def test_contributions_of_sites_in_different_blocks(stores):
     gram = question.selected[0].episode.read("image/contribution")[0, 1, 1].astype(np.float64)  # block 3, step 1
     first = of_image.filter(task_id=0, episode_index=0, replan=0, block=3, denoise_step=1)
     assert first["visual_norm"].item() == pytest.approx(np.sqrt(gram[:-1, :-1].sum()), rel=1e-5)
-    analysis = analyse(question)
-    row = analysis.contribution_rows.filter(layer="layers_avg").row(0, named=True)
+    result = ask_analyze(question)
+    row = result["contributions"].filter(layer="layers_avg").row(0, named=True)
     steps = table.group_by("task_id", "episode_index", "replan", "denoise_step").agg(
         pl.col("visual_norm", "linguistic_norm").mean()
     )
@@ -96,35 +97,32 @@ def test_contributions_of_sites_in_different_blocks(stores):
     assert row["geometric_mean"] == pytest.approx(np.exp(per_episode["log"].mean()), rel=1e-9)
     assert row["uniform_ratio"] > 0
     assert row["ratio_lift"] > 0
-    assert any("a ratio of visual to linguistic attention is not defined" in note for note in analysis.notes)
-    assert contribution_table(question.selected, question.selection, layers=(0, 2)) is None
+    assert any("a ratio of visual to linguistic attention is not defined" in note for note in result.notes)
+    assert side_norms(question_about(stores["split"], layers=(0, 2))) is None
 
 
 #: What each command says of any of the stores.
 SAYS = {
-    "": "",
-    "--list": "not known: picture size",
-    "heads": "",
+    "analyze": "",
+    "analyze --list": "not known: picture size",
+    "analyze --by layer,head": "",
+    "analyze --by time": "",
     "words": "",
-    "time": "gripper whose commands are known",
-    "groups": "",
     "overlay": "",
     "verify": "all whole",
     "report": "",
 }
 #: Every command once, and every store with the default question.
-FAST = [(command, "growing") for command in SAYS if command != "report"] + [("", name) for name in (*KINDS, "bare")]
+FAST = [(command, "growing") for command in SAYS if command != "report"]
+FAST += [("analyze", name) for name in (*KINDS, "bare")]
 
 
 @pytest.mark.parametrize(("command", "name"), thorough_except(FAST, product(SAYS, (*KINDS, "bare")), several=True))
 def test_commands(stores, tmp_path, capsys, command, name):
-    given = [str(stores[name]), "--list"] if command == "--list" else [*command.split(), str(stores[name])]
-    if command not in ("--list", "verify"):
-        given += [
-            "--out",
-            str(tmp_path / "out"),
-            *(["--no-plots"] if command in ("", "heads", "words", "time") else []),
-        ]
+    name_of_command, *more = command.split()
+    given = [name_of_command, str(stores[name]), *more]
+    if command != "verify":
+        given += ["--output", str(tmp_path / "out")]
     assert analyze(given) == 0
     printed = capsys.readouterr()
     assert SAYS[command] in " ".join(printed.out.split())
@@ -133,7 +131,7 @@ def test_commands(stores, tmp_path, capsys, command, name):
 def test_effects_of_recorded_rollouts(stores, tmp_path, capsys):
     knockout = Interventions("without_visual", keys=(KeyKnockout("role:image"),))
     other = write_site_store(tmp_path / "other.zarr", kind="growing", outcome="some", interventions=knockout)
-    assert analyze(["effects", str(stores["growing"]), str(other), "--out", str(tmp_path), "--no-plots"]) == 0
+    assert analyze(["effects", str(stores["growing"]), str(other), "--output", str(tmp_path), "--no-plots"]) == 0
     pairs = pl.read_parquet(tmp_path / "rollouts.parquet")
     assert (pairs["episode"] == pairs["episode_base"]).all()
     assert pairs["steps"].is_null().all()
@@ -142,7 +140,7 @@ def test_effects_of_recorded_rollouts(stores, tmp_path, capsys):
 
 def test_runs_are_compared_episode_by_episode_where_the_first_state_is_not_known(stores, tmp_path, capsys):
     other = write_site_store(tmp_path / "other.zarr", kind="growing", outcome="some", spread=0.5)
-    assert analyze(["compare", str(stores["growing"]), str(other), "--out", str(tmp_path), "--no-plots"]) == 0
+    assert analyze(["compare", str(stores["growing"]), str(other), "--output", str(tmp_path), "--no-plots"]) == 0
     pairs = pl.read_parquet(tmp_path / "pairs.parquet")
     assert (pairs["episode_first"] == pairs["episode_other"]).all()
     assert pairs["episode_first"].n_unique() == 3

@@ -181,7 +181,7 @@ def raw(path) -> np.ndarray:
 def test_masses_and_overlay_of_a_store_are_of_all_keys(made, tmp_path, capsys):
     path, layout = made
     rows, keys = raw(path), keys_of(layout, "front")
-    masses = va.open(path).masses("episodes", grouping="cameras").filter(pl.col("episode_index") == 0)
+    masses = va.open(path).analyze(grouping="cameras")["episodes_groups"].filter(pl.col("episode_index") == 0)
     own = masses.filter((pl.col("group") == "front") & (pl.col("layer") == "layers_avg"))
     np.testing.assert_allclose(own["mass"], rows[:, keys].sum(axis=1).mean(), rtol=1e-4)
     words = "--replans 0 2 --outline f=camera:front".split()
@@ -207,7 +207,7 @@ def test_masses_and_overlay_of_a_store_are_of_all_keys(made, tmp_path, capsys):
 @pytest.mark.parametrize("made", ["tiles and thumbnail"], indirect=True)
 def test_its_groups_and_its_report_are_drawn(made, tmp_path):
     path, _ = made
-    assert main(["groups", str(path), "--grouping", "cameras", "--output", str(tmp_path)]) == 0
+    assert main(["analyze", str(path), "--list", "--grouping", "cameras", "--output", str(tmp_path)]) == 0
     assert main(["report", str(path), "--output", str(tmp_path / "report.html")]) == 0
 
 

@@ -22,13 +22,11 @@ SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, contributions=True)
 OUT = ("--output", "OUT", "--no-cache")
 #: Commands that together write all kinds of files, in this process and in the second one.
 WRITING: dict[str, tuple[str, ...]] = {
-    "ratios, second process": ("ratios", "STORE", *OUT, "--threads", "2", "--layers", "0"),
-    "ratios, tables": ("ratios", "STORE", *OUT, "--no-plots"),
+    "analyze": ("analyze", "STORE", *OUT, "--layers", "0"),
+    "analyze, csv": ("analyze", "STORE", *OUT, "--no-plots", "--csv"),
     "words": ("words", "STORE", *OUT, "--task", "0"),
     "overlay": ("overlay", "STORE", *OUT, "--video", "gif"),
     "effects": ("effects", "STORE", "RERUN", *OUT),
-    "export csv": ("export", "STORE", "--csv", *OUT),
-    "export parquet": ("export", "STORE", "--parquet", *OUT),
     "copy": ("copy", "STORE", "OUT/copy.zarr"),
 }
 #: Bytes of the largest file.

@@ -30,10 +30,10 @@ def test_a_policy_that_generates_tokens(tmp_path, tokens):
                     with episode.replan(env_step=step):
                         policy.act(torch.rand(3, 8, 8), text, tokens)
     opened = va.open(tmp_path / "a.zarr")
-    groups = opened.masses("steps", grouping="instruction").filter(pl.col("keys") > 0)
+    groups = opened.analyze(grouping="instruction")["steps_groups"].filter(pl.col("keys") > 0)
     assert set(groups["group"]) == {"visual", "linguistic", "template", "action"}
     np.testing.assert_allclose(groups["lift"].to_numpy(), 1.0, rtol=1e-5)
-    cells = opened.ratios("steps")
+    cells = opened.analyze()["steps"]
     np.testing.assert_allclose(cells["ratio"].to_numpy(), cells["uniform_ratio"].to_numpy(), rtol=1e-5)
     np.testing.assert_allclose(opened.words("episodes").filter(kind="word")["lift"].to_numpy(), 1.0, rtol=1e-5)
 
@@ -49,6 +49,6 @@ def test_sites_in_different_blocks(tmp_path):
     ):
         policy.act(prefix, noise)
     for site, blocks, keys in (("self", [0, 2], [5, 3]), ("cross", [1, 3], [5])):
-        groups = va.open(tmp_path / "a.zarr").masses("steps", site=site).filter(pl.col("keys") > 0)
+        groups = va.open(tmp_path / "a.zarr").analyze(site=site)["steps_groups"].filter(pl.col("keys") > 0)
         assert groups["block"].unique().sort().to_list() == blocks
         assert groups["keys"].unique().to_list() == pytest.approx(sorted(keys))

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import polars as pl
 
-from tests.kit.made_up_steps import flat
-from vla_attention.analyze.measures.frames import Tables
+from tests.kit.made_up_steps import Made
 
 
 def written_steps(folder: Path) -> pl.DataFrame:
     """Steps from `steps.parquet` and `steps_groups.parquet`, with a column `{group}_{measure}` for each."""
-    return flat(Tables(*(pl.read_parquet(folder / f"{name}.parquet") for name in ("steps", "steps_groups"))))
+    return Made(*(pl.read_parquet(folder / f"{name}.parquet") for name in ("steps", "steps_groups"))).flat

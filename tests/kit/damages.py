@@ -23,6 +23,7 @@ import polars as pl
 import vla_attention as va
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.api import OpenStores
+from vla_attention.analyze.core.contributions import group_norms
 from vla_attention.schemas.effects import CHANGE, CUT
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import open_store
@@ -83,7 +84,7 @@ KINDS: tuple[FileKind, ...] = (
 
 
 def _groups(run: OpenStores, site: str, **groups: str) -> pl.DataFrame:
-    return run.masses(groups={**groups, "others": "*"}, site=site)
+    return run.analyze(groups={**groups, "others": "*"}, site=site)["steps_groups"]
 
 
 def _rest(run: OpenStores, site: str) -> dict[str, Any]:
@@ -101,8 +102,8 @@ def _rest(run: OpenStores, site: str) -> dict[str, Any]:
 
 def _of_groups(run: OpenStores, site: str) -> pl.DataFrame | None:
     """Norms of groups; those of `contributions` are read at the first site that has such keys."""
-    tables = run.analysis(site=site).group_contributions
-    return None if tables is None else tables.groups
+    norms = group_norms(run.ask(site=site))
+    return None if norms is None else norms.norms().collect()
 
 
 def _camera(run: OpenStores) -> str:
@@ -111,13 +112,17 @@ def _camera(run: OpenStores) -> str:
 
 #: Questions about a site; together they read every file of an episode.
 ANALYSES: dict[str, Callable[[OpenStores, str], object]] = {
-    "episodes": lambda run, site: (run.episodes, run.describe()),
-    "spans": lambda run, site: (run.ratios("steps", site=site), run.masses("tasks", site=site), run.summary(site=site)),
+    "episodes": lambda run, site: (run.episodes, str(run.analyze(list=True))),
+    "spans": lambda run, site: (
+        run.analyze(site=site)["steps"],
+        run.analyze(site=site)["tasks_groups"],
+        str(run.analyze(site=site)),
+    ),
     "patches": lambda run, site: _groups(run, site, corner=f"patch:{_camera(run)}[0:1,0:1]"),
-    "words": lambda run, site: run.words("episodes", site=site),
-    "contributions": lambda run, site: (run.contributions(site=site), _of_groups(run, site)),
+    "words": lambda run, site: run.words(site=site)["words_episodes"],
+    "contributions": lambda run, site: (run.analyze(site=site)["contributions_steps"], _of_groups(run, site)),
     "objects": lambda run, site: _groups(run, site, bowl="object:akita_black_bowl_1"),
-    "time": lambda run, site: run.time("course", bins=2, site=site),
+    "time": lambda run, site: run.analyze(by=("time",), site=site)["by"],
     "rest": _rest,
 }
 #: Not for stores of a replayed data set, which have neither objects nor the protocol of a simulator.

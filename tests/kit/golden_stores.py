@@ -6,11 +6,13 @@ import hashlib
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 
 import vla_attention as va
 from tests.kit.paths import GOLDEN
+from vla_attention.analyze.api import OpenStores
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import NUMBERS
 
@@ -41,14 +43,28 @@ def numbers_of(path: Path) -> dict[str, pl.DataFrame]:
     for site in run.attributes.sites:
         asked = {"site": site.name, "grouping": "default"}
         tables |= {
-            f"{site.name}_ratios": run.ratios("tasks", **asked),
-            f"{site.name}_masses": run.masses("replans", **asked),
-            f"{site.name}_heads": run.heads(**asked),
+            f"{site.name}_ratios": run.analyze(**asked)["tasks"],
+            f"{site.name}_masses": run.analyze(**asked)["replans_groups"],
+            **_heads(run, site.name, asked),
         }
     if run.stores[0].attributes.recording.effects is not None:
         kept = ["task_id", "episode_index", "condition", "num_replans", "effect", "effect_chunk", "keys", "lift"]
         tables["effects"] = run.effects(table="episodes").filter(pl.col("phase") == "all").select(kept)
     return {name: table for name, table in tables.items() if table.width}
+
+
+def _heads(run: OpenStores, site: str, asked: dict[str, Any]) -> dict[str, pl.DataFrame]:
+    """Ratios and lifts of every head, as base 2 logarithms; nothing for a site without a ratio."""
+    tables = {table.name: table for table in run.analyze(by=("layer", "head"), **asked).tables}
+    if "by" not in tables:
+        return {}
+    rows = tables["by"].shown.drop("layer").rename({"layer_number": "layer"})
+    logs = {"log2_ratio": "ratio", "log2_lift": "ratio_lift"}
+    ends = ("", "_low", "_high")
+    found = rows.with_columns(
+        pl.col(f"{of}{end}").log(2.0).alias(f"{name}{end}") for name, of in logs.items() for end in ends
+    )
+    return {f"{site}_heads": found}
 
 
 def _arrays(path: Path) -> pl.DataFrame:

@@ -249,7 +249,12 @@ class Form:
         floats = [pl.col(name).round(9) for name in self.keys if kept.schema[name].is_float()]
         kept = kept if self.still is None else kept.filter(self.still)
         kept = kept.drop(self.gone, strict=False).with_columns(floats)
-        rows = self.rows(tables).select(kept.columns).with_columns(floats).join(kept, on=self.keys, how="semi", nulls_equal=True)
+        rows = (
+            self.rows(tables)
+            .select(kept.columns)
+            .with_columns(floats)
+            .join(kept, on=self.keys, how="semi", nulls_equal=True)
+        )
         found, expected = (table.sort(self.keys, nulls_last=True) for table in (rows, kept))
         return differences(found, expected, alike)
 

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.measures.aggregate import replan_tables
-from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, Tables
-from vla_attention.analyze.measures.steps import MeasuredEpisode
+from vla_attention.analyze.core.levels import SIDES, Levels, task_cells, task_groups
+from vla_attention.analyze.core.measure import Measured
+from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS
+from vla_attention.analyze.published.results_writer import documents_of, write_results
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
+from vla_attention.schemas.results import FrameProxy, results_file_name
 
 #: Keys per group of the default grouping in something like pi0.5 with two cameras.
 DEFAULT_KEYS = {
@@ -150,27 +155,79 @@ def make_steps(
     return pl.DataFrame(columns)
 
 
-def measured_of(steps: pl.DataFrame, grouping: Grouping) -> list[MeasuredEpisode]:
+def measured_of(steps: pl.DataFrame, grouping: Grouping) -> list[Measured]:
     """The episodes of `make_steps` (in any order of its rows) as measured masses."""
     return [_measured(part, grouping) for part in steps.partition_by(EPISODE_ID, maintain_order=True)]
 
 
-def replans_of(steps: pl.DataFrame, grouping: Grouping) -> Tables:
-    return replan_tables(measured_of(steps, grouping), grouping)
+@dataclass(frozen=True)
+class Made:
+    """The cells of a level, and their groups."""
+
+    cells: pl.DataFrame
+    groups: pl.DataFrame
+    measured: Sequence[Measured] = ()
+
+    def of_group(self, name: str) -> pl.DataFrame:
+        """The rows of one group."""
+        return self.groups.filter(group=name)
+
+    @property
+    def flat(self) -> pl.DataFrame:
+        """Cells with a column `{group}_{measure}` for each group and measure."""
+        shared = [name for name in self.groups.columns if name in self.cells.columns]
+        keys = [name for name in shared if name not in ("num_episodes", "num_tasks", "num_families", "intervals")]
+        found = self.cells
+        for name in self.groups["group"].unique(maintain_order=True):
+            own = self.groups.filter(group=name).drop("group")
+            named = own.rename({column: f"{name}_{column}" for column in own.columns if column not in keys})
+            found = found.join(named, on=keys, how="left", nulls_equal=True, maintain_order="left")
+        return found
 
 
-def flat(tables: Tables) -> pl.DataFrame:
-    """Cells with a column `{group}_{measure}` for each group and measure."""
-    shared = [name for name in tables.groups.columns if name in tables.cells.columns]
-    parts = [tables.cells]
-    for name in tables.groups["group"].unique(maintain_order=True):
-        own = tables.of_group(name)
-        assert own.select(shared).equals(tables.cells.select(shared))
-        parts.append(own.drop(*shared, "group").rename(lambda column, name=name: f"{name}_{column}"))
-    return pl.concat(parts, how="horizontal")
+def made_levels(steps: pl.DataFrame, grouping: Grouping) -> Levels:
+    measured = measured_of(steps, grouping)
+    question: Any = SimpleNamespace(grouping=grouping, selection=measured[0].selection)
+    return Levels(question, measured, measured[0].mass.shape[3] > 1)
 
 
-def _measured(part: pl.DataFrame, grouping: Grouping) -> MeasuredEpisode:
+def steps_of(levels: Levels) -> Made:
+    return Made(levels.steps().collect(), levels.steps_groups().collect())
+
+
+def replans_of(steps: pl.DataFrame, grouping: Grouping) -> Made:
+    levels = made_levels(steps, grouping)
+    return Made(levels.replans().collect(), levels.groups("replan", "layer").collect(), levels.measured)
+
+
+def flat(made: Made) -> pl.DataFrame:
+    return made.flat
+
+
+def write_results_of_suites(
+    folder: Path, made: Made, grouping: Grouping, denoise_steps: Sequence[int], proxy: FrameProxy | None = None
+) -> list[Path]:
+    """The results files of made-up replans."""
+    paths = []
+    folder.mkdir(parents=True, exist_ok=True)
+    for suite in dict.fromkeys(one.item.store.suite for one in made.measured):
+        paths.append(folder / results_file_name(suite))
+        of_suite = [one for one in made.measured if one.item.store.suite == suite]
+        write_results(paths[-1], documents_of(of_suite, grouping, denoise_steps, proxy))
+    return paths
+
+
+def episodes_of(steps: pl.DataFrame, grouping: Grouping) -> Made:
+    levels = made_levels(steps, grouping)
+    return Made(levels.episodes(), levels.episodes_groups())
+
+
+def tasks_of(steps: pl.DataFrame, grouping: Grouping) -> Made:
+    episodes = episodes_of(steps, grouping)
+    return Made(task_cells(episodes.cells, Sampling()), task_groups(episodes.groups, Sampling()))
+
+
+def _measured(part: pl.DataFrame, grouping: Grouping) -> Measured:
     part = part.sort("replan", "layer", "denoise_step", "head")
     layers, steps, heads = (
         part[name].unique(maintain_order=True).to_list() for name in ("layer", "denoise_step", "head")
@@ -203,14 +260,29 @@ def _measured(part: pl.DataFrame, grouping: Grouping) -> MeasuredEpisode:
 
     num_keys = of([f"{name}_keys" for name in grouping.names], replans)
     num_valid = replans["num_valid"].to_numpy()
-    return MeasuredEpisode(
+    mass = of([f"{name}_mass" for name in grouping.names]).reshape(*shape, -1)
+    kinds, names = ["group"] * len(grouping.names), list(grouping.names)
+    whole = mass.sum(axis=-1)
+    if grouping.ratio is not None:
+        for kind, side in zip(SIDES, (grouping.ratio.numerator, grouping.ratio.denominator), strict=True):
+            at = [grouping.names.index(name) for name in side]
+            mass = np.concatenate([mass, mass[..., at].sum(axis=-1, keepdims=True)], axis=-1)
+            num_keys = np.concatenate([num_keys, num_keys[..., at].sum(axis=-1, keepdims=True)], axis=-1)
+            kinds.append(kind)
+            names.append(kind)
+    return Measured(
         item=item,
         selection=selection,
-        mass=of([f"{name}_mass" for name in grouping.names]).reshape(*shape, -1),
-        valid_mass=of(["valid_mass"]).reshape(shape),
-        row_sum=of(["row_sum"]).reshape(shape),
-        num_keys=num_keys,
-        num_valid=num_valid,
-        uniform_mass=(num_keys / num_valid[:, None])[:, None, None, None],
+        labels={"kind": pl.Series(kinds), "group": pl.Series(names)},
+        absent="zero",
+        mass=mass,
+        whole=whole,
+        valid=of(["valid_mass"]).reshape(shape),
+        keys=num_keys,
+        uniform=(num_keys / num_valid[:, None])[:, None, None, None],
         uniform_valid=np.ones((1, 1, 1, 1)),
+        row_sum=of(["row_sum"]).reshape(shape),
+        num_valid=num_valid,
+        env_step=arrays["env_step"],
+        denoise_time=arrays["denoise_time"],
     )

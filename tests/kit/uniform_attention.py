@@ -54,7 +54,7 @@ def lifts_of_groups(path: Path) -> dict[str, dict[str, list[float | None]]]:
     """Site -> group of the grouping 'default' -> its lift in every cell of a store (replan, layer, denoise, head)."""
     found = {}
     for site in open_store(path).attributes.sites:
-        table = va.open(path).masses(site=site.name, per_head=True)
+        table = va.open(path).analyze(site=site.name, per_head=True)["steps_groups"]
         found[site.name] = {group: part["lift"].to_list() for (group,), part in table.group_by("group")}
     return found
 

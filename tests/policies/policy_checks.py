@@ -182,7 +182,7 @@ def check_analysis(path: Path, sites: Sequence[str], *, ratios: bool = True) -> 
     """Run the questions of the analysis that a store of one episode can answer, at every site."""
     run = va.open(path / "run.zarr")
     for site in sites:
-        masses = run.masses(site=site)
+        masses = run.analyze(site=site)["steps_groups"]
         assert masses.height > 0
         if ratios:
-            assert run.ratios(site=site).height > 0
+            assert run.analyze(site=site)["tasks"].height > 0

@@ -174,7 +174,7 @@ def test_a_ratio_inside_a_text_only_block_has_a_sentence_or_no_number(case, tmp_
     record(case, tmp_path)
     run = va.open(tmp_path / "run.zarr")
     for site in ("cross_text", "cross_image", "self"):
-        assert run.masses(site=site).height > 0
+        assert run.analyze(site=site)["steps_groups"].height > 0
 
 
 def test_queries_of_zero_have_lift_1(case, tmp_path):

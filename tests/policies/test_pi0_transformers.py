@@ -110,7 +110,7 @@ def test_a_batch_is_split_by_row(case, tmp_path):
     ):
         case.policy.sample_actions(**given)
     store = va.open(tmp_path / "two.zarr")
-    assert store.masses().height > 0
+    assert store.analyze()["steps_groups"].height > 0
     for number, episode in enumerate(open_store(tmp_path / "two.zarr").episodes):
         one = {name: value[number : number + 1] for name, value in given.items()}
         alone = record(

@@ -145,5 +145,5 @@ def test_the_rows_are_those_of_the_same_call_outside_of_vla_eval(folder, tmp_pat
 
 def test_the_store_is_analysed(folder):
     run = va.open(folder / "run.zarr")
-    assert sorted(run.ratios().filter(scope="task")["instruction"].unique()) == sorted(TASKS)
-    assert {"base", "wrist", "linguistic"} <= set(run.masses(grouping="cameras")["group"].unique())
+    assert sorted(run.analyze()["tasks"].filter(scope="task")["instruction"].unique()) == sorted(TASKS)
+    assert {"base", "wrist", "linguistic"} <= set(run.analyze(grouping="cameras")["steps_groups"]["group"].unique())

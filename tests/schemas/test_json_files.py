@@ -6,8 +6,14 @@ import tomllib
 import jsonschema
 import pytest
 
-from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps, replans_of
-from vla_attention.analyze.published.results_writer import write_results_of_suites
+from tests.kit.made_up_steps import (
+    CUSTOM_KEYS,
+    custom_grouping,
+    default_grouping,
+    make_steps,
+    replans_of,
+    write_results_of_suites,
+)
 from vla_attention.schemas.json_files import FOLDER, schema_documents, schema_text
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.stores.reader import open_store

@@ -72,8 +72,8 @@ def measured(monkeypatch) -> list[str]:
 
 def tables(path: Path, **settings: object) -> list[pl.DataFrame]:
     run = va.open(path)
-    found = [run.ratios(level, **settings) for level in ("tasks", "episodes", "replans", "steps")]  # type: ignore
-    return [*found, run.masses("steps", **settings), run.masses("tasks", **settings)]  # type: ignore[arg-type]
+    found = [run.analyze(**settings)[level] for level in ("tasks", "episodes", "replans", "steps")]  # type: ignore
+    return [*found, run.analyze(**settings)["steps_groups"], run.analyze(**settings)["tasks_groups"]]  # type: ignore[arg-type]
 
 
 def same(found: list[pl.DataFrame], expected: list[pl.DataFrame]) -> bool:
@@ -246,7 +246,7 @@ import vla_attention as va
 run = va.open(sys.argv[1])
 print("ready", flush=True)
 sys.stdin.readline()
-run.ratios("steps", grouping="cameras").write_parquet(sys.argv[2])
+run.analyze(grouping="cameras")["steps"].write_parquet(sys.argv[2])
 """
 
 
@@ -269,5 +269,5 @@ def test_processes_that_fill_one_cache_at_the_same_time_agree(cache, stores, mea
         assert process.returncode == 0
     found = [pl.read_parquet(output) for output in outputs]
     assert all(one.equals(found[0]) for one in found)
-    assert va.open(stores[0]).ratios("steps", grouping="cameras").equals(found[0])
+    assert va.open(stores[0]).analyze(grouping="cameras")["steps"].equals(found[0])
     assert measured == []

@@ -330,7 +330,3 @@ def test_differences_over_tasks_are_by_families(tmp_path):
     said = " ".join(text_of(comparison_sections(found)).split())
     assert "about tasks like these, by 4 families" in said
     assert "4 families of tasks where these are the units" in said
-    plain = compare(opened(stores, "first", "other", intervals="independent-tasks"))
-    apart = one(plain.differences, scope="all", layer="layers_avg", quantity="log2_ratio")
-    assert apart["low"] == pytest.approx(stats.ttest_1samp(means, 0).confidence_interval().low)
-    assert "3 tasks where tasks are the units" in " ".join(text_of(comparison_sections(plain)).split())

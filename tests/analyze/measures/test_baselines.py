@@ -43,7 +43,7 @@ def test_means_and_lifts_are_those_of_the_table(tmp_path, case, uniform):
         found = uniform_keys(question.selected[0], question.selection).mean(axis=(1, 2, 3))
         wanted = np.array(expected["uniform"])
         np.testing.assert_allclose(np.broadcast_to(found, wanted.shape), wanted, rtol=CLOSE, atol=1e-9)
-        masses = run.masses("replans", **asked).filter(layer="layers_avg")
+        masses = run.analyze(**asked)["replans_groups"].filter(layer="layers_avg")
         for replan, lifts in enumerate(expected["lifts"]):
             shown = masses.filter(replan=replan)
             for group, lift in lifts.items():
@@ -90,14 +90,14 @@ def test_uniform_attention_has_lift_1_everywhere(data):
         run = va.open(path)
         for per_head in (False, True):
             for level in ("steps", "replans", "episodes", "tasks"):
-                all_one(run.masses(level, per_head=per_head), "lift")
-                ratios = run.ratios(level, per_head=per_head)
+                all_one(run.analyze(per_head=per_head)[f"{level}_groups"], "lift")
+                ratios = run.analyze(per_head=per_head)[level]
                 all_one(ratios, "ratio_lift")
                 assert ratios["ratio_lift"].is_finite().all()
-        words = run.words("episodes")
+        words = run.words()["words_episodes"]
         all_one(words, "lift")
-        all_one(run.heads("heads_groups"), "lift")
-        np.testing.assert_allclose(run.heads("heads")["log2_lift"].to_numpy(), 0.0, atol=1e-5)
+        all_one(run.analyze(by=("layer", "head"))["by_groups"], "lift")
+        np.testing.assert_allclose(run.analyze(by=("layer", "head"))["by"]["ratio_lift"].to_numpy(), 1.0, atol=1e-5)
         search = search_sinks(question_about(path), SinkRule(factor=1.0))
         assert search.sinks.is_empty()
         # Others take nothing at some replans, which their mean counts.
@@ -124,7 +124,7 @@ def all_one(table: pl.DataFrame, column: str) -> None:
 def test_a_group_that_no_query_sees_has_no_lift(tmp_path):
     (case,) = [case for case in TABLE["stored"] if case["name"] == "no query sees the pictures"]
     run = va.open(write_case(tmp_path / "a.zarr", case, case["weights"]))
-    visual = run.masses("steps").filter(group="visual")
+    visual = run.analyze()["steps_groups"].filter(group="visual")
     assert set(visual["mass"]) == {0.0}
     assert visual["keys"].to_list() == [2.0] * visual.height
     assert visual["lift"].is_null().all() or visual["lift"].is_nan().all()
@@ -140,7 +140,7 @@ def test_layers_without_a_finite_ratio_are_in_neither_mean(tmp_path):
         ("none", [pictures], [np.inf] * 3),
     ):
         run = va.open(write_case(tmp_path / f"{name}.zarr", case | {"seen": [layers]}, [1.0] * 8))
-        ratios = run.ratios("replans")
+        ratios = run.analyze()["replans"]
         assert ratios["layer"].to_list() == ["0", "1", "layers_avg"]
         assert ratios["uniform_ratio"].to_list() == pytest.approx(expected, rel=CLOSE), name
         if name == "one":

@@ -11,7 +11,7 @@ import pytest
 from tests.kit.attacks import files_of
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.ratios.analysis import analyse
+from vla_attention.analyze.commands.analyze import analyze
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.store_format import StoreError
 from vla_attention.testing.stores import write_store
@@ -47,16 +47,16 @@ def test_a_damaged_episode_ends_the_analysis_with_its_name_and_a_way_out(tmp_pat
 
 def test_a_damaged_episode_is_left_out_by_name_when_asked(tmp_path, capsys):
     path = write_store(tmp_path / "a.zarr")
-    whole = analyse(question_about(path)).episodes
+    whole = analyze(question_about(path))
     damage_rows(path, "task000_episode001")
     words = [str(path), "--no-plots", "--output", str(tmp_path / "out"), "--skip-corrupt"]
     assert main(words) == 0
     printed = " ".join(capsys.readouterr().out.split())
     assert "task000_episode001 of" in printed
     assert "is left out" in printed
-    expected = whole.filter(~((pl.col("task_id") == 0) & (pl.col("episode_index") == 1)))
-    assert pl.read_parquet(tmp_path / "out" / "episodes.parquet").equals(expected.cells)
-    assert pl.read_parquet(tmp_path / "out" / "episodes_groups.parquet").equals(expected.groups)
+    left = ~((pl.col("task_id") == 0) & (pl.col("episode_index") == 1))
+    for name in ("episodes", "episodes_groups"):
+        assert pl.read_parquet(tmp_path / "out" / f"{name}.parquet").equals(whole[name].filter(left))
 
 
 def test_an_episode_without_replans_is_named_and_left_out_only_when_asked(tmp_path):

@@ -14,7 +14,6 @@ from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.task_families import (
     alike_instructions,
 )
-from vla_attention.analyze.ratios.analysis import analyse
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.testing.stores import write_store
 
@@ -32,12 +31,12 @@ def store(tmp_path_factory):
 
 
 def headline(path, **settings):
-    return va.open(path).ratios(**settings).filter(scope="all", layer="layers_avg").row(0, named=True)
+    return va.open(path).analyze(**settings)["tasks"].filter(scope="all", layer="layers_avg").row(0, named=True)
 
 
 def test_the_interval_over_tasks_is_by_families(store):
     row = headline(store)
-    episodes = va.open(store).ratios("episodes").filter(layer="layers_avg")
+    episodes = va.open(store).analyze()["episodes"].filter(layer="layers_avg")
     means = (
         episodes.group_by("task_id").agg(pl.col("log_ratio_mean").mean()).sort("task_id")["log_ratio_mean"].to_numpy()
     )
@@ -56,20 +55,6 @@ def test_the_interval_over_tasks_is_by_families(store):
     assert (row["num_tasks"], row["num_families"], row["intervals"]) == (7, 4, "tasks-like-these")
 
 
-def test_tasks_can_be_counted_as_independent_and_the_text_says_what_that_assumes(store, tmp_path, capsys):
-    row = headline(store, intervals="independent-tasks")
-    bare = write_store(tmp_path / "bare.zarr", tasks=tuple(FAMILIES))
-    without = headline(bare)
-    for name in ("geometric_mean", "geometric_mean_low", "geometric_mean_high", "ratio_lift_low"):
-        assert row[name] == without[name]
-    assert without["num_families"] is None
-    words = [str(store), "--no-plots", "--output", str(tmp_path / "out"), "--intervals", "independent-tasks"]
-    assert main(words) == 0
-    said = " ".join(capsys.readouterr().out.split())
-    assert "Intervals assume that no two of the 7 tasks are related, though they are of 4 families" in said
-    assert "as if no two of them were related" in said
-
-
 def test_of_fewer_than_four_families_the_interval_is_about_these_tasks(store, tmp_path, capsys):
     these = headline(store, tasks=[0, 1, 2, 3, 4], intervals="these-tasks")
     few = headline(store, tasks=[0, 1, 2, 3, 4])
@@ -79,20 +64,15 @@ def test_of_fewer_than_four_families_the_interval_is_about_these_tasks(store, tm
     words = ["words", str(store), "--no-plots", "--output", str(tmp_path / "out"), "--task", "0", "1", "2", "3", "4"]
     assert main(words) == 0
     said = " ".join(capsys.readouterr().out.split())
-    assert (
-        "Intervals are about these tasks: the 5 tasks are of 3 families ('put A on B', 'open A', 'turn on A'), and "
-        "fewer than 4 show nothing about tasks like these. --intervals independent-tasks counts" in said
-    )
-    assert "about these tasks (with one task" in said
-    assert "tasks like these (with" not in said
+    assert "The 5 tasks are of 3 kinds" in said
+    assert "Intervals: 95%, about these tasks." in said
+    assert "tasks like these" not in said
 
 
 def test_the_families_of_several_suites_are_counted_together(store, tmp_path):
     other = write_store(tmp_path / "b.zarr", suite="other", tasks=(0, 1), task_families={0: "open A", 1: "fold A"})
-    row = va.open([store, other]).ratios().filter(scope="combined", layer="layers_avg").row(0, named=True)
+    row = va.open([store, other]).analyze()["tasks"].filter(scope="combined", layer="layers_avg").row(0, named=True)
     assert (row["num_tasks"], row["num_families"]) == (9, 5)
-    text = analyse(asked(store, other)).summary
-    assert "In tasks of fewer than 4 families, and so about these tasks: other." in " ".join(text.split())
 
 
 @pytest.mark.parametrize(

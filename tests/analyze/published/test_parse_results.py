@@ -181,7 +181,7 @@ def test_ratios_that_are_all_infinite_are_reported_and_pictures_are_drawn(tmp_pa
     mine, _ = ours(tmp_path / "mine", no_denominator=1.0)
     code, out, _ = run(capsys, "--results", mine, path, "--plot-comparison", "--output-dir", tmp_path / "compared")
     assert code == 0
-    assert len(list((tmp_path / "compared").iterdir())) == 4
+    assert len(list((tmp_path / "compared").iterdir())) == 6
 
 
 def test_episodes_without_steps_count_and_are_named(tmp_path, capsys):

@@ -22,7 +22,7 @@ from tests.analyze.published.published_results import (
     write_published,
 )
 from tests.kit.examples import examples
-from tests.kit.made_up_steps import default_grouping, flat, make_steps, replans_of
+from tests.kit.made_up_steps import default_grouping, flat, make_steps, replans_of, tasks_of, write_results_of_suites
 from vla_attention.analyze.published.results_reader import find_results, read_results_file
 from vla_attention.analyze.published.results_tables import (
     NO_FINITE_AS_ZERO,
@@ -31,7 +31,6 @@ from vla_attention.analyze.published.results_tables import (
     results_tables,
     spread_of,
 )
-from vla_attention.analyze.published.results_writer import write_results_of_suites
 from vla_attention.schemas.results import ResultsError, ResultsNotFound
 
 GROUPING = default_grouping()
@@ -102,14 +101,14 @@ def test_files_that_say_how_many_keys_each_side_has_get_a_baseline_and_a_lift(tm
     for column in ("uniform_ratio", "ratio_lift"):
         # The average over layers in a file is the published one, a mean of ratios; our lift is of their logarithms.
         own, expected = (
-            part.cells.filter(pl.col("layer") != "layers_avg").sort(
+            cells.filter(pl.col("layer") != "layers_avg").sort(
                 "task_id", "episode_index", "replan", "layer_number", nulls_last=True
             )[column]
-            for part in (tables.replans, replans)
+            for cells in (tables.replans, replans.cells)
         )
         np.testing.assert_allclose(own.to_numpy(), expected.to_numpy())
     theirs = results_tables([read_results_file(write_published(tmp_path, "theirs", pi_episodes()))], ["theirs"])
-    assert theirs.replans.cells["uniform_ratio"].is_null().all()
+    assert theirs.replans["uniform_ratio"].is_null().all()
 
 
 def test_files_of_different_groupings_or_denoise_steps_are_of_different_kinds(tmp_path):
@@ -175,13 +174,14 @@ def test_files_of_the_published_cosmos_script(tmp_path):
 
 
 def test_what_no_named_fraction_holds_is_the_rest(tmp_path):
-    path, replans = ours(tmp_path)
+    path, _ = ours(tmp_path)
     tables = results_tables([read_results_file(path)], ["x"])
     assert tables.grouping.names == ("visual", "linguistic", "action", "rest")
     others = [name for name in GROUPING.names if name not in ("visual", "linguistic", "action")]
     for measure in ("fraction", "mass"):
-        expected = sum(replans.of_group(name)[measure].to_numpy() for name in others)
-        np.testing.assert_allclose(tables.replans.of_group("rest")[measure].to_numpy(), expected, atol=1e-9)
+        found = tables.groups.filter(group="rest", scope="all", layer="layers_avg")[measure][0]
+        tasks = tasks_of(make_steps(), GROUPING).groups.filter(scope="all", layer="layers_avg")
+        assert found == pytest.approx(sum(tasks.filter(group=name)[measure][0] for name in others), abs=1e-9)
 
 
 def test_tables_are_those_of_numpy(tmp_path):
@@ -196,9 +196,9 @@ def test_tables_are_those_of_numpy(tmp_path):
                 finite = finite[finite > 0]
             key = (episode["task_id"], episode["episode_idx"], name.removeprefix("layer_"))
             means[key] = finite.mean() if finite.size else None
-    for row in tables.episodes.cells.iter_rows(named=True):
+    for row in tables.episodes.iter_rows(named=True):
         assert row["ratio_mean"] == pytest.approx(means[row["task_id"], row["episode_index"], row["layer"]])
-    for row in tables.tasks.cells.filter(scope="task").iter_rows(named=True):
+    for row in tables.tasks.filter(scope="task").iter_rows(named=True):
         own = [v for (task, _, layer), v in means.items() if (task, layer) == (row["task_id"], row["layer"]) and v]
         assert row["ratio_mean"] == pytest.approx(np.mean(own))
         assert row["num_episodes"] == 4

@@ -7,12 +7,17 @@ import polars as pl
 import pytest
 
 from tests.kit import made_up_steps
-from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, flat, make_steps
-from vla_attention.analyze.published.results_writer import (
-    episode_documents,
-    results_file,
+from tests.kit.made_up_steps import (
+    CUSTOM_KEYS,
+    custom_grouping,
+    default_grouping,
+    flat,
+    make_steps,
     write_results_of_suites,
 )
+from vla_attention.analyze.published import results_writer
+from vla_attention.analyze.published.results_writer import write_results
+from vla_attention.analyze.show.output_files import replacing
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.schemas.jsonable import from_json
 from vla_attention.schemas.results import (
@@ -31,13 +36,12 @@ def replans_of(steps, grouping=GROUPING):
 
 
 def documents_of(replans, grouping) -> list[dict]:
-    return [document for _, document in episode_documents(replans, grouping, DENOISE_STEPS)]
+    return list(results_writer.documents_of(replans.measured, grouping, DENOISE_STEPS))
 
 
 def write(path, documents) -> None:
-    with results_file(path) as add:
-        for document in documents:
-            add(document)
+    with replacing(path) as temporary:
+        write_results(temporary, documents)
 
 
 def episode_results(replans, grouping):

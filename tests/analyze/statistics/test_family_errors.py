@@ -108,10 +108,7 @@ def test_the_quotient_of_means_is_linearised():
 def test_related_tasks_are_not_counted_as_independent():
     """Families differ by 1 and their tasks by 0.4: intervals by families cover, those over tasks miss a third."""
     generator, tasks = np.random.default_rng(11), np.arange(17)
-    kinds = {
-        name: Units.of(tasks, estimand, FAMILIES)
-        for name, estimand in (("families", Estimand.TASKS_LIKE_THESE), ("tasks", Estimand.INDEPENDENT_TASKS))
-    }
+    kinds = {"families": Units.of(tasks, families=FAMILIES), "tasks": Units.of(tasks)}
     held = dict.fromkeys(kinds, 0)
     for _ in range(400):
         values = generator.normal(size=len(SIZES))[FAMILIES] + 0.4 * generator.normal(size=17)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import polars as pl
-import pytest
 
 from vla_attention.analyze.statistics.episode_intervals import Sampling, about_row, means_with_intervals
 from vla_attention.analyze.statistics.intervals import POSITIVE
 from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Estimand, Units
 
-LIKE, THESE, INDEPENDENT = Estimand.TASKS_LIKE_THESE, Estimand.THESE_TASKS, Estimand.INDEPENDENT_TASKS
+LIKE, THESE = Estimand.TASKS_LIKE_THESE, Estimand.THESE_TASKS
 TASKS = [7, 7, 3, 5, 9, 9]
 FAMILIES = ["b", "b", "a", "b", "", ""]
 
@@ -30,10 +29,9 @@ def test_tasks_are_numbered_and_a_task_without_a_family_is_one_of_its_own():
     assert units.part(np.array([False] * 4 + [True] * 2)).families is None
 
 
-@pytest.mark.parametrize("estimand", [THESE, INDEPENDENT])
-def test_families_count_where_intervals_are_about_tasks_like_these(estimand):
-    assert Units.of(TASKS, estimand, FAMILIES).families is None
-    assert Units.of(TASKS, estimand, FAMILIES).decided().estimand == estimand
+def test_families_count_where_intervals_are_about_tasks_like_these():
+    assert Units.of(TASKS, THESE, FAMILIES).families is None
+    assert Units.of(TASKS, THESE, FAMILIES).decided().estimand == THESE
 
 
 def test_fewer_families_than_four_show_nothing_about_other_tasks():
@@ -76,9 +74,6 @@ def test_a_row_says_of_how_many_families_it_is_and_what_its_intervals_are_about(
     ]
     these = means_with_intervals(given, ["thing"], {"value": POSITIVE}, Sampling(THESE))
     assert found.filter(thing="somewhere")["value_low"].item() == these.filter(thing="somewhere")["value_low"].item()
-    plain = means_with_intervals(given, ["thing"], {"value": POSITIVE}, Sampling(INDEPENDENT, families))
-    assert plain["num_families"].null_count() == 4
-    assert plain["intervals"].to_list()[:2] == ["independent-tasks"] * 2
 
 
 def test_families_are_those_of_suites_together():

@@ -55,11 +55,10 @@ def test_every_question_has_the_same_answer_to_the_last_bit(on_cluster, store):
     def tables():
         run = va.open(store)
         return [
-            run.ratios("steps", groups={"bowl": "word:bowl", "rest": "*"}),
-            run.masses("tasks"),
-            run.contributions(),
-            run.words(),
-            run.row_metrics(),
+            run.analyze(groups={"bowl": "word:bowl", "rest": "*"})["steps"],
+            run.analyze()["tasks_groups"],
+            run.analyze()["contributions_steps"],
+            run.words()["words"],
             run.objects()["iou"],
         ]
 

@@ -97,7 +97,7 @@ def test_a_row_of_another_sum_is_refused_by_its_place(tmp_path, queries, per_hea
 def test_commands_end_so_or_leave_the_episode_out(tmp_path, capsys):
     path = with_other_rows(tmp_path / "a.zarr", one_row)
     corner = ["--group", "corner=patch:base_0_rgb[0:1,0:1]"]
-    asked: list[list[str]] = [[str(path), *corner], *([name, str(path)] for name in ("heads", "words", "objects"))]
+    asked: list[list[str]] = [[str(path), *corner], *([name, str(path)] for name in ("words", "objects"))]
     for words in asked:
         out = str(tmp_path / f"out{len(words[0])}")
         words += ["--no-plots", "--no-cache", "--output", out]

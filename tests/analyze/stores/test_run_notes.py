@@ -25,16 +25,13 @@ KINDS = {
     "neither": (SPEC, ""),
 }
 COMMANDS = {
-    "ratios": (),
+    "analyze": (),
     "words": (),
     "objects": (),
     "effects": (),
-    "time": (),
-    "heads": (),
+    "by": ("--by", "time"),
     "overlay": ("--task", "0", "--episode", "0"),
     "report": (),
-    "groups": (),
-    "export": ("--csv",),
     "list": ("--list",),
     "view": ("--no-open",),
     "compare": (),
@@ -61,16 +58,16 @@ def stores(tmp_path_factory):
     ("kind", "command"),
     [
         *(("cut", command) for command in COMMANDS),
-        *(("replaced", command) for command in ("ratios", "list", "effects", "compare")),
-        *(("knocked out", command) for command in ("ratios", "words", "groups", "report")),
-        *(("neither", command) for command in ("ratios", "list")),
+        *(("replaced", command) for command in ("analyze", "list", "effects", "compare")),
+        *(("knocked out", command) for command in ("analyze", "words", "by", "report")),
+        *(("neither", command) for command in ("analyze", "list")),
     ],
 )
 def test_every_command_says_it(stores, tmp_path, monkeypatch, capsys, kind, command):
     monkeypatch.setattr("vla_attention.analyze.view.server.ViewerServer.serve_forever", lambda self: None)
-    words = [] if command in ("ratios", "list") else [command]
+    words = ["analyze" if command in ("list", "by") else command]
     words += [str(stores[kind])] + [str(stores["other"])] * (command == "compare") + list(COMMANDS[command])
-    if command not in ("list", "view", "groups"):
+    if command != "view":
         output = tmp_path / ("a.html" if command == "report" else "results")
         words += ["--output", str(output)]
     assert main(words) == 0

@@ -48,16 +48,15 @@ def test_results_come_in_order_from_other_processes(two):
 def tables(path, rerun):
     run = va.open(path)
     yield from (
-        run.ratios(level, groups={"bowl": "word:bowl", "rest": "*"}) for level in ("tasks", "episodes", "steps")
+        run.analyze(groups={"bowl": "word:bowl", "rest": "*"})[level] for level in ("tasks", "episodes", "steps")
     )
-    yield run.masses("steps", per_head=True)
-    yield run.contributions()
-    yield run.words()
-    yield from (run.heads(table) for table in ("heads", "depth", "denoise"))
-    yield run.row_metrics()
-    yield run.sinks()
+    yield run.analyze(per_head=True)["steps_groups"]
+    yield run.analyze()["contributions_steps"]
+    yield run.words()["words"]
+    yield from (run.analyze(by=by)["by"] for by in (("layer", "head"), ("denoise",)))
+    yield run.analyze(without_sinks="")["sinks"]
     yield from (run.objects()[f"{table}_episodes"] for table in ("objects", "pointing", "iou"))
-    yield run.time()
+    yield run.analyze(by=("time",))["by"]
     yield run.effects(rerun, "episodes")
 
 

@@ -84,7 +84,7 @@ def test_ratio_and_masses_of_every_replan(answers, stores, name, query):
     asked, _ = settings_of(query, answer["site"])
     which = (pl.col("task_id") == 0) & (pl.col("episode_index") == 0)
     mean = pl.col("layer") == "layers_avg"
-    masses = run.masses("replans", grouping="default", **asked).filter(which & mean)
+    masses = run.analyze(grouping="default", **asked)["replans_groups"].filter(which & mean)
     for replan, shown in enumerate(answer["replans"]):
         rows = masses.filter(replan=replan)
         assert rows["group"].to_list() == list(shown["groups"])
@@ -95,7 +95,7 @@ def test_ratio_and_masses_of_every_replan(answers, stores, name, query):
             np.testing.assert_allclose(
                 [float(value) for value in shown["groups"][row["group"]]], expected, rtol=CLOSE, atol=1e-12
             )
-    ratios = run.ratios("replans", grouping="default", **asked).filter(which & mean)
+    ratios = run.analyze(grouping="default", **asked)["replans"].filter(which & mean)
     if "ratio" not in ratios.columns or ratios["ratio"].is_null().all():
         assert answer["replans"][0]["ratio"] is None
         return
@@ -110,8 +110,8 @@ def test_the_lift_of_every_head(answers, stores, name, query):
     asked, replan = settings_of(query, answer["site"])
     asked = {field: value for field, value in asked.items() if field in ("site", "denoise")}
     mine = (pl.col("task_id") == 0) & (pl.col("episode_index") == 0) & (pl.col("replan") == replan)
-    masses = run.masses("steps", grouping="default", per_head=True, **asked).filter(mine)
-    cells = run.ratios("steps", grouping="default", per_head=True, **asked).filter(mine)
+    masses = run.analyze(grouping="default", per_head=True, **asked)["steps_groups"].filter(mine)
+    cells = run.analyze(grouping="default", per_head=True, **asked)["steps"].filter(mine)
     cell = ["layer", "head"]
     valid = cells.group_by(cell, maintain_order=True).agg(pl.col("valid_mass").mean() / pl.col("num_valid").first())
     of_groups = masses.group_by([*cell, "group"], maintain_order=True).agg(

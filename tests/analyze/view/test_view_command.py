@@ -33,7 +33,7 @@ def test_the_summary_has_the_numbers_of_the_analysis(store):
     assert (document["complete"], document["failed"], document["site"]) == (True, None, "joint")
     assert document["grouping"] == "default"
     assert document["ratio"] == "visual / linguistic"
-    expected = va.open(store).ratios("episodes").filter(layer="layers_avg").sort("task_id", "episode_index")
+    expected = va.open(store).analyze()["episodes"].filter(layer="layers_avg").sort("task_id", "episode_index")
     for found, row in zip(document["episodes"], expected.iter_rows(named=True), strict=True):
         assert found["name"] == f"task{row['task_id']:03d}_episode{row['episode_index']:03d}"
         for name, column in (

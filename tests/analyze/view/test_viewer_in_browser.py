@@ -53,7 +53,7 @@ def wait_for_ratios(view: Watched, episodes: int) -> None:
 
 def masses(store: Path, replan: int, **cell: int) -> dict[str, float]:
     """Python's masses of the groups in the first episode, means over the layers, denoise steps and heads of a cell."""
-    steps = va.open(store).masses("steps", per_head=True, tasks=0).filter(episode_index=0, replan=replan)
+    steps = va.open(store).analyze(per_head=True, tasks=0)["steps_groups"].filter(episode_index=0, replan=replan)
     names = {"layer": "layer", "denoise": "denoise_step", "head": "head"}
     chosen = steps.filter(*(pl.col(names[axis]) == value for axis, value in cell.items()))
     return dict(chosen.group_by("group").agg(pl.col("mass").mean()).iter_rows())
@@ -61,7 +61,7 @@ def masses(store: Path, replan: int, **cell: int) -> dict[str, float]:
 
 def test_a_walk_through_a_run_shows_pythons_numbers(view, server, store):
     view.open(f"{server.link}?replan=1&layer=4")
-    ratios = va.open(store).ratios("replans", tasks=0).filter(episode_index=0, replan=1)
+    ratios = va.open(store).analyze(tasks=0)["replans"].filter(episode_index=0, replan=1)
     for layer in ("4", "layers_avg"):
         cell = {} if layer == "layers_avg" else {"layer": 4}
         expected = masses(store, 1, **cell)
@@ -85,7 +85,7 @@ def test_a_walk_through_a_run_shows_pythons_numbers(view, server, store):
     # Another episode, by the list.
     assert server.stores[0].summary.wait() is None
     wait_for_ratios(view, 4)
-    episodes = va.open(store).ratios("episodes").filter(layer="layers_avg").sort("task_id", "episode_index")
+    episodes = va.open(store).analyze()["episodes"].filter(layer="layers_avg").sort("task_id", "episode_index")
     for i, row in enumerate(episodes.iter_rows(named=True)):
         shown = float(view.page.locator(".episodes li .ratio").nth(i).inner_text())
         assert shown == pytest.approx(row["geometric_mean"], rel=2e-3)

@@ -181,7 +181,7 @@ def test_a_sliding_layer_beside_a_full_one(tmp_path):
     np.testing.assert_allclose(by_layer["visual"][:, 0], 1, rtol=1e-5)
     assert np.isnan(by_layer["visual"][:, 1]).all()
     np.testing.assert_allclose(by_layer["action"], 1, rtol=1e-5)
-    cells = va.open(tmp_path / "a.zarr").ratios("replans").filter(layer="layers_avg")
+    cells = va.open(tmp_path / "a.zarr").analyze()["replans"].filter(layer="layers_avg")
     assert cells["ratio_lift"].to_list() == pytest.approx([1.0, 1.0], rel=1e-5)
     assert cells["uniform_ratio"].to_list() == pytest.approx([PATCHES / WORDS] * 2, rel=1e-5)
 

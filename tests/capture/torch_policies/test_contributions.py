@@ -134,7 +134,7 @@ def test_where_it_cannot_be_said_there_are_none_and_a_sentence_says_why(tmp_path
     assert not store.attributes.recording.contributions
     assert store.attributes.provenance["contributions"].removeprefix("none: ") in sentence
     assert [episode.has("joint/contribution") for episode in store.episodes] == [False, False]
-    assert va.open(tmp_path / "a.zarr").masses().height > 0
+    assert va.open(tmp_path / "a.zarr").analyze()["steps_groups"].height > 0
 
 
 class Adapter(nn.Module):

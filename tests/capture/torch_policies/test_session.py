@@ -201,7 +201,7 @@ def test_an_episode_may_know_almost_nothing(tmp_path, policy):
     assert not {"state", "actions", "noise_seed"} & set(attributes.arrays)
     labels = [Role(code).label for code in store.episodes[0].read("joint/key_role")[0]]
     assert labels[4:10] == ["instruction"] * 5 + ["padding"]
-    assert va.open(tmp_path / "a.zarr").ratios() is not None
+    assert va.open(tmp_path / "a.zarr").analyze()["tasks"] is not None
 
 
 def test_blocks_that_answer_from_a_queue_are_dropped_and_counted(tmp_path, policy):

@@ -67,7 +67,7 @@ def test_a_seal_has_the_first_bytes_of_the_sha256_of_every_chunk(original):
 
 
 def masses(path: Path) -> pl.DataFrame:
-    return va.open(path).masses("tasks", groups=dict([CORNER.split("=")]))
+    return va.open(path).analyze(groups=dict([CORNER.split("=")]))["tasks_groups"]
 
 
 def refused_by(command: list[str], capsys) -> str:

@@ -10,11 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vla_attention.analyze.measures.contribution_ratios import contribution_rows, joint_norm
-from vla_attention.analyze.measures.contributions import LINGUISTIC_ROLES, VISUAL_ROLES, contribution_table
-from vla_attention.analyze.measures.selected import load_tokens
-from vla_attention.analyze.statistics.episode_intervals import Sampling
-from vla_attention.analyze.stores.selection import select
+from tests.kit.questions import question_about
+from vla_attention.analyze.core.contributions import LINGUISTIC_ROLES, VISUAL_ROLES, Norms, joint_norm, side_norms
 from vla_attention.schemas.segments import segment_members, segments_of
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
@@ -22,6 +19,12 @@ from vla_attention.testing.stores import StoreSpec, contribution_vectors, expect
 from vla_attention.testing.tokens import small_tokens
 
 SPEC = StoreSpec(contributions=True, replans=3, tasks=(0, 1), episodes=2)
+
+
+def norms_of(store, **settings) -> Norms:
+    norms = side_norms(question_about(store, **settings))
+    assert norms is not None
+    return norms
 
 
 @given(seed=st.integers(0, 2**16), parts=st.integers(1, 6), chosen=st.integers(0, 63))
@@ -36,10 +39,7 @@ def test_the_norm_of_a_union_is_that_of_the_summed_vectors(seed, parts, chosen):
 def test_both_sides_and_their_ratio_equal_a_direct_computation(tmp_path):
     store = open_store(write_store(tmp_path / "a.zarr", spec=SPEC))
     assert verify_store(store) == []
-    selected = load_tokens([(store, episode) for episode in store.episodes], "joint")
-    parts = contribution_table(selected, select(store.attributes, layers=[2]))
-    assert parts is not None
-    table = parts.whole
+    table = norms_of(store, layers=(2,)).cells().collect()
     assert table.height == 4 * SPEC.replans * len(SPEC.denoise_steps)
     for row in table.iter_rows(named=True):
         seed = [SPEC.seed, row["task_id"], row["episode_index"]]
@@ -75,33 +75,23 @@ def uniform_over_valid(task, episode, tokens, rows):
 def test_uniform_attention_has_a_lift_of_one_whatever_the_values_are(tmp_path):
     spec = replace(SPEC, plant_rows=uniform_over_valid)
     store = open_store(write_store(tmp_path / "a.zarr", spec=spec))
-    parts = contribution_table(
-        load_tokens([(store, episode) for episode in store.episodes], "joint"), select(store.attributes)
-    )
-    assert parts is not None
-    table = parts.whole
+    table = norms_of(store).cells().collect()
     assert table["contribution_ratio"].std() > 0.1
     np.testing.assert_allclose(table["ratio_lift"], 1.0, rtol=1e-3)
 
 
 def test_the_baseline_needs_all_heads(tmp_path):
     store = open_store(write_store(tmp_path / "a.zarr", spec=replace(SPEC, heads=(1,))))
-    parts = contribution_table(
-        load_tokens([(store, episode) for episode in store.episodes], "joint"), select(store.attributes)
-    )
-    assert parts is not None
-    table = parts.whole
+    table = norms_of(store).cells().collect()
     assert table["contribution_ratio"].is_not_null().all()
     assert table["uniform_ratio"].is_null().all()
 
 
 def test_rows_over_episodes_have_the_three_means_and_what_each_is_of(tmp_path):
     store = open_store(write_store(tmp_path / "a.zarr", spec=SPEC))
-    selected = load_tokens([(store, episode) for episode in store.episodes], "joint")
-    parts = contribution_table(selected, select(store.attributes))
-    assert parts is not None
-    table = parts.whole
-    rows = contribution_rows(parts, "visual_norm", "linguistic_norm", Sampling())
+    norms = norms_of(store)
+    table = norms.cells().collect()
+    rows = norms.ratios(question_about(store).sampling)
     assert rows["layer"].to_list() == ["0", "2", "layers_avg"]
     wanted = (pl.col("layer") == 0, pl.col("layer") == 2, pl.lit(True))
     for layer, row in zip(wanted, rows.iter_rows(named=True), strict=True):

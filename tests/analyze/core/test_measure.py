@@ -1,4 +1,4 @@
-"""The tables of steps against independent arithmetic, straight from the raw Zarr arrays of random stores."""
+"""Measured items and tables of steps against independent arithmetic from the raw Zarr arrays of random stores."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from polars.testing import assert_frame_equal
 
 from tests.kit.examples import examples
-from tests.kit.made_up_steps import flat
+from tests.kit.made_up_steps import steps_of
 from tests.kit.questions import question_about
-from vla_attention.analyze.measures.selected import load_tokens, resolve_all, vocabulary_of
-from vla_attention.analyze.measures.steps import measure_episode, measure_episodes, step_tables
-from vla_attention.analyze.ratios.analysis import analyse
+from vla_attention.analyze.commands.analyze import analyze
+from vla_attention.analyze.core.levels import levels_of
+from vla_attention.analyze.measures.selected import load_tokens, vocabulary_of
 from vla_attention.analyze.stores.selection import select
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.builtin_groupings import default
@@ -39,12 +39,8 @@ QUICK = settings(
 )
 
 
-def table_of(path: Path, grouping: Grouping, **selected) -> pl.DataFrame:
-    store = open_store(path)
-    chosen = load_tokens([(store, episode) for episode in store.episodes], "joint")
-    selection, resolved = select(store.attributes, **selected), resolve_all(grouping, chosen)
-    measured = [measure_episode(*pair, selection, "joint") for pair in zip(chosen, resolved, strict=True)]
-    return flat(step_tables(measured, grouping))
+def table_of(path: Path, grouping: Grouping, heads: bool = False, **selected) -> pl.DataFrame:
+    return steps_of(levels_of(question_about(path, grouping, **selected), heads)).flat
 
 
 @QUICK
@@ -59,7 +55,7 @@ def test_masses_equal_sums_over_raw_rows_and_add_up_to_the_row_sums(data):
         path = write_store(
             Path(folder) / "a.zarr", tokens=tokens, tasks=(0,), episodes=1, mantissa_bits=bits, queries=queries
         )
-        table = table_of(path, grouping, per_head=per_head)
+        table = table_of(path, grouping, per_head)
         raw = zarr.open_group(path / "episodes/task000_episode000", mode="r")["joint"]
         rows, sums = raw["rows"][:].astype(np.float64), raw["row_sum"][:].astype(np.float64)
     rows, sums = rows.mean(axis=4), sums.mean(axis=4)
@@ -106,8 +102,10 @@ def test_fractions_lifts_and_ratios_follow_from_masses_and_counts(data):
 def test_a_selection_of_layers_steps_and_heads_takes_exactly_those(tmp_path):
     path = write_store(tmp_path / "a.zarr", heads=(1, 3), layers=(0, 2, 3), denoise_steps=(0, 4, 9))
     grouping = Grouping("g", {"words": ("word:the",), "rest": ("*",)})
-    whole = table_of(path, grouping, per_head=True)
-    part = table_of(path, grouping, layers=[3, 0], denoise=["last"], heads=[3], per_head=True)
+    whole = table_of(path, grouping, True)
+    part = steps_of(
+        levels_of(question_about(path, grouping, layers=(3, 0), denoise=("last",), heads=(3,)), heads=True)
+    ).flat
     assert part["block"].unique(maintain_order=True).to_list() == [3, 0]
     expected = whole.filter(pl.col("block").is_in([3, 0]), pl.col("denoise_step") == 9, pl.col("head") == 3)
     keys = ["task_id", "episode_index", "replan", "block"]
@@ -137,12 +135,12 @@ def test_a_word_of_one_task_only_gives_empty_groups_elsewhere(tmp_path):
 def test_several_stores_are_analysed_as_one_when_they_fit(tmp_path):
     first = open_store(write_store(tmp_path / "a.zarr", suite="one"))
     second = open_store(write_store(tmp_path / "b.zarr", suite="two"))
-    together = analyse(question_about([first, second]))
-    assert together.steps.cells["suite"].unique().sort().to_list() == ["one", "two"]
-    assert "two" in together.summary
+    together = analyze(question_about([first, second]))
+    assert together["steps"]["suite"].unique().sort().to_list() == ["one", "two"]
+    assert "on one, two" in together.about[0]
     other = open_store(write_store(tmp_path / "c.zarr", suite="three", layers=(1,)))
     with pytest.raises(StoreError, match="differ in their recording"):
-        analyse(question_about([first, other]))
+        question_about([first, other])
 
 
 def test_call_numbers_are_translated_and_kept_as_labels():
@@ -169,4 +167,4 @@ def test_a_group_without_keys_anywhere_is_refused_before_rows_are_read(tmp_path,
     monkeypatch.setattr(StoredEpisode, "read_layers", lambda *_: pytest.fail("rows were read"))
     question = question_about(path, groups=("a=word:the & camera:base_0_rgb", "b=word:the"))
     with pytest.raises(EmptyGroup, match=r"Group 'a' .* has no key in any of the 4 selected episodes"):
-        measure_episodes(question)
+        levels_of(question)

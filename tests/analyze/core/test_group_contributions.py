@@ -9,11 +9,9 @@ import numpy as np
 import polars as pl
 import pytest
 
-from tests.kit.made_up_steps import flat
 from tests.kit.questions import question_about
-from vla_attention.analyze.measures.group_contributions import group_contribution_tables, whole_segments
+from vla_attention.analyze.core.contributions import group_norms, whole_segments
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 from vla_attention.schemas.segments import Segment, segments_of
@@ -47,8 +45,12 @@ def grouping_of(ratio: Ratio | None = None, **groups) -> Grouping:
 
 
 def table_of(question: Question) -> pl.DataFrame | None:
-    tables = group_contribution_tables(question, resolve_all(question.grouping, question.selected))
-    return None if tables is None else flat(tables)
+    norms = group_norms(question)
+    if norms is None:
+        return None
+    cells = norms.cells().collect()
+    named = norms.norms().collect().partition_by("group", as_dict=True, maintain_order=True)
+    return cells.with_columns(table["norm"].alias(f"{name}_norm") for (name,), table in named.items())
 
 
 def norm_by_hand(spec: StoreSpec, row: dict, chosen, layer: int, denoise: int) -> float:

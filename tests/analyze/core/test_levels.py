@@ -7,16 +7,9 @@ import polars as pl
 import pytest
 
 from tests.kit import made_up_steps
-from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, flat, make_steps
-from vla_attention.analyze.measures.aggregate import (
-    episode_tables,
-    layer_order,
-    overall_layer,
-    overall_rows,
-    task_tables,
-)
+from tests.kit.made_up_steps import CUSTOM_KEYS, custom_grouping, default_grouping, make_steps
+from vla_attention.analyze.core.levels import overall
 from vla_attention.analyze.measures.frames import LAYERS_AVG
-from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.schemas.groupings.grouping import Ratio
 
 GROUPING = default_grouping()
@@ -25,6 +18,14 @@ STEPS = make_steps(num_tasks=3, num_episodes=4, heads=(0, 3), no_denominator=0.1
 
 def replans_of(steps, grouping=GROUPING):
     return made_up_steps.replans_of(steps, grouping)
+
+
+def episodes_of(steps, grouping=GROUPING):
+    return made_up_steps.episodes_of(steps, grouping)
+
+
+def tasks_of(steps, grouping=GROUPING):
+    return made_up_steps.tasks_of(steps, grouping)
 
 
 def one(table, **values):
@@ -36,7 +37,7 @@ def one(table, **values):
 def test_replans_average_masses_first_and_divide_afterwards():
     part = STEPS.filter(task_id=1, episode_index=2, replan=3, layer=25)
     assert part.height == 4  # two denoise steps, two heads
-    row = one(flat(replans_of(STEPS)), task_id=1, episode_index=2, replan=3, layer="25")
+    row = one(replans_of(STEPS).flat, task_id=1, episode_index=2, replan=3, layer="25")
     assert (row["layer_number"], row["block"], row["env_step"]) == (25, 7, 25)
     visual, linguistic = part["visual_mass"].to_numpy().mean(), part["linguistic_mass"].to_numpy().mean()
     assert row["visual_mass"] == pytest.approx(visual)
@@ -52,8 +53,9 @@ def test_replans_average_masses_first_and_divide_afterwards():
 
 
 def test_fractions_of_every_row_sum_to_one():
-    for tables in (replans_of(STEPS), episode_tables(replans_of(STEPS), GROUPING)):
-        assert tables.values("fraction").sum(axis=1) == pytest.approx(np.ones(tables.cells.height))
+    for tables in (replans_of(STEPS), episodes_of(STEPS)):
+        fractions = tables.groups["fraction"].to_numpy().reshape(tables.cells.height, -1)
+        assert fractions.sum(axis=1) == pytest.approx(np.ones(tables.cells.height))
 
 
 def test_infinite_and_undefined_ratios_differ_and_are_counted():
@@ -68,7 +70,7 @@ def test_infinite_and_undefined_ratios_differ_and_are_counted():
     of_layer = replans.cells.filter(layer="1")
     assert of_layer["ratio"].to_list() == [None, np.inf]
     assert of_layer["nonfinite_layers"].to_list() == [1, 1]
-    episode = one(episode_tables(replans, GROUPING).cells, layer="1")
+    episode = one(episodes_of(steps).cells, layer="1")
     assert episode["num_nonfinite"] == episode["geometric_left_out"] == 2
     assert episode["ratio_mean"] is None
     assert episode["ratio_of_means"] == np.inf
@@ -81,7 +83,7 @@ def test_layers_avg_is_the_geometric_mean_and_has_the_published_one_by_name():
     steps = steps.with_columns(
         pl.when(hit).then(0.0).otherwise(pl.col(name)).alias(name) for name in ("linguistic_mass", "denominator_mass")
     )
-    table = flat(replans_of(steps))
+    table = replans_of(steps).flat
     average, replans = table.filter(layer=LAYERS_AVG), table.filter(pl.col("layer") != LAYERS_AVG)
     assert average["layer_number"].null_count() == average["block"].null_count() == 3
     for replan in range(3):
@@ -109,10 +111,9 @@ def test_layers_avg_without_a_finite_ratio_is_null_not_zero():
 def test_the_average_over_layers_prefers_neither_side():
     """The mean of the layers' ratios is above that of either side alone; the mean of logarithms is not."""
     inverse = replace(GROUPING, ratio=Ratio(GROUPING.ratio.denominator, GROUPING.ratio.numerator))
-    tables = []
-    for grouping in (GROUPING, inverse):
-        episodes = episode_tables(made_up_steps.replans_of(make_steps(), grouping), grouping)
-        tables.append(task_tables(episodes, grouping, Sampling()).cells.filter(layer=LAYERS_AVG, scope="all"))
+    tables = [
+        tasks_of(make_steps(), grouping).cells.filter(layer=LAYERS_AVG, scope="all") for grouping in (GROUPING, inverse)
+    ]
     for column in ("geometric_mean", "ratio_lift", "uniform_ratio"):
         forward, backward = (table[column][0] for table in tables)
         assert forward * backward == pytest.approx(1.0)
@@ -125,15 +126,15 @@ def test_ratio_over_uniform_is_the_lift_also_where_a_task_has_no_finite_ratio():
         pl.when(pl.col("task_id") == 1).then(0.0).otherwise(pl.col("linguistic_mass")).alias("linguistic_mass"),
         pl.when(pl.col("task_id") == 1).then(60.0).otherwise(pl.col("linguistic_keys")).alias("linguistic_keys"),
     )
-    row = task_tables(episode_tables(replans_of(steps), GROUPING), GROUPING, Sampling()).cells.row(
+    row = tasks_of(steps).cells.row(
         by_predicate=(pl.col("scope") == "all") & (pl.col("layer") == LAYERS_AVG), named=True
     )
     assert row["geometric_mean"] / row["uniform_ratio"] == pytest.approx(row["ratio_lift"])
 
 
 def test_episode_statistics_are_those_of_numpy():
-    replans = flat(replans_of(STEPS))
-    episodes = flat(episode_tables(replans_of(STEPS), GROUPING))
+    replans = replans_of(STEPS).flat
+    episodes = episodes_of(STEPS).flat
     assert episodes.height == 3 * 4 * 4
     for layer in ("18", LAYERS_AVG):
         part = replans.filter(task_id=2, episode_index=1, layer=layer)
@@ -154,9 +155,8 @@ def test_episode_statistics_are_those_of_numpy():
 
 
 def test_tasks_are_means_over_episodes_with_intervals_around_them():
-    tables = episode_tables(replans_of(STEPS), GROUPING)
-    of_tasks = task_tables(tables, GROUPING, Sampling())
-    episodes, tasks = flat(tables), flat(of_tasks)
+    of_tasks = tasks_of(STEPS)
+    episodes, tasks = episodes_of(STEPS).flat, of_tasks.flat
     assert tasks.height == (3 + 1) * 4
     for layer in ("18", LAYERS_AVG):
         part = episodes.filter(task_id=1, layer=layer)
@@ -171,17 +171,14 @@ def test_tasks_are_means_over_episodes_with_intervals_around_them():
         assert row["num_nonfinite"] == part["num_nonfinite"].sum()
         for name in ("ratio_mean", "ratio_of_means", "geometric_mean", "ratio_lift", "visual_fraction"):
             assert row[f"{name}_low"] <= row[name] <= row[f"{name}_high"]
-    overall = one(overall_rows(of_tasks).cells, layer=LAYERS_AVG)
-    assert (overall["task_id"], overall["num_tasks"], overall["num_episodes"]) == (None, 3, 12)
-    assert overall["ratio_mean"] == pytest.approx(episodes.filter(layer=LAYERS_AVG)["ratio_mean"].mean())
+    whole = one(overall(of_tasks.cells), layer=LAYERS_AVG)
+    assert (whole["task_id"], whole["num_tasks"], whole["num_episodes"]) == (None, 3, 12)
+    assert whole["ratio_mean"] == pytest.approx(episodes.filter(layer=LAYERS_AVG)["ratio_mean"].mean())
 
 
 def test_results_do_not_depend_on_the_order_of_the_rows():
     shuffled = STEPS.sample(fraction=1.0, shuffle=True, seed=1)
-    first, second = (
-        flat(task_tables(episode_tables(replans_of(steps), GROUPING), GROUPING, Sampling()))
-        for steps in (STEPS, shuffled)
-    )
+    first, second = (tasks_of(steps).flat for steps in (STEPS, shuffled))
     for name, kind in first.schema.items():
         if kind == pl.Float64:
             plain, other = (table[name].fill_null(-1.0).to_numpy() for table in (first, second))
@@ -192,9 +189,8 @@ def test_results_do_not_depend_on_the_order_of_the_rows():
 
 def test_groupings_without_a_ratio_give_masses_fractions_and_lifts_only():
     grouping = custom_grouping(with_ratio=False)
-    replans = replans_of(make_steps(grouping, CUSTOM_KEYS), grouping)
-    episodes = episode_tables(replans, grouping)
-    tasks = task_tables(episodes, grouping, Sampling())
+    steps = make_steps(grouping, CUSTOM_KEYS)
+    replans, episodes, tasks = (of(steps, grouping) for of in (replans_of, episodes_of, tasks_of))
     for tables in (replans, episodes, tasks):
         assert {"group", "mass", "fraction", "lift"} <= set(tables.groups.columns)
         assert not [name for name in tables.cells.columns if "ratio" in name or "geometric" in name]
@@ -203,16 +199,22 @@ def test_groupings_without_a_ratio_give_masses_fractions_and_lifts_only():
 
 def test_same_task_ids_of_two_suites_stay_two_tasks():
     steps = pl.concat([make_steps(), make_steps(suite="libero_goal", seed=5)])
-    tasks = task_tables(episode_tables(replans_of(steps), GROUPING), GROUPING, Sampling())
+    tasks = tasks_of(steps)
     average = tasks.cells.filter(layer=LAYERS_AVG)
-    assert average["scope"].to_list() == ["task", "task", "all", "task", "task", "all", "combined"]
+    assert average["scope"].to_list() == [*["task"] * 4, "all", "all", "combined"]
     assert one(average, scope="combined")["num_tasks"] == 4
-    assert overall_rows(tasks).cells["num_episodes"].unique().to_list() == [12]
+    assert overall(tasks.cells)["num_episodes"].unique().to_list() == [12]
     assert one(average, scope="combined")["suite"] is None
 
 
 def test_layers_are_in_the_order_of_their_numbers():
-    replans = replans_of(make_steps(layers=(9, 10, 2))).cells
-    assert layer_order(replans) == ["2", "9", "10", LAYERS_AVG]
-    assert overall_layer(replans) == LAYERS_AVG
-    assert overall_layer(replans.filter(pl.col("layer") != LAYERS_AVG)) == "2"
+    layers = replans_of(make_steps(layers=(9, 10, 2))).cells["layer"].unique(maintain_order=True)
+    assert layers.to_list() == ["2", "9", "10", LAYERS_AVG]
+
+
+def test_a_ratio_of_some_episodes_says_of_how_many_it_is():
+    steps = make_steps(num_tasks=3)
+    none = pl.col("task_id") > 0
+    steps = steps.with_columns(pl.when(none).then(0.0).otherwise("linguistic_mass").alias("linguistic_mass"))
+    row = one(tasks_of(steps).cells.filter(layer=LAYERS_AVG), scope="all")
+    assert (row["num_episodes"], row["episodes_with_ratio"], row["tasks_with_ratio"]) == (9, 3, 1)
