@@ -132,6 +132,19 @@ class OpenStores:
         question = self.ask(**settings)
         return rows_of_episodes(question) if rows else masses_array(question)
 
+    def language(self, **settings: Unpack[SettingKeywords]) -> Answer:
+        """Does it listen? Tables "told_and_did", "told_episodes", "words"; "word_effects" where they were recorded."""
+        return self._answer("language", settings)
+
+    def failures(self, twins: str | Path | None = None, **settings: Unpack[SettingKeywords]) -> Answer:
+        """Why did it fail? Tables "instead", "failures", "failures_by_task".
+
+        `twins`: a store in which the same initial states are solved.
+        """
+        from vla_attention.schemas.stores.store_url import store_place
+
+        return self._answer("failures", settings, twins=None if twins is None else store_place(str(twins)))
+
     def words(self, by: Sequence[str] = (), **settings: Unpack[SettingKeywords]) -> Answer:
         """Which words of the instruction are read; tables "words", "words_scale", "words_episodes".
 

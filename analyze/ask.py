@@ -113,7 +113,12 @@ def answer_to(
         own: the question's own options.
         known: what earlier questions about the same stores have read.
     """
-    result: Result = _function(name)(_question(COMMANDS[name], stores, settings, known), **(own or {}))
+    from vla_attention.schemas.stores.reader import open_store
+
+    command, own = COMMANDS[name], dict(own or {})
+    if own.get("twins") is not None:
+        own["twins"] = _question(command, [open_store(own["twins"])], settings, None)
+    result: Result = _function(name)(_question(command, stores, settings, known), **own)
     return result
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.options import Numbers, add_task, number_range
 from vla_attention.schemas.safe_text import file_part
+from vla_attention.schemas.stores.store_url import store_place
 
 if TYPE_CHECKING:
     from vla_attention.analyze.measures.question_settings import AnalysisSettings
@@ -39,6 +40,9 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "intervals": {
         "choices": ("tasks-like-these", "these-tasks"), "default": "tasks-like-these",
         "help": "what intervals over several tasks are about (default: %(default)s; see docs/statistics.md)",
+    },
+    "twins": {
+        "type": store_place, "metavar": "STORE", "help": "a store in which the same initial states are solved",
     },
     "by": {
         "type": lambda text: tuple(part for part in text.split(",") if part), "default": (), "metavar": "AXIS,...",

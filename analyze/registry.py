@@ -47,6 +47,20 @@ COMMANDS: dict[str, Command] = {
             "analyze runs/libero_10.zarr --list",
         ),
     ),
+    "language": Command(
+        "does it listen: what it was told and did, which words decide, and which are read",
+        _ROWS,
+        ("text",),
+        _NO_WORDS,
+        ("language runs/cubes.zarr", "language runs/cubes.zarr --task 'touch the red cube' 'touch the blue cube'"),
+    ),
+    "failures": Command(
+        "why did it fail: what was done instead, and where failed episodes left solved ones",
+        ("site", "twins"),
+        ("text",),
+        _NO_WORDS,
+        ("failures runs/cubes.zarr", "failures runs/a.zarr --twins runs/b.zarr"),
+    ),
     "words": Command(
         "which words of the instruction are read",
         (*_ROWS, "by"),

@@ -10,6 +10,7 @@ In a null store every key's attention is the same in expectation; episodes and k
     time      nothing changes when the gripper closes, and solved episodes are as failed ones
     drift     the same, while attention moves steadily from the text to the pictures
     compare   two runs of the same distribution, paired by initial state
+    language  what is done has nothing to do with what is told (rollouts without attention: seconds)
 
 A planted store differs in one place: the attention to the word "the", to the first object, after the gripper closed,
 or of the second run, is higher, by `FACTOR` or a power of it.
@@ -32,7 +33,10 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from tests.kit.made_up_behaviour import STEPS, did, goals_of
 from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.analyze.commands.language import listens
+from vla_attention.analyze.core.behaviour import with_choices
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
 from vla_attention.testing.stores import StoreSpec, write_store
@@ -128,16 +132,48 @@ def printed(kind: str, number: int, planted: bool, folder: Path) -> str:
     return " ".join((folder / "out" / "summary.txt").read_text(encoding="utf-8").split())
 
 
+def says_it_listens(sets: int, planted: bool) -> float:
+    """The share of sets of rollouts of which `language` says that what was told was done more often than by chance.
+
+    In a null set the goals that a policy reaches, and when, are drawn without a look at what it was told; it reaches
+    some goals more readily than others. Rollouts end with their own goal, so what is seen depends on it. In a planted
+    set every second rollout goes to the told goal first.
+    """
+    said = 0
+    for number in range(sets):
+        generator = np.random.default_rng(number)
+        tasks, episodes = generator.integers(2, 5), generator.integers(4, 9)
+        goals = goals_of({task: f"touch cube {task}" for task in range(tasks)})
+        liked = generator.uniform(0, 1, tasks)
+        rollouts = []
+        for told in np.repeat(np.arange(tasks), episodes).tolist():
+            moments = {
+                task: int(generator.integers(1, STEPS)) for task in range(tasks) if generator.random() < liked[task]
+            }
+            if planted and generator.random() < FACTOR / 2:
+                moments[told] = 1
+            rollouts.append((told, moments))
+        said += listens(with_choices(did(rollouts, goals, "touch cube N"))).sentence.startswith(
+            ("It listens", "It did")
+        )
+    return said / sets
+
+
 def main() -> None:
     """Print a line per command."""
     parser = argparse.ArgumentParser(description="How often commands name something in null stores.")
     parser.add_argument("--stores", type=int, default=200, help="stores of each kind (default: 200)")
     parser.add_argument("--planted", action="store_true", help="with something to find")
-    parser.add_argument("--kinds", nargs="+", default=["words", "objects", "time", "drift", "compare"])
+    kinds = ["words", "objects", "time", "drift", "compare", "language"]
+    parser.add_argument("--kinds", nargs="+", default=kinds)
     arguments = parser.parse_args()
     what = "planted" if arguments.planted else "null"
     print(f"{arguments.stores} {what} stores of {TASKS} tasks x {EPISODES} episodes x {REPLANS} replans each:")
     for kind in arguments.kinds:
+        if kind == "language":
+            share = says_it_listens(arguments.stores, arguments.planted)
+            print(f"  {kind:8} says that it listens in {share:.1%}", flush=True)
+            continue
         named = 0
         for number in range(arguments.stores):
             with tempfile.TemporaryDirectory() as folder:

@@ -116,6 +116,20 @@ FAULTS = (
         ("tests/analyze/statistics",),
     ),
     Fault(
+        "listening: what was reached last counts, so a policy that tries everything does as told",
+        "analyze/core/behaviour.py",
+        'pl.col("held") == pl.min("held").over(episode)',
+        'pl.col("held") == pl.max("held").over(episode)',
+        ("tests/analyze/commands/test_language.py",),
+    ),
+    Fault(
+        "leaving: a centimetre, however far solved episodes are from one another",
+        "analyze/core/courses.py",
+        "band([np.zeros(1)] if same_state else own, len(apart))",
+        "band([np.zeros(1)], len(apart))",
+        ("tests/analyze/commands/test_failures.py",),
+    ),
+    Fault(
         "stale cache key: files that changed since",
         "analyze/cache/remembered.py",
         "hashlib.sha256(self._digest + state + about)",
@@ -138,10 +152,10 @@ FAULTS = (
     ),
     Fault(
         "wrong unit in a table: radians for degrees",
-        "analyze/effects/action_changes.py",
+        "analyze/core/action_changes.py",
         "angle: Array = np.degrees(",
         "angle: Array = np.abs(",
-        ("tests/analyze/effects", GOLDEN),
+        ("tests/analyze/core/test_action_changes.py", GOLDEN),
     ),
     Fault(
         "ignored option: --denoise",

@@ -34,7 +34,8 @@ _SOURCES = (
     "analyze/stores/*.py",
     "analyze/measures/*.py",
     "analyze/heads/*.py",
-    "analyze/words/*.py",
+    "analyze/core/*.py",
+    "analyze/commands/*.py",
 )
 
 

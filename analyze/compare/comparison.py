@@ -48,7 +48,7 @@ from vla_attention.analyze.statistics.intervals import (
     mean_over_episodes,
 )
 from vla_attention.analyze.statistics.units import Units
-from vla_attention.analyze.stores.run_notes import cut_notes
+from vla_attention.analyze.stores.run_notes import prompt_notes
 from vla_attention.schemas.groupings.grouping import Grouping
 
 LOG2_RATIO, SUCCESS = "log2_ratio", "success"
@@ -136,7 +136,9 @@ def compare(runs: Sequence[Run], allowed: Sequence[str] = ()) -> Comparison:
     notes = [*check_comparable(runs, allowed), *noted_differences(runs)]
     notes += [line for run in runs[1:] for line in intervention_notes(runs[0], run)]
     notes += dict.fromkeys(
-        line for run in runs for line in (*run.question.skipped, *cut_notes(run.question.episodes), *run.question.notes)
+        line
+        for run in runs
+        for line in (*run.question.skipped, *prompt_notes(run.question.episodes), *run.question.notes)
     )
     grouping = runs[0].question.grouping
     selected = [item for run in runs for item in run.question.selected]

@@ -68,12 +68,19 @@ class EpisodeMaps:
         """Whether the camera's pictures were stored."""
         return f"frames/{camera}" in self.item.episode.attributes.arrays
 
-    def frame(self, camera: str, replan: int) -> NDArray[np.uint8] | None:
-        """The picture as a person sees the scene, (row, column, 3); None where none was stored."""
-        if not self.has_frames(camera):
-            return None
-        picture: NDArray[np.uint8] = self.item.episode.read(f"frames/{camera}", replan)
-        return upright(picture, self.cameras[camera].view)
+
+def stored_picture(item: SelectedEpisode, camera: str, replan: int) -> NDArray[np.uint8] | None:
+    """The picture that the policy got, as a person sees the scene, (row, column, 3); None where none was stored."""
+    if f"frames/{camera}" not in item.episode.attributes.arrays:
+        return None
+    picture: NDArray[np.uint8] = item.episode.read(f"frames/{camera}", replan)
+    return upright(picture, view_of(item, camera))
+
+
+def view_of(item: SelectedEpisode, camera: str) -> PolicyCameraView:
+    """How a camera's pictures were turned."""
+    views = {view.name: view for view in item.store.attributes.policy.cameras}
+    return views.get(camera, PolicyCameraView(camera, camera, True, False))
 
 
 def camera_names(question: Question, wanted: Sequence[str] | None = None) -> tuple[str, ...]:
@@ -104,7 +111,6 @@ def episode_maps(question: Question, item: SelectedEpisode, cameras: Sequence[st
     # As much mass as the valid keys have, shared out as uniform attention does.
     uniform = mean_uniform(item, question.selection)
     uniform = uniform * ((mean * item.valid).sum(axis=1) / (uniform * item.valid).sum(axis=1))[:, None]
-    by_name = {view.name: view for view in item.store.attributes.policy.cameras}
     whole = image.sum(axis=1)
     maps = {}
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -113,9 +119,8 @@ def episode_maps(question: Question, item: SelectedEpisode, cameras: Sequence[st
             mass, even = (picture.spread(keys[:, picture.keys]) for keys in (mean, uniform))
             beside = [span for span in tokens.layout.camera_spans(camera) if span.grid is None]
             outside = sum((mean[:, span.start : span.stop].sum(axis=1) for span in beside), np.zeros(len(mean)))
-            view = by_name.get(camera, PolicyCameraView(camera, camera, True, False))
             share = mass / whole[:, None, None]
-            maps[camera] = CameraMap(picture, view, mass, mass / even, share, outside)
+            maps[camera] = CameraMap(picture, view_of(item, camera), mass, mass / even, share, outside)
         words = [
             [(word.text, float(mean[replan, list(word.keys)].sum() / uniform[replan, list(word.keys)].sum()))
              for word in tokens.words[prompt]]

@@ -39,7 +39,7 @@ from vla_attention.analyze.effects.paired_replans import (
 )
 from vla_attention.analyze.effects.reruns import BaseAndReruns, open_reruns, recorded_conditions
 from vla_attention.analyze.effects.rollouts import ROLLOUT_COLUMNS, rollout_pairs, rollout_summary
-from vla_attention.analyze.effects.same_calls import held_by_one
+from vla_attention.analyze.core.same_calls import held_by_one
 from vla_attention.analyze.effects.sums import sums_of_groups
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings

@@ -15,7 +15,7 @@ from vla_attention.analyze.effects.action_changes import (
     root_mean_square_change,
 )
 from vla_attention.analyze.effects.conditions import Condition
-from vla_attention.analyze.effects.same_calls import check_same_calls
+from vla_attention.analyze.core.same_calls import check_same_calls
 from vla_attention.analyze.measures.alignment import episode_timing, on_episode_time
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.selected import SelectedEpisode

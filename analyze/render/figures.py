@@ -10,6 +10,7 @@ The options of a figure, by kind:
     distribution  x, value: a box for each x, with a dot for each row. uniform, log, xlabel, ylabel.
     heat_map      x, y, value: factors around 1. xlabel, ylabel, label.
     scatter       x, y, label: points with names, NAME_low and NAME_high as bars. log, xlabel, ylabel.
+    pictures      none; see `pictures.pictures` for the columns.
 
     pictures      see `render.pictures`.
 

@@ -1,22 +1,24 @@
-"""What every answer says of a run that was changed, and of one whose policy did not read all of its prompt."""
+"""What every answer says of a run that was changed, or whose policy was told another sentence or a part of it."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.layout import Prompt
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
+from vla_attention.schemas.stores.store_format import EpisodeAttributes
 
 Episodes = Iterable[tuple[Store, StoredEpisode]]
 
 
 def run_notes(episodes: Episodes) -> tuple[str, ...]:
-    """A line on each store whose run was changed, and on each in which prompts were cut; empty without any."""
+    """A line on each store whose run was changed, and what `prompt_notes` says of it; empty without any."""
     episodes = list(episodes)
     stores = {str(store.path): store for store, _ in episodes}
-    return (*change_notes(stores.values()), *cut_notes(episodes))
+    return (*change_notes(stores.values()), *prompt_notes(episodes))
 
 
 def change_notes(stores: Iterable[Store]) -> tuple[str, ...]:
@@ -28,17 +30,43 @@ def change_notes(stores: Iterable[Store]) -> tuple[str, ...]:
     )
 
 
-def cut_notes(episodes: Episodes) -> tuple[str, ...]:
-    """A line on each store in which prompts were cut; empty without any."""
+def prompt_notes(episodes: Episodes) -> tuple[str, ...]:
+    """A line on each store whose policy was told another sentence than its task's, and where prompts were cut."""
+    told: dict[str, list[str]] = {}
     lost: dict[str, list[str]] = {}
     for store, episode in episodes:
+        given, instruction = told_instruction(store, episode.attributes), episode.attributes.instruction
+        if not same_words(given, instruction):
+            told.setdefault(store.path.name, []).append(
+                f"'{visible(given)}' where the task is '{visible(instruction)}'"
+            )
         if end := _never_read(episode.attributes.prompts):
             lost.setdefault(store.path.name, []).append(end)
-    return tuple(
+    others = [
+        f"The prompt is not the task's instruction in {plural(len(pairs), 'episode')} of {name}: the policy was told "
+        f"{listing(dict.fromkeys(pairs), 2)}."
+        for name, pairs in told.items()
+    ]
+    cut = [
         f"Prompts were cut in {name}: in {plural(len(ends), 'episode')} the policy never read the end of its prompt "
         f"({listing([f'{end!r}' for end in dict.fromkeys(ends)], 3)})."
         for name, ends in lost.items()
-    )
+    ]
+    return (*others, *cut)
+
+
+def told_instruction(store: Store, attributes: EpisodeAttributes) -> str:
+    """The sentence that the policy was given: the prompt's, or the task's where the prompt says nothing of one."""
+    known = [prompt.instruction_text for prompt in attributes.prompts[:1]]
+    if known and (known[0].strip() or store.attributes.interventions.prompt is not None):
+        return known[0]
+    return attributes.instruction
+
+
+def same_words(one: str, other: str) -> bool:
+    """Whether two sentences have the same words: tokenizers change case, underscores and line ends."""
+    first, second = (re.findall(r"\w+", text.casefold().replace("_", " ")) for text in (one, other))
+    return first == second
 
 
 def _never_read(prompts: Iterable[Prompt]) -> str:

@@ -101,7 +101,7 @@ def _notes(stores: Sequence[Store]) -> tuple[str, ...]:
     from contextlib import suppress
     from pathlib import Path
 
-    from vla_attention.analyze.stores.run_notes import change_notes, cut_notes
+    from vla_attention.analyze.stores.run_notes import change_notes, prompt_notes
     from vla_attention.schemas.errors import UserError
 
     readable = []
@@ -110,7 +110,7 @@ def _notes(stores: Sequence[Store]) -> tuple[str, ...]:
             with suppress(UserError):
                 if episode.attributes.prompts:
                     readable.append((store, episode))
-    return (*change_notes(stores), *cut_notes(readable))
+    return (*change_notes(stores), *prompt_notes(readable))
 
 
 def _serve(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None:

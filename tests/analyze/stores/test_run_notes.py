@@ -17,6 +17,7 @@ SPEC = StoreSpec(tasks=(0,), episodes=3, plant_effects=planted_effects())
 #: A store's spec, and what must be said of it.
 KINDS = {
     "cut": (SPEC, "the policy never read the end of its prompt ('and then the drawer')"),
+    "told": (replace(SPEC, plant_effects=None), "The prompt is not the task's instruction in 3 episodes"),
     "replaced": (replace(SPEC, interventions=Interventions("shuffled", prompt=PromptChange("shuffled"))), "shuffled"),
     "knocked out": (
         replace(SPEC, interventions=Interventions("blind", keys=(KeyKnockout("role:image"),))),
@@ -26,6 +27,8 @@ KINDS = {
 }
 COMMANDS = {
     "analyze": (),
+    "language": (),
+    "failures": (),
     "words": (),
     "objects": (),
     "effects": (),
@@ -44,12 +47,21 @@ def cut(tokens):
     return replace(tokens, prompts=tuple(prompts))
 
 
+def told(tokens):
+    """The tokens with prompts whose instruction is spelt backwards."""
+    made = []
+    for prompt in tokens.prompts:
+        first, last = prompt.instruction
+        made.append(replace(prompt, text=prompt.text[:first] + prompt.text[first:last][::-1] + prompt.text[last:]))
+    return replace(tokens, prompts=tuple(made))
+
+
 @pytest.fixture(scope="module")
 def stores(tmp_path_factory):
     folder = tmp_path_factory.mktemp("stores")
     made = {"other": write_store(folder / "other.zarr", spec=SPEC)}
     for name, (spec, _) in KINDS.items():
-        tokens = cut(small_tokens(3, 0, 0)) if name == "cut" else None
+        tokens = {"cut": cut, "told": told}.get(name, lambda _: None)(small_tokens(3, 0, 0))
         made[name] = write_store(folder / f"{name}.zarr", spec=replace(spec, tokens=tokens))
     return made
 
@@ -58,6 +70,7 @@ def stores(tmp_path_factory):
     ("kind", "command"),
     [
         *(("cut", command) for command in COMMANDS),
+        *(("told", command) for command in ("language", "list", "view", "compare")),
         *(("replaced", command) for command in ("analyze", "list", "effects", "compare")),
         *(("knocked out", command) for command in ("analyze", "words", "by", "report")),
         *(("neither", command) for command in ("analyze", "list")),
@@ -75,7 +88,11 @@ def test_every_command_says_it(stores, tmp_path, monkeypatch, capsys, kind, comm
     said = printed.out + printed.err + ((tmp_path / "a.html").read_text() if command == "report" else "")
     said = " ".join(said.replace("&#39;", "'").split())
     expected = KINDS[kind][1]
-    assert (expected in said) if expected else ("Prompts were cut" not in said and "was changed" not in said)
+    assert (
+        (expected in said)
+        if expected
+        else ("Prompts were cut" not in said and "was changed" not in said and "The prompt is" not in said)
+    )
 
 
 def test_the_page_opens_beside_a_damaged_episode(stores, tmp_path, monkeypatch, capsys):

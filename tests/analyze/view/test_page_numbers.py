@@ -21,7 +21,7 @@ from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answe
 from tests.end_to_end.test_cameras_of_several_spans import write_spans_store
 from tests.kit.golden_stores import FOLDER
 from tests.kit.http_ranges import serve
-from vla_attention.analyze.core.camera_maps import camera_names, episode_maps, scale_end
+from vla_attention.analyze.core.camera_maps import camera_names, episode_maps, scale_end, stored_picture
 from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.question_settings import settings_from_keywords
 from vla_attention.analyze.show.patch_pictures import NO_PICTURE, enlarge, upright
@@ -192,7 +192,7 @@ def test_pictures_have_the_attention_of_their_patches_in_inferno(answers, stores
         shape = (camera["height"], camera["width"], 4)
         pixels = np.array(camera["pixels"], dtype=np.uint8).reshape(shape)[..., :3]
         turned = in_inferno(
-            maps.frame(one.view.name, replan), upright(values.reshape(lift.shape), one.view), "smooth=1" in query, shape
+            stored_picture(question.selected[0], one.view.name, replan), upright(values.reshape(lift.shape), one.view), "smooth=1" in query, shape
         )
         # The page has colours of whole numbers, and a value at the border of two of the 256 may have either.
         difference = np.abs(pixels.astype(int) - turned.astype(int))

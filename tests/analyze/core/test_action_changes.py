@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vla_attention.analyze.effects.action_changes import (
+from vla_attention.analyze.core.action_changes import (
     Noise,
     action_spread,
     first_angle,
@@ -25,12 +25,6 @@ def test_spread_is_the_standard_deviation_over_all_replans_and_steps():
     # 0.01 is about 1% of the largest: what is below that is no movement.
     assert found.used[[0, 3]].all()
     assert 2 in found.left_out
-
-
-def test_chosen_dimensions_without_spread_stay_out():
-    actions = [np.stack([np.arange(4.0), np.zeros(4)], axis=1)[None]]
-    assert action_spread(actions, (0, 1)).left_out == (1,)
-    assert action_spread(actions, (1,)).left_out == (0, 1)
 
 
 def test_a_change_is_in_units_of_the_spread_over_the_steps_that_count():
@@ -70,7 +64,7 @@ def test_flips_are_counted_over_executed_steps():
     assert gripper_flips(base, other, np.array([3, 4])).tolist() == [1 / 3, 1 / 4]
 
 
-def test_a_dimension_that_is_mostly_noise_is_left_out_unless_it_was_chosen():
+def test_a_dimension_that_is_mostly_noise_is_left_out():
     generator = np.random.default_rng(3)
     signal, noise = np.array([1.0, 0.1, 1.0]), np.array([0.05, 0.2, 0.5])
     shape = (200, 5, 3)
@@ -80,12 +74,12 @@ def test_a_dimension_that_is_mostly_noise_is_left_out_unless_it_was_chosen():
     episodes = [slice(0, 50), slice(50, 120), slice(120, None)]
     change = noise_of([(base[part], other[part]) for part in episodes], spread.spread)
     np.testing.assert_allclose(change.change, np.sqrt(2) * noise / np.hypot(signal, noise), rtol=0.06)
-    assert with_noise(spread, change, leave_out=True).left_out == (1,)
-    assert with_noise(spread, change, leave_out=True).reasons == ("", "mostly noise", "")
-    assert with_noise(spread, change, leave_out=False).left_out == ()
-    alone = action_spread([base], dimensions=(1,))
+    assert with_noise(spread, change).left_out == (1,)
+    assert with_noise(spread, change).reasons == ("", "mostly noise", "")
     # A single episode has no interval, and two that differ have a wide one: nothing is left out by chance.
-    assert with_noise(spread, noise_of([(base, other)], spread.spread), leave_out=True).left_out == ()
+    assert with_noise(spread, noise_of([(base, other)], spread.spread)).left_out == ()
     near = Noise(np.array([0.3, 1.086, 0.4]), np.array([0.2, 0.948, 0.3]), np.array([0.4, 1.2, 0.5]))
-    assert with_noise(spread, near, leave_out=True).left_out == ()
-    assert with_noise(alone, change, leave_out=True).used.tolist() == [False, True, False]
+    assert with_noise(spread, near).left_out == ()
+    # Where everything is mostly noise, everything is kept.
+    alone = Noise(*(np.array([value] * 3) for value in (2.0, 1.5, 2.5)))
+    assert with_noise(spread, alone).left_out == ()

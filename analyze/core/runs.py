@@ -2,7 +2,7 @@
 
 Two runs may differ in the weights and in their names (policy name, checkpoint, digest). Everything else that affects
 the numbers must be equal, or be allowed by name (`--allow-mismatch FIELD`). A note names different versions of Python,
-torch and the like, which hardly affect them.
+torch and the like, which hardly affect them. A rerun repeats the policy calls of another run under a change.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.schemas.errors import BadArgument, UnknownName, UserError, did_you_mean, listing
+from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.store_url import StorePlace, store_place
 
@@ -47,6 +48,17 @@ class Run:
         """The stores of the run."""
         return self.question.stores
 
+    def repeats(self, other: Run) -> bool:
+        """Whether this run repeats the policy calls of another one."""
+        sources = [store.attributes.rerun_of for store in self.stores]
+        runs = {store.run for store in other.stores}
+        return all(source is not None and source.run in runs for source in sources)
+
+    @property
+    def changed(self) -> str:
+        """What interventions changed in it, in words."""
+        return listing(dict.fromkeys(visible(store.attributes.interventions.describe()) for store in self.stores))
+
     @property
     def suites(self) -> tuple[str, ...]:
         """The suites of the run's stores, in alphabetical order."""
@@ -75,7 +87,7 @@ def parse_runs(texts: Sequence[str]) -> list[RunArgument]:
     unnamed = [run.paths[0] for run in runs if not run.name]
     runs = [run if run.name else RunArgument(_name_among(run.paths[0], unnamed), run.paths) for run in runs]
     if len(runs) < 2:
-        raise BadArgument("A comparison needs two runs or more; look at one with vla-attention ratios.")
+        raise BadArgument("A comparison needs two runs or more; look at one with vla-attention analyze.")
     _refuse_twice(runs)
     return runs
 
@@ -246,7 +258,7 @@ def _refuse_families(stores: Sequence[tuple[str, Store]], allowed: bool) -> None
         if not set(sites) & set(other_sites):
             raise MixedPolicies(
                 f"{what}, which have no site in common ({listing(sites)}; {listing(other_sites)}): their softmaxes are "
-                "over different keys, and their masses cannot be compared; analyse each with vla-attention ratios."
+                "over different keys, and their masses cannot be compared; ask each with vla-attention analyze."
             )
         if not allowed:
             raise MixedPolicies(

@@ -1,0 +1,243 @@
+"""Does it listen? What it did when told, what the words do to its actions, and how much it attends to them.
+
+Three levels that are never mixed: a policy may attend to words that change nothing, and may move otherwise without
+doing what it was told.
+"""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import polars as pl
+
+from vla_attention.analyze.commands.words import words
+from vla_attention.analyze.core.about import about, notes
+from vla_attention.analyze.core.behaviour import behaviour, with_choices
+from vla_attention.analyze.core.result import Column, Finding, Result, Table
+from vla_attention.analyze.effects.reruns import recorded_conditions
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.statistics.exact_tests import shuffled
+from vla_attention.analyze.statistics.many_looks import NAMED_AT
+from vla_attention.schemas.errors import BadArgument, listing, plural
+
+if TYPE_CHECKING:
+    from vla_attention.analyze.effects.item_rows import ItemRow
+
+_LISTENS = "Does it listen?"
+#: From this share of episodes on, what was done most is said.
+_MOSTLY = 0.8
+#: Of episodes or steps.
+_HALF = 0.5
+
+
+def language(question: Question) -> Result:
+    """What was told and what was done, effects of the words where they were recorded, attention to the words.
+
+    Raises:
+        BadArgument: the keys of the site spell no words.
+    """
+    asked = with_choices(behaviour(question.episodes))
+    behaved = listens(asked)
+    if not asked.is_empty():
+        failures = f"vla-attention failures {_paths(question)}" if (~asked["outcome"]).any() else ""
+        behaved = replace(behaved, next_step=failures)
+    done = _behaviour_tables(asked)
+    decide, effects = _effects(question)
+    # Attention to the words: one call.
+    read = words(question)
+    missing = len(question.selected) - asked.height
+    left = [f"What {plural(missing, 'episode')} did is not known: no simulator of ours ran them."] if missing else []
+    return Result(
+        "Does it listen? What was told, and what was done",
+        about(question),
+        [behaved, decide, *read.findings[:1]],
+        [*done[:1], *effects, *done[1:], *read.tables[:1]],
+        read.figures[:1],
+        [*left, *notes(question)],
+    )
+
+
+def listens(asked: pl.DataFrame) -> Finding:
+    """Whether it did what it was told more often than with shuffled instructions, of the rows of `with_choices`."""
+    if asked.is_empty():
+        return Finding(
+            "Nobody knows what it did: the store holds no steps (positions, touches, goals), which our simulators "
+            "record. A rerun of stored calls does nothing of its own.",
+            _LISTENS,
+            next_step="vla-attention capture --help",
+        )
+    shown, n = asked.filter(pl.col("left_out").is_null()), asked.height
+    rest = [*asked.drop_nulls("left_out")["left_out"].value_counts(sort=True).sort("left_out").iter_rows()]
+    left = [f"{plural(count, 'episode')} left out: {why}." for why, count in rest]
+    if shown.is_empty():
+        done = asked.filter(pl.col("did") == pl.col("told")).height
+        whys = "; ".join(f"in {count} of {plural(n, 'episode')}, {why}" for why, count in rest)
+        return Finding(
+            f"These episodes cannot show whether it listens: {whys}. It did what it was told in {done} of {n}.",
+            _LISTENS,
+            {"right": done, "n": n},
+            "Tell two tasks in one scene, best from the same initial states.",
+        )
+    found = shuffled(shown["told_goal"].to_list(), shown["first"].to_list(), shown["stratum"].to_list())
+    right, n = found.matches, shown.height
+    p = "p < 0.001" if found.p_value < 0.001 else f"p = {found.p_value:.2g}"
+    by_chance = f"shuffled instructions: {found.expected:.3g} expected, {p}"
+    where = "in which the scene allowed something else"
+    # Where each task has its own initial states, the pictures say what to do as well as the words.
+    shared = shown.select((pl.col("told_goal").n_unique().over("stratum", "state") > 1).mean()).item() >= _HALF
+    if found.p_value > NAMED_AT:
+        sentence = f"Not shown to listen: {_whatever(shown)}it did what it was told in {right} of {n} episodes {where}"
+    elif not shared:
+        sentence = f"It did what it was told in {right} of {n} episodes {where}"
+    else:
+        verdict = "It listens" if 2 * right > n else "It listens in part"
+        sentence = f"{verdict}: it did what it was told in {right} of {n} episodes {where}"
+    limits = []
+    if found.least_p > NAMED_AT:
+        limits.append(f"Too few episodes: even without a mistake p would be {found.least_p:.2g}.")
+    if not shared:
+        limits.append("Each task has its own initial states here, so the pictures could say what to do.")
+    if nothing := shown["first"].null_count():
+        limits.append(f"In {plural(nothing, 'episode')} none of the told goals was reached.")
+    another = pl.col("before").is_not_null() | pl.col("first").ne_missing(pl.col("told_goal"))
+    if others := shown.filter(pl.col("outcome") & another).height:
+        limits.append(f"In {plural(others, 'solved episode')} another goal held before the told one.")
+    numbers = {"right": right, "n": n, "expected": found.expected, "p": found.p_value, "nothing_reached": nothing}
+    return Finding(f"{sentence} ({by_chance}).", _LISTENS, numbers, " ".join([*limits, *left]))
+
+
+def _whatever(shown: pl.DataFrame) -> str:
+    """What was done in most of the episodes, told more than one thing."""
+    for column, how in (("touched", "touched the {}"), ("did", "reached the goal of '{}'")):
+        for value, count in shown[column].drop_nulls().value_counts(sort=True).head(1).iter_rows():
+            if count >= _MOSTLY * shown.height and shown.filter(pl.col(column) == value)["told_goal"].n_unique() > 1:
+                often = f"in {count} of {shown.height} episodes"
+                return f"whatever it was told, it {how.format(value)} first ({often}); "
+    return ""
+
+
+def _behaviour_tables(asked: pl.DataFrame) -> list[Table]:
+    """Told and did, counted, and every episode."""
+    if asked.is_empty():
+        return []
+    nothing = pl.col("did").fill_null("no goal of the scene")
+    matrix = asked.group_by("told", nothing).agg(pl.len().alias("episodes"))
+    matrix = matrix.with_columns(share=pl.col("episodes") / pl.sum("episodes").over("told"))
+    matrix = matrix.sort("told", "episodes", "did", descending=[False, True, False])
+    result = pl.col("outcome").replace_strict({True: "solved", False: "failed"}, default="not known")
+    rows = asked.with_columns(outcome=result).drop(
+        "goals", "scene", "stratum", "state", "own_goal", "told_goal", "first"
+    )
+    return [
+        Table("told_and_did", matrix, _MATRIX, "Told and did", rows=20),
+        Table("told_episodes", rows.sort("suite", "task_id", "episode_index"), _EPISODES, "Episode by episode", rows=8),
+    ]
+
+
+_MATRIX = [
+    Column("told", "text"),
+    Column("did", "text", "did", "the told goal where it was reached, else the goal of the scene that held first"),
+    Column("episodes", "count"),
+    Column("share", "percent", "of those told"),
+]
+_EPISODES = [
+    Column("told", "text"),
+    Column("touched", "text", "touched first"),
+    Column("touched_at", "count", "at step"),
+    Column("did", "text", "goal reached"),
+    Column("did_at", "count", "at step"),
+    Column("before", "text", "before it", "another goal of the same kind that held earlier", screen=False),
+    Column("outcome", "text"),
+    Column("left_out", "text", "left out", "why the episode cannot show listening", screen=False),
+]
+_DECIDE = "Which words decide?"
+_MORE, _LESS, _OPEN, _UNTESTED = "more", "less", "too few episodes", "not tested"
+
+
+def _effects(question: Question) -> tuple[Finding, list[Table]]:
+    """How the action changes without each word, where the run recorded it."""
+    if len(question.stores) > 1 or not recorded_conditions(question.stores[0]):
+        which = "" if len(question.stores) == 1 else " of one store; several stores are asked one at a time"
+        rerun = f"vla-attention capture rerun {_paths(question, 1)} --effects text,cameras"
+        return Finding(f"Not recorded: how the action changes without a word{which}.", _DECIDE, next_step=rerun), []
+    # Effects, as today's study reads them: one call, which takes a second to import.
+    from vla_attention.analyze.effects.effect_study import study_effects
+    from vla_attention.analyze.effects.item_rows import item_rows
+
+    try:
+        study = study_effects(question.stores[0].path, [], question.settings)
+    except BadArgument as error:
+        return Finding(f"Not shown: {error}", _DECIDE), []
+    rows = [_word_row(row) for row in item_rows(study) if row.kind == "word"]
+    spoken = {word.text.casefold() for item in question.selected for line in item.tokens.words for word in line}
+    rows += [
+        {"word": f"'{word}'", "than_noise": _UNTESTED} for word in sorted(spoken - {str(r["word"])[1:-1] for r in rows})
+    ]
+    order = pl.col("than_noise").replace_strict({_MORE: 0, _UNTESTED: 2}, default=1)
+    table = pl.DataFrame(rows, schema=_EFFECT_SCHEMA).sort(order, "total", descending=[False, True], nulls_last=True)
+    return _deciding(table), [Table("word_effects", table, _EFFECTS, "What the action does without a word")]
+
+
+def _word_row(row: ItemRow) -> dict[str, object]:
+    most = row.strongest
+    q, above = most["minus_noise_q"], (most["minus_noise"] or 0.0) > 0
+    shown = _OPEN if q is None else _LESS if not above else _MORE if q <= NAMED_AT else "not shown to be more"
+    parts = {
+        f"{reader}{end}": of[f"effect{end}"]
+        for reader, of in row.by_reader.items()
+        if reader in ("total", "direct")
+        for end in ("", "_low", "_high")
+    }
+    sizes = {"turn": most["angle"], "grip": most["gripper_flips"], "noise": most["noise"]}
+    return {"word": row.name, **parts, **sizes, "episodes": most["num_episodes"], "than_noise": shown}
+
+
+def _deciding(table: pl.DataFrame) -> Finding:
+    tested_words = table.drop_nulls("total")
+    untested = table.height - tested_words.height
+    limit = f"{plural(untested, 'word')} of the instructions not tested." if untested else ""
+    if tested_words.is_empty():
+        return Finding("Not tested: the run recorded no effect of a single word.", _DECIDE, {}, limit)
+    top = tested_words.sort("total", descending=True).row(0, named=True)
+    said = (
+        f"Without {top['word']} the action changes most: by {top['total']:.2g} standard deviations of the run's "
+        f"actions (another noise seed: {top['noise'] or 0:.2g})."
+    )
+    if (top["grip"] or 0) >= _HALF:
+        turn = f", while the movement turns by {top['turn']:.0f} degrees" if top["turn"] is not None else ""
+        said += f" This is mostly the gripper, which closes or opens instead in {top['grip']:.0%} of the steps{turn}."
+    surely = table.filter(than_noise=_MORE)
+    sure = [f"{word} ({total:.2g})" for word, total in surely.select("word", "total").iter_rows()]
+    more = f"Shown to change it by more than another noise seed does: {listing(sure, 5)}."
+    few = f"Only {plural(top['episodes'], 'episode')} with {top['word']}. " if top["than_noise"] == _OPEN else ""
+    said += f" {more if sure else 'No word is shown to change it by more than another noise seed does.'}"
+    return Finding(said, _DECIDE, {**top}, f"{few}{limit}".strip())
+
+
+_EFFECT_SCHEMA = {
+    "word": pl.String,
+    **{f"{reader}{end}": pl.Float64 for reader in ("total", "direct") for end in ("", "_low", "_high")},
+    **dict.fromkeys(("turn", "grip", "noise"), pl.Float64),
+    "episodes": pl.Int64,
+    "than_noise": pl.String,
+}
+_EFFECTS = [
+    Column("word", "text"),
+    Column(
+        "total", "number", "nobody reads it", "how far the action moves, in standard deviations of the run's actions"
+    ),
+    Column("direct", "number", "action tokens do not", "the same if the action tokens alone do not read the word"),
+    Column("turn", "number", "turn", "how far the direction of the hand's movement turns, in degrees"),
+    Column("grip", "percent", "gripper", "steps in which the gripper is told the opposite"),
+    Column("noise", "number", "another noise", "how far another noise seed moves the action in the same episodes"),
+    Column(
+        "than_noise", "text", "than noise", "whether nobody reading it moves the action more than another noise seed"
+    ),
+    Column("episodes", "count"),
+]
+
+
+def _paths(question: Question, most: int | None = None) -> str:
+    return shlex.join(str(store.path) for store in question.stores[:most])

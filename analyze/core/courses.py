@@ -1,0 +1,141 @@
+"""Where hands and things were, step by step, and where failed episodes left solved ones that began like them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from vla_attention.analyze.measures.alignment import episode_timing
+from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.statistics.leaving import Array, band, by_replan, distance, leaves_at, path_of
+from vla_attention.schemas.episode_steps import HAND, POSES
+
+#: Solved episodes of the task whose initial states are nearest.
+_TWINS = 3
+#: Replans of a strip, from the one at which an episode leaves.
+_SHOWN = (-1, 0, 1, 2)
+
+
+@dataclass(frozen=True)
+class Course:
+    """The steps of an episode.
+
+    Attributes:
+        item: the episode.
+        starts: (replan,) steps executed before each replan.
+        path: (moment, quantity), see `statistics.leaving`, of the things that the task names; of all if it names none.
+        start: where all bodies are at the beginning, (body, 3) in metres.
+    """
+
+    item: SelectedEpisode
+    starts: NDArray[np.int64]
+    path: Array
+    start: Array
+
+
+@dataclass(frozen=True)
+class Leaving:
+    """A failed episode beside its twins.
+
+    Attributes:
+        item, twin: the episode, and its nearest twin.
+        starts: (replan,) as in `Course`.
+        apart: (replan,) how far it is from its twins, in metres.
+        within: (replan,) how far twins are from one another.
+        replan: from which on it is farther apart than that, to its end; None: it never is.
+        num_solved: solved episodes that this is known from; 1 where the twin has the same state.
+    """
+
+    item: SelectedEpisode
+    twin: SelectedEpisode
+    starts: NDArray[np.int64]
+    apart: Array
+    within: Array
+    replan: int | None
+    num_solved: int
+
+
+def course_of(item: SelectedEpisode) -> Course | None:
+    """The steps of an episode; None where they are not known."""
+    steps = item.episode.attributes.steps
+    if steps is None:
+        return None
+    poses = item.episode.read(POSES).astype(np.float64)[..., :3]
+    starts, _ = episode_timing(item.store.attributes, item.episode, item.episode.read("env_step").astype(np.int64))
+    named = {thing.name for thing in item.episode.attributes.objects if thing.of_interest}
+    things = [i for i, name in enumerate(steps.bodies) if name != HAND]
+    things = [i for i in things if steps.bodies[i] in named] or things
+    hand = poses[:, steps.bodies.index(HAND)]
+    return Course(item, starts, path_of(hand, [poses[:, i] for i in things]), poses[0])
+
+
+def leavings(
+    failed: Sequence[SelectedEpisode], others: Iterable[SelectedEpisode], same_state: bool
+) -> Iterator[Leaving]:
+    """Each failed episode that has twins among the solved ones of `others`, beside them.
+
+    same_state: twins have the same initial state, and one of them is enough. Else they are those of the task with the
+    nearest states, of which two are needed to know how far twins are apart.
+    """
+    tasks = {item.task for item in failed}
+    solved = [one for one in others if one.task in tasks and one.episode.attributes.success]
+    for task in sorted(tasks):
+        courses = [course for one in solved if one.task == task and (course := course_of(one)) is not None]
+        own = [_apart(one, near) for one in courses if (near := _nearest(one, courses))]
+        for item in failed:
+            course = course_of(item) if item.task == task else None
+            if course is None:
+                continue
+            state = item.episode.attributes.initial_state_digest
+            alike = [one for one in courses if one.item.episode.attributes.initial_state_digest == state]
+            near = _nearest(course, alike if same_state else courses if own else [])
+            if near:
+                apart = _apart(course, near)
+                within = band([np.zeros(1)] if same_state else own, len(apart))
+                number = 1 if same_state else len(own)
+                yield Leaving(item, near[0].item, course.starts, apart, within, leaves_at(apart, within), number)
+
+
+def _nearest(course: Course, others: Sequence[Course]) -> list[Course]:
+    """The nearest others in whose scenes there are as many bodies and named things; with others no path compares."""
+
+    def shape(one: Course) -> tuple[int, int]:
+        return len(one.start), one.path.shape[1]
+
+    other = [one for one in others if one is not course and shape(one) == shape(course)]
+    return sorted(other, key=lambda one: float(((one.start - course.start) ** 2).sum()))[:_TWINS]
+
+
+def _apart(course: Course, others: Sequence[Course]) -> Array:
+    return by_replan(np.min([distance(course.path, one.path) for one in others], axis=0), course.starts)
+
+
+def strip_of(one: Leaving) -> pl.DataFrame:
+    """Where the pictures around the replan lie at which an episode leaves; none where the store has no pictures.
+
+    Returns:
+        One row per picture: row (0: the failed episode, 1: its twin), column, above, replan, camera.
+    """
+    last, rows = one.item.episode.attributes.num_replans - 1, []
+    shown = [replan for shift in _SHOWN if 0 <= (replan := (one.replan or 0) + shift) <= last]
+    for row, (who, item) in enumerate((("failed", one.item), ("solved", one.twin))):
+        cameras = [camera.name for camera in item.store.attributes.policy.cameras]
+        camera = next((name for name in cameras if f"frames/{name}" in item.episode.attributes.arrays), None)
+        for column, replan in enumerate(shown if camera else []):
+            mark = ", leaves" if (row, replan) == (0, one.replan) else ""
+            own = min(replan, item.episode.attributes.num_replans - 1)
+            label = f"{who}, step {int(one.starts[replan])}{mark}" if own == replan else f"{who}, at its end"
+            rows.append((row, column, label, own, camera))
+    return pl.DataFrame(rows, schema=_STRIP, orient="row")
+
+
+_STRIP = {
+    **dict.fromkeys(("row", "column"), pl.Int64),
+    "above": pl.String,
+    "replan": pl.Int64,
+    "camera": pl.String,
+}

@@ -1,0 +1,198 @@
+"""`language` on policies that listen, that are deaf or stubborn, and on scenes in which some goals count for nobody."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from math import factorial
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from benchmarks.null_stores import says_it_listens
+from tests.kit.made_up_behaviour import COLOURS, did, goals_of
+from tests.kit.paths import ROOT
+from tests.kit.questions import question_about
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.analyze.commands.language import language, listens
+from vla_attention.analyze.core.behaviour import with_choices
+from vla_attention.analyze.statistics.exact_tests import mcnemar, shuffled
+from vla_attention.schemas.interventions import Interventions, PromptChange
+from vla_attention.testing.stores import rerun_source, small_steps, write_store
+
+SHIPPED = ROOT / "vla_attention/example_stores"
+EIGHT = [task for task in range(3) for _ in range(8)]
+
+
+def said(*args, **options):
+    return listens(with_choices(did(*args, **options)))
+
+
+@pytest.mark.parametrize(("store", "right", "p"), [("cubes", 6, 1 / 90), ("cubes_one_colour", 2, 1.0)])
+def test_the_shipped_pair(store, right, p):
+    found = language(question_about(SHIPPED / f"{store}.zarr"))
+    assert (found.findings[0].numbers["right"], found.findings[0].numbers["n"]) == (right, 6)
+    assert found.findings[0].numbers["p"] == pytest.approx(p)
+    assert found["told_and_did"]["episodes"].sum() == 6
+    if store == "cubes_one_colour":
+        assert "whatever it was told, it touched the blue cube first" in found.findings[0].sentence
+        assert "does not listen" not in found.findings[0].sentence
+
+
+def test_a_policy_that_listens_and_one_whose_tasks_the_pictures_tell():
+    does = [(task, {task: 9}) for task in EIGHT]
+    assert said(does).sentence.startswith("It listens: it did what it was told in 24 of 24")
+    apart = said(does, state=None)
+    assert apart.sentence.startswith("It did what it was told")
+    assert "pictures could say what to do" in apart.limit
+
+
+@pytest.mark.parametrize("course", [{2: 5}, {0: 3, 1: 6, 2: 9}, {}, {0: 5, 1: 5}])
+def test_a_policy_that_does_the_same_whatever_it_is_told(course):
+    """Also one that tries everything, whose episodes all end well because each ends with its own goal."""
+    found = said([(task, course) for task in EIGHT])
+    assert found.sentence.startswith("Not shown to listen")
+    assert found.numbers["p"] == 1.0
+
+
+def test_a_goal_reached_on_the_way_to_the_told_one_is_said():
+    found = said([(task, {0: 3, 1: 6, 2: 9}) for task in EIGHT])
+    assert found.numbers["right"] == 8
+    assert "In 16 solved episodes another goal held before the told one" in found.limit
+
+
+def test_episodes_that_reached_nothing_are_counted():
+    found = said([(task, {task: 9} if i % 2 else {}) for i, task in enumerate(EIGHT)])
+    assert (found.numbers["right"], found.numbers["n"], found.numbers["nothing_reached"]) == (12, 24, 12)
+
+
+def test_a_part_of_a_told_goal_counts_for_nobody():
+    """Opened on the way to putting something in: neither done instead, nor evidence."""
+    goals = goals_of(
+        {0: "open the drawer", 1: "open the drawer and put the bowl in", 2: "push the plate"},
+        {0: ("open",), 1: ("open", "in")},
+    )
+    frame = with_choices(did([(1, {0: 3, 1: 9}), (1, {0: 4}), (2, {2: 5}), (2, {0: 2, 2: 8}), (0, {0: 3})], goals, ""))
+    assert frame["did"].to_list() == [goals[1].instruction, None, "push the plate", "push the plate", "open the drawer"]
+    assert frame["first"].to_list() == ["in\x1fopen", None, "goal_2", "goal_2", None]
+    assert frame["left_out"].is_null().to_list() == [True, True, True, True, False]
+
+
+def test_a_goal_that_held_at_the_beginning_counts_for_nobody():
+    frame = with_choices(did([(0, {0: 9, 2: 0}), (1, {1: 9, 2: 0}), (2, {2: 0}), (0, {1: 3})]))
+    assert frame["left_out"].is_null().to_list() == [True, True, False, True]
+    assert frame["first"].to_list() == ["goal_0", "goal_1", None, "goal_1"]
+    assert listens(frame).numbers["n"] == 3
+
+
+def test_a_lift_touches_first_and_is_what_was_told():
+    """Goals of another sentence template are on the way; what was reached is named by the told one's template."""
+    goals = [*COLOURS, *goals_of({3: "lift the red cube", 4: "lift the blue cube"})]
+    families = {
+        **dict.fromkeys(range(3), "touch the COLOUR cube"),
+        3: "lift the COLOUR cube",
+        4: "lift the COLOUR cube",
+    }
+    plan = [(0, {0: 4}), (2, {2: 4}), (3, {0: 4, 3: 9}), (4, {2: 4, 4: 9}), (3, {2: 4, 4: 9})]
+    frame = with_choices(did(plan, goals, families))
+    assert frame["did"].to_list() == [goals[i].instruction for i in (0, 2, 3, 4, 4)]
+    assert listens(frame).numbers["right"] == 4
+
+
+def test_one_possible_goal_shows_nothing():
+    found = said([(0, {0: 9})] * 10)
+    assert "cannot show" in found.sentence
+    assert "10 of 10" in found.sentence
+
+
+def test_sentences_that_name_no_goal_are_no_test():
+    found = said([(task, {task: 9}) for task in EIGHT], told="")
+    assert "names no goal of the scene" in found.sentence
+
+
+def test_scenes_are_shuffled_apart():
+    """In each scene one goal is always reached; only all together it would look like listening."""
+    other = [goal.__class__(**{**vars(goal), "conditions": (f"elsewhere_{goal.task_id}",)}) for goal in COLOURS]
+    here = did([(0, {0: 9})] * 6 + [(1, {0: 9})] * 2)
+    there = did([(1, {1: 9})] * 6 + [(0, {1: 9})] * 2, other, suite="other")
+    assert listens(with_choices(pl.concat([here, there]))).numbers["p"] == 1.0
+
+
+courses = st.lists(st.tuples(st.integers(0, 2), st.sampled_from([None, 0, 1, 2])), min_size=1, max_size=7)
+
+
+@given(courses, st.randoms(use_true_random=False))
+def test_p_is_the_share_of_all_shuffles_and_knows_neither_order_nor_names(pairs, random):
+    told, done = [f"t{t}" for t, _ in pairs], [None if d is None else f"t{d}" for _, d in pairs]
+    found = shuffled(told, done, [""] * len(pairs))
+    matches = [sum(a == b for a, b in zip(way, done, strict=True)) for way in itertools.permutations(told)]
+    assert found.p_value == pytest.approx(np.mean(np.array(matches) >= found.matches))
+    assert found.expected == pytest.approx(np.mean(matches))
+    assert found.least_p == pytest.approx(
+        sum(way == tuple(told) for way in itertools.permutations(told)) / factorial(len(told))
+    )
+    order = random.sample(range(len(pairs)), len(pairs))
+    names = dict(zip(("t0", "t1", "t2", None), [*random.sample(["x", "y", "z"], 3), None], strict=True))
+    again = shuffled([names[told[i]] for i in order], [names[done[i]] for i in order], ["s"] * len(pairs))
+    assert again == found
+
+
+def test_strata_add_up():
+    found = shuffled(["a", "b", "a", "b"], ["a", "b", "a", "b"], ["1", "1", "2", "2"])
+    assert (found.p_value, found.expected) == (0.25, 2.0)
+
+
+def test_many_episodes_are_exact_too():
+    told = [str(i % 10) for i in range(200)]
+    assert shuffled(told, told[1:] + told[:1], [""] * 200).p_value == pytest.approx(1.0)
+    # 20 pairs of which 17 are won: as R's binom.test(17, 20)
+    assert mcnemar(17, 3) == pytest.approx(0.002577, abs=1e-6)
+    assert mcnemar(0, 0) == mcnemar(4, 4) == 1.0
+
+
+def test_null_policies_are_said_to_listen_in_at_most_five_of_a_hundred():
+    assert says_it_listens(400, planted=False) <= 0.05
+    assert says_it_listens(40, planted=True) > 0.8
+
+
+def test_effects_say_which_words_decide_and_which_were_not_tested():
+    question = question_about(ROOT / "tests/golden/tables/stores/effects.zarr")
+    table = language(question)["word_effects"]
+    golden = pl.read_parquet(ROOT / "tests/golden/tables/effects_effects/effects_summary.parquet")
+    rows = golden.filter(scope="all", phase="all")
+    for reader, ending in (("total", "_queries_all"), ("direct", "")):
+        for word, value in table.drop_nulls("total").select("word", reader).iter_rows():
+            condition = f"without_word_{word[1:-1]}{ending}"
+            assert value == pytest.approx(rows.row(by_predicate=pl.col("condition") == condition, named=True)["effect"])
+    assert table["word"][0] == "'green'"
+
+
+def test_a_store_without_steps_names_the_next_step(tmp_path, capsys):
+    store = write_store(tmp_path / "a.zarr")
+    assert analyze(["language", str(store), "--output", str(tmp_path / "out"), "--no-plots"]) == 0
+    assert "vla-attention capture" in capsys.readouterr().out
+    first = json.loads((tmp_path / "out" / "result.json").read_text())["findings"][0]
+    assert first["sentence"].startswith("Nobody knows what it did")
+
+
+def test_a_rerun_did_nothing_of_its_own(tmp_path):
+    base = write_store(tmp_path / "base.zarr", plant_steps=small_steps)
+    rerun = write_store(tmp_path / "rerun.zarr", plant_steps=small_steps, rerun_of=rerun_source(base))
+    assert language(question_about(base)).findings[0].numbers["n"] == 4
+    assert language(question_about(rerun)).findings[0].sentence.startswith("Nobody knows")
+
+
+def test_other_words_for_the_same_goal_are_a_test_of_it():
+    found = said([(task, {task: 9}) for task in EIGHT], told="poke the crimson one", same=True)
+    assert found.sentence.startswith("It listens")
+
+
+def test_another_prompt_is_told_first(tmp_path):
+    change = Interventions("other", prompt=PromptChange("text", text="go"))
+    plain, told = (
+        write_store(tmp_path / f"{name}.zarr", **more) for name, more in (("a", {}), ("b", {"interventions": change}))
+    )
+    assert len(language(question_about(plain)).about) < len(language(question_about(told)).about)
