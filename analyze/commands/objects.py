@@ -180,10 +180,9 @@ def _finding(question: Question, classes: pl.DataFrame, by: Collection[str]) -> 
         return Finding(f"What the instruction names gets {gets}.", _ASKS, numbers, limit, step)
     place = f"and {_times(row, 'over_place')} what its place would explain"
     low = row["over_place_low"]
-    if question.untrained or low is None or low <= 1:
+    verdict = "What the instruction names: it gets"
+    if not question.untrained and (low is None or low <= 1):
         verdict = "It is not shown to look for what the instruction names, which gets"
-    else:
-        verdict = "What the instruction names: it gets"
     return Finding(f"{verdict} {gets}, {place}.", _ASKS, numbers, enough(question), step)
 
 
