@@ -162,29 +162,20 @@ class OpenStores:
 
         return Answer.of(answer_to(name, self.stores, settings_from_keywords(**settings), own, self._known))
 
-    def objects(
-        self,
-        table: Literal["objects", "summary", "times", "pointing", "iou"] = "objects",
-        **settings: Unpack[SettingKeywords],
-    ) -> pl.DataFrame:
-        """Attention on the objects: shares and enrichment, shares over time, pointing game, or IoU with their masks.
+    def objects(self, by: Sequence[str] = (), iou: bool = True, **settings: Unpack[SettingKeywords]) -> Answer:
+        """Which objects are looked at; tables "objects", "pointing", "iou", each of them with "_episodes" too.
 
-        "summary" has means over episodes with intervals, and the enrichment over the control.
+        `by`: keep apart layer, head, denoise, replan, time, task, family, episode or camera. `iou`: compare maps with
+        the objects' masks, which takes most of the time.
 
-        >>> objects = va.open(store).objects()
+        >>> objects = va.open(store).objects(iou=False)["objects"]
         >>> "akita_black_bowl_1" in objects["item"].to_list()
         True
 
         Raises:
             BadArgument: the stores hold no object masks.
         """
-        from vla_attention.analyze.objects.object_settings import ObjectSettings
-        from vla_attention.analyze.objects.object_study import study_objects
-
-        check_name("table", table, ("objects", "summary", "times", "pointing", "iou"))
-        options = ObjectSettings(spatial=table in ("pointing", "iou"))
-        study = study_objects(self.stores, settings_from_keywords(**settings), options)
-        return study.summary if table == "summary" else getattr(study.tables, table).whole
+        return self._answer("objects", settings, by=tuple(by), iou=iou)
 
     def compare(
         self,
@@ -271,40 +262,27 @@ class OpenStores:
 
     def overlay(
         self,
-        task: int | None = None,
         episode: int | None = None,
         replans: int | Sequence[int] | None = None,
         cameras: str | Sequence[str] | None = None,
-        folder: str | Path | None = None,
-        measure: Literal["lift", "share"] = "lift",
-        smooth: bool = False,
+        outline: Sequence[str] = (),
+        video: Literal["gif", "mp4"] | None = None,
         **settings: Unpack[SettingKeywords],
-    ) -> pl.DataFrame:
-        """Attention on the pictures of one episode: one row per (replan, camera, patch).
+    ) -> Answer:
+        """Attention on the pictures of some episodes; tables "overlay" (a row per picture) and "overlay_patches".
 
-        With `folder`, a strip of pictures is drawn there, with outlines around `groups`. Without `task`, `episode` and
-        `replans`: the first episode, every replan. `vla-attention overlay` can also make videos.
+        Without `episode` and `replans`: two episodes, up to eight policy calls of each. `outline`: groups around whose
+        patches lines are drawn, as "bowl=object:akita_black_bowl_1". `video`: with `.save(folder)` also a film.
 
-        >>> patches = va.open(store).overlay(task=1, replans=0, folder=folder)
-        >>> patches.height, sorted(file.suffix for file in folder.iterdir())
-        (16, ['.csv', '.pdf', '.png'])
+        >>> va.open(store).overlay(tasks=1, replans=0)["overlay_patches"].height
+        16
         """
-        from vla_attention.analyze.overlay.overlay_study import study_overlay
-
-        check_name("measure", measure, ("lift", "share"))
-        study = study_overlay(
-            self.stores,
-            settings_from_keywords(**settings),
-            task=task,
-            episode=episode,
-            cameras=[cameras] if isinstance(cameras, str) else cameras,
-            replans=[replans] if isinstance(replans, int) else replans,
-        )
-        if folder is not None:
-            from vla_attention.analyze.overlay.plot_strip import plot_overlay_strip
-
-            plot_overlay_strip(study, Path(folder), measure=measure, smooth=smooth)
-        return study.table
+        own = {
+            "episode": episode,
+            "replans": [replans] if isinstance(replans, int) else replans,
+            "cameras": [cameras] if isinstance(cameras, str) else cameras,
+        }
+        return self._answer("overlay", settings, **own, outline=tuple(outline), video=video)
 
     def report(
         self, path: str | Path, num_episodes: int = 2, num_replans: int = 8, **settings: Unpack[SettingKeywords]

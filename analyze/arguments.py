@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -73,23 +72,6 @@ def add_site_and_tasks(chosen: argparse._ArgumentGroup) -> None:
         help="softmax family: joint (pi), self or cross (Cosmos), or others that --list shows; default: the first one",
     )
     add_task(chosen, "tasks", "tasks", was=("--tasks",))
-
-
-def add_episode(parser: argparse.ArgumentParser, title: str) -> argparse._ArgumentGroup:
-    """--episode, which names one episode of the chosen tasks."""
-    episode = parser.add_argument_group(title)
-    episode.add_argument("--episode", type=int, metavar="N", help="its number in its task (default: the first one)")
-    return episode
-
-
-def only_task(arguments: argparse.Namespace, stores: Sequence[Store]) -> int | None:
-    """The number of the task that --task chose, where it is a single one."""
-    if arguments.tasks is None:
-        return None
-    from vla_attention.analyze.stores.selection import task_numbers
-
-    numbers = {number for store in stores for number in task_numbers(store, arguments.tasks)}
-    return numbers.pop() if len(numbers) == 1 else None
 
 
 def add_selection(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:

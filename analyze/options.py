@@ -55,6 +55,10 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "type": lambda text: tuple(part for part in text.split(",") if part), "default": (), "metavar": "AXIS,...",
         "help": f"keep apart: one or several of {', '.join(AXES)}",
     },
+    "iou": {
+        "action": argparse.BooleanOptionalAction, "default": True,
+        "help": "pointing game and IoU of maps and objects, which take most of the time (default: yes)",
+    },
     "without_sinks": {
         "nargs": "?", "const": "", "metavar": "RULE",
         "help": "take out keys that take far more than their share in most heads, and list them; a rule as "
@@ -63,6 +67,15 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "save_viz": {"action": "store_true", "help": "also a picture per episode and layer"},
     "num_episodes": {"type": int, "default": 2, "metavar": "N", "help": "with pictures (default: %(default)s)"},
     "num_replans": {"type": int, "default": 8, "metavar": "N", "help": "of each, at most (default: %(default)s)"},
+    "episode": {"type": int, "metavar": "N", "help": "the one to show"},
+    "replans": {"type": int, "nargs": "+", "metavar": "N", "help": "policy calls to show, from 0"},
+    "cameras": {"nargs": "+", "metavar": "NAME", "help": "cameras to show (default: all that the policy sees)"},
+    "outline": {
+        "action": "append", "default": [], "metavar": "NAME=SELECTOR", "help": "draw a line around a group's patches",
+    },
+    "smooth": {"action": "store_true", "help": "attention changes smoothly between patches"},
+    "video": {"choices": ("gif", "mp4"), "help": "also a film of each episode"},
+    "fps": {"type": float, "default": 4.0, "metavar": "X", "help": "policy calls a second (default: %(default)s)"},
     "open": {"action": "store_true", "help": "show the page in the browser"},
     "list": {"action": "store_true", "help": "what the stores hold, and what the grouping takes of it"},
 }  # fmt: skip

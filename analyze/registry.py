@@ -35,6 +35,7 @@ class Command:
 _ROWS = ("layers", "denoise", "heads", "site", "intervals")
 _GROUPING = ("grouping", "group", "ratio")
 _NO_WORDS = "its keys spell no words; choose a site with text by --site (Cosmos: cross)"
+_NO_PICTURES = "its keys are no patches of pictures; choose a site with cameras by --site (Cosmos: self)"
 
 #: Name -> command. The function NAME of `analyze.commands.NAME` answers a question.
 COMMANDS: dict[str, Command] = {
@@ -69,7 +70,13 @@ COMMANDS: dict[str, Command] = {
         _NO_WORDS,
         ("words runs/libero_10.zarr", "words runs/libero_10.zarr --task 3", "words runs/cosmos.zarr --by layer"),
     ),
-    "objects": Command("which objects are looked at", folder=True),
+    "objects": Command(
+        "which objects are looked at, over their area and over what their place explains; pointing game and IoU",
+        (*_ROWS, "by", "iou"),
+        ("image", "latent"),
+        _NO_PICTURES,
+        ("objects runs/libero_10.zarr", "objects runs/libero_10.zarr --by layer", "objects runs/cubes.zarr --no-iou"),
+    ),
     "effects": Command("what the action depends on: without a word, a picture, an object", folder=True),
     "compare": Command(
         "what changed between runs: success, what was done, actions of reruns, attention",
@@ -82,7 +89,30 @@ COMMANDS: dict[str, Command] = {
         ),
         runs=True,
     ),
-    "overlay": Command("attention on the stored pictures: strips, GIF or MP4", folder=True),
+    "overlay": Command(
+        "attention on the stored pictures: strips, GIF or MP4",
+        (
+            *_ROWS,
+            *_GROUPING,
+            "episode",
+            "replans",
+            "cameras",
+            "outline",
+            "smooth",
+            "video",
+            "fps",
+            "num_episodes",
+            "num_replans",
+        ),
+        ("image", "latent"),
+        _NO_PICTURES,
+        (
+            "overlay runs/libero_10.zarr",
+            "overlay runs/libero_10.zarr --task 3 --episode 1 --layers 13 --heads 5",
+            "overlay runs/libero_10.zarr --outline bowl=object:akita_black_bowl_1 --video gif",
+            "overlay runs/libero_10.zarr --replans 0 5 10 --cameras base_0_rgb",
+        ),
+    ),
     "deviation": Command("how far actions are from the data set's, beside attention", folder=True),
     "report": Command(
         "all of it in one HTML file",

@@ -61,7 +61,6 @@ MEMORY_COMMANDS = {
     "words STORE": (("words",), ("--no-plots",)),
     "heads STORE": (("heads",), ("--no-plots",)),
     "objects STORE": (("objects",), ("--no-plots",)),
-    "objects STORE --save-steps": (("objects",), ("--save-steps", "--no-plots")),
 }
 
 

@@ -72,10 +72,13 @@ def specialist(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray)
     return normalised(weights)
 
 
+SINK = ["overlay", "--cameras", "base_0_rgb", "--episode", "0"]
+
+
 def draw_run(store: Path, scratch: Path, folder: Path) -> None:
     """Draw the pictures of README.md: a strip of one episode, and the layers."""
-    strip = ["overlay", "--task", "10", "--replans", "0", "1", "2", "4"]
-    draw("overlay", store, strip, "overlay_task010_episode000", scratch / "overlay", folder)
+    strip = ["overlay", "--task", "1", "--episode", "0"]
+    draw("overlay", store, strip, "overlay_task001_episode000", scratch / "overlay", folder)
     draw("layers", store, ["ratios"], "layer_profile", scratch / "ratios", folder)
 
 
@@ -108,7 +111,7 @@ def main() -> None:
     )
     cases = {
         "baseline": (favour, {"layers": (0, 9, 17), "tasks": (0, 1, 2), "episodes": 6}, ["ratios"], "ratio_per_task"),
-        "sink": (sink, {"layers": (9,), "tasks": (0,), "episodes": 2}, ["overlay", "--camera", "base_0_rgb"], None),
+        "sink": (sink, {"layers": (9,), "tasks": (0,), "episodes": 2}, SINK, None),
         "specialist_head": (specialist, {"tasks": (0, 1), "episodes": 3}, ["heads"], "head_grid"),
     }
     for name, (plant, changes, command, picture) in cases.items():

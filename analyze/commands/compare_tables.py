@@ -7,10 +7,12 @@ from dataclasses import replace
 
 import polars as pl
 
+from vla_attention.analyze.core.camera_maps import stored_picture
 from vla_attention.analyze.core.compared import KINDS, Compared, side_by_side, strip_of_pair
 from vla_attention.analyze.core.result import Column, Figure, Table
 from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.schemas.errors import shortened
+from vla_attention.schemas.safe_text import visible
 
 ALL = pl.col("scope") == "all"
 
@@ -75,8 +77,11 @@ def figures_of(part: Compared, told: Mapping[str, pl.DataFrame]) -> list[Figure]
         title = f"Attention to words, {name} against {first}"
         words = _as_factors(part.rows["words"].filter(ALL))
         found.append(Figure(f"words_{name}", "forest", words, title, _BARS, looks))
-    if part.pairs.height and (strip := strip_of_pair(part, told[first], told[name])).height:
-        found.append(Figure(f"pair_{name}", "pictures", strip, f"The same beginning: {first} and {name}"))
+    if part.pairs.height:
+        items, rows = strip_of_pair(part, told[first], told[name])
+        title = f"Told '{visible(items[0].episode.attributes.instruction)}' from one beginning: {first} and {name}"
+        look = {"picture": lambda a: stored_picture(items[a["row"]], a["camera"], a["replan"])}
+        found += [Figure(f"pair_{name}", "pictures", rows, title, options=look)] if rows.height else []
     return found
 
 

@@ -38,13 +38,13 @@ def ratios_by(levels: Levels, by: Collection[str]) -> pl.DataFrame:
             cells = cells.unique(cell, keep="first", maintain_order=True)
         names = [*EPISODE_KEYS, *_names(by, axes)]
         if "time" in by:
-            cells = _with_time(cells, levels.measured)
+            cells = with_time(cells, levels.measured)
         weight = pl.col("weight") if "time" in by else pl.lit(1.0)
         logs = {name: pl.col(name).log() for name in ("ratio", "uniform_ratio", "ratio_lift")}
         plain = ("numerator_fraction", "denominator_fraction", "numerator_mass", "denominator_mass")
         return cells.group_by(names, maintain_order=True).agg(
-            *(_weighted(log, weight).exp().alias(name) for name, log in logs.items()),
-            *(_weighted(pl.col(name), weight).alias(name) for name in plain),
+            *(weighted(log, weight).exp().alias(name) for name, log in logs.items()),
+            *(weighted(pl.col(name), weight).alias(name) for name in plain),
             (~logs["ratio"].is_finite().fill_null(False)).sum().cast(pl.Int64).alias("num_nonfinite"),
         )
 
@@ -62,10 +62,10 @@ def groups_by(levels: Levels, by: Collection[str]) -> pl.DataFrame:
             rows = rows.filter(pl.col("layer") != LAYERS_AVG)
         if "time" not in by:
             return rows
-        rows = _with_time(rows, levels.measured)
+        rows = with_time(rows, levels.measured)
         names = [*EPISODE_KEYS, *_names(by, axes), "group"]
         return rows.group_by(names, maintain_order=True).agg(
-            _weighted(pl.col(name), pl.col("weight")).alias(name) for name in ("keys", "mass", "fraction", "lift")
+            weighted(pl.col(name), pl.col("weight")).alias(name) for name in ("keys", "mass", "fraction", "lift")
         )
 
     made = partial(means, by=frozenset({*axes, *(("replan",) if "time" in by else ())}))
@@ -77,14 +77,14 @@ def _names(by: Collection[str], axes: Sequence[str]) -> list[str]:
     return [*(name for axis in axes for name in columns[axis]), *(("phase",) if "time" in by else ())]
 
 
-def _weighted(value: pl.Expr, weight: pl.Expr) -> pl.Expr:
+def weighted(value: pl.Expr, weight: pl.Expr) -> pl.Expr:
     """Weighted mean over the finite values; null without any."""
     known = value.is_finite().fill_null(False)
     total = pl.when(known).then(weight).otherwise(0.0).sum()
     return pl.when(total > 0).then(pl.when(known).then(value * weight).otherwise(0.0).sum() / total)
 
 
-def _with_time(rows: pl.DataFrame, measured: Sequence[Measured]) -> pl.DataFrame:
+def with_time(rows: pl.DataFrame, measured: Sequence[Measured]) -> pl.DataFrame:
     """The rows once for each part of the episode's time that their replan lasts in, with the share as `weight`.
 
     `phase` is the middle of the part. A replan's value holds until the next replan, as its actions do.

@@ -12,6 +12,8 @@ The options of a figure, by kind:
     scatter       x, y, label: points with names, NAME_low and NAME_high as bars. log, xlabel, ylabel.
     pictures      none; see `pictures.pictures` for the columns.
 
+    pictures      see `render.pictures`.
+
 NAME_low and NAME_high of a value are its interval; `num_episodes`, if the frame has it, is said.
 """
 
@@ -171,7 +173,9 @@ def _legend(axes: Axes, rows: pl.DataFrame, o: Any) -> None:
 
 
 def _legend_above(axes: Axes, handles: Sequence[Any], labels: Sequence[str]) -> None:
-    axes.legend(handles, labels, loc="lower left", bbox_to_anchor=(0, 1), ncols=4, borderaxespad=0.1,
+    figure = axes.get_figure(root=True)
+    columns = 4 if figure is None or figure.get_figwidth() > 4 else 2
+    axes.legend(handles, labels, loc="lower left", bbox_to_anchor=(0, 1), ncols=columns, borderaxespad=0.1,
                 handlelength=1.4, columnspacing=1.0)  # fmt: skip
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import polars as pl
 
 from vla_attention.analyze.show.numbers import plural
-from vla_attention.analyze.statistics.many_looks import NAMED_AT, NamedLeader
+from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Units
 from vla_attention.schemas.errors import listing
 
@@ -40,23 +40,6 @@ def findings(
         return f"Of {of}, none shows {what} {bound}."
     verb = "shows" if len(named) == 1 else "show"
     return f"Of {of}, {len(named)} {verb} {what} {bound}: {listing(named, 8)}."
-
-
-def apart_note(leaders: Sequence[NamedLeader], column: str) -> str:
-    """With which items leaders that are named share too few episodes; nothing where they share enough with all.
-
-    column: of the leaders' names, the one that is said.
-    """
-    said = []
-    for leading in leaders:
-        others = dict.fromkeys(name[column] for name in leading.apart if name[column] != leading.name[column])
-        if others:
-            which = listing([f"'{other}'" for other in others])
-            said.append(
-                f"'{leading.name[column]}' shares too few episodes with {which}: the differences to these are between "
-                "tasks, whose scenes and sentences differ too."
-            )
-    return " ".join(dict.fromkeys(said))
 
 
 def few_families_note(table: pl.DataFrame, name: str, units: Units) -> str:

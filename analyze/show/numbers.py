@@ -70,11 +70,6 @@ def solved_text(outcomes: Iterable[bool | None]) -> str:
     return f"{solved} solved" if len(known) == len(given) else f"{solved} of {len(known)} with a known outcome solved"
 
 
-def outcome_word(success: bool | None, solved: str = "success", failed: str = "failure") -> str:
-    """The outcome of an episode in a word or two."""
-    return "outcome not known" if success is None else solved if success else failed
-
-
 def of_tasks(num_episodes: int, num_tasks: int) -> str:
     """`16 episodes of 8 tasks`."""
     return f"{plural(num_episodes, 'episode')} of {plural(num_tasks, 'task')}"

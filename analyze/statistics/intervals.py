@@ -220,22 +220,6 @@ def estimates(statistics: Sequence[EpisodeStatistic], units: Units) -> list[Esti
     return [_estimate(*one) for one in each]
 
 
-def quotient_by_episode(numerator: ArrayLike, denominator: ArrayLike, tasks: ArrayLike) -> NDArray[np.float64]:
-    """One value per episode, whose mean over tasks is the quotient of means, with the quotient's variance (episode,).
-
-    quotient + (numerator - quotient * denominator) / mean denominator: the quotient to first order. It makes quotients
-    of different items comparable episode by episode.
-    """
-    above, below = np.asarray(numerator, dtype=np.float64), np.asarray(denominator, dtype=np.float64)
-    quotient, mean_below = (
-        one.value
-        for one in estimates([ratio_of_means_over_episodes(above, below), mean_over_episodes(below)], Units.of(tasks))
-    )
-    if quotient is None or not mean_below:
-        return np.full(len(above), np.nan)
-    return quotient + (above - quotient * below) / mean_below
-
-
 def strata_error(
     squares: NDArray[np.float64], size: NDArray[np.float64], num_tasks: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -20,14 +20,14 @@ from vla_attention.analyze.show import plot_style
 HERE, DRAW = Path(__file__).parent, Figure.savefig
 
 
-def white_pixel() -> bytes:
+def white_pixel(kind: str) -> bytes:
     buffer = io.BytesIO()
-    Image.new("RGB", (1, 1), "white").save(buffer, format="PNG")
+    Image.new("RGB", (1, 1), "white").save(buffer, format=kind)
     return buffer.getvalue()
 
 
 #: Whole files, and what PDF files begin with.
-BLANK = {"png": white_pixel(), "pdf": b"%PDF-1.4\n"}
+BLANK = {"png": white_pixel("PNG"), "pdf": b"%PDF-1.4\n", "webp": white_pixel("WEBP")}
 
 
 def leave_blank(_figure: Figure, file: Any, **options: Any) -> None:

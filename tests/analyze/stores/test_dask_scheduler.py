@@ -59,7 +59,7 @@ def test_every_question_has_the_same_answer_to_the_last_bit(on_cluster, store):
             run.analyze()["tasks_groups"],
             run.analyze()["contributions_steps"],
             run.words()["words"],
-            run.objects("iou"),
+            run.objects()["iou"],
         ]
 
     there = tables()

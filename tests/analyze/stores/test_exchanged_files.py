@@ -43,13 +43,13 @@ QUESTIONS: dict[str, Callable[[OpenStores, Path], pl.DataFrame | list[pl.DataFra
     "heads": lambda run, other: [run.analyze(by=("layer", "head"))["by"], run.analyze(by=("denoise",))["by"]],
     "sinks": lambda run, other: run.analyze(without_sinks="")["sinks"],
     "words": lambda run, other: [run.words()["words"], run.words()["words_episodes"]],
-    "objects": lambda run, other: [run.objects(), run.objects("iou")],
+    "objects": lambda run, other: [run.objects()["objects_episodes"], run.objects()["iou_episodes"]],
     "time": lambda run, other: run.analyze(by=("time",))["by"],
     "compare": lambda run, other: run.compare(other, allow_mismatch=["seed"]),
     "export": lambda run, other: [
         pl.DataFrame(one["rows"].to_series().reset_index()) for one in run.to_xarray(rows=True)
     ],
-    "overlay": lambda run, other: run.overlay(replans=0),
+    "overlay": lambda run, other: run.overlay(replans=0)["overlay_patches"],
 }
 
 

@@ -55,7 +55,7 @@ def tables(path, rerun):
     yield run.words()["words"]
     yield from (run.analyze(by=by)["by"] for by in (("layer", "head"), ("denoise",)))
     yield run.analyze(without_sinks="")["sinks"]
-    yield from (run.objects(table) for table in ("objects", "pointing", "iou"))
+    yield from (run.objects()[f"{table}_episodes"] for table in ("objects", "pointing", "iou"))
     yield run.analyze(by=("time",))["by"]
     yield run.effects(rerun, "episodes")
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import polars as pl
@@ -21,29 +21,23 @@ from tests.kit.bowl_scene import CAMERAS, bowl_coverage, bowl_tokens, write_bowl
 from tests.kit.examples import examples
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.commands.objects import objects
 from vla_attention.analyze.commands.words import words
-from vla_attention.analyze.objects.object_attention import ObjectTables, object_tables
-from vla_attention.analyze.objects.object_settings import ObjectSettings
-from vla_attention.analyze.objects.object_study import followed_objects, iou_summary, leading_finder, objects_summary
-from vla_attention.analyze.statistics.episode_intervals import Sampling
-from vla_attention.analyze.statistics.units import Estimand
+from vla_attention.analyze.core.object_maps import enrichment_on
+from vla_attention.analyze.core.result import Result
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.testing.tokens import OBJECTS, random_rows
 
 QUICK = settings(
-    max_examples=examples(4), phases=[Phase.explicit, Phase.generate], deadline=None,
+    max_examples=examples(2), phases=[Phase.explicit, Phase.generate], deadline=None,
     suppress_health_check=[HealthCheck.too_slow],
 )  # fmt: skip
 CLASS_OF = {"akita_black_bowl_1": "of interest", "plate_1": "of interest", "wooden_cabinet_1": "other objects"}
+BOWL = pl.col("item") == "akita_black_bowl_1"
 
 
-def measured(path: Path, wanted: ObjectSettings | None = None, keep_steps: bool = False, **selected) -> SimpleNamespace:
-    return whole(object_tables(question_about(path, **selected), wanted, keep_steps))
-
-
-def whole(tables: ObjectTables) -> SimpleNamespace:
-    """The tables as frames."""
-    return SimpleNamespace(**{name: part and part.whole for name, part in vars(tables).items()})
+def measured(path: Path, by: tuple[str, ...] = (), iou: bool = True, **selected) -> Result:
+    return objects(question_about(path, **selected), by, iou)
 
 
 def follow_bowl(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray) -> np.ndarray:
@@ -87,9 +81,9 @@ def raw_episode(path: Path, name: str) -> tuple[np.ndarray, dict[str, np.ndarray
 
 
 def test_shares_and_enrichment_equal_sums_over_raw_rows(follower_store):
-    objects = measured(follower_store, ObjectSettings(spatial=False)).objects
+    table = measured(follower_store, iou=False)["objects_episodes"]
     rows, coverage, spans = raw_episode(follower_store, "task001_episode000")
-    own = objects.filter((pl.col("task_id") == 1) & (pl.col("episode_index") == 0) & (pl.col("layer") == "2"))
+    own = table.filter((pl.col("task_id") == 1) & (pl.col("episode_index") == 0) & (pl.col("layer") == "2"))
     assert own.height == 3 * (4 + 5)
     mean = rows[:, 1].mean(axis=(1, 2))  # (replan, key)
     for row in own.iter_rows(named=True):
@@ -118,12 +112,12 @@ def test_shares_and_enrichment_equal_sums_over_raw_rows(follower_store):
 
 
 def test_enrichment_of_all_cameras_is_a_mean_of_the_cameras(follower_store):
-    objects = measured(follower_store, ObjectSettings(spatial=False)).objects
+    table = measured(follower_store, iou=False)["objects_episodes"]
     keys = ["task_id", "episode_index", "layer", "kind", "item"]
-    of_camera = objects.filter(pl.col("camera") != "all").group_by(keys)
-    for name in ("enrichment", "control_enrichment"):
+    of_camera = table.filter(pl.col("camera") != "all").group_by(keys)
+    for name in ("enrichment", "enrichment_elsewhere"):
         bounds = of_camera.agg(pl.col(name).min().alias("low"), pl.col(name).max().alias("high"))
-        both = objects.filter(pl.col("camera") == "all").join(bounds, on=keys).drop_nulls([name, "low"])
+        both = table.filter(pl.col("camera") == "all").join(bounds, on=keys).drop_nulls([name, "low"])
         assert both.height > 0
         assert (both[name] >= both["low"] - 1e-6).all()
         assert (both[name] <= both["high"] + 1e-6).all()
@@ -145,12 +139,9 @@ def moved_ious(values: np.ndarray, mask: set[int], percentile: float, replan: in
 
 @QUICK
 @given(data=st.data())
-def test_spatial_metrics_equal_loops_over_raw_maps(data):
-    """On random rows and coverage, per replan, layer, denoise step and head."""
+def test_pointing_and_iou_equal_loops_over_raw_maps(data):
+    """On random rows, per layer and head: means over replans with a mask and denoise steps."""
     size, seed = data.draw(st.integers(7, 9)), data.draw(st.integers(0, 2**16))
-    tokens = bowl_tokens(replans=2, size=size)
-    percentile = data.draw(st.sampled_from([75.0, 90.0]))
-    least, tolerance = data.draw(st.sampled_from([0.3, 0.7])), data.draw(st.sampled_from([0.0, 1.0, 1.5]))
 
     def plant(task, episode, tokens, rows):
         rows = random_rows(tokens, rows.shape[1:-1], seed, spread=1.0)
@@ -158,105 +149,93 @@ def test_spatial_metrics_equal_loops_over_raw_maps(data):
 
     with tempfile.TemporaryDirectory() as folder:
         path = write_bowl_store(
-            Path(folder) / "a.zarr", tokens=tokens, tasks=(0,), episodes=1, layers=(0, 1), plant_rows=plant
-        )
-        chosen = ObjectSettings(percentiles=(percentile,), mask_coverage=least, tolerance=tolerance)
-        tables = measured(path, chosen, keep_steps=True, per_head=True)
+            Path(folder) / "a.zarr", tokens=bowl_tokens(replans=2, size=size), tasks=(0,), episodes=1, layers=(0, 1),
+            plant_rows=plant,
+        )  # fmt: skip
+        tables = measured(path, ("head",))
+        pointing, overlaps = tables["pointing_episodes"], tables["iou_episodes"]
         rows, coverage, spans = raw_episode(path, "task000_episode000")
-    steps, iou_steps = tables.steps, tables.iou_steps
-    assert steps is not None
-    assert iou_steps is not None
-    assert tables.iou is not None
-    assert tables.pointing is not None
-    where = ["replan", "layer", "denoise_step", "head", "camera", "kind", "item"]
-    by_threshold = iou_steps.rows_by_key([*where, "threshold"], named=True)
     centres = np.array([(r + 0.5, c + 0.5) for r in range(size) for c in range(size)])
-    for row in steps.sample(80, seed=seed).iter_rows(named=True):
-        layer, denoise = row["layer"], {0: 0, 9: 1}[row["denoise_step"]]
-        values = rows[row["replan"], layer, denoise, row["head"], spans[row["camera"]]]
-        area = coverage[row["camera"]][row["replan"]][:, members_of(row["kind"], row["item"])].sum(axis=1)
-        mask = set(np.flatnonzero(area >= least).tolist())
-        of_map = [row[name] for name in where]
-        otsu, overlap = (by_threshold[*of_map, name][0] for name in ("otsu", f"p{percentile:g}"))
-        centre = np.average(centres, axis=0, weights=values)
-        np.testing.assert_allclose([row["centre_row"], row["centre_column"]], centre, rtol=1e-5)
-        assert row["mass"] == pytest.approx((values * area).sum(), rel=1e-5)
-        if not mask:
-            assert row["pointing"] is None
-            assert otsu["iou"] is None
-            continue
-        region = set(np.flatnonzero(values >= scipy.stats.scoreatpercentile(values, percentile)).tolist())
-        assert overlap["iou"] == pytest.approx(len(region & mask) / len(region | mask))
-        moved = moved_ious(values, mask, percentile, row["replan"], size)
-        assert overlap["iou_chance"] == pytest.approx(np.mean(moved))
-        # Stored rows are rounded, so two patches can be equally high.
-        highest = centres[values == values.max()]
-        near = [any(math.dist(place, centres[patch]) <= tolerance for patch in mask) for place in highest]
-        assert row["pointing"] == pytest.approx(np.mean(near))
-        of_object = np.average(centres, axis=0, weights=area)
-        assert row["distance"] == pytest.approx(np.hypot(*(centre - of_object)) / size, rel=1e-5)
-    # The episode's tables hold the means of these steps over replans with a mask and denoise steps.
-    keys = ["layer", "head", "camera", "kind", "item"]
-    for table, of_steps, by, names, height in (
-        (tables.pointing, steps, keys, ["pointing", "distance"], 2 * 2 * 2 * 9),
-        (tables.iou, iou_steps, [*keys, "threshold"], ["iou", "iou_chance"], 2 * 2 * 2 * 9 * 2),
-    ):
-        means = of_steps.with_columns(pl.col("layer").cast(pl.String)).group_by(by).agg(pl.col(names).mean())
-        joined = table.filter(pl.col("layer") != "layers_avg").join(means, on=by, suffix="_mean")
-        assert joined.height == height
-        for name in names:
-            wanted = joined[f"{name}_mean"].cast(pl.Float64).to_numpy()
-            np.testing.assert_allclose(joined[name].cast(pl.Float64).to_numpy(), wanted, rtol=1e-9)
+    by_map = overlaps.rows_by_key(["layer", "head", "camera", "kind", "item", "threshold"], named=True)
+    for row in pointing.filter(pl.col("layer") != "layers_avg").sample(20, seed=seed).iter_rows(named=True):
+        of_map = [row[name] for name in ("layer", "head", "camera", "kind", "item")]
+        found: dict[str, list[float]] = {}
+        for replan, denoise in np.ndindex(rows.shape[0], rows.shape[2]):
+            values = rows[replan, int(row["layer"]), denoise, row["head"], spans[row["camera"]]]
+            area = coverage[row["camera"]][replan][:, members_of(row["kind"], row["item"])].sum(axis=1)
+            mask = set(np.flatnonzero(area >= 0.5).tolist())
+            if not mask:
+                continue
+            centre = np.average(centres, axis=0, weights=values)
+            # Stored rows are rounded, so two patches can be equally high.
+            highest = centres[values == values.max()]
+            near = [any(math.dist(place, centres[patch]) <= 1 for patch in mask) for place in highest]
+            of_object = np.average(centres, axis=0, weights=area)
+            found.setdefault("pointing", []).append(np.mean(near))
+            found.setdefault("distance", []).append(np.hypot(*(centre - of_object)) / size)
+            for percentile in (80.0, 95.0):
+                region = set(np.flatnonzero(values >= scipy.stats.scoreatpercentile(values, percentile)).tolist())
+                iou, moved = len(region & mask) / len(region | mask), moved_ious(values, mask, percentile, replan, size)
+                found.setdefault(f"p{percentile:g}", []).append(iou)
+                found.setdefault(f"p{percentile:g} by chance", []).append(np.mean(moved))
+        for name in ("pointing", "distance"):
+            assert row[name] == (pytest.approx(np.mean(found[name]), rel=1e-5) if found else None)
+        for threshold in ("p80", "p95"):
+            overlap = by_map[*of_map, threshold][0]
+            for name, where in (("iou", threshold), ("iou_chance", f"{threshold} by chance")):
+                assert overlap[name] == (pytest.approx(np.mean(found[where])) if found else None)
 
 
 def test_uniform_attention_scores_exactly_what_chance_does(tmp_path):
     path = write_bowl_store(tmp_path / "uniform.zarr", plant_rows=attend_uniformly, tasks=(0,), episodes=1)
     tables = measured(path)
-    assert tables.iou is not None
-    np.testing.assert_allclose(tables.objects["enrichment"].drop_nulls(), 1.0, rtol=1e-5)
-    np.testing.assert_allclose(
-        tables.objects["share"], tables.objects["area_share"] * _of_all(tables.objects), rtol=1e-5
-    )
-    assert tables.pointing is not None
-    seen = tables.pointing.filter(pl.col("mask_replans") > 0)
+    episodes = tables["objects_episodes"]
+    np.testing.assert_allclose(episodes["enrichment"].drop_nulls(), 1.0, rtol=1e-5)
+    of_all = np.where(episodes["camera"].to_numpy() == "all", 1.0, 0.5)
+    np.testing.assert_allclose(episodes["share"], episodes["area_share"] * of_all, rtol=1e-5)
+    seen = tables["pointing_episodes"].filter(pl.col("mask_replans") > 0)
     np.testing.assert_allclose(seen["pointing"], seen["pointing_chance"], rtol=1e-6)
-    overlap = tables.iou.filter(pl.col("threshold") == "p90").drop_nulls("iou")
+    overlap = tables["iou_episodes"].filter(pl.col("threshold") == "p90").drop_nulls("iou")
     assert overlap.height == seen.height
     np.testing.assert_allclose(overlap["iou"], overlap["iou_chance"], rtol=1e-6)
     np.testing.assert_allclose(seen["centre_row"], 8.0, rtol=1e-5)
     np.testing.assert_allclose(seen["distance"], seen["distance_uniform"], rtol=1e-4)
 
 
-def _of_all(objects: pl.DataFrame) -> np.ndarray:
-    """The part of all cameras' pictures that the row's cameras are."""
-    return np.where(objects["camera"].to_numpy() == "all", 1.0, 0.5)
+def test_what_is_planted_is_found_where_it_is(follower_store):
+    tables = measured(follower_store, ("layer", "head"))
+    shares = tables["objects"].filter(BOWL, camera="all").sort("enrichment", descending=True)
+    assert shares.select("layer", "head").row(0) == ("2", 1)
+    assert shares["enrichment_low"][0] > 1.5
+    found = tables["iou"].filter(BOWL, threshold="p90").with_columns(above=pl.col("iou") - pl.col("iou_chance"))
+    assert found.sort("above").select("layer", "head").row(-1) == ("2", 1)
+    cabinet = tables["objects"].filter(camera="all", item="wooden_cabinet_1", layer="2", head=0)
+    assert cabinet["enrichment_high"][0] < shares["enrichment_low"][0]
 
 
-def test_a_planted_follower_is_found_and_named(follower_store):
-    tables = object_tables(question_about(follower_store, per_head=True))
-    assert tables.iou is not None
-    names = [
-        (one.name, one.found.is_named()) for one in followed_objects(tables.objects, Sampling(Estimand.THESE_TASKS))
-    ]
-    bowl = {"item": "akita_black_bowl_1"}
-    assert names == [
-        (bowl | {"layer": "2", "head": 1}, True)
-    ]  # the cabinet does not move, and one object leads nothing
-    finder = leading_finder(tables.iou, "p90", Sampling(Estimand.THESE_TASKS))
-    assert (finder.name["layer"], finder.name["head"]) == ("2", 1)
-    assert finder.found.value > 0.1
-    summary = objects_summary(tables.objects, Sampling())
-    bowl = summary.filter((pl.col("camera") == "all") & (pl.col("item") == "akita_black_bowl_1")).row(0, named=True)
-    assert bowl["enrichment_low"] > 1.5
-    cabinet = summary.filter((pl.col("camera") == "all") & (pl.col("item") == "wooden_cabinet_1")).row(0, named=True)
-    assert cabinet["enrichment_high"] < 1.1
-    found = iou_summary(tables.iou, Sampling()).filter(pl.col("threshold") == "p90")
-    assert found.filter(pl.col("item") == "akita_black_bowl_1")["num_episodes"].to_list() == [4, 4]
+def test_an_object_that_does_not_move_has_nothing_over_its_place_and_a_followed_one_has(follower_store):
+    table = measured(follower_store, iou=False)["objects"].filter(camera="all")
+    assert table.filter(item="wooden_cabinet_1")["over_place"][0] == pytest.approx(1.0, abs=1e-5)
+    assert table.filter(BOWL)["over_place_low"][0] > 1.4  # it moves within an episode
+
+
+def test_a_map_that_is_fixed_to_a_place_has_nothing_over_it_and_one_that_follows_has():
+    """An object that stands elsewhere in each of 40 episodes, on two cameras with different shares."""
+    generator = np.random.default_rng(0)
+    areas = np.zeros((40, 128, 1))
+    areas[np.arange(40), generator.integers(20, 40, 40)] = areas[np.arange(40), 64 + generator.integers(0, 64, 40)] = 1
+    middle = np.exp(-((np.arange(128) % 64 - 30) ** 2) / 200.0) * np.repeat([3.0, 1.0], 64)
+    for follow, wanted in ((0.0, 1.0), (1.0, 1.9)):
+        maps = middle * (1 + follow * areas[..., 0])
+        own = np.array([enrichment_on(one, area, [64, 64])[0] for one, area in zip(maps, areas, strict=True)])
+        elsewhere = np.array(
+            [enrichment_on(maps[i], np.delete(areas, i, 0).mean(axis=0), [64, 64])[0] for i in range(40)]
+        )
+        assert own.mean() / elsewhere.mean() == pytest.approx(wanted, rel=0.1)
 
 
 def test_classes_follow_the_task_and_add_up(follower_store):
-    tables = measured(follower_store, ObjectSettings(spatial=False))
-    times = tables.times.filter(pl.col("camera") == "all")
+    times = measured(follower_store, iou=False)["object_times"].filter(pl.col("camera") == "all")
     whole = (
         times.filter(pl.col("kind") == "class")
         .group_by("task_id", "episode_index", "replan")
@@ -267,6 +246,16 @@ def test_classes_follow_the_task_and_add_up(follower_store):
     assert classes == {**CLASS_OF, "robot": "robot", "background": "background"}
 
 
+def test_parts_of_time_add_up_to_the_episode(follower_store):
+    by_time = measured(follower_store, ("time", "episode"))["objects"].filter(camera="all", kind="class")
+    whole = measured(follower_store, ("episode",), iou=False)["objects"].filter(camera="all", kind="class")
+    keys = ["task_id", "episode_index", "item"]
+    mean = by_time.group_by(keys).agg(pl.col("area_share").mean())
+    joined = whole.join(mean, on=keys, suffix="_of_parts")
+    assert (by_time["phase"].n_unique(), joined.height) == (20, whole.height)
+    np.testing.assert_allclose(joined["area_share"], joined["area_share_of_parts"], rtol=0.05)
+
+
 def test_an_object_out_of_sight_has_no_enrichment_and_no_mask(tmp_path):
     tokens = bowl_tokens(replans=2)
     coverage = bowl_coverage(2, 16)
@@ -275,18 +264,14 @@ def test_an_object_out_of_sight_has_no_enrichment_and_no_mask(tmp_path):
     hidden = EpisodeTokens(tokens.layout, tokens.key_role, tokens.prompts, tokens.prompt_index, OBJECTS, coverage)
     tables = measured(write_bowl_store(tmp_path / "hidden.zarr", tokens=hidden, tasks=(0,), episodes=1))
     plate = (pl.col("item") == "plate_1") & (pl.col("camera") == CAMERAS[1])
-    assert tables.objects.filter(plate)["enrichment"].is_null().all()
-    assert tables.iou is not None
-    assert tables.iou.filter(plate)["iou"].is_null().all()
-    assert tables.pointing is not None
-    unseen = tables.pointing.filter(plate)
+    episodes = tables["objects_episodes"]
+    assert episodes.filter(plate)["enrichment"].is_null().all()
+    assert tables["iou_episodes"].filter(plate)["iou"].is_null().all()
+    unseen = tables["pointing_episodes"].filter(plate)
     assert (unseen["mask_replans"] == 0).all()
     assert unseen.select("pointing", "distance", "pointing_chance").null_count().row(0) == (unseen.height,) * 3
-    assert (
-        tables.objects.filter((pl.col("item") == "plate_1") & (pl.col("camera") == "all"))["enrichment"]
-        .is_not_null()
-        .all()
-    )
+    assert episodes.filter(pl.col("item") == "plate_1", camera="all")["enrichment"].is_not_null().all()
+    assert "No task has two episodes" in tables.findings[0].limit
 
 
 def test_a_block_that_has_two_numbers_counts_once_in_the_average(follower_store):
@@ -298,9 +283,9 @@ def test_a_block_that_has_two_numbers_counts_once_in_the_average(follower_store)
         layer_labels=(*chosen.layer_labels, 20),
         blocks=(*chosen.blocks, chosen.blocks[1]),
     )
-    once, doubled = whole(object_tables(question)), whole(object_tables(replace(question, selection=twice)))
-    for name in ("objects", "pointing", "iou"):
-        averages = [getattr(tables, name).filter(pl.col("layer") == "layers_avg") for tables in (once, doubled)]
+    once, doubled = objects(question), objects(replace(question, selection=twice))
+    for name in ("objects_episodes", "pointing_episodes", "iou_episodes"):
+        averages = [tables[name].filter(pl.col("layer") == "layers_avg") for tables in (once, doubled)]
         assert_frame_equal(*averages)
     both = [words(part)["words_episodes"] for part in (question, replace(question, selection=twice))]
     assert_frame_equal(*(table.filter(pl.col("layer") == "layers_avg") for table in both))
@@ -308,38 +293,22 @@ def test_a_block_that_has_two_numbers_counts_once_in_the_average(follower_store)
 
 @pytest.mark.drawn
 def test_the_command_prints_writes_and_draws(follower_store, tmp_path, capsys):
-    arguments = [
-        "objects",
-        str(follower_store),
-        "--output",
-        str(tmp_path),
-        "--per-head",
-        "--save-steps",
-        "--task",
-        "1",
-        "--pdf",
-    ]
-    assert main(arguments) == 0
-    assert len(capsys.readouterr().out.splitlines()) <= 40
-    whole = (tmp_path / "summary.txt").read_text()
-    assert "layers surely finds the objects of interest better" in whole  # two episodes show too little
+    assert main(["objects", str(follower_store), "--output", str(tmp_path), "--pdf"]) == 0
+    printed = capsys.readouterr().out
+    assert all(len(line) <= 100 for line in printed.splitlines() if str(tmp_path) not in line)
+    tables = ("objects", "pointing", "iou", *(f"{name}_episodes" for name in ("objects", "pointing", "iou")))
     assert {path.name for path in tmp_path.iterdir()} == {
-        "summary.txt",
-        *(f"{name}.parquet" for name in ("objects", "object_times", "object_steps", "objects_summary", "iou_steps")),
-        *(f"{name}{end}.parquet" for name in ("pointing", "iou") for end in ("", "_summary")),
-        *(f"{name}.{kind}" for name in ("object_shares", "object_iou") for kind in ("png", "pdf", "csv")),
+        "result.json", "object_times.parquet", *(f"{name}.parquet" for name in tables),
+        *(f"objects_{name}.{kind}" for name in ("enrichment", "iou") for kind in ("png", "pdf")),
     }  # fmt: skip
-    assert main(["objects", str(follower_store), "--output", str(tmp_path / "less"), "--no-iou"]) == 0
-    assert not (tmp_path / "less" / "object_iou.png").exists()
-    assert "IoU" not in capsys.readouterr().out
+    numbers = json.loads((tmp_path / "result.json").read_text())["findings"][0]["numbers"]
+    assert numbers["enrichment_low"] < numbers["enrichment"] < numbers["enrichment_high"]
 
 
 def test_a_mistake_ends_with_one_sentence(follower_store, tmp_path, capsys):
     for arguments, said in (
         (["--task", "9"], "has no episode of task 9; it has tasks 0, 1"),
-        (["--percentiles", "100"], "Percentile 100 was given"),
-        (["--mask-coverage", "0"], "Mask coverage 0 was given"),
-        (["--tolerance", "-1"], "Tolerance -1 was given"),
+        (["--by", "heads"], "Did you mean 'head'?"),
     ):
         assert main(["objects", str(follower_store), "--output", str(tmp_path), *arguments]) == 2
         error = capsys.readouterr().err

@@ -79,44 +79,13 @@ def pointing_hits(maps: NDArray[np.floating], masks: Masks | NDArray[np.float32]
     return np.where(_over_replans(there, hits.ndim), hits, np.nan)
 
 
-def percentile_regions(maps: NDArray[np.floating], percentile: float) -> Masks:
-    """Patches at or above a map's own percentile (linear interpolation between values).
+def regions_of_percentiles(maps: NDArray[np.floating], percentiles: Sequence[float]) -> list[Masks]:
+    """For each percentile the patches at or above it in their own map (linear interpolation between values).
 
     Of 256 patches that is 26 at 90 and 52 at 80; of a constant map it is all.
     """
-    return regions_of_percentiles(maps, [percentile])[0]
-
-
-def regions_of_percentiles(maps: NDArray[np.floating], percentiles: Sequence[float]) -> list[Masks]:
-    """`percentile_regions` of several percentiles, for which the values are put in order once."""
     limits = np.percentile(maps, list(percentiles), axis=-1, keepdims=True)
     return [np.asarray(maps >= limit) for limit in limits]
-
-
-def otsu_thresholds(maps: NDArray[np.floating]) -> Floats:
-    """Otsu's threshold of each map (..., patch): the value t for which {<= t} and {> t} differ most.
-
-    Maximises the between-class variance w0 w1 (mu0 - mu1)^2 (Otsu 1979, "A threshold selection method from gray-level
-    histograms", IEEE SMC 9, eq. 14) over all splits between different values, not over bins of a histogram; the lowest
-    of equally good ones. Shape (...); NaN for a constant map.
-    """
-    ordered = np.sort(np.asarray(maps, dtype=np.float64), axis=-1)
-    count = ordered.shape[-1]
-    below = np.arange(1, count, dtype=np.float64)  # values in the lower class when the split is after the i-th
-    # Taken from the mean, so that the sums of nearly equal values keep their digits.
-    sums = np.cumsum(ordered - ordered.mean(axis=-1, keepdims=True), axis=-1)
-    lower, total = sums[..., :-1], sums[..., -1:]
-    between = (lower / below - (total - lower) / (count - below)) ** 2 * below * (count - below)
-    between = np.where(ordered[..., :-1] < ordered[..., 1:], between, -1.0)
-    best = between.argmax(axis=-1)[..., None]
-    threshold = np.take_along_axis(ordered, best, axis=-1)[..., 0]
-    return np.where(np.take_along_axis(between, best, axis=-1)[..., 0] < 0, np.nan, threshold)
-
-
-def otsu_regions(maps: NDArray[np.floating]) -> Masks:
-    """Patches above each map's Otsu threshold; none of a constant map."""
-    thresholds = otsu_thresholds(maps)[..., None]
-    return np.asarray(maps > np.where(np.isnan(thresholds), np.inf, thresholds))
 
 
 def mask_sizes(masks: Masks | NDArray[np.float32]) -> Floats:

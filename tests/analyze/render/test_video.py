@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vla_attention.analyze.overlay.video import write_video
+from vla_attention.analyze.render.video import write_video
 
 COLORS = ((200, 30, 40), (20, 160, 60), (30, 40, 220))
 
@@ -28,6 +28,19 @@ def test_a_gif_has_every_picture_at_its_rate(tmp_path: Path) -> None:
             gif.seek(i)
             assert gif.info["duration"] == 250
             np.testing.assert_allclose(np.asarray(gif.convert("RGB"))[10, 10], color, atol=4)
+
+
+def test_a_small_cube_keeps_its_colour_in_a_gif_of_large_grey_pictures(tmp_path: Path) -> None:
+    from PIL import Image
+
+    generator = np.random.default_rng(0)
+    frames = [np.repeat(generator.integers(0, 255, (120, 160, 1), dtype=np.uint8), 3, axis=2) for _ in range(9)]
+    frames[4][50:54, 60:64] = (40, 170, 60)  # neither in the first, the middle nor the last quarter alone
+    frames[6][50:54, 60:64] = (190, 40, 30)
+    with Image.open(write_video(tmp_path / "a.gif", frames, 4, "gif")) as gif:
+        for i in (4, 6):
+            gif.seek(i)
+            np.testing.assert_allclose(np.asarray(gif.convert("RGB"))[52, 62], frames[i][52, 62], atol=8)
 
 
 def test_an_mp4_has_even_sides_and_every_picture(tmp_path: Path) -> None:
@@ -53,7 +66,7 @@ def test_a_disk_that_takes_no_more_is_an_error_and_leaves_no_part_of_an_mp4(tmp_
     assert write_video(tmp_path / "whole.mp4", noise(), 5, "mp4").stat().st_size > 20_000
     code = (
         "import resource, sys; from pathlib import Path\n"
-        "from tests.analyze.overlay.test_video import noise, write_video\n"
+        "from tests.analyze.render.test_video import noise, write_video\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\n"
         "try:\n    write_video(Path(sys.argv[1]), noise(), 5, 'mp4')\n"
         "except OSError as error:\n    print(error)\n"

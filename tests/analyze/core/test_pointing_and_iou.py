@@ -12,15 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.kit.examples import examples
-from vla_attention.analyze.objects.pointing_and_iou import (
+from vla_attention.analyze.core.pointing_and_iou import (
     centre_of_mass,
     grown,
     intersection_over_union,
     near_patches,
     object_masks,
     patch_centres,
-    percentile_regions,
     pointing_hits,
+    regions_of_percentiles,
     shifted_iou,
     shifted_masks,
 )
@@ -78,7 +78,7 @@ def test_pointing_game_counts_highest_patches_near_the_mask(case, tolerance):
 @given(maps_and_masks(), st.sampled_from([5.0, 50.0, 80.0, 95.0]))
 def test_iou_is_that_of_python_sets(case, percentile):
     _, _, maps, masks = case
-    regions = percentile_regions(maps, percentile)
+    regions = regions_of_percentiles(maps, [percentile])[0]
     found = intersection_over_union(regions, masks)
     for replan in range(maps.shape[0]):
         for head in range(maps.shape[1]):
@@ -102,12 +102,12 @@ def test_chance_iou_is_the_mean_over_all_shifts_of_the_map(case, percentile):
     rows, columns, maps, masks = case
     if rows > 4 or columns > 4:
         return
-    found = shifted_iou(percentile_regions(maps, percentile), shifted_masks(masks, rows, columns))
+    found = shifted_iou(regions_of_percentiles(maps, [percentile])[0], shifted_masks(masks, rows, columns))
     for replan, head, item in np.ndindex(*maps.shape[:2], masks.shape[2]):
         mask = masks[replan, :, item]
         picture = maps[replan, head].reshape(rows, columns)
         moved = [np.roll(picture, by, (0, 1)).ravel() for by in np.ndindex(rows, columns)]
-        regions = [percentile_regions(one, percentile) for one in moved]
+        regions = [regions_of_percentiles(one, [percentile])[0] for one in moved]
         wanted = [(region & mask).sum() / (region | mask).sum() for region in regions] if mask.any() else [np.nan]
         assert found[replan, head, item] == pytest.approx(np.mean(wanted), nan_ok=True)
 

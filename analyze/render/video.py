@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.core.result import Figure
+from vla_attention.analyze.render.pictures import pictures
+from vla_attention.analyze.render.style import Style
 from vla_attention.analyze.show.output_files import replacing
 from vla_attention.schemas.errors import BadArgument, MissingDependency
 from vla_attention.schemas.safe_text import visible
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 VideoFormat = Literal["gif", "mp4"]
 #: Colours in a GIF, which has one table for all pictures.
@@ -45,6 +54,26 @@ def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, kin
     return path
 
 
+def write_film(path: Path, figure: Figure, fps: float, kind: VideoFormat) -> None:
+    """A figure of kind `pictures` as a film: for each of its columns the rows side by side, all of one size."""
+    write_video(path, _film(figure), fps, kind)
+
+
+def _film(figure: Figure) -> Iterator[NDArray[np.uint8]]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    style, frame = Style(), figure.frame.with_columns(pl.col("row").cast(pl.String))
+    named = frame["row"].n_unique() > 1
+    above = pl.format("{}\n{}", "row", "above") if named else pl.col("above")
+    with style.settings():
+        for part in frame.partition_by("column", maintain_order=True):
+            side_by_side = part.with_columns(row=pl.lit(0), column="row", above=above)
+            canvas = pictures(replace(figure, frame=side_by_side), style).canvas
+            assert isinstance(canvas, FigureCanvasAgg)
+            canvas.draw()  # type: ignore[no-untyped-call]
+            yield np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
+
+
 def check_video(kind: VideoFormat) -> None:
     """Raise `MissingDependency` when that kind cannot be written here; before anything is computed."""
     if kind == "mp4":
@@ -58,20 +87,30 @@ def check_video(kind: VideoFormat) -> None:
 
 
 def write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> None:
-    """Write an endless GIF. Its colours are chosen for the first, the middle and the last picture together."""
+    """Write an endless GIF. Its colours are chosen for all pictures together, so that a small cube stays green."""
     from PIL import Image
 
-    pictures = [Image.fromarray(frame) for frame in _same_size(frames)]
-    samples = [pictures[i] for i in sorted({0, len(pictures) // 2, len(pictures) - 1})]
-    sheet = Image.new("RGB", (samples[0].width, sum(sample.height for sample in samples)))
-    for i, sample in enumerate(samples):
-        sheet.paste(sample, (0, i * sample.height))
-    palette = sheet.quantize(_GIF_COLORS, method=Image.Quantize.MEDIANCUT)
+    drawn = [Image.fromarray(frame) for frame in _same_size(frames)]
+    sheet = Image.fromarray(_colours_of(drawn))
+    palette = sheet.quantize(_GIF_COLORS, method=Image.Quantize.MEDIANCUT, kmeans=1)
     # Without dithering: noise would change from picture to picture, look like content, and triple the file.
-    indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in drawn]
     indexed[0].save(
         path, format="GIF", save_all=True, append_images=indexed[1:], duration=round(1000 / fps), loop=0, optimize=False
     )
+
+
+def _colours_of(pictures: Sequence[Image]) -> NDArray[np.uint8]:
+    """A picture (1, number, 3) of the colours of all pictures; the more pixels one has, the more often, by root."""
+    counts: Counter[int] = Counter()
+    for picture in pictures:
+        coarse = np.asarray(picture, dtype=np.uint32) >> 2
+        codes, numbers = np.unique((coarse[..., 0] << 12) | (coarse[..., 1] << 6) | coarse[..., 2], return_counts=True)
+        counts.update(dict(zip(codes.tolist(), numbers.tolist(), strict=True)))
+    codes = np.array(list(counts))
+    colours = np.stack([codes >> 12, (codes >> 6) & 63, codes & 63], axis=-1) * 255 // 63
+    often = np.ceil(np.sqrt(np.array(list(counts.values())))).clip(1, 8).astype(int)
+    return np.repeat(colours, often, axis=0)[None].astype(np.uint8)
 
 
 def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> None:
@@ -84,8 +123,8 @@ def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> No
         FfmpegFailed: ffmpeg ended with an error.
     """
     check_video("mp4")
-    pictures = _same_size(frames)
-    first = next(pictures)
+    drawn = _same_size(frames)
+    first = next(drawn)
     height, width = (side + side % 2 for side in first.shape[:2])
     program = subprocess.Popen(
         _ffmpeg(path, width, height, fps),
@@ -97,7 +136,7 @@ def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> No
     with program:
         assert program.stdin is not None
         try:
-            for picture in chain((first,), pictures):
+            for picture in chain((first,), drawn):
                 margins = ((0, height - picture.shape[0]), (0, width - picture.shape[1]), (0, 0))
                 program.stdin.write(np.pad(picture, margins, mode="edge").tobytes())
             said = program.communicate()[1]
