@@ -28,12 +28,14 @@ def tables_of(parts: Sequence[Compared], told: Mapping[str, pl.DataFrame]) -> li
     each = {kind: pl.concat(rows) for kind, rows in rows_of.items() if rows}
     groups, main = each["groups"], each["groups"]["quantity"][0]
     average = pl.col("layer") == (LAYERS_AVG if (groups["layer"] == LAYERS_AVG).any() else groups["layer"][0])
-    shown = ALL & average & (pl.col("quantity") != "success")
-    found.append(Table("differences", groups, [*several, Column("quantity", "text"), *both], "Attention", shown))
     for kind, columns, title in _EACH:
         if kind in each:
             rows = each[kind].sort(pl.col("difference").abs(), descending=True, nulls_last=True, maintain_order=True)
             found.append(Table(kind, rows, [*several, *columns, *both], title, ALL, rows=5))
+    shown = ALL & average & (pl.col("quantity") != "success")
+    # Behind objects and words, before the heads.
+    at = len(found) - ("heads" in each)
+    found.insert(at, Table("differences", groups, [*several, Column("quantity", "text"), *both], "Attention", shown))
     of_main = pl.col("quantity") == main
     layers, tasks = [*several, Column("layer", "text"), *both], [*several, Column("task_id", "count", "task"), *both]
     found.append(Table("layers", groups, layers, f"{main} by layer", ALL & ~average & of_main, of="differences"))
@@ -111,6 +113,7 @@ _BOTH = [
 ]
 _WORD, _LAYER, _HEAD = Column("item", "text", "word"), Column("layer", "count"), Column("head", "count")
 _EACH = (
+    ("objects", [Column("item", "text", "object")], "Objects: log2 of their attention over that of their area"),
     ("words", [_WORD], "Words: log2 of their attention over evenly spread"),
     ("heads", [_LAYER, _HEAD], "Heads: their attention on the first side of the ratio"),
 )

@@ -21,6 +21,13 @@ from vla_attention.analyze.core.differences import (
 )
 from vla_attention.analyze.core.levels import SIDES, Levels, levels_of, task_cells, task_groups
 from vla_attention.analyze.core.measure import measure, table_of
+from vla_attention.analyze.core.object_shares import (
+    ALL_CAMERAS,
+    cameras_of,
+    measure_objects,
+    object_episodes,
+    with_coverage,
+)
 from vla_attention.analyze.core.runs import Run
 from vla_attention.analyze.core.word_items import items_of
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
@@ -32,6 +39,7 @@ KINDS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "groups": (("layer", "quantity"), ("layer",)),
     "heads": (("layer", "head"), ()),
     "words": (("item",), ()),
+    "objects": (("kind", "item"), ("kind",)),
 }
 
 
@@ -56,11 +64,20 @@ class RunValues:
 
     @cached_property
     def values(self) -> Mapping[str, pl.DataFrame]:
-        """By kind of `KINDS`, a table of values (see `differences`); those of words and ratios are log2."""
+        """By kind of `KINDS`, a table of values (see `differences`).
+
+        Those of words and objects are log2 of their attention over what they would get if it were spread evenly.
+        """
         tables = {"groups": values_of_groups(self.levels), "heads": self._heads()}
         if self.run.question.vocabulary.words:
             words = table_of(measure(self.run.question, items_of, "words")).filter(pl.col("kind") == "word")
             tables["words"] = words.select(*EPISODE_ID, "item", value=pl.col("lift").log(2.0)).collect()
+        if any(cameras_of(item) for item in self.run.question.selected):
+            objects = object_episodes(measure_objects(with_coverage(self.run.question)))
+            objects = objects.filter(camera=ALL_CAMERAS, layer=LAYERS_AVG)
+            tables["objects"] = objects.select(
+                *EPISODE_ID, "kind", "item", value=pl.col("enrichment").log(2.0)
+            ).collect()
         return tables
 
     def _heads(self) -> pl.DataFrame:
