@@ -33,9 +33,7 @@ _SOURCES = (
     "schemas/stores/*.py",
     "analyze/stores/*.py",
     "analyze/measures/*.py",
-    "analyze/heads/*.py",
     "analyze/core/*.py",
-    "analyze/commands/*.py",
 )
 
 

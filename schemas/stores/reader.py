@@ -84,6 +84,11 @@ class StoredEpisode:
     place: ByteSource | None = None
     indexed: str = ""
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """A pickle holds where the episode is and nothing that was read; another process may run in another folder."""
+        given = (_from_anywhere(self.folder), self.name, self.run, self.version, self.place, self.indexed)
+        return StoredEpisode, given
+
     @cached_property
     def source(self) -> ByteSource:
         """The episode's files as they are found, not yet compared with the seal."""
@@ -375,6 +380,10 @@ class Store:
     run: str
     episodes: tuple[StoredEpisode, ...]
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """A pickle is without the episodes: it travels with each of them, of which there may be thousands."""
+        return Store, (_from_anywhere(self.path), self.attributes, self.run, ())
+
     @property
     def suite(self) -> str:
         """The task suite of the run."""
@@ -384,6 +393,10 @@ class Store:
     def task_ids(self) -> tuple[int, ...]:
         """Ids of the tasks that have at least one episode."""
         return tuple(sorted({parse_episode_name(episode.name)[0] for episode in self.episodes}))
+
+
+def _from_anywhere(place: StorePlace) -> StorePlace:
+    return place.absolute() if isinstance(place, Path) else place
 
 
 def open_store(path: str | StorePlace) -> Store:
