@@ -180,28 +180,29 @@ class OpenStores:
     def compare(
         self,
         other: OpenStores | str | Path | Sequence[str | Path],
-        table: Literal["differences", "estimates", "pairs", "unpaired", "effects"] = "differences",
         allow_mismatch: Sequence[str] = (),
         names: tuple[str, str] = ("first", "other"),
         **settings: Unpack[SettingKeywords],
-    ) -> pl.DataFrame:
-        """This run against another: other minus this one, paired where initial states and seeds are shared.
+    ) -> Answer:
+        """What changed from this run to another; paired where initial states and seeds are shared.
 
-        >>> differences = va.open(store).compare(other)
+        Tables "differences", "words", "heads", "behaviour", "pairs", "runs" and more; of a rerun "moved".
+
+        >>> differences = va.open(store).compare(other)["differences"]
         >>> differences.filter(scope="all", layer="layers_avg", quantity="success")["difference"].to_list()
         [0.0]
 
         Raises:
             MixedPolicies, RunsDiffer: the runs differ in more than their weights and `allow_mismatch` does not name it;
-                see `vla_attention.analyze.compare.runs`.
+                see `vla_attention.analyze.core.runs`.
         """
-        from vla_attention.analyze.compare.comparison import compare_stores
-        from vla_attention.analyze.compare.runs import RunArgument
+        from vla_attention.analyze.ask import compared
+        from vla_attention.analyze.core.runs import RunArgument
+        from vla_attention.analyze.render.answer import Answer
 
-        known = ("differences", "estimates", "pairs", "unpaired", "effects")
         both = self, other if isinstance(other, OpenStores) else open_stores(other)
         runs = [RunArgument(name, tuple(one.path for one in run.stores)) for name, run in zip(names, both, strict=True)]
-        return _chosen(table, known, lambda: compare_stores(runs, settings_from_keywords(**settings), allow_mismatch))
+        return Answer.of(compared(runs, settings_from_keywords(**settings), allow_mismatch))
 
     def effects(
         self,

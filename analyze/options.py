@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +44,12 @@ OPTIONS: dict[str, dict[str, Any]] = {
     },
     "twins": {
         "type": store_place, "metavar": "STORE", "help": "a store in which the same initial states are solved",
+    },
+    "allow_mismatch": {
+        "action": "append", "default": [], "metavar": "FIELD",
+        "help": "compare although the runs differ in this field, of family, suite, seed, protocol, image_size, "
+        "wait_steps, replan_steps, max_steps, layers, denoise_steps, heads, queries, depth, layout, cameras, "
+        "processing, simulator; may be repeated",
     },
     "by": {
         "type": lambda text: tuple(part for part in text.split(",") if part), "default": (), "metavar": "AXIS,...",
@@ -139,16 +146,14 @@ def settings_of(given: argparse.Namespace) -> AnalysisSettings:
     return AnalysisSettings(**values)
 
 
-def results_folder(store: StorePlace, command: str, given: argparse.Namespace) -> Path:
+def results_folder(stores: Sequence[StorePlace], command: str, given: argparse.Namespace) -> Path:
     """`results/PATH OF STORE/COMMAND`, with the options that change the answer in its name.
 
-    A store outside of the working folder is named by its whole path: results of stores of one name lie apart.
+    A store outside of the working folder is named by its whole path: results of stores of one name lie apart. Further
+    runs of a comparison are named as it is.
     """
-    if isinstance(store, Path):
-        path = store.absolute()
-        path = path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path.relative_to(path.anchor)
-    else:
-        path = Path(*str(store).split("://", 1)[1].split("/"))
+    path, *others = (_path_of(store) for store in stores)
+    command = "-".join([command, *(one.with_suffix("").name for one in others)])
     said = [
         f"{name}-{'-'.join(map(str, value)) if isinstance(value, list | tuple) else value}"
         for name in ("tasks", *OPTIONS)
@@ -158,3 +163,10 @@ def results_folder(store: StorePlace, command: str, given: argparse.Namespace) -
     if len(name) > _LONGEST_NAME:
         name = f"{name[:_LONGEST_NAME]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
     return Path("results", *path.with_suffix("").parts, name)
+
+
+def _path_of(store: StorePlace) -> Path:
+    if not isinstance(store, Path):
+        return Path(*str(store).split("://", 1)[1].split("/"))
+    path = store.absolute()
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path.relative_to(path.anchor)

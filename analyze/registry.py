@@ -18,6 +18,7 @@ class Command:
         folder: whether it is `analyze.NAME.command`, with a parser of its own, instead of a question.
         keeps: whether it keeps stores instead of asking them.
         page: whether its function gives several results, which are one HTML file.
+        runs: whether it takes runs, each of one or several stores, instead of the stores of one.
     """
 
     answers: str
@@ -28,6 +29,7 @@ class Command:
     folder: bool = False
     keeps: bool = False
     page: bool = False
+    runs: bool = False
 
 
 _ROWS = ("layers", "denoise", "heads", "site", "intervals")
@@ -76,7 +78,17 @@ COMMANDS: dict[str, Command] = {
         ("objects runs/libero_10.zarr", "objects runs/libero_10.zarr --by layer", "objects runs/cubes.zarr --no-iou"),
     ),
     "effects": Command("what the action depends on: without a word, a picture, an object", folder=True),
-    "compare": Command("two or more runs, paired where they share initial states and seeds", folder=True),
+    "compare": Command(
+        "what changed between runs: success, what was done, actions of reruns, attention",
+        (*_ROWS, *_GROUPING, "allow_mismatch"),
+        examples=(
+            "compare runs/base.zarr runs/tuned.zarr",
+            "compare base=runs/a.zarr,runs/b.zarr tuned=runs/c.zarr,runs/d.zarr",
+            "compare runs/base.zarr runs/without_visual.zarr runs/noise.zarr",
+            "compare runs/libero_spatial.zarr runs/libero_goal.zarr --allow-mismatch suite",
+        ),
+        runs=True,
+    ),
     "overlay": Command(
         "attention on the stored pictures: strips, GIF or MP4",
         (*_ROWS, *_GROUPING, "episode", "replans", "cameras", "outline", "smooth", "video", "fps", "num_episodes",

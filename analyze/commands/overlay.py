@@ -222,7 +222,10 @@ def _figure(
     several = len(question.stores) > 1
     name = f"overlay_{file_part(maps.item.store.suite) + '_' if several else ''}{maps.item.episode.name}"
     # Read now: a damaged picture ends the command before anything is written.
-    read = {place: stored_picture(maps.item, *place) for place in frame.select("camera", "replan").iter_rows()}
+    read = {
+        place: stored_picture(maps.item.store, maps.item.episode, *place)
+        for place in frame.select("camera", "replan").iter_rows()
+    }
     lines = " and ".join(f"{level:g}" for level in levels)
     caption = (
         "Attention of the action queries on the pictures that the policy saw, mean over the selected layers, denoise "

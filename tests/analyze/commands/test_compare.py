@@ -7,19 +7,19 @@ import polars as pl
 import pytest
 from scipy import stats
 
+from tests.kit.paths import ROOT
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.compare import runs as runs_module
-from vla_attention.analyze.compare.comparison import compare
-from vla_attention.analyze.compare.runs import (
+from vla_attention.analyze.commands.compare import compare
+from vla_attention.analyze.core import runs as runs_module
+from vla_attention.analyze.core.runs import (
     MixedPolicies,
     RunsDiffer,
     check_comparable,
     open_runs,
     parse_runs,
 )
-from vla_attention.analyze.compare.text import comparison_sections
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
-from vla_attention.analyze.show.answer import text_of
+from vla_attention.analyze.render.terminal import screen
 from vla_attention.schemas.layout import Role
 from vla_attention.testing.stores import StoreSpec, rerun_source, write_store
 
@@ -84,73 +84,65 @@ def test_paired_differences_are_those_of_the_planted_pairs(stores):
         for task in TASKS
         for episode in range(EPISODES)
     }
-    row = one(found.differences, scope="all", layer="layers_avg", quantity="log2_ratio")
+    row = one(found["differences"], scope="all", layer="layers_avg", quantity="log2_ratio")
     values = np.array(list(expected.values()))
     assert row["difference"] == pytest.approx(values.mean(), rel=1e-4)
-    corrected = 1 - 3 / (4 * (len(values) - 1) - 1)
-    assert row["d_z"] == pytest.approx(corrected * values.mean() / values.std(ddof=1), rel=1e-3)
-    assert row["hedges_g"] is None
-    assert (row["paired"], row["num_pairs"], row["num_tasks"]) == (True, 16, 4)
-    assert row["low"] < 0.25 / np.log(2) < row["high"]
-    assert row["low"] > 0.2
+    assert (row["paired"], row["num_first"], row["num_tasks"]) == (True, 16, 4)
+    assert row["difference_low"] < 0.25 / np.log(2) < row["difference_high"]
+    assert row["difference_low"] > 0.2
     for task in TASKS:
         own = np.array([value for (of, _), value in expected.items() if of == task])
-        row = one(found.differences, scope="task", task_id=task, layer="1", quantity="log2_ratio")
+        row = one(found["differences"], scope="task", task_id=task, layer="1", quantity="log2_ratio")
         assert row["difference"] == pytest.approx(own.mean(), rel=1e-3)
         ends = stats.t.interval(0.95, 3, own.mean(), stats.sem(own))
-        assert (row["low"], row["high"]) == pytest.approx(ends, rel=1e-2)
-    pair = one(found.pairs, task_id=5, episode_first=3, layer="layers_avg", quantity="log2_ratio")
+        assert (row["difference_low"], row["difference_high"]) == pytest.approx(ends, rel=1e-2)
+    pair = one(found["pairs"], task_id=5, episode_first=3, layer="layers_avg", quantity="log2_ratio")
     assert pair["difference"] == pytest.approx(expected[5, 3], rel=1e-3)
-    assert found.unpaired.is_empty()
+    assert found["unpaired"].is_empty()
 
 
 def test_with_another_seed_allowed_the_initial_state_alone_makes_a_pair(stores):
     found = compare(opened(stores, "base", "reseeded", allowed=("seed",)), ("seed",))
-    row = one(found.differences, scope="all", layer="layers_avg", quantity="log2_ratio")
-    assert (row["paired"], row["num_pairs"]) == (True, 4)
-    assert found.pairs.height == 4 * 3 * len(found.quantities)
+    row = one(found["differences"], scope="all", layer="layers_avg", quantity="log2_ratio")
+    assert (row["paired"], row["num_first"]) == (True, 4)
+    assert found["pairs"].height == 4 * 3 * found["pairs"]["quantity"].n_unique()
     assert [note for note in found.notes if "seed" in note]
-    text = " ".join(text_of(comparison_sections(found)).split())
-    assert "4 pairs of episodes with the same suite, task and initial state. Their seeds may differ" in text
+    text = " ".join(screen(found).split())
+    assert "with the same task and initial state; seeds may differ." in text
     assert "initial state and seed" not in text
-    assert (row["d_z"], row["d_z_low"]) == (None, None)  # four pairs are too few for an effect size
 
 
 def test_episodes_without_a_partner_are_counted_and_named(stores):
     runs = opened(stores, "base", "lower")
     found = compare(runs)
-    alone = found.unpaired.group_by("run").len().sort("run").rows()
+    alone = found["unpaired"].group_by("run").len().sort("run").rows()
     assert alone == [("base", 4), ("lower", 3)]
-    assert one(found.differences, scope="all", layer="layers_avg", quantity="log2_ratio")["num_pairs"] == 12
-    text = text_of(comparison_sections(found))
-    assert "task000_episode000" in text
-    assert "task001_episode004" in text
-    assert max(map(len, text.splitlines())) <= 101
+    assert one(found["differences"], scope="all", layer="layers_avg", quantity="log2_ratio")["num_first"] == 12
+    text = screen(found)
+    assert "task 0 episode 0" in text
+    assert "task 1 episode 4" in text
 
 
 def test_nothing_that_pairs_is_compared_unpaired_and_said(stores):
     runs = opened(stores, "base", "goal", allowed=("suite",))
     found = compare(runs, ("suite",))
-    row = one(found.differences, scope="all", layer="layers_avg", quantity="log2_ratio")
+    row = one(found["differences"], scope="all", layer="layers_avg", quantity="log2_ratio")
     first, other = ([log_ratio(run, t, e) / np.log(2) for t in TASKS for e in range(EPISODES)] for run in (0, 1))
     assert row["paired"] is False
     assert row["difference"] == pytest.approx(np.mean(other) - np.mean(first), rel=1e-4)
     assert (row["mean_first"], row["mean_other"]) == pytest.approx((np.mean(first), np.mean(other)), rel=1e-4)
-    assert row["low"] < row["difference"] < row["high"]
-    assert row["high"] - row["low"] > 1.0  # scenes are in it
-    assert found.pairs.is_empty()
-    assert found.unpaired.height == 32
-    assert "NOT PAIRED" in text_of(comparison_sections(found))
-    assert found.runs_with_common_tasks == ()
+    assert row["difference_low"] < row["difference"] < row["difference_high"]
+    assert row["difference_high"] - row["difference_low"] > 1.0  # scenes are in it
+    assert found["unpaired"].height == 32
+    assert "NOT PAIRED" in screen(found)
 
 
 def test_a_run_of_several_stores_is_compared_suite_by_suite(stores):
     words = [f"old={stores['base']},{stores['goal_base']}", f"new={stores['higher']},{stores['goal']}"]
     found = compare(open_runs(parse_runs(words), AnalysisSettings()))
-    assert found.names == ("old", "new")
-    of_ratio = found.differences.filter(layer="layers_avg", quantity="log2_ratio")
+    of_ratio = found["differences"].filter(layer="layers_avg", quantity="log2_ratio")
     assert of_ratio["scope"].to_list() == ["task"] * 8 + ["suite"] * 2 + ["all"]
-    assert of_ratio.filter(scope="all")["num_pairs"].to_list() == [32]
+    assert of_ratio.filter(scope="all")["num_first"].to_list() == [32]
     assert of_ratio.filter(scope="all")["num_tasks"].to_list() == [8]
 
 
@@ -159,8 +151,8 @@ def test_layers_named_in_two_ways_are_one_block(tmp_path):
     path = write_store(tmp_path / "labelled.zarr", spec=replace(small, plant_rows=planting(1), layer_labels=(18, 19)))
     plain = write_store(tmp_path / "plain.zarr", spec=replace(small, plant_rows=planting(0)))
     found = compare(open_runs(parse_runs([str(plain), str(path)]), AnalysisSettings()))
-    assert found.differences["layer"].unique().sort().to_list() == ["0", "1", "layers_avg"]
-    assert found.differences["paired"].all()
+    assert found["differences"]["layer"].unique().sort().to_list() == ["0", "1", "layers_avg"]
+    assert found["differences"]["paired"].all()
 
 
 CHANGES = {
@@ -218,7 +210,7 @@ def test_layers_that_only_one_run_recorded_are_refused_until_chosen(stores):
     with pytest.raises(RunsDiffer, match=r"layers: 0, 1 and 1.*--layers"):
         compare(opened(stores, "base", "one_layer"))
     found = compare(opened(stores, "base", "one_layer", layers=(1,)))
-    assert one(found.differences, scope="all", layer="1", quantity="log2_ratio")["num_pairs"] == 4
+    assert one(found["differences"], scope="all", layer="1", quantity="log2_ratio")["num_first"] == 4
 
 
 @pytest.mark.parametrize(
@@ -245,6 +237,44 @@ def test_mistakes_are_one_sentence(stores, words, said, capsys):
     assert len(error.strip().splitlines()) == 1
 
 
+OUTCOMES = {
+    "six lost": ([True] * 8, [False] * 6 + [True] * 2, "does worse", 0.03125),
+    "five lost": ([True] * 8, [False] * 5 + [True] * 3, "Not shown to differ", 0.0625),
+    "as many won": ([True] * 4 + [False] * 4, [False] * 4 + [True] * 4, "Not shown to differ", 1.0),
+}
+
+
+@pytest.mark.parametrize("case", OUTCOMES)
+def test_success_is_that_of_pairs_and_says_what_they_could_have_shown(stores, monkeypatch, case):
+    first, other, verdict, p = OUTCOMES[case]
+    runs = opened(stores, "base", "higher")
+    for run, outcomes in zip(runs, (first, other), strict=True):
+        episodes = run.question.selected[:8]
+        for item, solved in zip(episodes, outcomes, strict=True):
+            monkeypatch.setitem(item.episode.__dict__, "attributes", replace(item.episode.attributes, success=solved))
+        for item in run.question.selected[8:]:
+            monkeypatch.setitem(item.episode.__dict__, "attributes", replace(item.episode.attributes, success=None))
+    found = compare(runs)
+    (finding,) = (finding for finding in found.findings if "better" in finding.asks)
+    assert verdict in finding.sentence
+    assert finding.numbers["p"] == pytest.approx(p)
+    assert (finding.numbers["n"], finding.numbers["lost"]) == (8, sum(a > b for a, b in zip(first, other, strict=True)))
+    assert ("once 6 change" in finding.limit) == (p > 0.05)
+
+
+def test_a_deaf_policy_is_said_first(example_pair):
+    found = compare(open_runs(parse_runs(example_pair), AnalysisSettings()))
+    finding = found.findings[0]
+    assert "cubes_one_colour is not shown to listen" in finding.sentence
+    assert "touched the blue cube first" in finding.sentence
+    assert (finding.numbers["right_first"], finding.numbers["right_other"]) == (6, 2)
+
+
+@pytest.fixture
+def example_pair():
+    return [str(ROOT / "vla_attention" / "example_stores" / f"{name}.zarr") for name in ("cubes", "cubes_one_colour")]
+
+
 @pytest.mark.drawn
 def test_the_command_writes_tables_and_pictures(stores, tmp_path, capsys):
     out = tmp_path / "out"
@@ -262,12 +292,12 @@ def test_the_command_writes_tables_and_pictures(stores, tmp_path, capsys):
         )
         == 0
     )
-    assert "new AGAINST base" in capsys.readouterr().out
-    assert pl.read_parquet(out / "comparison.parquet")["run"].unique().sort().to_list() == ["lower", "new"]
+    assert "new" in capsys.readouterr().out
+    assert pl.read_parquet(out / "differences.parquet")["run"].unique().sort().to_list() == ["lower", "new"]
     pairs = pl.read_parquet(out / "pairs.parquet")
     assert pairs.filter(quantity="log2_ratio").height == (16 + 12) * 3
-    for stem in ("forest", "paired_differences_new", "paired_differences_lower"):
-        for kind in ("png", "pdf", "csv"):
+    for stem in ("layers_new", "words_lower"):
+        for kind in ("png", "pdf"):
             assert (out / f"{stem}.{kind}").stat().st_size > 0
 
 
@@ -285,17 +315,18 @@ def test_a_rerun_pairs_at_every_replan(stores, tmp_path):
     spec = replace(PLAIN, plant_rows=plant, rerun_of=rerun_source(stores["base"]), tasks=(1, 2, 5))
     known = {**stores, "rerun": write_store(tmp_path / "rerun.zarr", spec=spec)}
     found = compare(opened(known, "base", "rerun"))
-    pairs = found.pairs.filter(quantity="log2_ratio", layer="0")
+    pairs = found["pairs"].filter(quantity="log2_ratio", layer="0")
     assert pairs.height == 12
     for row in pairs.iter_rows(named=True):
         task, episode = row["task_id"], row["episode_first"]
         assert row["episode_other"] == episode
         wanted = (log_ratio(1, task, episode) - log_ratio(0, task, episode)) / np.log(2)
         assert row["difference"] == pytest.approx(wanted, rel=1e-3)
-    text = " ".join(text_of(comparison_sections(found)).split())
-    assert "12 pairs of episodes, replan by replan: rerun is a rerun of base, the same calls." in text
-    assert "Of base, 4 have no partner" in text
-    assert found.reruns == ("rerun",)
+    text = " ".join(screen(found).split())
+    assert "12 pairs of episodes of rerun and base with the same policy calls. 4 episodes of base without" in text
+    assert "outcome not run" in text
+    assert "success" not in found["differences"]["quantity"].to_list()
+    assert found["runs"].filter(run="rerun")["success_rate"].null_count() == found["runs"].filter(run="rerun").height
 
 
 def test_a_rerun_with_other_replans_is_refused(stores, tmp_path):
@@ -315,9 +346,9 @@ def test_differences_over_tasks_are_by_families(tmp_path):
         write_store(tmp_path / f"{name}.zarr", spec=replace(spec, plant_rows=planting(run)))
     stores = {name: tmp_path / f"{name}.zarr" for name in ("first", "other")}
     found = compare(opened(stores, "first", "other"))
-    row = one(found.differences, scope="all", layer="layers_avg", quantity="log2_ratio")
+    row = one(found["differences"], scope="all", layer="layers_avg", quantity="log2_ratio")
     assert (row["num_tasks"], row["num_families"], row["intervals"]) == (7, 4, "tasks-like-these")
-    pairs = found.pairs.filter(layer="layers_avg", quantity="log2_ratio")
+    pairs = found["pairs"].filter(layer="layers_avg", quantity="log2_ratio")
     means = pairs.group_by("task_id").agg(pl.col("difference").mean()).sort("task_id")["difference"].to_numpy()
     labels = np.array([0, 0, 0, 1, 1, 2, 3])
     sums, size = np.bincount(labels, means - means.mean()), np.bincount(labels)
@@ -325,8 +356,8 @@ def test_differences_over_tasks_are_by_families(tmp_path):
     degrees = 1 / ((size**2).sum() / 49 + shares.sum() ** 2 - (shares**2).sum())
     reach = stats.t.ppf(0.975, degrees) * np.sqrt((sums**2 / (7 * (7 - size))).sum())
     assert row["difference"] == pytest.approx(means.mean())
-    assert (row["low"], row["high"]) == pytest.approx((means.mean() - reach, means.mean() + reach))
-    assert row["d_z_low"] < row["d_z"] < row["d_z_high"]
-    said = " ".join(text_of(comparison_sections(found)).split())
+    assert (row["difference_low"], row["difference_high"]) == pytest.approx(
+        (means.mean() - reach, means.mean() + reach)
+    )
+    said = " ".join(screen(found).split())
     assert "about tasks like these, by 4 families" in said
-    assert "4 families of tasks where these are the units" in said
