@@ -91,8 +91,19 @@ COMMANDS: dict[str, Command] = {
     ),
     "overlay": Command(
         "attention on the stored pictures: strips, GIF or MP4",
-        (*_ROWS, *_GROUPING, "episode", "replans", "cameras", "outline", "smooth", "video", "fps", "num_episodes",
-         "num_replans"),
+        (
+            *_ROWS,
+            *_GROUPING,
+            "episode",
+            "replans",
+            "cameras",
+            "outline",
+            "smooth",
+            "video",
+            "fps",
+            "num_episodes",
+            "num_replans",
+        ),
         ("image", "latent"),
         _NO_PICTURES,
         (

@@ -29,12 +29,13 @@ from vla_attention.analyze.statistics.exact_tests import mcnemar
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.schemas.errors import listing, plural
+from vla_attention.schemas.safe_text import visible
 
 _BETTER, _LISTEN, _MOVED, _ATTENTION = (
     "Which does better?", "Do they listen?", "How far do the actions move?", "And the attention?",
 )  # fmt: skip
-#: Differences of three kinds are named: groups, words and heads.
-_SURE = pl.col("difference_q") <= NAMED_AT / 3
+#: Differences of four kinds are named: groups, objects, words and heads.
+_SURE = pl.col("difference_q") <= NAMED_AT / 4
 #: So many differences of a kind are named.
 _MOST_NAMED = 3
 
@@ -173,15 +174,18 @@ def _attention(part: Compared) -> Finding:
     """The groups, words and heads whose attention is shown to differ, the largest differences first."""
     groups = _overall(part).filter(pl.col("quantity") != "success")
     said = [_of_group(row) for row in _largest(groups).iter_rows(named=True)]
-    words = _largest(part.rows["words"].filter(ALL)) if "words" in part.rows else groups.clear()
-    said += [f"{2.0 ** row['difference']:.2g} times as much on '{row['item']}'" for row in words.iter_rows(named=True)]
+    for kind, quote in (("objects", ""), ("words", "'")):
+        items = _largest(part.rows[kind].filter(ALL)) if kind in part.rows else groups.clear()
+        for row in items.iter_rows(named=True):
+            named = f"{quote}{visible(row['item'].replace('_', ' '))}{quote}"
+            said.append(f"{2.0 ** row['difference']:.2g} times as much on {named}")
     heads = part.rows["heads"].filter(ALL)
     if sure := heads.filter(_SURE).height:
         top = _largest(heads).row(0, named=True)
         most = f"most in layer {top['layer']}, head {top['head']}: {100 * top['difference']:+.1f} points"
         said.append(f"{sure} of {plural(heads.height, 'head')} differ ({most})")
     against = f"{part.name} against {part.first.run.name}"
-    numbers = {"groups": groups.filter(_SURE).height, "words": words.height, "heads": sure}
+    numbers = {kind: rows.filter(ALL, _SURE).height for kind, rows in part.rows.items()}
     limit = "Equal attention is not equal use: a word may change the action without more attention."
     return Finding(f"{against}: {'; '.join(said) if said else 'no difference is shown'}.", _ATTENTION, numbers, limit)
 

@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import polars as pl
 
-from vla_attention.analyze.core.camera_maps import named_picture
+from vla_attention.analyze.core.camera_maps import stored_picture
 from vla_attention.analyze.core.compared import KINDS, Compared, side_by_side, strip_of_pair
 from vla_attention.analyze.core.result import Column, Figure, Table
 from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.schemas.errors import shortened
+from vla_attention.schemas.safe_text import visible
 
 ALL = pl.col("scope") == "all"
 
@@ -27,12 +28,14 @@ def tables_of(parts: Sequence[Compared], told: Mapping[str, pl.DataFrame]) -> li
     each = {kind: pl.concat(rows) for kind, rows in rows_of.items() if rows}
     groups, main = each["groups"], each["groups"]["quantity"][0]
     average = pl.col("layer") == (LAYERS_AVG if (groups["layer"] == LAYERS_AVG).any() else groups["layer"][0])
-    shown = ALL & average & (pl.col("quantity") != "success")
-    found.append(Table("differences", groups, [*several, Column("quantity", "text"), *both], "Attention", shown))
     for kind, columns, title in _EACH:
         if kind in each:
             rows = each[kind].sort(pl.col("difference").abs(), descending=True, nulls_last=True, maintain_order=True)
             found.append(Table(kind, rows, [*several, *columns, *both], title, ALL, rows=5))
+    shown = ALL & average & (pl.col("quantity") != "success")
+    # Behind objects and words, before the heads.
+    at = len(found) - ("heads" in each)
+    found.insert(at, Table("differences", groups, [*several, Column("quantity", "text"), *both], "Attention", shown))
     of_main = pl.col("quantity") == main
     layers, tasks = [*several, Column("layer", "text"), *both], [*several, Column("task_id", "count", "task"), *both]
     found.append(Table("layers", groups, layers, f"{main} by layer", ALL & ~average & of_main, of="differences"))
@@ -76,9 +79,11 @@ def figures_of(part: Compared, told: Mapping[str, pl.DataFrame]) -> list[Figure]
         title = f"Attention to words, {name} against {first}"
         words = _as_factors(part.rows["words"].filter(ALL))
         found.append(Figure(f"words_{name}", "forest", words, title, _BARS, looks))
-    if part.pairs.height and (strip := strip_of_pair(part, told[first], told[name])).height:
-        title = f"The same beginning: {first} and {name}"
-        found.append(Figure(f"pair_{name}", "pictures", strip, title, options={"picture": named_picture}))
+    if part.pairs.height:
+        items, rows = strip_of_pair(part, told[first], told[name])
+        title = f"Told '{visible(items[0].episode.attributes.instruction)}' from one beginning: {first} and {name}"
+        look = {"picture": lambda a: stored_picture(items[a["row"]], a["camera"], a["replan"])}
+        found += [Figure(f"pair_{name}", "pictures", rows, title, options=look)] if rows.height else []
     return found
 
 
@@ -108,6 +113,7 @@ _BOTH = [
 ]
 _WORD, _LAYER, _HEAD = Column("item", "text", "word"), Column("layer", "count"), Column("head", "count")
 _EACH = (
+    ("objects", [Column("item", "text", "object")], "Objects: log2 of their attention over that of their area"),
     ("words", [_WORD], "Words: log2 of their attention over evenly spread"),
     ("heads", [_LAYER, _HEAD], "Heads: their attention on the first side of the ratio"),
 )

@@ -11,7 +11,7 @@ import polars as pl
 
 from vla_attention.analyze.core.about import about
 from vla_attention.analyze.core.behaviour import OTHER_GOAL, TOLD_SO, UNFINISHED, behaviour
-from vla_attention.analyze.core.camera_maps import named_picture
+from vla_attention.analyze.core.camera_maps import stored_picture
 from vla_attention.analyze.core.courses import Leaving, leavings, strip_of
 from vla_attention.analyze.core.measure import measure, table_of
 from vla_attention.analyze.core.object_shares import ALL_CAMERAS, measure_objects, object_times, with_coverage
@@ -227,7 +227,8 @@ def _strip(left: Sequence[Leaving]) -> list[Figure]:
     if gone is None or (rows := strip_of(gone)).is_empty():
         return []
     title = f"'{visible(gone.item.episode.attributes.instruction)}': a failed episode, a solved one that began like it"
-    return [Figure("failure", "pictures", rows, title, options={"picture": named_picture})]
+    look = {"picture": lambda a: stored_picture((gone.item, gone.twin)[a["row"]], a["camera"], a["replan"])}
+    return [Figure("failure", "pictures", rows, title, options=look)]
 
 
 _PLACES: dict[str, Any] = {

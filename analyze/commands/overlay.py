@@ -223,7 +223,7 @@ def _figure(
     name = f"overlay_{file_part(maps.item.store.suite) + '_' if several else ''}{maps.item.episode.name}"
     # Read now: a damaged picture ends the command before anything is written.
     places, item = frame.select("camera", "replan").rows(), maps.item
-    read = {place: stored_picture(item.store, item.episode, *place) for place in places}
+    read = {place: stored_picture(item, *place) for place in places}
     lines = " and ".join(f"{level:g}" for level in levels)
     caption = (
         "Attention of the action queries on the pictures that the policy saw, mean over the selected layers, denoise "

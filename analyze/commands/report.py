@@ -28,8 +28,10 @@ def report(question: Question, num_episodes: int = 2, num_replans: int = 8) -> l
         question: stores, selection and grouping.
         num_episodes, num_replans: how many episodes are shown with pictures, and how many of their replans.
     """
-    shown_parts = {"num_episodes": num_episodes, "num_replans": num_replans}
-    own: dict[str, dict[str, Any]] = {"overlay": shown_parts, "objects": {"iou": False}}
+    own: dict[str, dict[str, Any]] = {
+        "overlay": {"num_episodes": num_episodes, "num_replans": num_replans},
+        "objects": {"iou": False},
+    }
     results = list(_answers(question, own))
     said = {line for result in results[:1] for line in result.about}
     told: set[str] = set()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -17,9 +16,7 @@ from vla_attention.analyze.measures.selected import SelectedEpisode, positions_b
 from vla_attention.analyze.show.patch_pictures import upright
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.layout import Role
-from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import PolicyCameraView
-from vla_attention.schemas.stores.store_url import store_place
 
 Array = NDArray[np.float64]
 #: A scale ends at this quantile of all values that are shown with it: a single patch must not make the others pale.
@@ -72,24 +69,17 @@ class EpisodeMaps:
         return f"frames/{camera}" in self.item.episode.attributes.arrays
 
 
-def stored_picture(store: Store, episode: StoredEpisode, camera: str, replan: int) -> NDArray[np.uint8] | None:
+def stored_picture(item: SelectedEpisode, camera: str, replan: int) -> NDArray[np.uint8] | None:
     """The picture that the policy got, as a person sees the scene, (row, column, 3); None where none was stored."""
-    if f"frames/{camera}" not in episode.attributes.arrays:
+    if f"frames/{camera}" not in item.episode.attributes.arrays:
         return None
-    picture: NDArray[np.uint8] = episode.read(f"frames/{camera}", replan)
-    return upright(picture, view_of(store, camera))
+    picture: NDArray[np.uint8] = item.episode.read(f"frames/{camera}", replan)
+    return upright(picture, view_of(item, camera))
 
 
-def named_picture(row: Mapping[str, Any]) -> NDArray[np.uint8] | None:
-    """The stored picture that a row of a figure names by store, episode, camera and replan."""
-    store = open_store(store_place(row["store"]))
-    episode = next(episode for episode in store.episodes if episode.name == row["episode"])
-    return stored_picture(store, episode, row["camera"], row["replan"])
-
-
-def view_of(store: Store, camera: str) -> PolicyCameraView:
+def view_of(item: SelectedEpisode, camera: str) -> PolicyCameraView:
     """How a camera's pictures were turned."""
-    views = {view.name: view for view in store.attributes.policy.cameras}
+    views = {view.name: view for view in item.store.attributes.policy.cameras}
     return views.get(camera, PolicyCameraView(camera, camera, True, False))
 
 
@@ -130,7 +120,7 @@ def episode_maps(question: Question, item: SelectedEpisode, cameras: Sequence[st
             beside = [span for span in tokens.layout.camera_spans(camera) if span.grid is None]
             outside = sum((mean[:, span.start : span.stop].sum(axis=1) for span in beside), np.zeros(len(mean)))
             share = mass / whole[:, None, None]
-            maps[camera] = CameraMap(picture, view_of(item.store, camera), mass, mass / even, share, outside)
+            maps[camera] = CameraMap(picture, view_of(item, camera), mass, mass / even, share, outside)
         words = [
             [(word.text, float(mean[replan, list(word.keys)].sum() / uniform[replan, list(word.keys)].sum()))
              for word in tokens.words[prompt]]

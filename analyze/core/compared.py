@@ -21,9 +21,17 @@ from vla_attention.analyze.core.differences import (
 )
 from vla_attention.analyze.core.levels import SIDES, Levels, levels_of, task_cells, task_groups
 from vla_attention.analyze.core.measure import measure, table_of
+from vla_attention.analyze.core.object_shares import (
+    ALL_CAMERAS,
+    cameras_of,
+    measure_objects,
+    object_episodes,
+    with_coverage,
+)
 from vla_attention.analyze.core.runs import Run
 from vla_attention.analyze.core.word_items import items_of
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
+from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 
 #: What is compared -> the columns that name an item of it, and inside of which looks are counted.
@@ -31,6 +39,7 @@ KINDS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "groups": (("layer", "quantity"), ("layer",)),
     "heads": (("layer", "head"), ()),
     "words": (("item",), ()),
+    "objects": (("kind", "item"), ("kind",)),
 }
 
 
@@ -55,11 +64,20 @@ class RunValues:
 
     @cached_property
     def values(self) -> Mapping[str, pl.DataFrame]:
-        """By kind of `KINDS`, a table of values (see `differences`); those of words and ratios are log2."""
+        """By kind of `KINDS`, a table of values (see `differences`).
+
+        Those of words and objects are log2 of their attention over what they would get if it were spread evenly.
+        """
         tables = {"groups": values_of_groups(self.levels), "heads": self._heads()}
         if self.run.question.vocabulary.words:
             words = table_of(measure(self.run.question, items_of, "words")).filter(pl.col("kind") == "word")
             tables["words"] = words.select(*EPISODE_ID, "item", value=pl.col("lift").log(2.0)).collect()
+        if any(cameras_of(item) for item in self.run.question.selected):
+            objects = object_episodes(measure_objects(with_coverage(self.run.question)))
+            objects = objects.filter(camera=ALL_CAMERAS, layer=LAYERS_AVG)
+            tables["objects"] = objects.select(
+                *EPISODE_ID, "kind", "item", value=pl.col("enrichment").log(2.0)
+            ).collect()
         return tables
 
     def _heads(self) -> pl.DataFrame:
@@ -136,35 +154,31 @@ def compared(first: RunValues, other: RunValues, sampling: Sampling) -> Compared
     return Compared(first, other, pairs, rows, values)
 
 
-def strip_of_pair(part: Compared, told_first: pl.DataFrame, told_other: pl.DataFrame) -> pl.DataFrame:
-    """Where the pictures of three moments of a pair lie, of one that ended otherwise if there is one.
+def strip_of_pair(
+    part: Compared, told_first: pl.DataFrame, told_other: pl.DataFrame
+) -> tuple[tuple[SelectedEpisode, SelectedEpisode], pl.DataFrame]:
+    """A pair of episodes, one that ended otherwise if there is one, and three moments of both.
 
     Returns:
-        One row per picture: row (0: the first run, 1: the other), column, label, store, episode, replan, camera; none
-        where the stores have no pictures.
+        The two episodes; and one row per picture: row (0: the first run, 1: the other), column, above, replan, camera;
+        none where the stores have no pictures.
     """
     keys, pairs = ["suite", "task_id"], part.pairs
     for side, told in (("first", told_first), ("other", told_other)):
         did = told.select(*keys, pl.col("episode_index").alias(f"episode_{side}"), pl.col("did").alias(f"did_{side}"))
         pairs = pairs.join(did, on=[*keys, f"episode_{side}"], how="left", maintain_order="left")
     pair = pairs.sort(pl.col("did_first").eq_missing(pl.col("did_other")), maintain_order=True).row(0, named=True)
-    rows = []
+    items, rows = [], []
     for row, (side, of) in enumerate((("first", part.first), ("other", part.other))):
-        task = (pair["suite"], pair["task_id"])
-        item = next(
-            item
-            for item in of.run.question.selected
-            if item.task == task and item.episode.attributes.episode_index == pair[f"episode_{side}"]
-        )
-        last = item.episode.attributes.num_replans - 1
+        key = (pair["suite"], pair["task_id"], pair[f"episode_{side}"])
+        named = {(*item.task, item.episode.attributes.episode_index): item for item in of.run.question.selected}
+        items.append(item := named[key])
+        last, steps = item.episode.attributes.num_replans - 1, item.episode.attributes.env_step
         cameras = [camera.name for camera in item.store.attributes.policy.cameras]
         camera = next((name for name in cameras if item.episode.has(f"frames/{name}")), None)
-        moments = sorted({0, last // 2, last}) if camera else []
-        steps = item.episode.attributes.env_step
-        for column, replan in enumerate(moments):
-            label = f"{of.run.name}, step {steps[replan] - steps[0]}"
-            rows.append((row, column, label, str(item.store.path), item.episode.name, replan, camera))
-    return pl.DataFrame(rows, schema=PICTURES, orient="row")
+        for column, replan in enumerate(sorted({0, last // 2, last}) if camera else []):
+            rows.append((row, column, f"{of.run.name}, step {steps[replan] - steps[0]}", replan, camera))
+    return (items[0], items[1]), pl.DataFrame(rows, schema=PICTURES, orient="row")
 
 
 def side_by_side(part: Compared, told: Mapping[str, pl.DataFrame]) -> pl.DataFrame | None:

@@ -15,6 +15,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.core.same_calls import held_by_one
 from vla_attention.analyze.effects.action_changes import (
     ActionSpread,
     action_spread,
@@ -39,7 +40,6 @@ from vla_attention.analyze.effects.paired_replans import (
 )
 from vla_attention.analyze.effects.reruns import BaseAndReruns, open_reruns, recorded_conditions
 from vla_attention.analyze.effects.rollouts import ROLLOUT_COLUMNS, rollout_pairs, rollout_summary
-from vla_attention.analyze.core.same_calls import held_by_one
 from vla_attention.analyze.effects.sums import sums_of_groups
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.analyze.core.same_calls import check_same_calls
 from vla_attention.analyze.effects.action_changes import (
     ActionSpread,
     first_angle,
@@ -15,7 +16,6 @@ from vla_attention.analyze.effects.action_changes import (
     root_mean_square_change,
 )
 from vla_attention.analyze.effects.conditions import Condition
-from vla_attention.analyze.core.same_calls import check_same_calls
 from vla_attention.analyze.measures.alignment import episode_timing, on_episode_time
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.selected import SelectedEpisode

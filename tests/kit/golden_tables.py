@@ -237,20 +237,20 @@ class Form:
         keys: the columns by which rows are matched.
         rows: today's rows, in the kept columns, from all tables of the results.
         gone: kept columns that are given no more.
-        without: kept rows that are given no more.
+        still: the kept rows that are still given; all unless it is given.
         absolute: difference that is allowed whatever the size of a number.
     """
 
     keys: tuple[str, ...]
     rows: Callable[[Mapping[str, pl.DataFrame]], pl.DataFrame]
     gone: tuple[str, ...] = ()
-    without: pl.Expr | None = None
+    still: pl.Expr | None = None
     absolute: float = 1e-8
 
     def differences(self, tables: Mapping[str, pl.DataFrame], kept: pl.DataFrame) -> list[str]:
         """Where today's rows differ from the kept ones."""
         floats = [pl.col(name).round(9) for name in self.keys if kept.schema[name].is_float()]
-        kept = kept if self.without is None else kept.filter(~self.without)
+        kept = kept if self.still is None else kept.filter(self.still)
         kept = kept.drop(self.gone, strict=False).with_columns(floats)
         rows = (
             self.rows(tables)
@@ -335,7 +335,7 @@ def _conditions(name: str) -> Callable[[Mapping[str, pl.DataFrame]], pl.DataFram
 
 
 #: A rerun has no success of its own.
-_NO_OUTCOME = (pl.col("run") == "noise") & (pl.col("quantity") == "success")
+_NO_OUTCOME = ~((pl.col("run") == "noise") & (pl.col("quantity") == "success"))
 #: Differences of numbers that are equal to many digits keep few of them.
 _OF_DIFFERENCES = 5e-6
 _OF_MOVES = ("kind", "group", "selector", "phase", "mass", "lift", "norm", "keys", "random", "minus_random")
@@ -406,13 +406,13 @@ FORMS: dict[tuple[str, str], Form] = {
     ("objects", "iou"): Form(
         (*_EPISODE, "layer", "camera", "threshold", "kind", "item"),
         lambda tables: tables["iou_episodes"],
-        without=pl.col("threshold") == "otsu",
+        still=pl.col("threshold") != "otsu",
     ),
     ("objects", "iou_summary"): Form(
         ("camera", "kind", "item", "threshold"),
         lambda tables: tables["iou"],
         ("iou_episodes", "iou_chance_episodes"),
-        pl.col("threshold") == "otsu",
+        pl.col("threshold") != "otsu",
     ),
     ("analyze", "contributions"): Form(
         (*_EPISODE, "replan", "layer", "block", "denoise_step"), lambda tables: tables["contributions_steps"]
@@ -457,7 +457,7 @@ FORMS: dict[tuple[str, str], Form] = {
     ),
     ("compare", "runs"): Form(("run", "layer", "quantity"), _runs, ("block",), _NO_OUTCOME),
     ("reruns_compare", "effects"): Form(
-        (*_EPISODE, "condition"), _conditions("moved_episodes"), (*_OF_MOVES, "instruction"), pl.col("phase") != "all"
+        (*_EPISODE, "condition"), _conditions("moved_episodes"), (*_OF_MOVES, "instruction"), pl.col("phase") == "all"
     ),
     ("reruns_compare", "effects_summary"): Form(
         ("condition",),
@@ -474,7 +474,7 @@ FORMS: dict[tuple[str, str], Form] = {
             *(f"{name}{end}" for name in (*_OF_MOVES[4:], "over_random") for end in _ENDS),
             *(f"{name}_episodes" for name in _CHANGED),
         ),
-        (pl.col("phase") != "all") | (pl.col("scope") != "all"),
+        (pl.col("phase") == "all") & (pl.col("scope") == "all"),
     ),
     ("time", "time_course"): Form(("quantity", "position"), _time_course, _COURSE),
 }
