@@ -222,7 +222,8 @@ def _figure(
     several = len(question.stores) > 1
     name = f"overlay_{file_part(maps.item.store.suite) + '_' if several else ''}{maps.item.episode.name}"
     # Read now: a damaged picture ends the command before anything is written.
-    read = {place: stored_picture(maps.item, *place) for place in frame.select("camera", "replan").iter_rows()}
+    places, item = frame.select("camera", "replan").rows(), maps.item
+    read = {place: stored_picture(item, *place) for place in places}
     lines = " and ".join(f"{level:g}" for level in levels)
     caption = (
         "Attention of the action queries on the pictures that the policy saw, mean over the selected layers, denoise "
@@ -243,5 +244,6 @@ def _finding(question: Question, maps: EpisodeMaps, table: pl.DataFrame) -> Find
         f"{row['lift']:.2g} times what evenly spread attention would give it (step {row['env_step']})."
     )
     numbers = {name: row[name] for name in ("lift", "share", "camera", "replan", "env_step", "place", "object")}
-    limit = "This is one patch of one policy call; over all episodes:"
-    return Finding(said, "Where does it look?", numbers, limit, f"vla-attention objects {question.stores[0].path}")
+    limit, store = "This is one patch of one policy call; over all episodes:", question.stores[0].path
+    over_all = f"analyze {store} --by camera" if row["object"] is None else f"objects {store}"
+    return Finding(said, "Where does it look?", numbers, limit, f"vla-attention {over_all}")

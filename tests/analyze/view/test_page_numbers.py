@@ -191,9 +191,8 @@ def test_pictures_have_the_attention_of_their_patches_in_inferno(answers, stores
             assert (np.argsort(values, kind="stable") == np.argsort(mass.ravel(), kind="stable")).all()
         shape = (camera["height"], camera["width"], 4)
         pixels = np.array(camera["pixels"], dtype=np.uint8).reshape(shape)[..., :3]
-        turned = in_inferno(
-            stored_picture(question.selected[0], one.view.name, replan), upright(values.reshape(lift.shape), one.view), "smooth=1" in query, shape
-        )
+        frame = stored_picture(question.selected[0], one.view.name, replan)
+        turned = in_inferno(frame, upright(values.reshape(lift.shape), one.view), "smooth=1" in query, shape)
         # The page has colours of whole numbers, and a value at the border of two of the 256 may have either.
         difference = np.abs(pixels.astype(int) - turned.astype(int))
         assert difference.max() <= 4
