@@ -185,7 +185,7 @@ def _main_module_hidden() -> Iterator[None]:
 
 @contextmanager
 def _cluster(address: str) -> Iterator[tuple[Executor, int]]:
-    """The workers of a dask scheduler, `address` as its `Client` takes it; it begins an episode again whose worker died."""
+    """The workers of a dask scheduler at an address that its `Client` takes. Where one dies, another does its work."""
     try:
         from distributed import Client
         from distributed.comm.addressing import get_address_host_port
