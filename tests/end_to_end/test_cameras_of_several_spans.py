@@ -184,7 +184,7 @@ def test_masses_and_overlay_of_a_store_are_of_all_keys(made, tmp_path, capsys):
     masses = va.open(path).analyze(grouping="cameras")["episodes_groups"].filter(pl.col("episode_index") == 0)
     own = masses.filter((pl.col("group") == "front") & (pl.col("layer") == "layers_avg"))
     np.testing.assert_allclose(own["mass"], rows[:, keys].sum(axis=1).mean(), rtol=1e-4)
-    words = "--replans 0 2 --outline f=camera:front".split()
+    words = ["--replans", "0", "2", "--outline", "f=camera:front"]
     assert main(["overlay", str(path), "--output", str(tmp_path), *words]) == 0
     table = pl.read_parquet(tmp_path / "overlay_patches.parquet").filter(pl.col("camera") == "front")
     placed = [
