@@ -84,7 +84,7 @@ class OpenStores:
 
     def analyze(
         self,
-        by: Sequence[str] = (),
+        by: str | Sequence[str] = (),
         without_sinks: str | None = None,
         list: bool = False,
         **settings: Unpack[SettingKeywords],
@@ -104,7 +104,7 @@ class OpenStores:
         >>> masses.group_by("group").agg(pl.col("keys").mean()).filter(group="linguistic")["keys"].to_list()
         [5.0]
         """
-        return self._answer("analyze", settings, by=tuple(by), without_sinks=without_sinks, list=list)
+        return self._answer("analyze", settings, by=_names(by), without_sinks=without_sinks, list=list)
 
     @overload
     def to_xarray(self, rows: Literal[False] = False, **settings: Unpack[SettingKeywords]) -> xarray.Dataset: ...
@@ -145,7 +145,7 @@ class OpenStores:
 
         return self._answer("failures", settings, twins=None if twins is None else store_place(str(twins)))
 
-    def words(self, by: Sequence[str] = (), **settings: Unpack[SettingKeywords]) -> Answer:
+    def words(self, by: str | Sequence[str] = (), **settings: Unpack[SettingKeywords]) -> Answer:
         """Which words of the instruction are read; tables "words", "words_scale", "words_episodes".
 
         `by`: keep apart layer, head, denoise, replan, task, family or episode.
@@ -154,7 +154,7 @@ class OpenStores:
         >>> sorted(words.filter(kind="word")["item"].to_list())
         ['bowl', 'on', 'plate', 'put', 'the']
         """
-        return self._answer("words", settings, by=tuple(by))
+        return self._answer("words", settings, by=_names(by))
 
     def _answer(self, name: str, settings: SettingKeywords, **own: Any) -> Answer:
         from vla_attention.analyze.ask import answer_to
@@ -162,7 +162,7 @@ class OpenStores:
 
         return Answer.of(answer_to(name, self.stores, settings_from_keywords(**settings), own, self._known))
 
-    def objects(self, by: Sequence[str] = (), iou: bool = True, **settings: Unpack[SettingKeywords]) -> Answer:
+    def objects(self, by: str | Sequence[str] = (), iou: bool = True, **settings: Unpack[SettingKeywords]) -> Answer:
         """Which objects are looked at; tables "objects", "pointing", "iou", each of them with "_episodes" too.
 
         `by`: keep apart layer, head, denoise, replan, time, task, family, episode or camera. `iou`: compare maps with
@@ -175,12 +175,12 @@ class OpenStores:
         Raises:
             BadArgument: the stores hold no object masks.
         """
-        return self._answer("objects", settings, by=tuple(by), iou=iou)
+        return self._answer("objects", settings, by=_names(by), iou=iou)
 
     def compare(
         self,
         other: OpenStores | str | Path | Sequence[str | Path],
-        allow_mismatch: Sequence[str] = (),
+        allow_mismatch: str | Sequence[str] = (),
         names: tuple[str, str] = ("first", "other"),
         **settings: Unpack[SettingKeywords],
     ) -> Answer:
@@ -202,7 +202,7 @@ class OpenStores:
 
         both = self, other if isinstance(other, OpenStores) else open_stores(other)
         runs = [RunArgument(name, tuple(one.path for one in run.stores)) for name, run in zip(names, both, strict=True)]
-        return Answer.of(compared(runs, settings_from_keywords(**settings), allow_mismatch))
+        return Answer.of(compared(runs, settings_from_keywords(**settings), _names(allow_mismatch)))
 
     def effects(
         self,
@@ -311,6 +311,11 @@ class OpenStores:
             "         .report(path) .to_xarray()",
         ]
         return "\n  ".join([str(self), *lines])
+
+
+def _names(given: str | Sequence[str]) -> tuple[str, ...]:
+    """One name, several with commas between them, or a sequence of names."""
+    return tuple(part.strip() for part in given.split(",")) if isinstance(given, str) else tuple(given)
 
 
 def _chosen(table: str, known: Collection[str], study: Callable[[], object]) -> pl.DataFrame:

@@ -6,7 +6,7 @@ from collections.abc import Collection
 
 import polars as pl
 
-from vla_attention.analyze.core.about import about, notes
+from vla_attention.analyze.core.about import about, enough, notes
 from vla_attention.analyze.core.axes import OF_ROWS, check_axes, columns_of, with_families
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.measure import measure, table_of
@@ -105,9 +105,8 @@ def _columns(num_tasks: int) -> list[Column]:
 def _finding(question: Question, words: pl.DataFrame, by: Collection[str]) -> Finding:
     """Which words get more, and which less, than evenly spread attention would give them."""
     effects = f"vla-attention effects {question.stores[0].path}"
-    limit = (
-        "Being read is not deciding: a word that the pictures have read decides with hardly any attention of its own."
-    )
+    limit = "Being read is not deciding: a word that the pictures have read decides with hardly any attention."
+    limit = f"{enough(question)} {limit}".lstrip()
     if by:
         return Finding(
             f"Below, a row for each word and {' and '.join(by)}.", "Which words are read?", {}, limit, effects

@@ -27,7 +27,7 @@ def test_the_second_run_differs_in_its_weights_alone():
     cubes, one_colour = va.open(CUBES), va.open(ONE_COLOUR)
     assert cubes.attributes.policy.digest != one_colour.attributes.policy.digest
     assert cubes.attributes.protocol == one_colour.attributes.protocol
-    assert cubes.compare(one_colour, "unpaired").height == 0
+    assert cubes.compare(one_colour)["unpaired"].height == 0
     assert cubes.episodes["success"].all()
     assert one_colour.episodes.filter(success=True)["instruction"].unique().to_list() == ["touch the blue cube"]
 

@@ -84,7 +84,7 @@ def test_bits_that_keep_the_checksum_are_refused_by_every_reading(forged, origin
     asked = ["--group", CORNER, "--no-plots", "--output", str(tmp_path / "out")]
     assert SENTENCE in refused_by([str(forged), *asked], capsys)
     assert analyze([str(forged), *asked, "--skip-corrupt"]) == 0
-    assert FIRST in " ".join((tmp_path / "out/summary.txt").read_text().split())
+    assert FIRST in " ".join((tmp_path / "out/result.json").read_text().split())
     episode = open_store(forged).episodes[0]
     with pytest.raises(CorruptEpisode, match=SENTENCE):
         episode.read("joint/rows", np.s_[:, 1, 0])

@@ -349,5 +349,5 @@ def test_a_link_that_no_seal_lists_is_a_fault(path, tmp_path, capsys, program, o
     assert "no part of the store" not in said
     assert f"{path}: 2 episodes, 2 faults" in said
     assert main([str(path), "--no-plots", "--no-cache", "--output", str(tmp_path / "out")]) == 0  # no number is of it
-    assert program(["repair", str(path)]) == 0
+    assert program(["verify", str(path), "--repair", "--quick"]) == 0
     assert [episode.name for episode in open_store(path).episodes] == ["task001_episode000"]
