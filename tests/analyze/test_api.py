@@ -18,7 +18,7 @@ import vla_attention.analyze.measures.question_settings
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.api import OpenStores
 from vla_attention.analyze.measures.question_settings import AnalysisSettings, settings_from_keywords
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.interventions import Interventions, KeyKnockout
 from vla_attention.schemas.precision import mass_error_bound
 from vla_attention.schemas.stores.store_format import StoreError, StoreNotFound
@@ -139,7 +139,7 @@ def test_keywords_become_settings(given, expected):
     ],
 )
 def test_mistakes_say_what_exists(run, call, message):
-    with pytest.raises(BadArgument, match=message):
+    with pytest.raises((BadArgument, UnknownName), match=message):
         call(run)
 
 
