@@ -79,7 +79,7 @@ def draw_run(store: Path, scratch: Path, folder: Path) -> None:
     """Draw the pictures of README.md: a strip of one episode, and the layers."""
     strip = ["overlay", "--task", "1", "--episode", "0"]
     draw("overlay", store, strip, "overlay_task001_episode000", scratch / "overlay", folder)
-    draw("layers", store, ["ratios"], "layer_profile", scratch / "ratios", folder)
+    draw("layers", store, ["analyze"], "layer_profile", scratch / "analyze", folder)
 
 
 def draw(name: str, store: Path, command: list[str], picture: str | None, scratch: Path, folder: Path) -> None:
@@ -110,9 +110,14 @@ def main() -> None:
         coverage=False,
     )
     cases = {
-        "baseline": (favour, {"layers": (0, 9, 17), "tasks": (0, 1, 2), "episodes": 6}, ["ratios"], "ratio_per_task"),
+        "baseline": (favour, {"layers": (0, 9, 17), "tasks": (0, 1, 2), "episodes": 6}, ["analyze"], "ratio_per_task"),
         "sink": (sink, {"layers": (9,), "tasks": (0,), "episodes": 2}, SINK, None),
-        "specialist_head": (specialist, {"tasks": (0, 1), "episodes": 3}, ["heads"], "head_grid"),
+        "specialist_head": (
+            specialist,
+            {"tasks": (0, 1), "episodes": 3},
+            ["analyze", "--by", "layer,head"],
+            "by_layer_head",
+        ),
     }
     for name, (plant, changes, command, picture) in cases.items():
         store = write_store(scratch / f"{name}.zarr", spec=shape, plant_rows=plant, suite="made_up", **changes)

@@ -170,7 +170,7 @@ def _frame(
             rows.append({
                 **identity, "replan": replan, "env_step": step, "camera": camera, "row": camera, "column": replan,
                 "above": f"step {step}" + ("" if ratio is None else f", ratio {ratio:.3g}"),
-                "below": f"{share:.0%} of image attention\nhighest {lift[row, column]:.2g}, {place}",
+                "below": f"{share:.0%} of image attention\nhighest {float(f'{lift[row, column]:.2g}'):g}, {place}",
                 "map": lift.tolist(), "share": share, "lift": float(lift[row, column]), "place": place,
                 "object": None if covering is None else _object(maps, camera, covering[replan], replan),
                 "ratio": ratio,
