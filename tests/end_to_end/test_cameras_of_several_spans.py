@@ -19,6 +19,9 @@ from tests.kit.examples import examples
 from tests.kit.questions import question_about
 from tests.kit.small_torch_policy import HORIZON, SmallPolicy, small_layout
 from tests.kit.small_torch_policy import given as policy_inputs
+from tests.kit.stores import StoreSpec, write_store
+from tests.kit.strategies import episode_tokens
+from tests.kit.tokens import OBJECTS, small_prompt, tokens_of
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.objects import objects
 from vla_attention.analyze.measures.patch_maps import PictureMap
@@ -35,9 +38,6 @@ from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, SceneObjec
 from vla_attention.schemas.interventions import ImageChange
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, camera_grids
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing.stores import StoreSpec, write_store
-from vla_attention.testing.strategies import episode_tokens
-from vla_attention.testing.tokens import OBJECTS, small_prompt, tokens_of
 
 WHOLE, TOP, LEFT = (0.0, 0.0, 1.0, 1.0), (0.0, 0.0, 0.5, 1.0), (0.0, 0.0, 1.0, 0.5)
 
@@ -184,7 +184,7 @@ def test_masses_and_overlay_of_a_store_are_of_all_keys(made, tmp_path, capsys):
     masses = va.open(path).analyze(grouping="cameras")["episodes_groups"].filter(pl.col("episode_index") == 0)
     own = masses.filter((pl.col("group") == "front") & (pl.col("layer") == "layers_avg"))
     np.testing.assert_allclose(own["mass"], rows[:, keys].sum(axis=1).mean(), rtol=1e-4)
-    words = "--replans 0 2 --outline f=camera:front".split()
+    words = ["--replans", "0", "2", "--outline", "f=camera:front"]
     assert main(["overlay", str(path), "--output", str(tmp_path), *words]) == 0
     table = pl.read_parquet(tmp_path / "overlay_patches.parquet").filter(pl.col("camera") == "front")
     placed = [

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import linalg, stats
-
 from vla_attention.analyze.statistics.effect_sizes import contrast, mean_difference
+
 from vla_attention.analyze.statistics.family_errors import family_error
 from vla_attention.analyze.statistics.intervals import (
     estimates,

@@ -3,7 +3,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import stats
-
 from vla_attention.analyze.statistics.effect_sizes import (
     cliffs_delta,
     contrast,
@@ -11,6 +10,7 @@ from vla_attention.analyze.statistics.effect_sizes import (
     hedges_g,
     mean_difference,
 )
+
 from vla_attention.analyze.statistics.intervals import Estimand
 from vla_attention.analyze.statistics.units import Units
 
