@@ -66,8 +66,8 @@ MEMORY_COMMANDS = {
 
 def make_store(path: Path, episodes: int, replans: int, heads: int) -> None:
     """Write the store; fifty episodes of eight heads take a minute or two."""
-    from vla_attention.testing.stores import StoreSpec, write_store
-    from vla_attention.testing.tokens import libero_tokens
+    from tests.kit.stores import StoreSpec, write_store
+    from tests.kit.tokens import libero_tokens
 
     spec = StoreSpec(
         suite="libero_10",

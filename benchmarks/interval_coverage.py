@@ -259,11 +259,11 @@ def through_files(case: Case, num_stores: int, seed: int) -> dict[str, float]:
     """The same with stores on disk: written by the real writer, read back and analysed."""
     from vla_attention.analyze.ratios.analysis import analyse
 
+    from tests.kit.stores import StoreSpec, write_store
     from vla_attention.analyze.measures.question import ask
     from vla_attention.analyze.measures.question_settings import AnalysisSettings
     from vla_attention.schemas.layout import Role
     from vla_attention.schemas.stores.reader import open_store
-    from vla_attention.testing.stores import StoreSpec, write_store
 
     generator = np.random.default_rng([seed, 1])
     num_tasks, num_episodes = len(case.episodes), case.episodes[0]

@@ -34,12 +34,12 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from tests.kit.made_up_behaviour import STEPS, did, goals_of
+from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.commands.language import listens
 from vla_attention.analyze.core.behaviour import with_choices
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
-from vla_attention.testing.stores import StoreSpec, write_store
 
 TASKS, EPISODES, REPLANS = 5, 4, 6
 FACTOR = 4 / 3

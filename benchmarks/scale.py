@@ -62,7 +62,7 @@ def main() -> None:
 
 def small_store(folder: Path, episodes: int) -> Path:
     """A store of so many small episodes of ten tasks, unless it is there."""
-    from vla_attention.testing import write_store
+    from tests.kit.stores import write_store
 
     path, first = folder / f"of_{episodes}.zarr", folder / "one_of_each.zarr"
     if not path.exists():

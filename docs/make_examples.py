@@ -20,9 +20,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.null_stores import SPEC as NULL_STORE
 from benchmarks.null_stores import Rows, normalised, plant_of
+from tests.kit.stores import write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
-from vla_attention.testing.stores import write_store
 
 FOLDER = Path(__file__).parent / "examples"
 COMMANDS = ("analyze", "words", "objects")

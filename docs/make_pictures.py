@@ -18,11 +18,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from tests.kit.stores import StoreSpec, write_store
+from tests.kit.tokens import libero_tokens
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
-from vla_attention.testing.stores import StoreSpec, write_store
-from vla_attention.testing.tokens import libero_tokens
 
 #: Task 0 ignores content, task 1 looks (patches get four times as much as words), task 2 reads (the reverse).
 FAVOURS = {0: 1.0, 1: 4.0, 2: 0.25}

@@ -93,7 +93,7 @@ def command_lines(document: Path) -> Iterator[list[str]]:
 def test_the_parsers_take_every_command_line(document):
     for program, *given in command_lines(document):
         if program == "vla-attention" and given[0] in PROGRAM_COMMANDS and given[0] not in ("analyze", "capture"):
-            continue  # example, completion
+            continue  # example
         if program == "vla-attention" and given[0] in ("analyze", "capture"):
             program, *given = f"vla-{given[0]}", *given[1:]
         if program == "vla-capture":

@@ -15,6 +15,9 @@ from polars.testing import assert_frame_equal
 import vla_attention as va
 import vla_attention.analyze.api
 import vla_attention.analyze.measures.question_settings
+from tests.kit.site_stores import write_site_store
+from tests.kit.stores import StoreSpec, rerun_source, write_store
+from tests.kit.tokens import small_layout
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.api import OpenStores
 from vla_attention.analyze.measures.question_settings import AnalysisSettings, settings_from_keywords
@@ -22,9 +25,6 @@ from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.interventions import Interventions, KeyKnockout
 from vla_attention.schemas.precision import mass_error_bound
 from vla_attention.schemas.stores.store_format import StoreError, StoreNotFound
-from vla_attention.testing.site_stores import write_site_store
-from vla_attention.testing.stores import StoreSpec, rerun_source, write_store
-from vla_attention.testing.tokens import small_layout
 
 MODULES = (va, vla_attention.analyze.api, vla_attention.analyze.measures.question_settings)
 

@@ -13,6 +13,8 @@ from typing import Any
 
 import pytest
 
+from tests.kit.site_stores import SiteStoreSpec, write_site_store
+from tests.kit.stores import StoreSpec, rerun_source, reseal, reseal_root, write_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.published.parse_results import main as parse
@@ -21,8 +23,6 @@ from vla_attention.schemas.interventions import Interventions, PromptChange
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import SiteLayout, Span
 from vla_attention.schemas.stores.digest import bytes_digest, seal_digest
-from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
-from vla_attention.testing.stores import StoreSpec, rerun_source, reseal, reseal_root, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, contributions=True)
 #: Clears a screen, moves the cursor, reverses the direction of writing, begins a line, is markup, and is a formula.

@@ -10,6 +10,7 @@ import polars as pl
 import pytest
 
 from tests.kit.questions import question_about
+from tests.kit.site_stores import write_site_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.commands.analyze import analyze as ask_analyze
@@ -17,7 +18,6 @@ from vla_attention.analyze.core.contributions import side_norms
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions, KeyKnockout
-from vla_attention.testing.site_stores import write_site_store
 
 KINDS = ("alternating", "split", "growing")
 

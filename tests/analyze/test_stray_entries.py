@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from tests.analyze.test_hostile_stores import WORDS
+from tests.kit.site_stores import SiteStoreSpec, write_site_store
+from tests.kit.stores import StoreSpec, rerun_source, write_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.schemas.errors import Note
 from vla_attention.schemas.interventions import Interventions, NoiseChange
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
-from vla_attention.testing.stores import StoreSpec, rerun_source, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, contributions=True)
 NAMED = "among its episodes: README.md, notes, task000_episode007, task0_episode1, task1\\x1b; they are no episodes."

@@ -15,11 +15,11 @@ from typing import Any
 
 import pytest
 
+from tests.kit.stores import StoreSpec, reseal, reseal_root, write_store
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.schemas.command_line import run_command
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.testing.stores import StoreSpec, reseal, reseal_root, write_store
 
 FORGED = "FORGED: all whole"
 #: Clears a screen, reverses the direction of writing, sets a title (C1), ends a line in five ways.

@@ -19,6 +19,9 @@ from tests.kit.examples import examples
 from tests.kit.questions import question_about
 from tests.kit.small_torch_policy import HORIZON, SmallPolicy, small_layout
 from tests.kit.small_torch_policy import given as policy_inputs
+from tests.kit.stores import StoreSpec, write_store
+from tests.kit.strategies import episode_tokens
+from tests.kit.tokens import OBJECTS, small_prompt, tokens_of
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.objects import objects
 from vla_attention.analyze.measures.patch_maps import PictureMap
@@ -35,9 +38,6 @@ from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, SceneObjec
 from vla_attention.schemas.interventions import ImageChange
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, camera_grids
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing.stores import StoreSpec, write_store
-from vla_attention.testing.strategies import episode_tokens
-from vla_attention.testing.tokens import OBJECTS, small_prompt, tokens_of
 
 WHOLE, TOP, LEFT = (0.0, 0.0, 1.0, 1.0), (0.0, 0.0, 0.5, 1.0), (0.0, 0.0, 1.0, 0.5)
 

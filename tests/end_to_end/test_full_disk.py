@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 
+from tests.kit.site_stores import SiteStoreSpec, write_site_store
+from tests.kit.stores import StoreSpec, rerun_source, write_store
 from vla_attention.schemas.interventions import Interventions, NoiseChange
-from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
-from vla_attention.testing.stores import StoreSpec, rerun_source, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, contributions=True)
 OUT = ("--output", "OUT", "--no-cache")

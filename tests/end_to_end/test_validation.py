@@ -17,11 +17,11 @@ from benchmarks.validation.policies import load_policy
 from benchmarks.validation.tables import spearman
 from tests.kit.made_up_demonstrations import INSTRUCTIONS, write_demonstrations
 from tests.kit.reruns import BASE, base_actions, write_base
+from tests.kit.stores import rerun_source, write_store
 from vla_attention.analyze.effects.effect_study import study_effects
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing.stores import rerun_source, write_store
 
 
 def quiet(line: str) -> None:

@@ -21,6 +21,8 @@ import numpy as np
 import polars as pl
 
 import vla_attention as va
+from tests.kit.site_stores import SiteStoreSpec, write_site_store
+from tests.kit.stores import StoreSpec, small_effects, small_steps, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.api import OpenStores
 from vla_attention.analyze.core.contributions import group_norms
@@ -28,8 +30,6 @@ from vla_attention.schemas.effects import CHANGE, CUT
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.seal import SEAL_FILE
-from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
-from vla_attention.testing.stores import StoreSpec, small_effects, small_steps, write_store
 
 #: Small enough that every analysis takes some hundredths of a second.
 SPEC = StoreSpec(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from tests.kit.stores import write_store
 from vla_attention.__main__ import main
-from vla_attention.testing.stores import write_store
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,8 @@ import sys
 import pytest
 
 from tests.kit.stopped_programs import after_call, at_import, run_stopped
+from tests.kit.stores import StoreSpec, write_store
 from vla_attention.schemas.stop_signals import run_until_stopped, stops_kept_from_children
-from vla_attention.testing.stores import StoreSpec, write_store
 
 pytestmark = pytest.mark.usefixtures("usual_signals")
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.cache.housekeeping import clear, kept_files, make_room
 from vla_attention.analyze.cache.kept_files import ENDING, kept_bytes, write_file
 from vla_attention.analyze.cache.places import CachePlace
-from vla_attention.testing.stores import StoreSpec, write_store
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,7 @@ import pytest
 
 import vla_attention as va
 from tests.kit.attacks import attacks, files_of, first, two
+from tests.kit.stores import StoreSpec, write_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.cache import fingerprints, remembered
 from vla_attention.analyze.cache.housekeeping import kept_files
@@ -28,7 +29,6 @@ from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
-from vla_attention.testing.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=9, contributions=True, prompts="same")
 ARRAYS = (

@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 from tests.kit.paths import ROOT
+from tests.kit.stores import StoreSpec, rerun_source, write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.compare import compare
 from vla_attention.analyze.core import runs as runs_module
@@ -21,7 +22,6 @@ from vla_attention.analyze.core.runs import (
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.render.terminal import screen
 from vla_attention.schemas.layout import Role
-from vla_attention.testing.stores import StoreSpec, rerun_source, write_store
 
 TASKS, EPISODES = (0, 1, 2, 5), 4
 

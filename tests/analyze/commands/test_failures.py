@@ -14,6 +14,7 @@ import vla_attention as va
 from tests.kit.made_up_behaviour import COLOURS, did, goals_of
 from tests.kit.paths import ROOT
 from tests.kit.questions import question_about
+from tests.kit.stores import StoreSpec, rerun_source, small_steps, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.commands.failures import failures
 from vla_attention.analyze.core.behaviour import NO_TOUCH, OTHER_GOAL, OTHER_TOUCH, TOLD_SO, UNFINISHED
@@ -22,7 +23,6 @@ from vla_attention.analyze.show.patch_pictures import upright
 from vla_attention.analyze.statistics.leaving import TOGETHER, band, by_replan, distance, leaves_at, path_of
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing.stores import StoreSpec, rerun_source, small_steps, write_store
 
 REPLANS, TURN = 8, 3
 SPEC = StoreSpec(tasks=(0, 1), episodes=6, replans=REPLANS, layers=(0,), heads=(0,), denoise_steps=(9,))

@@ -20,13 +20,13 @@ from polars.testing import assert_frame_equal
 from tests.kit.bowl_scene import CAMERAS, bowl_coverage, bowl_tokens, write_bowl_store
 from tests.kit.examples import examples
 from tests.kit.questions import question_about
+from tests.kit.tokens import OBJECTS, random_rows
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.objects import objects
 from vla_attention.analyze.commands.words import words
 from vla_attention.analyze.core.object_maps import enrichment_on
 from vla_attention.analyze.core.result import Result
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
-from vla_attention.testing.tokens import OBJECTS, random_rows
 
 QUICK = settings(
     max_examples=examples(2), phases=[Phase.explicit, Phase.generate], deadline=None,

@@ -12,7 +12,7 @@ import polars as pl
 import pytest
 import zarr
 
-import vla_attention.testing.stores as kit
+import tests.kit.stores as kit
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.overlay import overlay

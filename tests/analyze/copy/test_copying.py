@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.kit.stores import StoreSpec, reseal, small_effects, small_steps, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.copy.copying import PARTS, copy_store, part_sizes
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode, RunMismatch, StoreError
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import StoreSpec, reseal, small_effects, small_steps, write_store
 
 SPEC = StoreSpec(
     tasks=(0,),

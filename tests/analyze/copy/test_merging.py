@@ -10,13 +10,12 @@ from pathlib import Path
 import pytest
 
 from tests.kit.attacks import files_of
+from tests.kit.stores import StoreSpec, assert_whole, reseal, root_attributes, write_episode, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.analyze.copy.merging import merge_stores
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing import assert_whole
-from vla_attention.testing.stores import StoreSpec, reseal, root_attributes, write_episode, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=1, layers=(0,), heads=(0,))
 

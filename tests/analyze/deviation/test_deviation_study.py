@@ -10,9 +10,9 @@ import pytest
 import zarr
 
 from tests.kit.questions import question_about
+from tests.kit.site_stores import write_site_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.deviation.deviation_study import study_deviation
-from vla_attention.testing.site_stores import write_site_store
 
 
 @pytest.fixture(scope="module")

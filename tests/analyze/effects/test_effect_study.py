@@ -22,6 +22,7 @@ from tests.kit.reruns import (
     write_rerun,
     write_series,
 )
+from tests.kit.stores import expected_arrays, rerun_source, write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.effects.effect_study import study_effects
 from vla_attention.analyze.effects.paired_replans import BaseEpisode
@@ -32,7 +33,6 @@ from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange, RerunSource
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.store_format import StoreError, StoreNotFound
-from vla_attention.testing.stores import expected_arrays, rerun_source, write_store
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,8 @@ import polars as pl
 import pytest
 
 from tests.kit.planted_effects import FIRST, ITEMS, RANDOM, READERS, WORDS, planted_effects
+from tests.kit.stores import StoreSpec, write_store
+from tests.kit.tokens import INSTRUCTIONS
 from vla_attention.analyze.effects.answer import mostly_one_dimension, word_lines
 from vla_attention.analyze.effects.effect_study import study_effects
 from vla_attention.analyze.effects.item_rows import item_rows, ratio_of_effects, ratios_by_family
@@ -16,8 +18,6 @@ from vla_attention.analyze.effects.over_time import shares_of_dimensions
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.show.findings import findings
 from vla_attention.analyze.show.numbers import format_number
-from vla_attention.testing.stores import StoreSpec, write_store
-from vla_attention.testing.tokens import INSTRUCTIONS
 
 
 @pytest.fixture(scope="module")

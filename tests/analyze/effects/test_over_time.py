@@ -8,10 +8,10 @@ import pytest
 import zarr
 
 from tests.kit.planted_effects import FIRST, planted_effects
+from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.effects.effect_study import study_effects
 from vla_attention.analyze.effects.over_time import effects_by_replan, effects_over_time
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
-from vla_attention.testing.stores import StoreSpec, write_store
 
 REPLANS = 4
 

@@ -15,13 +15,13 @@ from hypothesis import strategies as st
 import vla_attention as va
 from tests.kit.questions import question_about
 from tests.kit.raw_rows import FEW
+from tests.kit.stores import StoreSpec, write_store
+from tests.kit.strategies import episode_tokens
 from tests.kit.uniform_cases import TABLE, tokens_of_case, write_case
 from vla_attention.analyze.core.camera_maps import camera_names, episode_maps
 from vla_attention.analyze.measures.baselines import uniform_keys
 from vla_attention.analyze.measures.sinks import SinkRule, search_sinks
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
-from vla_attention.testing.stores import StoreSpec, write_store
-from vla_attention.testing.strategies import episode_tokens
 
 #: Stored in float32.
 CLOSE = 2e-6

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
+from tests.kit.stores import write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.stores.checking import faults_of_each
 from vla_attention.analyze.stores.parallel import workers
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import write_store
 
 
 @pytest.fixture

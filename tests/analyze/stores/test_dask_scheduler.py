@@ -10,11 +10,11 @@ from polars.testing import assert_frame_equal
 
 import vla_attention as va
 from tests.analyze.stores.episode_work import slow_square
+from tests.kit.stores import write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.stores import parallel
 from vla_attention.analyze.stores.parallel import map_episodes, workers
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.testing.stores import write_store
 
 pytestmark = pytest.mark.thorough
 

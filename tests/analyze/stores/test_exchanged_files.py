@@ -12,6 +12,7 @@ import pytest
 
 import vla_attention as va
 from tests.kit.attacks import attacks, edit_root, encode_again, first, root_leaves
+from tests.kit.stores import StoreSpec, reseal_root, write_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.api import OpenStores
@@ -20,7 +21,6 @@ from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import StoreSpec, reseal_root, write_store
 
 #: Both episodes of a task have arrays of the same shapes; rows are in three blocks.
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=9, contributions=True, prompts="same")

@@ -10,11 +10,11 @@ from polars.testing import assert_frame_equal
 
 import vla_attention as va
 from tests.analyze.stores.episode_work import damaged, defect, killed_at_two, process_of, square
+from tests.kit.stores import write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.stores.parallel import WorkersLost, each_episode, map_episodes, workers
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.store_format import CorruptEpisode
-from vla_attention.testing.stores import write_store
 
 #: The ends of the folders' names in the files.
 OWN, OTHERS = b"/a/", b"/b/"

@@ -13,11 +13,11 @@ import pytest
 import vla_attention as va
 from tests.kit.browser import Watched, needs_chromium, watched_page
 from tests.kit.http_ranges import serve
+from tests.kit.stores import StoreSpec, rerun_source, write_store
 from tests.kit.viewer import served
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.view.server import ViewerServer
 from vla_attention.schemas.interventions import Interventions, PromptChange
-from vla_attention.testing.stores import StoreSpec, rerun_source, write_store
 
 pytestmark = needs_chromium
 

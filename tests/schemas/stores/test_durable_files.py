@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from tests.kit.durable_stores import write_store
+from tests.kit.stores import StoreSpec
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.testing.stores import StoreSpec
 
 SPEC = StoreSpec(tasks=(0, 2), episodes=2, replans=2)
 

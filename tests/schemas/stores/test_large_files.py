@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from tests.kit.durable_stores import write_store
+from tests.kit.stores import StoreSpec
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.store import codecs
 from vla_attention.schemas.stores import reader, sealed_files
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import StoreSpec
 
 MOST = 5_000
 ROWS = "joint/rows/c.0.0.0.0.0.0"

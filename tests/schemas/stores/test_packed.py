@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.analyze.copy.packing import write_zip
@@ -19,7 +20,6 @@ from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.digest import seal_digest
 from vla_attention.schemas.stores.packed_index import INDEX_FILE
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0,), episodes=2, replans=2, layers=(0, 2), denoise_steps=(0, 9), heads=(0,))
 FIRST, SECOND = (f"episodes/task000_000/task000_episode00{i}.zip" for i in (0, 1))

@@ -17,6 +17,7 @@ import pytest
 from tests.kit.attacks import files_of
 from tests.kit.crashes import before_call, die, run_child
 from tests.kit.still_scene import capture_without_simulator
+from tests.kit.stores import StoreSpec, write_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main
@@ -29,7 +30,6 @@ from vla_attention.schemas.stores.repair import damaged_folder, repair_store
 from vla_attention.schemas.stores.store_format import StoreError
 from vla_attention.schemas.stores.verify import verify_store
 from vla_attention.schemas.stores.worker import Worker, this_worker
-from vla_attention.testing.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0, 2), episodes=2, replans=1, layers=(0,), heads=(0,), frames=False)
 DAMAGED, WHOLE = "task000_episode001", ["task000_episode000", "task002_episode000", "task002_episode001"]

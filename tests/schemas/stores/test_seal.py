@@ -15,12 +15,12 @@ import pytest
 
 import vla_attention as va
 from tests.kit.attacks import FIRST, forge_chunk
+from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.schemas.stores import shards
 from vla_attention.schemas.stores.digest import seal_digest
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
-from vla_attention.testing.stores import StoreSpec, write_store
 
 #: Two layers and two denoise steps: four chunks of 39 keys.
 SPEC = StoreSpec(tasks=(0, 1), episodes=1, replans=9)

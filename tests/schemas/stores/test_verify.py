@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 
 from tests.kit.attacks import files_of, with_checksum
 from tests.kit.examples import examples
+from tests.kit.stores import StoreSpec, reseal, small_steps, write_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 from vla_attention.schemas.stores.verify import Fault, verify_store
-from vla_attention.testing.stores import StoreSpec, reseal, small_steps, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=1, replans=3, heads=(0,), plant_steps=small_steps)
 EPISODE = "task000_episode000"

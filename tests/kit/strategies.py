@@ -1,22 +1,14 @@
-"""Hypothesis strategies: random layouts, tokens and groupings, all of them valid.
-
-Importing this module needs hypothesis, which vla-attention does not install.
-"""
+"""Hypothesis strategies: random layouts, tokens and groupings, all of them valid."""
 
 from __future__ import annotations
 
 import numpy as np
+from hypothesis import strategies as st
 
-from vla_attention.schemas.errors import MissingDependency
+from tests.kit.tokens import SpelledPrompt, spell_prompt, tokens_of
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, ObjectKind, SceneObject
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, SpanKind
-from vla_attention.testing.tokens import SpelledPrompt, spell_prompt, tokens_of
-
-try:
-    from hypothesis import strategies as st
-except ImportError:
-    raise MissingDependency("vla_attention.testing.strategies needs hypothesis: pip install hypothesis.") from None
 
 NOUNS = ("bowl", "plate", "drawer", "stove", "mug")
 #: Parts of its picture that a span of a camera covers; None: a token that lies nowhere in it.

@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tests.kit.tokens import INSTRUCTIONS, random_rows, small_layout, small_tokens
 from vla_attention.capture.store.episode_writer import EpisodeWriter
 from vla_attention.capture.store.replan_records import (
     EpisodeStart,
@@ -35,6 +36,7 @@ from vla_attention.schemas.layout import Role, SiteLayout, picture_size
 from vla_attention.schemas.precision import round_mantissa
 from vla_attention.schemas.segments import segment_members, segments_of
 from vla_attention.schemas.stores.digest import with_digest
+from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.root import read_run
 from vla_attention.schemas.stores.seal import seal_episode
 from vla_attention.schemas.stores.store_format import (
@@ -46,7 +48,7 @@ from vla_attention.schemas.stores.store_format import (
     Recording,
     RootAttributes,
 )
-from vla_attention.testing.tokens import INSTRUCTIONS, random_rows, small_layout, small_tokens
+from vla_attention.schemas.stores.verify import verify_store
 
 #: Task, episode, the episode's tokens and random rows (replan, layer, denoise, head, query, key) to the rows to store.
 PlantRows = Callable[[int, int, EpisodeTokens, NDArray[np.float32]], NDArray[np.floating]]
@@ -429,3 +431,9 @@ def gram_of(vectors: NDArray[np.float64]) -> NDArray[np.float32]:
     parts = np.concatenate([vectors, vectors.sum(axis=3, keepdims=True)], axis=3)
     gram: NDArray[np.float32] = np.einsum("ldqaw,ldqbw->ldab", parts, parts).astype(np.float32) / vectors.shape[2]
     return gram
+
+
+def assert_whole(path: Path) -> None:
+    """Raise `AssertionError` with every fault of the store at `path`."""
+    faults = verify_store(open_store(path))
+    assert not faults, "; ".join(f"{fault.where}: {fault.problem}" for fault in faults)

@@ -1,4 +1,4 @@
-"""The shipped kit: what it says a store holds is what plain Zarr finds."""
+"""The made-up stores: what it says a store holds is what plain Zarr finds."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import zarr
 
-import vla_attention.testing as kit
+from tests.kit import stores as kit
+from tests.kit.tokens import libero_tokens
 from vla_attention.schemas.stores.store_format import NUMBERS
 
 
@@ -15,7 +16,7 @@ from vla_attention.schemas.stores.store_format import NUMBERS
     [
         kit.StoreSpec(),
         kit.StoreSpec(mantissa_bits=23, queries="all", frames=False, coverage=False, tasks=(4,), episodes=1),
-        kit.StoreSpec(tokens=kit.libero_tokens(2), layers=(1,), heads=(0,), tasks=(0,), episodes=1),
+        kit.StoreSpec(tokens=libero_tokens(2), layers=(1,), heads=(0,), tasks=(0,), episodes=1),
     ],
     ids=["default", "all queries, no pictures", "libero"],
 )

@@ -19,6 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tests.kit.tokens import INSTRUCTIONS
 from vla_attention.capture.store.replan_records import EpisodeStart, RecordedRows, ReplanRecord
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.groupings.key_counts import uniform_rows
@@ -34,7 +35,6 @@ from vla_attention.schemas.stores.store_format import (
     Recording,
     RootAttributes,
 )
-from vla_attention.testing.tokens import INSTRUCTIONS
 
 _NUM_LAYERS, _NUM_HEADS, _PROMPT_KEYS = 4, 3, 12
 #: Generated tokens of a replan of the kind `growing` that become keys, at most; the last token is never one.
