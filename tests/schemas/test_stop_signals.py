@@ -69,14 +69,16 @@ def store(tmp_path_factory):
     return write_store(tmp_path_factory.mktemp("stopped") / "a.zarr", spec=StoreSpec(tasks=(0,), episodes=2, replans=2))
 
 
-WORKERS = "concurrent.futures.process"
+IN_A_POOL = ("concurrent.futures.process", "ProcessPoolExecutor", "submit")
 
 
 @pytest.mark.parametrize(
     ("moment", "words"),
     [
         (at_import("numpy"), []),
-        pytest.param(after_call(WORKERS, "ProcessPoolExecutor", "submit"), ["--workers", "2"], marks=pytest.mark.thorough),
+        pytest.param(
+            after_call(WORKERS, "ProcessPoolExecutor", "submit"), ["--workers", "2"], marks=pytest.mark.thorough
+        ),
         (after_call("os", "", "replace"), ["--no-plots"]),
     ],
     ids=["numpy", "workers", "first file"],
