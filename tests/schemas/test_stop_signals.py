@@ -76,9 +76,7 @@ IN_A_POOL = ("concurrent.futures.process", "ProcessPoolExecutor", "submit")
     ("moment", "words"),
     [
         (at_import("numpy"), []),
-        pytest.param(
-            after_call(WORKERS, "ProcessPoolExecutor", "submit"), ["--workers", "2"], marks=pytest.mark.thorough
-        ),
+        pytest.param(after_call(*IN_A_POOL), ["--workers", "2"], marks=pytest.mark.thorough),
         (after_call("os", "", "replace"), ["--no-plots"]),
     ],
     ids=["numpy", "workers", "first file"],
