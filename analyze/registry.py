@@ -68,10 +68,13 @@ COMMANDS: dict[str, Command] = {
         ("words runs/libero_10.zarr", "words runs/libero_10.zarr --task 3", "words runs/cosmos.zarr --by layer"),
     ),
     "objects": Command("which objects are looked at", folder=True),
-    "effects": Command("what the action depends on: without a word, a picture, an object", folder=True),
+    "effects": Command(
+        "what the action depends on: without a word, a picture, an object; or a data set's actions",
+        (*_ROWS, "by"),
+        examples=("effects runs/cubes.zarr", "effects runs/cubes.zarr --by task", "effects runs/droid.zarr"),
+    ),
     "compare": Command("two or more runs, paired where they share initial states and seeds", folder=True),
     "overlay": Command("attention on the stored pictures: strips, GIF or MP4", folder=True),
-    "deviation": Command("how far actions are from the data set's, beside attention", folder=True),
     "report": Command(
         "all of it in one HTML file",
         (*_ROWS, *_GROUPING, "num_episodes", "num_replans", "open"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
@@ -17,17 +18,14 @@ from vla_attention.analyze.compare.differences import (
 )
 from vla_attention.analyze.compare.replan_pairs import is_rerun
 from vla_attention.analyze.compare.runs import Run
-from vla_attention.analyze.effects.conditions import Reader
-from vla_attention.analyze.effects.effect_study import EffectStudy, study_effects
-from vla_attention.analyze.effects.item_rows import item_rows
-from vla_attention.analyze.effects.paired_replans import ALL
-from vla_attention.analyze.effects.reruns import recorded_conditions
+from vla_attention.analyze.core.action_changes import units_of_recorded
+from vla_attention.analyze.core.recorded_effects import recorded_effects
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.schemas.errors import BadArgument, listing
 
-#: The readers whose effects are compared; see `conditions.Reader`.
-_READERS: tuple[Reader, ...] = ("total", "direct")
+#: The readers whose effects are compared.
+_READERS = ("total", "direct")
 _NO_BLOCK = pl.lit(None, pl.Int64).alias("block")
 EMPTY = pl.DataFrame(schema={"run": pl.String, "item": pl.String, "reader": pl.String, **DIFFERENCE_SCHEMA})
 
@@ -44,7 +42,7 @@ def effect_differences(
         `reader` ("total", "direct") for the quantity; and notes. Effects are in the spread of their own run's actions,
         over the dimensions that all runs compare.
     """
-    having = [run for run in runs if any(recorded_conditions(store) for store in run.stores)]
+    having = [run for run in runs if any(store.attributes.recording.effects for store in run.stores)]
     if runs[0] not in having or len(having) < 2:
         lacking = [run.name for run in runs if run not in having]
         return EMPTY, [f"effects are not compared: {listing(lacking)} recorded none."] if having else []
@@ -80,33 +78,18 @@ def effect_differences(
 
 def _values(runs: Sequence[Run]) -> Mapping[str, pl.DataFrame]:
     """By run, one row per episode with a column `READER ITEM` for every effect."""
-    studies = {run.name: _studies(run) for run in runs}
-    used = np.all([study.spread.used for of_run in studies.values() for study in of_run], axis=0)
+    units = {run.name: units_of_recorded(*run.stores) for run in runs}
+    used = np.all([spread.used for spread in units.values()], axis=0)
     if not used.any():
         raise BadArgument("no dimension of the action is compared in all of the runs.")
-    dimensions = [int(number) for number in np.flatnonzero(used)]
-    if any((study.spread.used != used).any() for of_run in studies.values() for study in of_run):
-        studies = {run.name: _studies(run, dimensions) for run in runs}
-    return {
-        name: pl.concat([_by_episode(study) for study in of_run], how="diagonal") for name, of_run in studies.items()
+    found = {
+        run.name: recorded_effects(run.question, attention=False, spread=replace(units[run.name], used=used))
+        for run in runs
     }
+    return {name: _by_episode(effects.episodes()) for name, effects in found.items() if effects is not None}
 
 
-def _studies(run: Run, dimensions: Sequence[int] | None = None) -> list[EffectStudy]:
-    settings = run.question.settings
-    return [study_effects(store.path, [], settings, dimensions) for store in run.stores if recorded_conditions(store)]
-
-
-def _by_episode(study: EffectStudy) -> pl.DataFrame:
-    columns = {
-        f"{reader} {item.name}": item.by_reader[reader]["condition"]
-        for item in item_rows(study)
-        for reader in _READERS
-        if reader in item.by_reader
-    }
-    whole = study.episodes.filter(phase=ALL)
-    table = whole.select(EPISODE_ID).unique(maintain_order=True)
-    for name, condition in columns.items():
-        of = whole.filter(condition=condition).select(*EPISODE_ID, pl.col("effect").alias(name))
-        table = table.join(of, on=EPISODE_ID, how="left", maintain_order="left")
-    return table.select("suite", "task_id", "episode_index", *columns)
+def _by_episode(episodes: pl.DataFrame) -> pl.DataFrame:
+    rows = episodes.filter(pl.col("reader").is_in(_READERS), kind="without")
+    named = rows.with_columns(quantity=pl.format("{} {}", "reader", "item"))
+    return named.pivot("quantity", index=EPISODE_ID, values="effect")

@@ -43,8 +43,8 @@ def ratios_by(levels: Levels, by: Collection[str]) -> pl.DataFrame:
         logs = {name: pl.col(name).log() for name in ("ratio", "uniform_ratio", "ratio_lift")}
         plain = ("numerator_fraction", "denominator_fraction", "numerator_mass", "denominator_mass")
         return cells.group_by(names, maintain_order=True).agg(
-            *(_weighted(log, weight).exp().alias(name) for name, log in logs.items()),
-            *(_weighted(pl.col(name), weight).alias(name) for name in plain),
+            *(weighted(log, weight).exp().alias(name) for name, log in logs.items()),
+            *(weighted(pl.col(name), weight).alias(name) for name in plain),
             (~logs["ratio"].is_finite().fill_null(False)).sum().cast(pl.Int64).alias("num_nonfinite"),
         )
 
@@ -65,7 +65,7 @@ def groups_by(levels: Levels, by: Collection[str]) -> pl.DataFrame:
         rows = _with_time(rows, levels.measured)
         names = [*EPISODE_KEYS, *_names(by, axes), "group"]
         return rows.group_by(names, maintain_order=True).agg(
-            _weighted(pl.col(name), pl.col("weight")).alias(name) for name in ("keys", "mass", "fraction", "lift")
+            weighted(pl.col(name), pl.col("weight")).alias(name) for name in ("keys", "mass", "fraction", "lift")
         )
 
     made = partial(means, by=frozenset({*axes, *(("replan",) if "time" in by else ())}))
@@ -77,7 +77,7 @@ def _names(by: Collection[str], axes: Sequence[str]) -> list[str]:
     return [*(name for axis in axes for name in columns[axis]), *(("phase",) if "time" in by else ())]
 
 
-def _weighted(value: pl.Expr, weight: pl.Expr) -> pl.Expr:
+def weighted(value: pl.Expr, weight: pl.Expr) -> pl.Expr:
     """Weighted mean over the finite values; null without any."""
     known = value.is_finite().fill_null(False)
     total = pl.when(known).then(weight).otherwise(0.0).sum()

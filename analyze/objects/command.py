@@ -73,7 +73,6 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure the objects; print them, write tables and pictures."""
-    from vla_attention.analyze.effects.text import recorded_sections
     from vla_attention.analyze.objects.object_settings import ObjectSettings
     from vla_attention.analyze.objects.object_study import study_objects
     from vla_attention.analyze.objects.text import objects_sections
@@ -100,6 +99,5 @@ def run(arguments: argparse.Namespace) -> int:
 
         return [*plot_object_shares(study, folder), *(plot_object_iou(study, folder) if not arguments.no_iou else [])]
 
-    sections = [*objects_sections(study), *recorded_sections(stores, settings, "object")]
-    answer = Answer(sections, study.files(), draw)
+    answer = Answer(objects_sections(study), study.files(), draw)
     return show(answer, output_folder(arguments, "objects"), arguments)

@@ -64,9 +64,8 @@ CASES: dict[str, tuple[tuple[str, ...], ...]] = {
     "cubes_export": (("analyze", "cubes.zarr"),),
     "cubes_per_head": (("analyze", "cubes.zarr", "--by", "head", "--task", "0"),),
     "pair_compare": (("compare", "cubes.zarr", "one_colour.zarr"),),
-    "reruns_effects": (("effects", "cubes.zarr", "RERUNS"),),
     "noise_compare": (("compare", "cubes.zarr", "RERUN"),),
-    "effects_effects": (("effects", "effects.zarr"),),
+    "effects_effects": (("effects", "effects.zarr"), ("effects", "effects.zarr", "--by", "task")),
     "effects_analyze": (("analyze", "effects.zarr"),),
     "effects_words": (("words", "effects.zarr"),),
     "libero_analyze": (("analyze", "libero.zarr"),),
@@ -80,7 +79,7 @@ CASES: dict[str, tuple[tuple[str, ...], ...]] = {
     "cosmos_cross": (("analyze", "cosmos.zarr", "--site", "cross"),),
     "cosmos_heads": tuple(("analyze", "cosmos.zarr", *more) for more in _HEADS),
     "cosmos_groups": (("analyze", "cosmos.zarr", "--list"),),
-    "replay_deviation": (("deviation", "replay.zarr"),),
+    "replay_deviation": (("effects", "replay.zarr"),),
     "published_results": (("parse", "cubes.zarr"),),
     "published_comparison": (("parse", "cubes.zarr", "libero.zarr"),),
 }
@@ -236,15 +235,18 @@ class Form:
         keys: the columns by which rows are matched.
         rows: today's rows, in the kept columns, from all tables of the results.
         gone: kept columns that are given no more.
+        still: the kept rows that are given still.
     """
 
     keys: tuple[str, ...]
     rows: Callable[[Mapping[str, pl.DataFrame]], pl.DataFrame]
     gone: tuple[str, ...] = ()
+    still: pl.Expr | None = None
 
     def differences(self, tables: Mapping[str, pl.DataFrame], kept: pl.DataFrame) -> list[str]:
         """Where today's rows differ from the kept ones."""
         floats = [pl.col(name).round(9) for name in self.keys if kept.schema[name].is_float()]
+        kept = kept if self.still is None else kept.filter(self.still)
         kept = kept.drop(self.gone, strict=False).with_columns(floats)
         rows = (
             self.rows(tables)
@@ -304,6 +306,22 @@ _OF_DENOISE = (
     "geometric_left_out", "nonfinite_layers", "numerator_mass", "denominator_mass", "ratio_mean", "ratio_mean_low",
     "ratio_mean_high", "ratio_of_means_low", "ratio_of_means_high",
 )  # fmt: skip
+_CHANGED = ("effect", "effect_chunk", "angle", "gripper_flips", "mass", "lift", "norm", "keys", "noise")
+_WHOLE = pl.col("phase") == "all"
+_ENDS = ("", "_low", "_high", "_episodes", "_q", "_p")
+
+
+def _gone(*names: str) -> tuple[str, ...]:
+    """The columns of values, with all that is said of them."""
+    return tuple(f"{name}{end}" for name in names for end in _ENDS)
+
+
+def _effects(tables: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
+    whole = tables["effects_summary"].with_columns(scope=pl.lit("all"))
+    tasks = tables["1/effects_summary"].with_columns(scope=pl.lit("task"))
+    return pl.concat([whole, tasks], how="diagonal")
+
+
 #: (Command, or the end of a case's name; kept table) -> how it is found.
 FORMS: dict[tuple[str, str], Form] = {
     ("words", "words_summary"): Form(
@@ -350,6 +368,48 @@ FORMS: dict[tuple[str, str], Form] = {
     ),
     ("heads", "sinks"): Form((*_EPISODE[:2], "key"), lambda tables: tables["2/sinks"]),
     ("heads", "sink_heads"): Form((*_EPISODE[:2], "key", "layer", "head"), lambda tables: tables["2/sink_heads"]),
+    ("effects", "effects"): Form(
+        (*_EPISODE, "condition"),
+        lambda tables: tables["effects_episodes"],
+        ("phase", "group", "random", "minus_random"),
+        _WHOLE,
+    ),
+    ("effects", "effects_summary"): Form(
+        ("scope", "suite", "task_id", "condition"),
+        _effects,
+        (
+            "phase",
+            "group",
+            *_gone("random", "minus_random", "over_random"),
+            *(f"{name}_episodes" for name in (*_CHANGED, "over_noise", "minus_noise")),
+        ),
+        _WHOLE,
+    ),
+    ("effects", "effects_by_condition_plotted"): Form(
+        ("condition",),
+        lambda tables: tables["effects_summary"],
+        ("row", "point"),
+        pl.col("point").is_in(["without", "direct", "only"]),
+    ),
+    ("effects", "attention_and_effect_plotted"): Form(
+        ("effect",),
+        lambda tables: tables["effects_summary"],
+        ("group",),
+    ),
+    ("deviation", "deviation"): Form(
+        ("scope", "suite", "task_id"),
+        lambda tables: tables["deviation"],
+        ("phase", "first_episodes", "chunk_episodes"),
+        _WHOLE,
+    ),
+    ("deviation", "deviation_dimensions"): Form(
+        ("dimension",),
+        lambda tables: tables["deviation_dimensions"],
+        (*(f"{name}_episodes" for name in ("first", "chunk", "bias")), "bias_p"),
+    ),
+    ("deviation", "deviation_attention"): Form(
+        ("quantity", "of", "measure"), lambda tables: tables["deviation_attention"], ("correlation_episodes",)
+    ),
     ("time", "time_course"): Form(("quantity", "position"), _time_course, _COURSE),
 }
 

@@ -7,10 +7,11 @@ from dataclasses import replace
 import pytest
 
 from tests.kit.planted_effects import FIRST, ITEMS, planted_effects
+from tests.kit.questions import question_about
+from vla_attention.analyze.commands.effects import effects
 from vla_attention.analyze.compare.comparison import compare
 from vla_attention.analyze.compare.runs import open_runs, parse_runs
 from vla_attention.analyze.compare.text import comparison_sections
-from vla_attention.analyze.effects.effect_study import study_effects
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.show.answer import text_of
 from vla_attention.testing.stores import StoreSpec, write_store
@@ -47,14 +48,13 @@ def compared(stores, *names, allowed=()):
 
 def test_the_differences_are_those_of_the_two_commands(stores):
     comparison = compared(stores, "base", "other")
-    studies = [study_effects(stores[name], [], SETTINGS) for name in ("base", "other")]
+    tables = [
+        effects(question_about(stores[name], intervals="these-tasks"))["effects_items"] for name in ("base", "other")
+    ]
     rows = comparison.effects.filter(scope="all")
     assert rows.height == 2 * len(ITEMS)
     for row in rows.iter_rows(named=True):
-        bare = row["item"].strip("'")
-        group = bare if row["item"] == bare else f"word_{bare}"
-        name = f"without_{group}" + ("_queries_all" if row["reader"] == "total" else "")
-        sides = [study.summary.filter(scope="all", phase="all", condition=name)["effect"].item() for study in studies]
+        sides = [table.filter(item=row["item"])[row["reader"]].item() for table in tables]
         assert [row["mean_first"], row["mean_other"]] == pytest.approx(sides, rel=1e-9)
         assert row["difference"] == pytest.approx(sides[1] - sides[0], rel=1e-6, abs=1e-9)
         assert row["paired"]
