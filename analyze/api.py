@@ -1,7 +1,7 @@
 """The Python API: an opened store whose methods are the commands of `vla-analyze` and return polars frames.
 
-The examples run as tests, with `store` and `other` being paths of small stores, `rerun` that of a rerun of `store`, and
-`folder` that of an empty folder.
+The examples run as tests, with `store` and `other` being paths of small stores, `with_effects` and `replayed` those of
+stores with recorded effects and of a replayed data set, and `folder` that of an empty folder.
 """
 
 from __future__ import annotations
@@ -204,61 +204,23 @@ class OpenStores:
         runs = [RunArgument(name, tuple(one.path for one in run.stores)) for name, run in zip(names, both, strict=True)]
         return Answer.of(compared(runs, settings_from_keywords(**settings), _names(allow_mismatch)))
 
-    def effects(
-        self,
-        reruns: str | Path | Sequence[str | Path] = (),
-        table: Literal["summary", "episodes", "rollouts", "rollout_episodes", "replans"] = "summary",
-        dimensions: Sequence[int] | None = None,
-        **settings: Unpack[SettingKeywords],
-    ) -> pl.DataFrame:
-        """How much actions change in reruns of this store, beside its attention, noise and random keys.
+    def effects(self, by: Sequence[str] = (), **settings: Unpack[SettingKeywords]) -> Answer:
+        """What the action depends on, as far as the run recorded it (`vla-attention capture --effects`).
 
-        `reruns`: stores of `vla-capture rerun`, rollouts with interventions, or folders of them; this is their base.
-        Without any, the effects that were measured beside its own calls (`vla-capture --effects`).
-        `dimensions`: those of the action that are compared. "rollouts" compares success and number of steps, "replans"
-        has every replan of effects that were measured beside the calls.
+        Tables "effects_items", "effects_summary", "effects_episodes", "effects" (every replan, condition and reader),
+        "effects_time"; of a replayed data set "deviation", "deviation_dimensions", "deviation_attention",
+        "deviation_replans". `by`: keep apart task, family, episode, replan or time.
 
-        >>> effects = va.open(store).effects(rerun)
-        >>> effects.filter(scope="all", phase="all").select("condition", "group", "num_episodes").rows()
-        [('without_visual', 'visual', 4)]
+        >>> rows = va.open(with_effects).effects()["effects"]
+        >>> rows.filter(item="all pictures", reader="total").select("task_id", "replan").rows()[:2]
+        [(0, 0), (0, 1)]
+        >>> va.open(replayed).effects()["deviation"].filter(scope="all")["num_episodes"].to_list()
+        [6]
 
         Raises:
-            BadArgument: several stores are open, or a store is no rerun of this one.
+            BadArgument: the stores hold neither effects nor a data set's actions.
         """
-        from vla_attention.analyze.effects.effect_study import study_effects
-        from vla_attention.analyze.effects.over_time import effects_by_replan
-
-        known, stores = ("summary", "episodes", "rollouts", "rollout_episodes", "replans"), self.stores
-        if len(stores) > 1:
-            raise BadArgument(f"Effects are those of reruns of one store; {len(stores)} are open: open one of them.")
-        paths = [Path(reruns)] if isinstance(reruns, (str, Path)) else [Path(path) for path in reruns]
-        asked = settings_from_keywords(**settings)
-        check_name("table", table, known)
-        study = study_effects(stores[0].path, paths, asked, dimensions)
-        return effects_by_replan(study) if table == "replans" else _chosen(table, known, lambda: study)
-
-    def deviation(
-        self,
-        table: Literal["summary", "dimensions", "attention", "replans"] = "summary",
-        **settings: Unpack[SettingKeywords],
-    ) -> pl.DataFrame:
-        """How far the policy's actions are from the data set's that it was replayed over, in the data set's spread.
-
-        "summary": over everything, by task and phase. "dimensions": of the action. "attention": correlation with the
-        ratio and with lifts over replans. "replans": every replan.
-
-        >>> deviation = va.open(replayed).deviation()
-        >>> deviation.filter(scope="all", phase="all").select("num_episodes", "first_episodes").rows()
-        [(6, 6)]
-
-        Raises:
-            BadArgument: the stores hold no actions of a data set.
-        """
-        from vla_attention.analyze.deviation.deviation_study import study_deviation
-
-        check_name("table", table, ("summary", "dimensions", "attention", "replans"))
-        member = {"summary": "phases", "attention": "correlations"}.get(table, table)
-        return _chosen(member, (member,), lambda: study_deviation(self.ask(**settings)))
+        return self._answer("effects", settings, by=tuple(by))
 
     def overlay(
         self,
@@ -307,7 +269,7 @@ class OpenStores:
     def __repr__(self) -> str:
         lines = [
             *header_lines(self.stores),
-            "ask with .analyze() .words() .objects() .compare(other) .effects(reruns) .deviation() .overlay()",
+            "ask with .analyze() .words() .objects() .compare(other) .effects() .overlay()",
             "         .report(path) .to_xarray()",
         ]
         return "\n  ".join([str(self), *lines])

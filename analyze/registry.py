@@ -77,7 +77,11 @@ COMMANDS: dict[str, Command] = {
         _NO_PICTURES,
         ("objects runs/libero_10.zarr", "objects runs/libero_10.zarr --by layer", "objects runs/cubes.zarr --no-iou"),
     ),
-    "effects": Command("what the action depends on: without a word, a picture, an object", folder=True),
+    "effects": Command(
+        "what the action depends on: without a word, a picture, an object; or a data set's actions",
+        (*_ROWS, "by"),
+        examples=("effects runs/cubes.zarr", "effects runs/cubes.zarr --by task", "effects runs/droid.zarr"),
+    ),
     "compare": Command(
         "what changed between runs: success, what was done, actions of reruns, attention",
         (*_ROWS, *_GROUPING, "allow_mismatch"),
@@ -113,7 +117,6 @@ COMMANDS: dict[str, Command] = {
             "overlay runs/libero_10.zarr --replans 0 5 10 --cameras base_0_rgb",
         ),
     ),
-    "deviation": Command("how far actions are from the data set's, beside attention", folder=True),
     "report": Command(
         "all of it in one HTML file",
         (*_ROWS, *_GROUPING, "num_episodes", "num_replans", "open"),

@@ -11,6 +11,7 @@ In a null store every key's attention is the same in expectation; episodes and k
     drift     the same, while attention moves steadily from the text to the pictures
     compare   two runs of the same distribution, paired by initial state
     language  what is done has nothing to do with what is told (rollouts without attention: seconds)
+    effects   the action changes as much without each word as with another noise seed (tables: seconds)
 
 A planted store differs in one place: the attention to the word "the", to the first object, after the gripper closed,
 or of the second run, is higher, by `FACTOR` or a power of it.
@@ -29,6 +30,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -36,8 +38,13 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tests.kit.made_up_behaviour import STEPS, did, goals_of
 from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.analyze.commands.effects.answer import deciding
+from vla_attention.analyze.commands.effects.items import by_item
 from vla_attention.analyze.commands.language import listens
+from vla_attention.analyze.core.action_changes import ActionSpread
 from vla_attention.analyze.core.behaviour import with_choices
+from vla_attention.analyze.core.recorded_effects import summary_of
+from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
 
@@ -159,12 +166,42 @@ def says_it_listens(sets: int, planted: bool) -> float:
     return said / sets
 
 
+def names_a_word(sets: int, planted: float) -> float:
+    """The share of sets of recorded effects of which `effects` says that a word is shown to exceed another noise seed.
+
+    In a null set all words and another noise seed change the action by as much on average; tasks scatter, each word
+    scatters by tasks, and episodes scatter. In a planted set the first word changes it by `planted` more.
+    """
+    return sum(_shown_words(np.random.default_rng(number), planted) > 0 for number in range(sets)) / sets
+
+
+def _shown_words(generator: np.random.Generator, planted: float, tasks: int = 6, episodes: int = 3) -> int:
+    scene, rows = generator.normal(0, 0.2, (tasks, episodes)), []
+    for number in range(9):  # the last is another noise seed
+        of_task, name = generator.normal(0, 0.15, tasks), f"'{number}'" if number < 8 else "noise"
+        for task in range(tasks):
+            for episode in range(episodes):
+                effect = np.exp(scene[task, episode] + of_task[task] + generator.normal(0, 0.2)) - 0.5
+                rows.append((task, episode, name, effect + planted * (number == 0)))
+    frame = pl.DataFrame(rows, schema=["task_id", "episode_index", "item", "effect"], orient="row")
+    is_word, place = pl.col("item") != "noise", ["task_id", "episode_index"]
+    noise = frame.filter(~is_word).select(*place, noise="effect")
+    frame = frame.filter(is_word).join(noise, on=place).with_columns(
+        pl.lit("s").alias("suite"), pl.lit("without").alias("kind"), pl.lit("word").alias("item_kind"),
+        pl.lit("total").alias("reader"), pl.lit("").alias("selector"), pl.col("item").alias("condition"),
+        minus_noise=pl.col("effect") - pl.col("noise"), square=pl.col("effect") ** 2, gripper_square=pl.lit(0.0),
+        **dict.fromkeys(("effect_chunk", "angle", "gripper_flips", "keys", "mass", "lift", "norm"), pl.lit(1.0)),
+    )  # fmt: skip
+    words = by_item(summary_of(frame, Sampling()))
+    return int(deciding(words, ActionSpread(np.ones(7), np.ones(7, bool))).numbers["shown"] or 0)
+
+
 def main() -> None:
     """Print a line per command."""
     parser = argparse.ArgumentParser(description="How often commands name something in null stores.")
     parser.add_argument("--stores", type=int, default=200, help="stores of each kind (default: 200)")
     parser.add_argument("--planted", action="store_true", help="with something to find")
-    kinds = ["words", "objects", "time", "drift", "compare", "language"]
+    kinds = ["words", "objects", "time", "drift", "compare", "language", "effects"]
     parser.add_argument("--kinds", nargs="+", default=kinds)
     arguments = parser.parse_args()
     what = "planted" if arguments.planted else "null"
@@ -173,6 +210,10 @@ def main() -> None:
         if kind == "language":
             share = says_it_listens(arguments.stores, arguments.planted)
             print(f"  {kind:8} says that it listens in {share:.1%}", flush=True)
+            continue
+        if kind == "effects":
+            share = names_a_word(arguments.stores, 0.8 * arguments.planted)
+            print(f"  {kind:8} names a word in {share:.1%}", flush=True)
             continue
         named = 0
         for number in range(arguments.stores):

@@ -105,10 +105,8 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
     base = f"{example}/cubes.zarr"
     yield "compare", ["vla-analyze", "compare", base, f"{example}/cubes_one_colour.zarr", "--output", "results/compare"]
     yield "effects", ["vla-analyze", "effects", base, "--output", "results/effects"]
-    yield "effects_series", ["vla-analyze", "effects", cubes, "stores/series", "--output", "results/effects_series"]
-    rerun_of_it = ["--reruns", f"{example}/cubes_noise.zarr"]
-    yield "report_effects", ["vla-analyze", "report", base, *rerun_of_it, "--output", "results/report_effects"]
-    yield "deviation", ["vla-analyze", "deviation", "stores/replay.zarr", "--output", "results/deviation"]
+    yield "report_effects", ["vla-analyze", "report", base, "--output", "results/report_effects"]
+    yield "effects_of_data", ["vla-analyze", "effects", "stores/replay.zarr", "--output", "results/effects_of_data"]
     yield "own_groups", [
         "vla-analyze", base, "--group", "colour=word:red,word:green,word:blue", "--group", "seen=role:image", "--ratio",
         "seen/colour", "--output", "results/own_groups",

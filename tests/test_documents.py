@@ -16,7 +16,7 @@ from scripts.site_hooks import OUTSIDE
 from tests.kit.golden_tables import STORES
 from vla_attention.__main__ import COMMANDS as PROGRAM_COMMANDS
 from vla_attention.__main__ import main as vla_attention
-from vla_attention.analyze.ask import question_parser
+from vla_attention.analyze.command_line import build_parser as build_analyze_parser
 from vla_attention.analyze.registry import COMMANDS, DEFAULT_COMMAND
 from vla_attention.capture.commands.arguments import build_parser
 
@@ -101,10 +101,7 @@ def test_the_parsers_take_every_command_line(document):
         else:
             name = given[0] if given[0] in COMMANDS else DEFAULT_COMMAND
             given = given[given[0] in COMMANDS :]
-            place = f"vla_attention.analyze.{name}.command"
-            parser = import_module(place).build_parser() if COMMANDS[name].folder else question_parser(name)
-            for option in ("--threads", "--no-cache"):  # which all commands get when they run
-                given = [word for word in given if word != option]
+            parser = build_analyze_parser(name)
         parser.parse_args(given)  # a mistake ends it with a sentence and 2
 
 

@@ -8,22 +8,18 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import polars as pl
 
+from vla_attention.analyze.commands.effects import word_effects
 from vla_attention.analyze.commands.words import words
 from vla_attention.analyze.core.about import about, notes
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
-from vla_attention.analyze.effects.reruns import recorded_conditions
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.statistics.exact_tests import shuffled
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
-from vla_attention.schemas.errors import BadArgument, listing, plural
-
-if TYPE_CHECKING:
-    from vla_attention.analyze.effects.item_rows import ItemRow
+from vla_attention.schemas.errors import plural
 
 _LISTENS = "Does it listen?"
 #: From this share of episodes on, what was done most is said.
@@ -44,7 +40,7 @@ def language(question: Question) -> Result:
         failures = f"vla-attention failures {_paths(question)}" if (~asked["outcome"]).any() else ""
         behaved = replace(behaved, next_step=failures)
     done = _behaviour_tables(asked)
-    decide, effects = _effects(question)
+    decide, effects = word_effects(question)
     # Attention to the words: one call.
     read = words(question)
     missing = len(question.selected) - asked.height
@@ -152,92 +148,7 @@ _EPISODES = [
     Column("outcome", "text"),
     Column("left_out", "text", "left out", "why the episode cannot show listening", screen=False),
 ]
-_DECIDE = "Which words decide?"
-_MORE, _LESS, _OPEN, _UNTESTED = "more", "less", "too few episodes", "not tested"
 
 
-def _effects(question: Question) -> tuple[Finding, list[Table]]:
-    """How the action changes without each word, where the run recorded it."""
-    if len(question.stores) > 1 or not recorded_conditions(question.stores[0]):
-        which = "" if len(question.stores) == 1 else " of one store; several stores are asked one at a time"
-        rerun = f"vla-attention capture rerun {_paths(question, 1)} --effects text,cameras"
-        return Finding(f"Not recorded: how the action changes without a word{which}.", _DECIDE, next_step=rerun), []
-    # Effects, as today's study reads them: one call, which takes a second to import.
-    from vla_attention.analyze.effects.effect_study import study_effects
-    from vla_attention.analyze.effects.item_rows import item_rows
-
-    try:
-        study = study_effects(question.stores[0].path, [], question.settings)
-    except BadArgument as error:
-        return Finding(f"Not shown: {error}", _DECIDE), []
-    rows = [_word_row(row) for row in item_rows(study) if row.kind == "word"]
-    spoken = {word.text.casefold() for item in question.selected for line in item.tokens.words for word in line}
-    rows += [
-        {"word": f"'{word}'", "than_noise": _UNTESTED} for word in sorted(spoken - {str(r["word"])[1:-1] for r in rows})
-    ]
-    order = pl.col("than_noise").replace_strict({_MORE: 0, _UNTESTED: 2}, default=1)
-    table = pl.DataFrame(rows, schema=_EFFECT_SCHEMA).sort(order, "total", descending=[False, True], nulls_last=True)
-    return _deciding(table), [Table("word_effects", table, _EFFECTS, "What the action does without a word")]
-
-
-def _word_row(row: ItemRow) -> dict[str, object]:
-    most = row.strongest
-    q, above = most["minus_noise_q"], (most["minus_noise"] or 0.0) > 0
-    shown = _OPEN if q is None else _LESS if not above else _MORE if q <= NAMED_AT else "not shown to be more"
-    parts = {
-        f"{reader}{end}": of[f"effect{end}"]
-        for reader, of in row.by_reader.items()
-        if reader in ("total", "direct")
-        for end in ("", "_low", "_high")
-    }
-    sizes = {"turn": most["angle"], "grip": most["gripper_flips"], "noise": most["noise"]}
-    return {"word": row.name, **parts, **sizes, "episodes": most["num_episodes"], "than_noise": shown}
-
-
-def _deciding(table: pl.DataFrame) -> Finding:
-    tested_words = table.drop_nulls("total")
-    untested = table.height - tested_words.height
-    limit = f"{plural(untested, 'word')} of the instructions not tested." if untested else ""
-    if tested_words.is_empty():
-        return Finding("Not tested: the run recorded no effect of a single word.", _DECIDE, {}, limit)
-    top = tested_words.sort("total", descending=True).row(0, named=True)
-    said = (
-        f"Without {top['word']} the action changes most: by {top['total']:.2g} standard deviations of the run's "
-        f"actions (another noise seed: {top['noise'] or 0:.2g})."
-    )
-    if (top["grip"] or 0) >= _HALF:
-        turn = f", while the movement turns by {top['turn']:.0f} degrees" if top["turn"] is not None else ""
-        said += f" This is mostly the gripper, which closes or opens instead in {top['grip']:.0%} of the steps{turn}."
-    surely = table.filter(than_noise=_MORE)
-    sure = [f"{word} ({total:.2g})" for word, total in surely.select("word", "total").iter_rows()]
-    more = f"Shown to change it by more than another noise seed does: {listing(sure, 5)}."
-    few = f"Only {plural(top['episodes'], 'episode')} with {top['word']}. " if top["than_noise"] == _OPEN else ""
-    said += f" {more if sure else 'No word is shown to change it by more than another noise seed does.'}"
-    return Finding(said, _DECIDE, {**top}, f"{few}{limit}".strip())
-
-
-_EFFECT_SCHEMA = {
-    "word": pl.String,
-    **{f"{reader}{end}": pl.Float64 for reader in ("total", "direct") for end in ("", "_low", "_high")},
-    **dict.fromkeys(("turn", "grip", "noise"), pl.Float64),
-    "episodes": pl.Int64,
-    "than_noise": pl.String,
-}
-_EFFECTS = [
-    Column("word", "text"),
-    Column(
-        "total", "number", "nobody reads it", "how far the action moves, in standard deviations of the run's actions"
-    ),
-    Column("direct", "number", "action tokens do not", "the same if the action tokens alone do not read the word"),
-    Column("turn", "number", "turn", "how far the direction of the hand's movement turns, in degrees"),
-    Column("grip", "percent", "gripper", "steps in which the gripper is told the opposite"),
-    Column("noise", "number", "another noise", "how far another noise seed moves the action in the same episodes"),
-    Column(
-        "than_noise", "text", "than noise", "whether nobody reading it moves the action more than another noise seed"
-    ),
-    Column("episodes", "count"),
-]
-
-
-def _paths(question: Question, most: int | None = None) -> str:
-    return shlex.join(str(store.path) for store in question.stores[:most])
+def _paths(question: Question) -> str:
+    return shlex.join(str(store.path) for store in question.stores)

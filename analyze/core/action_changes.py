@@ -190,6 +190,7 @@ class BaseEpisode:
         starts: (replan,) policy steps before each replan.
         executed: (replan,) how many steps of each chunk were executed; all of them where that is not known
             (`stores_executed`).
+        num_steps: policy steps of the episode.
     """
 
     item: SelectedEpisode
@@ -197,6 +198,7 @@ class BaseEpisode:
     env_step: NDArray[np.int64]
     starts: NDArray[np.int64]
     executed: NDArray[np.int64]
+    num_steps: int
 
     @property
     def name(self) -> str:
@@ -214,7 +216,7 @@ class BaseEpisode:
             known = item.store.attributes.protocol.replan_steps
             until_next = np.diff(np.append(starts, num_steps))
             executed = np.minimum(executed, np.minimum(until_next, known))
-        return cls(item, actions, env_step, starts, executed)
+        return cls(item, actions, env_step, starts, executed, num_steps)
 
     def at(self, replans: NDArray[np.int64]) -> BaseEpisode:
         """The same at some replans, which may repeat."""

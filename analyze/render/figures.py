@@ -9,7 +9,7 @@ The options of a figure, by kind:
     stacked       x, value, color: a column of parts, which are stacked in their order. ylabel, xlabel.
     distribution  x, value: a box for each x, with a dot for each row. uniform, log, xlabel, ylabel.
     heat_map      x, y, value: factors around 1. xlabel, ylabel, label.
-    scatter       x, y, label: points with names, NAME_low and NAME_high as bars. log, xlabel, ylabel.
+    scatter       x, y, label: points with names, NAME_low and NAME_high as bars. log (both axes), xlabel, ylabel.
     pictures      none; see `pictures.pictures` for the columns.
 
     pictures      see `render.pictures`.
@@ -201,7 +201,10 @@ def _lines(figure: Figure, style: Style) -> Canvas:
         axes.plot(part[o["x"]], part[o["uniform"]], "--", color=BASELINE_COLOR, linewidth=1, label=BASELINE_NAME)
     if o.get("log"):
         uniform = rows[o["uniform"]].drop_nulls().to_list() if "uniform" in o else []
-        ratio_axis(axes.yaxis, np.concatenate([*_bounds(rows, o["value"]), uniform]))
+        value, low, high = _bounds(rows, o["value"])
+        # A band that runs far beyond all values is cut at the frame.
+        ends = np.clip([low, high], value.min() / 3, value.max() * 3).ravel()
+        ratio_axis(axes.yaxis, np.concatenate([value, ends, uniform]))
     else:
         axes.set_ylim(bottom=0)
     if rows[o["x"]].dtype.is_integer():
@@ -315,6 +318,9 @@ def _scatter(figure: Figure, style: Style) -> Canvas:
     axes.scatter(x, y, c=colors, s=18, zorder=3)
     for at, up, label in zip(x, y, rows[o["label"]], strict=True):
         axes.annotate(shortened(str(label), 24), (at, up), (4, 3), textcoords="offset points", size=7)
+    if o.get("log"):
+        ratio_axis(axes.xaxis, np.concatenate([x, left, right]))
+        ratio_axis(axes.yaxis, np.concatenate([y, low, high]))
     axes.set_xlabel(str(o.get("xlabel", o["x"])))
     axes.set_ylabel(str(o.get("ylabel", o["y"])))
     axes.grid()

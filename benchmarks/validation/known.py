@@ -17,7 +17,7 @@ from benchmarks.validation.calls import NOTHING, changed_episodes
 from benchmarks.validation.changes import BASE_CAMERA, WRIST_CAMERA, colour_word, known_changes, named_object
 from benchmarks.validation.policies import KnownPolicy
 from benchmarks.validation.tables import SCALES, means
-from vla_attention.analyze.effects.action_changes import ActionSpread
+from vla_attention.analyze.core.action_changes import ActionSpread
 from vla_attention.analyze.measures.sinks import SinkRule
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import Store

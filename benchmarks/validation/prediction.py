@@ -13,10 +13,9 @@ import polars as pl
 import vla_attention as va
 from benchmarks.validation.calls import ChangedEpisode, changed_episodes
 from benchmarks.validation.changes import LINGUISTIC, VISUAL
+from benchmarks.validation.group_attention import MEASURES, GroupAttention, GroupOfKeys, Place, group_attention
 from benchmarks.validation.tables import means, spearman
-from vla_attention.analyze.effects.action_changes import ActionSpread
-from vla_attention.analyze.effects.conditions import GroupOfKeys, Place
-from vla_attention.analyze.effects.group_attention import MEASURES, GroupAttention, group_attention
+from vla_attention.analyze.core.action_changes import ActionSpread
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.sinks import SinkRule, search_sinks, without_sinks
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens

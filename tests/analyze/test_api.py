@@ -15,14 +15,14 @@ from polars.testing import assert_frame_equal
 import vla_attention as va
 import vla_attention.analyze.api
 import vla_attention.analyze.measures.question_settings
+from tests.kit.planted_effects import planted_effects
 from tests.kit.site_stores import write_site_store
-from tests.kit.stores import StoreSpec, rerun_source, write_store
+from tests.kit.stores import StoreSpec, write_store
 from tests.kit.tokens import small_layout
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.api import OpenStores
 from vla_attention.analyze.measures.question_settings import AnalysisSettings, settings_from_keywords
 from vla_attention.schemas.errors import BadArgument, UnknownName
-from vla_attention.schemas.interventions import Interventions, KeyKnockout
 from vla_attention.schemas.precision import mass_error_bound
 from vla_attention.schemas.stores.store_format import StoreError, StoreNotFound
 
@@ -40,10 +40,8 @@ def other(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def rerun(tmp_path_factory, store) -> Path:
-    knockout = Interventions("without_visual", keys=(KeyKnockout("role:image"),))
-    spec = StoreSpec(interventions=knockout, rerun_of=rerun_source(store), plant_actions=lambda *_: np.ones((3, 5, 7)))
-    return write_store(tmp_path_factory.mktemp("rerun") / "r.zarr", spec=spec)
+def with_effects(tmp_path_factory) -> Path:
+    return write_store(tmp_path_factory.mktemp("effects") / "e.zarr", spec=StoreSpec(plant_effects=planted_effects()))
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +63,9 @@ def examples(module: ModuleType) -> list[doctest.DocTest]:
     [test for module in MODULES for test in examples(module)],
     ids=lambda test: test.name,
 )
-def test_examples(test, store, other, rerun, replayed, tmp_path):
-    test.globs.update(store=store, other=other, rerun=rerun, replayed=replayed, folder=tmp_path, va=va, pl=pl)
+def test_examples(test, store, other, with_effects, replayed, tmp_path):
+    given = {"store": store, "other": other, "with_effects": with_effects, "replayed": replayed}
+    test.globs.update(**given, folder=tmp_path, va=va, pl=pl)
     result = doctest.DocTestRunner(verbose=False).run(test)
     assert result.failed == 0
     assert result.attempted > 0

@@ -13,14 +13,13 @@ from typing import Any
 
 import pytest
 
+from tests.kit.planted_effects import planted_effects
 from tests.kit.site_stores import SiteStoreSpec, write_site_store
-from tests.kit.stores import StoreSpec, rerun_source, reseal, reseal_root, write_store
+from tests.kit.stores import StoreSpec, reseal, reseal_root, write_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.published.parse_results import main as parse
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.schemas.interventions import Interventions, PromptChange
-from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import SiteLayout, Span
 from vla_attention.schemas.stores.digest import bytes_digest, seal_digest
 
@@ -83,15 +82,6 @@ def hostile_texts(store: Path) -> None:
     change_episodes(store, episode)
 
 
-def make_rerun(store: Path, of: Path) -> None:
-    """Turn a copy into a rerun with a hostile name and a hostile prompt."""
-    interventions = Interventions(MARKUP, prompt=PromptChange("text", text=INSTRUCTION))
-    source = {"run": rerun_source(of).run, "name": MARKUP}
-    change(store / "zarr.json", lambda root: root.update(interventions=to_json(interventions), rerun_of=source))
-    for folder in (store / "episodes").glob("task*"):
-        reseal(folder)
-
-
 def files_under(folder: Path) -> set[Path]:
     return {path for path in folder.rglob("*") if path.is_file()}
 
@@ -128,8 +118,8 @@ WORDS: dict[str, tuple[str, ...]] = {
     "words": ("STORE", "--output", "OUT", "--task", "0"),
     "objects": ("STORE", "--output", "OUT"),
     "compare": ("STORE", "OTHER", "--output", "OUT", "--no-plots"),
-    "effects": ("STORE", "OTHER", "--output", "OUT"),
-    "deviation": ("STORE", "--output", "OUT"),
+    "effects": ("STORE", "--output", "OUT"),
+    "effects of data": ("STORE", "--output", "OUT"),
     "overlay": ("STORE", "OTHER", "--output", "OUT"),
     "report": ("STORE", "--output", "OUT", "--num-episodes", "1", "--task", "0", "--layers", "0"),
     "view": ("STORE", "--output", "OUT"),
@@ -145,19 +135,18 @@ WORDS: dict[str, tuple[str, ...]] = {
 def test_hostile_texts_are_printed_visibly_and_nothing_is_written_elsewhere(
     store, tmp_path, monkeypatch, capsys, command
 ):
-    if command == "deviation":  # of a store with the actions of a data set
+    if command == "effects of data":  # of a store with the actions of a data set
         shutil.rmtree(store)
         write_site_store(store, HostileSites(dataset_actions=0.5, protocol="dataset"))
     else:
+        if command == "effects":
+            shutil.rmtree(store)
+            write_store(store, spec=replace(SPEC, plant_effects=planted_effects()))
         hostile_texts(store)
     other = write_store(tmp_path / "stores" / "b.zarr", spec=SPEC, suite="other")
     if command == "compare":
         shutil.rmtree(other)
         shutil.copytree(store, other)
-    if command == "effects":
-        shutil.rmtree(other)
-        shutil.copytree(store, other)
-        make_rerun(other, of=store)
     out = tmp_path / "out"
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
@@ -170,7 +159,7 @@ def test_hostile_texts_are_printed_visibly_and_nothing_is_written_elsewhere(
         word.replace("STORE", str(store)).replace("OTHER", str(other)).replace("OUT", str(out))
         for word in WORDS[command]
     ]
-    code = analyze([command, *given])
+    code = analyze([command.split()[0], *given])
     printed = check_output(capsys)
     assert code == 0, printed
     assert all(out in path.parents for path in files_under(tmp_path) - before)

@@ -17,7 +17,6 @@ from vla_attention.analyze.commands.analyze import analyze as ask_analyze
 from vla_attention.analyze.core.contributions import side_norms
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.schemas.interventions import Interventions, KeyKnockout
 
 KINDS = ("alternating", "split", "growing")
 
@@ -126,16 +125,6 @@ def test_commands(stores, tmp_path, capsys, command, name):
     assert analyze(given) == 0
     printed = capsys.readouterr()
     assert SAYS[command] in " ".join(printed.out.split())
-
-
-def test_effects_of_recorded_rollouts(stores, tmp_path, capsys):
-    knockout = Interventions("without_visual", keys=(KeyKnockout("role:image"),))
-    other = write_site_store(tmp_path / "other.zarr", kind="growing", outcome="some", interventions=knockout)
-    assert analyze(["effects", str(stores["growing"]), str(other), "--output", str(tmp_path), "--no-plots"]) == 0
-    pairs = pl.read_parquet(tmp_path / "rollouts.parquet")
-    assert (pairs["episode"] == pairs["episode_base"]).all()
-    assert pairs["steps"].is_null().all()
-    assert pairs["success"].null_count() == 2
 
 
 def test_runs_are_compared_episode_by_episode_where_the_first_state_is_not_known(stores, tmp_path, capsys):

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from tests.analyze.test_hostile_stores import WORDS
+from tests.kit.planted_effects import planted_effects
 from tests.kit.site_stores import SiteStoreSpec, write_site_store
-from tests.kit.stores import StoreSpec, rerun_source, write_store
+from tests.kit.stores import StoreSpec, write_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.schemas.errors import Note
-from vla_attention.schemas.interventions import Interventions, NoiseChange
 from vla_attention.schemas.stores.reader import open_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, contributions=True)
@@ -33,7 +33,7 @@ def add_strays(store: Path) -> None:
 
 @pytest.fixture(scope="module")
 def stores(tmp_path_factory) -> Path:
-    """Stores with strays: a.zarr, another of the same run, a rerun, two parts of a run, and one of a data set."""
+    """With strays: a.zarr, another of the same run, two parts of a run, one with effects, one of a data set."""
     folder = tmp_path_factory.mktemp("strays")
     store = write_store(folder / "a.zarr", spec=SPEC)
     for name in ("other", "one", "two"):
@@ -41,8 +41,7 @@ def stores(tmp_path_factory) -> Path:
     for name, left in (("one", 0), ("two", 1)):
         for episode in (folder / f"{name}.zarr/episodes").glob(f"task00{left}_*"):
             shutil.rmtree(episode)
-    noise = Interventions("noise", noise=NoiseChange(1))
-    write_store(folder / "rerun.zarr", spec=SPEC, rerun_of=rerun_source(store), interventions=noise)
+    write_store(folder / "effects.zarr", spec=SPEC, plant_effects=planted_effects())
     write_site_store(folder / "data.zarr", SiteStoreSpec(dataset_actions=0.5, protocol="dataset"))
     for path in folder.glob("*.zarr"):
         add_strays(path)
@@ -55,9 +54,9 @@ def store(stores) -> Path:
 
 
 #: The stores of a command that takes others than a.zarr, or two.
-STORES = {"effects": ("a", "rerun"), "deviation": ("data",), "copy": ("one", "two"), "overlay": ("one", "two")}
+STORES = {"effects": ("effects",), "effects of data": ("data",), "copy": ("one", "two"), "overlay": ("one", "two")}
 #: Commands that draw unless they are told not to.
-DRAWING = ("analyze", "words", "objects", "effects", "deviation", "overlay")
+DRAWING = ("analyze", "words", "objects", "effects", "effects of data", "overlay")
 #: `verify` and `repair` name strays in their own way.
 READING = [command for command in WORDS if command not in ("verify", "repair", "cache")]
 

@@ -21,7 +21,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 NOTEBOOKS = sorted((DOCS.parent / "examples").glob("*.ipynb"))
 PROGRAMS = {"vla-capture": capture, "vla-analyze": analyze, "vla-attention": every_command}
 #: Questions of `vla-analyze` that draw plots beside their text; a store in their place is the first one.
-PLOTTED = ("analyze", "words", "objects", "deviation", "effects", "compare")
+PLOTTED = ("analyze", "words", "objects", "effects", "compare")
 
 
 def walk(page: str) -> int:

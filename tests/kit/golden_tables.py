@@ -67,7 +67,7 @@ CASES: dict[str, tuple[tuple[str, ...], ...]] = {
     "pair_compare": (("compare", "cubes.zarr", "one_colour.zarr"),),
     "reruns_compare": (("compare", "cubes.zarr", "RERUNS"),),
     "noise_compare": (("compare", "cubes.zarr", "RERUN"),),
-    "effects_effects": (("effects", "effects.zarr"),),
+    "effects_effects": (("effects", "effects.zarr"), ("effects", "effects.zarr", "--by", "task")),
     "effects_analyze": (("analyze", "effects.zarr"),),
     "effects_words": (("words", "effects.zarr"),),
     "libero_analyze": (("analyze", "libero.zarr"),),
@@ -81,7 +81,7 @@ CASES: dict[str, tuple[tuple[str, ...], ...]] = {
     "cosmos_cross": (("analyze", "cosmos.zarr", "--site", "cross"),),
     "cosmos_heads": tuple(("analyze", "cosmos.zarr", *more) for more in _HEADS),
     "cosmos_groups": (("analyze", "cosmos.zarr", "--list"),),
-    "replay_deviation": (("deviation", "replay.zarr"),),
+    "replay_deviation": (("effects", "replay.zarr"),),
     "published_results": (("parse", "cubes.zarr"),),
     "published_comparison": (("parse", "cubes.zarr", "libero.zarr"),),
 }
@@ -348,6 +348,22 @@ _OF_DENOISE = (
     "geometric_left_out", "nonfinite_layers", "numerator_mass", "denominator_mass", "ratio_mean", "ratio_mean_low",
     "ratio_mean_high", "ratio_of_means_low", "ratio_of_means_high",
 )  # fmt: skip
+_OF_EFFECTS = ("effect", "effect_chunk", "angle", "gripper_flips", "mass", "lift", "norm", "keys", "noise")
+_WHOLE = pl.col("phase") == "all"
+_WITH_ENDS = ("", "_low", "_high", "_episodes", "_q", "_p")
+
+
+def _gone(*names: str) -> tuple[str, ...]:
+    """The columns of values, with all that is said of them."""
+    return tuple(f"{name}{end}" for name in names for end in _WITH_ENDS)
+
+
+def _effects(tables: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
+    whole = tables["effects_summary"].with_columns(scope=pl.lit("all"))
+    tasks = tables["1/effects_summary"].with_columns(scope=pl.lit("task"))
+    return pl.concat([whole, tasks], how="diagonal")
+
+
 #: (Case, the end of its name, or its command; kept table) -> how it is found.
 FORMS: dict[tuple[str, str], Form] = {
     ("words", "words_summary"): Form(
@@ -475,6 +491,48 @@ FORMS: dict[tuple[str, str], Form] = {
             *(f"{name}_episodes" for name in _CHANGED),
         ),
         (pl.col("phase") == "all") & (pl.col("scope") == "all"),
+    ),
+    ("effects", "effects"): Form(
+        (*_EPISODE, "condition"),
+        lambda tables: tables["effects_episodes"],
+        ("phase", "group", "random", "minus_random"),
+        _WHOLE,
+    ),
+    ("effects", "effects_summary"): Form(
+        ("scope", "suite", "task_id", "condition"),
+        _effects,
+        (
+            "phase",
+            "group",
+            *_gone("random", "minus_random", "over_random"),
+            *(f"{name}_episodes" for name in (*_OF_EFFECTS, "over_noise", "minus_noise")),
+        ),
+        _WHOLE,
+    ),
+    ("effects", "effects_by_condition_plotted"): Form(
+        ("condition",),
+        lambda tables: tables["effects_summary"],
+        ("row", "point"),
+        pl.col("point").is_in(["without", "direct", "only"]),
+    ),
+    ("effects", "attention_and_effect_plotted"): Form(
+        ("effect",),
+        lambda tables: tables["effects_summary"],
+        ("group",),
+    ),
+    ("deviation", "deviation"): Form(
+        ("scope", "suite", "task_id"),
+        lambda tables: tables["deviation"],
+        ("phase", "first_episodes", "chunk_episodes"),
+        _WHOLE,
+    ),
+    ("deviation", "deviation_dimensions"): Form(
+        ("dimension",),
+        lambda tables: tables["deviation_dimensions"],
+        (*(f"{name}_episodes" for name in ("first", "chunk", "bias")), "bias_p"),
+    ),
+    ("deviation", "deviation_attention"): Form(
+        ("quantity", "of", "measure"), lambda tables: tables["deviation_attention"], ("correlation_episodes",)
     ),
     ("time", "time_course"): Form(("quantity", "position"), _time_course, _COURSE),
 }

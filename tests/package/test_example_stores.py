@@ -35,18 +35,19 @@ def test_the_second_run_differs_in_its_weights_alone():
 def test_another_colour_changes_the_action_of_the_first_policy_alone():
     """To the second all colours are one word; without any it does something else, as the first does."""
     for store, least, most in ((CUBES, 1.5, 3.0), (ONE_COLOUR, 0.0, 1e-5)):
-        effects = va.open(store).effects(dimensions=[0, 1, 2]).filter(scope="all", phase="all")
-        exchanged = effects.filter(pl.col("condition").str.starts_with("prompt_synonyms_"))
+        effects = va.open(store).effects()["effects_items"]
+        exchanged = effects.filter(pl.col("item").str.contains("' as '"))
         assert exchanged.height == 6
         assert exchanged["effect"].is_between(least, most).all()
-        without = effects.filter(pl.col("condition").str.contains("^without_word_(red|green|blue)_queries_all$"))
-        assert without["effect"].is_between(1, 3).to_list() == [True] * 3
+        without = effects.filter(pl.col("item").is_in(["'red'", "'green'", "'blue'"]))
+        assert without["total"].is_between(1, 3).to_list() == [True] * 3
 
 
 def test_the_rerun_is_of_the_first_store():
-    episodes = va.open(CUBES).effects(NOISE, "episodes")
-    assert set(episodes.select("task_id", "episode_index").unique().rows()) == {(0, 0), (1, 0), (2, 0)}
-    assert set(episodes["kind"]) == {"noise"}
+    rerun = va.open(NOISE)
+    assert rerun.attributes.rerun_of.run == va.open(CUBES).stores[0].run
+    assert rerun.attributes.interventions.noise is not None
+    assert set(rerun.episodes.select("task_id", "episode_index").rows()) == {(0, 0), (1, 0), (2, 0)}
 
 
 def test_no_store_names_a_place_of_the_machine_that_made_it():

@@ -16,9 +16,7 @@ from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answe
 from tests.kit.golden_stores import folder_of
 from tests.kit.http_ranges import serve
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.effects.effect_study import study_effects, units_of_recorded
-from vla_attention.analyze.effects.item_rows import item_rows
-from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.core.action_changes import units_of_recorded
 from vla_attention.analyze.view.summary_process import summary_parts
 from vla_attention.schemas.stores.reader import open_store
 
@@ -64,20 +62,22 @@ def found(golden: Path) -> list[Any]:
     return [answer["effects"] for answer in answers_of(stores, [False, True, False])]
 
 
+def on_the_page(condition: str) -> str:
+    """The page's name of an item, which it takes from that of a condition."""
+    kind, _, name = (stem := condition.removeprefix("without_").split("_queries_")[0]).partition("_")
+    return f"'{name}'" if kind == "word" else name if kind in ("camera", "object") else stem
+
+
 def test_means_of_the_episode_are_pythons(found, golden):
-    study = study_effects(golden, (), AnalysisSettings())
-    table = va.open(golden).effects(table="episodes").filter(phase="all", task_id=0, episode_index=0)
+    table = va.open(golden).effects()["effects_episodes"].filter(task_id=0, episode_index=0)
     effect = {row["condition"]: row for row in table.iter_rows(named=True)}
-    of_episode = 0
-    for item in item_rows(study):
-        for reader, row in item.by_reader.items():
-            if row["condition"] in effect:  # the others are of words that only the other episode has
-                mean, low, high, count = found[0]["items"][item.name][reader]["mean"]
-                assert mean == pytest.approx(effect[row["condition"]]["effect"], rel=CLOSE), row["condition"]
-                assert low <= mean <= high
-                assert count == effect[row["condition"]]["num_replans"]
-                of_episode += 1
-    assert of_episode == sum(len(readers) for readers in found[0]["items"].values()) > 20
+    without = table.filter(kind="without").rows(named=True)
+    for row in without:
+        mean, low, high, count = found[0]["items"][on_the_page(row["condition"])][row["reader"]]["mean"]
+        assert mean == pytest.approx(row["effect"], rel=CLOSE), row["condition"]
+        assert low <= mean <= high
+        assert count == row["num_replans"]
+    assert len(without) == sum(len(readers) for readers in found[0]["items"].values()) > 20
     assert found[0]["noise"]["mean"][0] == pytest.approx(effect["noise"]["effect"], rel=CLOSE)
     random = [row for name, row in effect.items() if name.startswith("random_") and "_queries_" not in name]
     shown = sorted(readers["direct"]["mean"][0] for readers in found[0]["random"].values())

@@ -1,6 +1,6 @@
 /**
- * How far actions change without an item, as analyze/effects has it: root mean square change of the executed actions,
- * each dimension in units of its spread, by who no longer reads the item.
+ * How far actions change without an item, as analyze/core/recorded_effects.py has it: root mean square change of the
+ * executed actions, each dimension in units of its spread, by who no longer reads the item.
  */
 import type { EpisodeDocument, RootDocument } from "../store/documents";
 import type { ConditionDocument, EffectsDocument } from "../store/effects_document";
@@ -54,7 +54,7 @@ export function strongest(item: Item, replan: number | null): Sizes {
   return sizesOf(item.by.total ?? item.by.direct, replan);
 }
 
-/** Numbers of steps of each chunk that were executed: `BaseEpisode` of analyze/effects/paired_replans.py. */
+/** Numbers of steps of each chunk that were executed: `BaseEpisode` of analyze/core/action_changes.py. */
 export function executedSteps({ protocol }: RootDocument, document: EpisodeDocument, horizon: number): number[] {
   const { env_step: steps, num_steps, num_replans } = document;
   if (protocol.name === "dataset" || protocol.replan_steps === 0) return Array.from({ length: num_replans }, () => horizon);
@@ -95,7 +95,7 @@ function changeSquares(
   return squares;
 }
 
-/** Size of each entry's change (entry): `root_mean_square_change` of analyze/effects/action_changes.py. */
+/** Size of each entry's change (entry): `root_mean_square_change` of analyze/core/action_changes.py. */
 function changeSizes(squares: Float64Array, size: number, { replan }: EffectsDocument, spread: readonly (number | null)[], executed: readonly number[]): Float64Array {
   const used = spread.filter((one) => one !== null).length;
   return Float64Array.from(replan, (at, entry) => {
@@ -120,7 +120,7 @@ function onlyAtom(selector: string): Atom | null {
   }
 }
 
-/** `'red'` for a word, `agentview` for a camera: `item_name` of analyze/effects/conditions.py. */
+/** `'red'` for a word, `agentview` for a camera; other groups by the name that they were recorded under. */
 function itemName({ name }: ConditionDocument, atom: Atom | null): string {
   const group = name.replace(/^(without|random)_/, "").replace(/_queries_(all|prefix)(_of_.*)?$/s, "");
   const bare = atom && group.startsWith(`${atom.kind}_`) ? group.slice(atom.kind.length + 1) : group;

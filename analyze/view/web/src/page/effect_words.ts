@@ -1,10 +1,10 @@
-/** What recorded effects say of the words, in sentences: the wording of analyze/effects/answer.py. */
+/** What recorded effects say of the words, in sentences: as analyze/commands/effects/answer.py has them. */
 import { findPhrase, type Word } from "../grouping/words";
 import { type EpisodeEffects, type Item, type Reader, READERS, sizesOf, type Sizes, strongest } from "../measures/effects";
 import { formatNumber, formatPercent, plural } from "./number_text";
 
 const MOST_NAMED = 8;
-/** So much of a squared effect in one dimension is said, as in analyze/effects/answer.py. */
+/** So much of a squared effect in one dimension is said, as in analyze/commands/effects/answer.py. */
 const MOST_OF_IT = 0.8;
 const ALONE: Readonly<Partial<Record<Reader, string>>> = { direct: "the action queries", pictures: "the pictures", text: "the text" };
 

@@ -1,4 +1,4 @@
-"""The base run's attention to the groups that reruns are about, replan by replan."""
+"""Attention to groups of keys in some layers and heads, replan by replan."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.contributions import joint_norm, selected_gram, whole_segments
-from vla_attention.analyze.effects.conditions import GroupOfKeys
 from vla_attention.analyze.measures.masses import group_measures
 from vla_attention.analyze.measures.question import Question, select_again
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, resolve_all, vocabulary_of
@@ -17,11 +16,34 @@ from vla_attention.analyze.measures.steps import MeasuredEpisode, measure_episod
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping, check_names
+from vla_attention.schemas.safe_text import visible
 
 Array = NDArray[np.float64]
 
 #: The columns of `GroupAttention.values`.
 MEASURES = ("mass", "lift", "norm", "keys")
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where attention is measured; None is everywhere."""
+
+    layers: tuple[int, ...] | None = None
+    heads: tuple[int, ...] | None = None
+    denoise_steps: tuple[int, ...] | None = None
+
+
+@dataclass(frozen=True)
+class GroupOfKeys:
+    """The union of selectors of the grouping language, and where it counts."""
+
+    selectors: tuple[str, ...]
+    place: Place = Place()
+
+    @property
+    def text(self) -> str:
+        """The selectors as one."""
+        return visible(" | ".join(self.selectors))
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,229 @@
+"""What the action depends on: how it changes without a word, a picture, an object, beside the attention to these."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Collection
+
+import polars as pl
+
+from vla_attention.analyze.commands.effects.data_set import deviation, has_dataset_actions
+from vla_attention.analyze.commands.effects.items import (
+    FEW,
+    LESS,
+    MORE,
+    NO_NOISE,
+    OPEN,
+    UNIT,
+    by_item,
+    columns_of_items,
+    figures_of_items,
+    with_untested,
+)
+from vla_attention.analyze.core.about import about, enough, notes
+from vla_attention.analyze.core.action_changes import ActionSpread
+from vla_attention.analyze.core.axes import check_axes, columns_of
+from vla_attention.analyze.core.estimate import Scale, estimate
+from vla_attention.analyze.core.recorded_effects import PICTURES, TEXT, RecordedEffects, recorded_effects
+from vla_attention.analyze.core.result import Figure, Finding, Result, Table
+from vla_attention.analyze.core.words_of_numbers import with_interval
+from vla_attention.analyze.measures.alignment import GRIPPER
+from vla_attention.analyze.measures.frames import EPISODE_ID
+from vla_attention.analyze.measures.question import Question
+from vla_attention.schemas.errors import BadArgument, listing, plural
+
+_DECIDE = "Which words decide?"
+#: Of the items, so many are named, and drawn over time.
+_MOST_NAMED, _MOST_DRAWN = 5, 4
+#: From this part of a squared effect on, it is said that it is the gripper's.
+_HALF = 0.5
+
+
+def effects(question: Question, by: Collection[str] = ()) -> Result:
+    """Recorded effects of every item, and how far the actions are from a data set's where the stores hold it.
+
+    Raises:
+        BadArgument: the stores hold neither.
+    """
+    check_axes(by, ("task", "family", "episode", "replan", "time"))
+    found = recorded_effects(question)
+    of_data = deviation(question) if has_dataset_actions(question) else ([], [], [])
+    if found is None and not of_data[0]:
+        rerun = f"vla-attention capture rerun {shlex.quote(str(question.stores[0].path))} --effects text,cameras"
+        raise BadArgument(
+            f"{question.stores[0].path} holds neither effects nor a data set's actions; its calls can be made again "
+            f"without each word and each picture: {rerun}"
+        )
+    findings, tables, figures = ([], [], []) if found is None else _recorded(found, by)
+    left_out = () if found is None else (*found.notes, *_left_out(found.spread))
+    return Result(
+        "What the action depends on",
+        about(question),
+        [*findings, *of_data[0]],
+        [*tables, *of_data[1]],
+        [*figures, *of_data[2]],
+        [*left_out, *notes(question)],
+    )
+
+
+def word_effects(question: Question) -> tuple[Finding, list[Table]]:
+    """How the action changes without each word: the finding that `effects` begins with, and table "word_effects"."""
+    try:
+        found = recorded_effects(question, attention=False)
+    except BadArgument as error:
+        return Finding(f"Not shown: {error}", _DECIDE), []
+    if found is None:
+        rerun = f"vla-attention capture rerun {shlex.quote(str(question.stores[0].path))} --effects text,cameras"
+        return Finding("Not recorded: how the action changes without a word.", _DECIDE, next_step=rerun), []
+    items = with_untested(question, by_item(found.summary()))
+    table = items.filter(item_kind="word")
+    columns = [column for column in columns_of_items(table) if column.name != "lift"]
+    return deciding(table, found.spread), [Table("word_effects", table, columns, "What the action does without a word")]
+
+
+def _recorded(found: RecordedEffects, by: Collection[str]) -> tuple[list[Finding], list[Table], list[Figure]]:
+    """Findings, tables and figures of recorded effects."""
+    question, looks = found.question, columns_of(by)
+    summary = found.summary(by)
+    items = by_item(summary, [column.name for column in looks])
+    files = [
+        Table("effects_summary", summary),
+        Table("effects_episodes", found.episodes(by).drop("square", "gripper_square")),
+        Table("effects", found.rows()),
+    ]
+    shown = [*looks, *columns_of_items(items)]
+    if by:
+        said = f"Below, a row for each item and {' and '.join(by)}."
+        return [Finding(said, "What does the action depend on?")], [Table("effects_items", items, shown), *files], []
+    items = with_untested(question, items)
+    words, others = items.filter(item_kind="word"), items.filter(pl.col("item_kind") != "word")
+    findings = [deciding(words, found.spread), *_sides(found, items), *_others(others), *_ways(words)]
+    findings += _unlike_attention(words)
+    course = _over_time(found, items)
+    tables = [Table("effects_items", items, shown, "Without it, the action changes by", rows=16), *files]
+    return findings, [*tables, Table("effects_time", course)], figures_of_items(items, course, summary)
+
+
+def deciding(words: pl.DataFrame, spread: ActionSpread) -> Finding:
+    """The words without which the action changes most, of the rows of `by_item` that are words."""
+    tested = words.drop_nulls("effect").sort("effect", descending=True)
+    untested = words.height - tested.height
+    limits = [f"{plural(untested, 'word')} of the instructions not tested."] if untested else []
+    if tested.is_empty():
+        return Finding("Not tested: no effect of a single word was recorded.", _DECIDE, {}, " ".join(limits))
+    sure, few = tested.filter(than_noise=MORE), tested.filter(than_noise=FEW)
+    top = (sure if sure.height else tested).row(0, named=True)
+    without = f"{'Without' if top['reader'] == 'total' else 'Hidden from the action tokens,'} {top['item']}"
+    size = f"{with_interval(top, 'effect')} {UNIT}"
+    noise = "" if top["noise"] is None else f" (another noise seed: {top['noise']:.2g})"
+    if sure.height:
+        said = f"{without} the action changes most: by {size}{noise}."
+        if sure.height > 1:
+            said += f" Also shown to change it by more than another noise seed does: {_named(sure[1:])}."
+        if (larger := tested.filter(pl.col("effect") > top["effect"])).height:
+            limits.insert(0, f"Larger, but not shown for other episodes: {_named(larger)}.")
+    elif few.height < tested.height:
+        said = f"No word is shown to change the action by more than another noise seed does. {without} it changes most "
+        said += f"here: by {size}{noise}."
+    else:
+        said = f"{without} the action changes most in these episodes: by {size}{noise}."
+        said += f" Next: {_named(tested[1:])}." if tested.height > 1 else ""
+    if few.height:
+        limits.insert(0, f"Too few episodes to say more of {listing(few['item'], _MOST_NAMED)}.")
+    numbers = {"word": top["item"], "estimate": top["effect"], "low": top["effect_low"], "high": top["effect_high"],
+               "noise": top["noise"], "shown": sure.height, "tested": tested.height}  # fmt: skip
+    if (top["grip_part"] or 0.0) >= _HALF:
+        said += f" Of this, {top['grip_part']:.0%} is the gripper, told the opposite in {top['grip']:.0%} of the steps "
+        said += f"(standard deviation of its commands: {spread.spread[GRIPPER]:.2g}); the hand's direction turns by "
+        said += f"{top['turn'] or 0.0:.0f} degrees."
+        turn = tested.sort("turn", descending=True, nulls_last=True).row(0, named=True)
+        if turn["item"] != top["item"] and turn["turn"] is not None:
+            said += f" The hand's direction turns most without {turn['item']}: by {turn['turn']:.0f} degrees."
+    return Finding(said, _DECIDE, numbers, " ".join(limits))
+
+
+def _named(rows: pl.DataFrame, value: str = "effect") -> str:
+    return listing([f"{item} ({size:.2g})" for item, size in rows.select("item", value).iter_rows()], _MOST_NAMED)
+
+
+def _sides(found: RecordedEffects, items: pl.DataFrame) -> list[Finding]:
+    """Without all pictures against without all text, in the episodes that have both."""
+    rows = found.episodes().filter(pl.col("item").is_in([PICTURES, TEXT]), kind="without", reader="total")
+    both = rows.pivot("item", index=EPISODE_ID, values="effect").with_columns(side=pl.lit("pictures / text"))
+    if not {PICTURES, TEXT} <= set(both.columns):
+        return []
+    sizes: dict[str, Scale] = {PICTURES: "positive", TEXT: "positive"}
+    row = estimate(both.drop_nulls(), ["side"], sizes, found.question.sampling, quotients={"ratio": (PICTURES, TEXT)})
+    one = row.row(0, named=True)
+    if one["ratio"] is None:
+        return []
+    said = (
+        f"Without all pictures the action changes {with_interval(one, 'ratio')} times as much as without all text "
+        f"({one[PICTURES]:.2g} and {one[TEXT]:.2g})."
+    )
+    mostly = items.filter(pl.col("item").is_in([PICTURES, TEXT]), pl.col("grip_part") >= _HALF)["item"].to_list()
+    said += f" Without {mostly[0] if len(mostly) == 1 else 'either'} it is mostly the gripper." if mostly else ""
+    numbers = {"estimate": one["ratio"], "low": one["ratio_low"], "high": one["ratio_high"], "n": one["num_episodes"]}
+    return [Finding(said, "Pictures or text?", numbers, enough(found.question))]
+
+
+def _others(items: pl.DataFrame) -> list[Finding]:
+    """Pictures, parts, objects and exchanges that are shown to exceed another noise seed, and those below it."""
+    items = items.filter(pl.col("than_noise") != NO_NOISE)
+    if items.is_empty():
+        return []
+    sure, less = items.filter(than_noise=MORE), items.filter(than_noise=LESS)
+    rest = items.height - sure.height - less.height
+    parts = [f"shown for {_named(sure)}"] if sure.height else []
+    parts += [f"smaller than what another noise seed does: {_named(less)}"] if less.height else []
+    parts += [f"not shown for {plural(rest, 'other item') if parts else 'any item'}"] if rest else []
+    said = "; ".join(parts)
+    numbers = {"shown": sure.height, "smaller": less.height, "open": rest}
+    return [Finding(f"{said[0].upper()}{said[1:]}.", "What else changes it by more than another noise seed?", numbers)]
+
+
+def _ways(words: pl.DataFrame) -> list[Finding]:
+    """Which of the shown words the action tokens read themselves, and which act through what has read them."""
+    words = words.filter(than_noise=MORE).drop_nulls(["total", "direct"])
+    half = 2 * pl.col("direct") >= pl.col("total")
+    own, rest = words.filter(half), words.filter(~half)
+    seen = (2 * pl.col("pictures") >= pl.col("total")).fill_null(False)
+    parts = [f"the action tokens read {listing(own['item'], _MOST_NAMED)} themselves"] if own.height else []
+    for is_it, through in ((seen, "the pictures, which have read it"), (~seen, "other tokens")):
+        part = rest.filter(is_it)
+        if part.height:
+            sizes = sorted(part["direct"].to_list())
+            alone = f"hidden from the action tokens alone: {sizes[0]:.2g}"
+            alone += f" to {sizes[-1]:.2g}" if part.height > 1 else ""
+            parts.append(f"{listing(part['item'], _MOST_NAMED)} acts through {through} ({alone})")
+    said = "; ".join(parts)
+    return [Finding(f"{said[0].upper()}{said[1:]}.", "How do these words reach the action?")] if parts else []
+
+
+def _unlike_attention(words: pl.DataFrame) -> list[Finding]:
+    """Words whose attention says something else than their effect."""
+    silent = words.filter(pl.col("lift") < 1, than_noise=MORE)
+    idle = words.filter(pl.col("lift") > 1, pl.col("than_noise").is_in([OPEN, LESS]))
+    parts = [f"less than its share, and shown to decide: {_named(silent, 'lift')}"] if silent.height else []
+    parts += [f"more than its share, and not shown to: {_named(idle, 'lift')}"] if idle.height else []
+    said = "; ".join(parts)
+    limit = "In brackets: attention to the word, evenly spread over all tokens = 1."
+    return [Finding(f"{said[0].upper()}{said[1:]}.", "Does attention tell?", limit=limit)] if parts else []
+
+
+def _left_out(spread: ActionSpread) -> list[str]:
+    """The dimensions of the action that are not compared, and why."""
+    parts = [f"{i} ({why})" for i, why in enumerate(spread.reasons) if why]
+    return [f"Dimensions of the action that are not compared: {listing(parts, 20)}."] if parts else []
+
+
+def _over_time(found: RecordedEffects, items: pl.DataFrame) -> pl.DataFrame:
+    """Effects over the parts of an episode's time: of pictures, text, the largest words or other items, and noise."""
+    of_side = pl.col("item").is_in([PICTURES, TEXT])
+    words = items.filter(item_kind="word").drop_nulls("effect")
+    largest = (words if words.height else items.filter(~of_side)).head(_MOST_DRAWN)
+    drawn = pl.concat([items.filter(of_side), largest])["condition"].drop_nulls().to_list()
+    rows = found.episodes(["time"]).filter(pl.col("condition").is_in(drawn) | (pl.col("kind") == "noise"))
+    course = estimate(rows, ["condition", "item", "reader", "phase"], {"effect": "positive"}, found.question.sampling)
+    order = pl.col("condition").replace_strict({name: i for i, name in enumerate(drawn)}, default=len(drawn))
+    return course.sort(order, "condition", "phase")

@@ -1,0 +1,113 @@
+"""Recorded effects item by item: the table that is shown, and the pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import polars as pl
+
+from vla_attention.analyze.core.result import Column, Figure
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.statistics.many_looks import NAMED_AT
+
+#: Whether an item is shown to change the action by more than another noise seed does.
+MORE, OPEN, LESS, FEW, UNTESTED, NO_NOISE = (
+    "more", "not shown to be more", "smaller", "too few episodes", "not tested", "not recorded"
+)  # fmt: skip
+_SHOWN_KINDS = ("without", "only", "prompt", "image")
+#: In the order of tables and pictures.
+_KINDS = ("word", "pictures", "camera", "object", "text", "part", "exchange")
+_READERS = ("total", "direct", "pictures", "text")
+_ALWAYS = ("item", "than_noise")
+UNIT = "standard deviations of the run's actions"
+
+
+def by_item(summary: pl.DataFrame, looks: Sequence[str] = ()) -> pl.DataFrame:
+    """One row per item (and cell of the columns `looks`), words first, the largest effects of each kind first.
+
+    Returns:
+        looks, item, item_kind, condition, reader; effect: that of the reader `total`, or where it was not recorded of
+        `direct`; in its row of `RecordedEffects.summary` turn, grip, grip_part, lift, noise, q and num_episodes;
+        than_noise; and the effect of every reader. Effects have intervals.
+    """
+    names = [*looks, "item", "item_kind"]
+    rows = summary.filter(pl.col("kind").is_in(_SHOWN_KINDS)).with_columns(pl.col("reader").fill_null("total"))
+    of_total = rows.filter(reader="total")
+    direct = rows.filter(reader="direct").join(of_total, on=names, how="anti", nulls_equal=True)
+    q, above = pl.col("minus_noise_q"), pl.col("minus_noise")
+    shown = (
+        pl.when(above.is_null()).then(pl.lit(NO_NOISE))
+        .when(above <= 0).then(pl.lit(LESS))
+        .when(q.is_null()).then(pl.lit(FEW))
+        .when(q <= NAMED_AT).then(pl.lit(MORE))
+        .otherwise(pl.lit(OPEN))
+    )  # fmt: skip
+    found = pl.concat([of_total, direct]).select(
+        *names, "condition", "reader", *_with_ends("effect"), turn="angle", grip="gripper_flips",
+        grip_part="gripper_part", lift="lift", noise="noise", than_noise=shown, q=q, num_episodes="num_episodes",
+    )  # fmt: skip
+    for reader in _READERS:
+        part = rows.filter(reader=reader).select(*names, *_with_ends("effect", reader))
+        found = found.join(part, on=names, how="left", nulls_equal=True, maintain_order="left")
+    order = pl.col("item_kind").replace_strict({kind: i for i, kind in enumerate(_KINDS)}, default=len(_KINDS))
+    down = [*(False for _ in looks), False, True]
+    return found.sort(*looks, order, "effect", descending=down, nulls_last=True, maintain_order=True)
+
+
+def _with_ends(name: str, to: str = "") -> list[pl.Expr]:
+    return [pl.col(f"{name}{end}").alias(f"{to or name}{end}") for end in ("", "_low", "_high")]
+
+
+def with_untested(question: Question, items: pl.DataFrame) -> pl.DataFrame:
+    """The items with the words of the instructions that were not tested, behind the others."""
+    spoken = {f"'{word.text.casefold()}'" for one in question.selected for line in one.tokens.words for word in line}
+    rows = [(word, "word", UNTESTED) for word in sorted(spoken - set(items["item"]))]
+    untested = pl.DataFrame(rows, schema=["item", "item_kind", "than_noise"], orient="row", schema_overrides=_TEXTS)
+    is_word = pl.col("item_kind") == "word"
+    return pl.concat([items.filter(is_word), untested, items.filter(~is_word)], how="diagonal")
+
+
+_TEXTS = dict.fromkeys(("item", "item_kind", "than_noise"), pl.String)
+
+
+def figures_of_items(items: pl.DataFrame, course: pl.DataFrame, summary: pl.DataFrame) -> list[Figure]:
+    """Effects by item; over time; and beside attention."""
+    noise = summary.filter(kind="noise")["effect"].drop_nulls().mean()
+    n = "Means over episodes, every task weighing the same; {}: 95% intervals."
+    floor = {} if noise is None else {"baseline": noise, "baseline_name": "another noise seed"}
+    items = items.with_columns(color=pl.col("item_kind").replace({"camera": "pictures", "part": "text"}))
+    by_kind, change = {"color": "color"}, "change (standard deviations)"
+    forest = {"value": "effect", "label": "item", "xlabel": change, "log": True, **floor, **by_kind}
+    title = "How the action changes without it, or with it exchanged"
+    found = [Figure("effects_by_item", "forest", items, title, n.format("bars"), forest)]
+    if course["phase"].n_unique() > 1:
+        lines = {"x": "phase", "value": "effect", "color": "item", "log": True, "ylabel": change,
+                 "xlabel": "time (0: first replan, 1: end)", "colors": {"another noise seed": "#7F7F7F"}}  # fmt: skip
+        title = "How the action changes without it, over an episode"
+        found.append(Figure("effects_over_time", "lines", course, title, n.format("bands"), lines))
+    rows = items.filter(pl.col("item_kind").is_in(["word", "object"])).drop_nulls("lift")
+    if rows.height > 1:
+        points = {"x": "lift", "y": "effect", "label": "item", "log": True, **by_kind,
+                  "xlabel": "attention per token, evenly spread = 1", "ylabel": change}  # fmt: skip
+        title = "Attention to it, and how the action changes without it"
+        found.append(Figure("attention_and_effect", "scatter", rows, title, n.format("bars"), points))
+    return found
+
+
+def columns_of_items(items: pl.DataFrame) -> list[Column]:
+    """The columns of the rows of `by_item` that are shown; those that nothing was recorded of are not."""
+    columns = [
+        Column("item", "text", "without, or changed"),
+        Column("total", "number", "nobody reads it", f"how far the action moves then, in {UNIT}"),
+        Column("direct", "number", "action tokens do not", "the same, while others may read it"),
+        Column("than_noise", "text", "than noise", "whether that is shown to be more than another noise seed does"),
+        Column("turn", "number", "turn", "of the hand's direction, in degrees"),
+        Column("grip", "percent", "gripper", "steps in which it is told the opposite"),
+        Column("lift", "factor", "attention", "per token, evenly spread = 1"),
+        Column("noise", "number", "another noise", "how far another seed moves it there"),
+        Column("num_episodes", "count", "episodes"),
+        Column("pictures", "number", "pictures do not", "the same if the tokens of pictures do not read it", False),
+        Column("text", "number", "text does not", "the same if the tokens of the prompt do not read it", False),
+        Column("q", "p", "q", "p of no difference from another noise seed, adjusted for the number of rows", False),
+    ]
+    return [column for column in columns if column.name in _ALWAYS or items[column.name].drop_nulls().len()]

@@ -1,0 +1,369 @@
+"""Effects that runs recorded beside their calls (`schemas.effects`): how the action changes without an item.
+
+An item is what was taken away or exchanged: a word, a picture, an object, a part of the prompt. A reader is who no
+longer reads it: nobody reads it (`total`), the action queries do not (`direct`), or the tokens of the pictures, or of
+the text, do not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from vla_attention.analyze.core.action_changes import (
+    CHANGES,
+    ActionSpread,
+    BaseEpisode,
+    changes_noise_alone,
+    changes_of,
+    root_mean_square_change,
+    units_of_recorded,
+)
+from vla_attention.analyze.core.axes import columns_of, with_families
+from vla_attention.analyze.core.by_axes import weighted
+from vla_attention.analyze.core.contributions import joint_norm, selected_gram, whole_segments
+from vla_attention.analyze.core.estimate import Scale, estimate
+from vla_attention.analyze.core.lazy_frames import frame_of_episodes
+from vla_attention.analyze.core.measure import Items, Measured, means, measure
+from vla_attention.analyze.measures.alignment import GRIPPER
+from vla_attention.analyze.measures.frames import EPISODE_ID, episode_columns
+from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_episode
+from vla_attention.analyze.statistics.episode_intervals import Sampling
+from vla_attention.analyze.stores.parallel import each_episode
+from vla_attention.analyze.stores.selection import Selection
+from vla_attention.schemas.effects import CHANGE
+from vla_attention.schemas.errors import BadArgument, UnknownName, UserError
+from vla_attention.schemas.groupings.grouping import Grouping
+from vla_attention.schemas.groupings.resolve import check_names
+from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
+from vla_attention.schemas.groupings.selectors import SelectorError
+from vla_attention.schemas.interventions import Interventions, KeyKnockout
+from vla_attention.schemas.safe_text import visible
+
+#: Change of an unchanged call among those made together that float32 explains, in spreads; bfloat16 leaves .02 to .05.
+_MOST_ROUNDING = 1e-3
+#: Parts of an episode's time.
+TIME_PARTS = 10
+PICTURES, TEXT = "all pictures", "all text"
+#: Role of keys -> what they are called; unions of several are all text.
+_PARTS = {"image": PICTURES, "bos": "first token", "template": "fixed words of the prompt",
+          "instruction": "whole instruction", "state": "state digits"}  # fmt: skip
+_EPISODE = (*EPISODE_ID[:2], "instruction", EPISODE_ID[2])
+#: What names a row: the condition as it was recorded, and what it changed.
+NAMES = ("condition", "kind", "item", "item_kind", "selector", "reader")
+_ATTENTION = ("keys", "mass", "lift", "norm")
+_VALUES: dict[str, Scale] = {
+    **dict.fromkeys(("effect", "effect_chunk", "angle", *_ATTENTION, "noise"), "positive"),
+    "gripper_flips": "share",
+    "minus_noise": "plain",
+}
+
+
+@dataclass(frozen=True)
+class RecordedEffects:
+    """The recorded effects of the selected episodes; frames are made of them when they are asked for.
+
+    Attributes:
+        question: stores and selection.
+        spread: the units.
+        measured: of each episode itself, its arrays by entry, and its attention to the items.
+        notes: how far unchanged calls are from those that the robot executed.
+    """
+
+    question: Question
+    spread: ActionSpread
+    measured: Sequence[tuple[SelectedEpisode, Mapping[str, NDArray[Any]], Measured | None]]
+    notes: tuple[str, ...]
+
+    def rows(self) -> pl.LazyFrame:
+        """One row per recorded replan and condition.
+
+        Returns:
+            suite, task_id, instruction, episode_index, replan, env_step; begin, end (the part of the episode's time in
+            which the call's actions were executed, 0 to 1); condition, kind (without, only, random, noise, prompt,
+            image), item, item_kind (word, camera, object, part, pictures, text, exchange, ...), selector, reader;
+            `action_changes.CHANGES`; gripper_effect (the effect if the gripper alone had changed); and keys, mass, lift
+            and norm of the item in the same replan (norm: of its contribution to the residual stream).
+        """
+        return frame_of_episodes(self.measured, _rows)
+
+    def episodes(self, by: Collection[str] = ()) -> pl.DataFrame:
+        """Means over the replans of every episode, condition and cell of the axes `by` (replan, time, ...).
+
+        Returns:
+            suite, task_id, instruction, episode_index, family, the axes' columns, `NAMES`, num_replans; `CHANGES`,
+            keys, mass, lift, norm; noise: the effect of another noise seed there, and minus_noise: the effect minus it.
+        """
+        cells = [name for axis, name in (("replan", "replan"), ("replan", "env_step"), ("time", "phase")) if axis in by]
+        then = partial(_means, cells=cells)
+        rows = frame_of_episodes(self.measured, _rows, then).collect()
+        place = [*EPISODE_ID, *cells]
+        noise = rows.filter(kind="noise").group_by(place).agg(noise=pl.col("effect").mean())
+        rows = rows.join(noise, on=place, how="left", maintain_order="left")
+        rows = rows.with_columns(noise=pl.when(pl.col("kind") != "noise").then("noise"))
+        rows = rows.with_columns(minus_noise=pl.col("effect") - pl.col("noise"))
+        return with_families(rows, self.question.sampling)
+
+    def summary(self, by: Collection[str] = ()) -> pl.DataFrame:
+        """`summary_of` the episodes, kept apart by the axes `by`."""
+        return summary_of(self.episodes(by), self.question.sampling, [column.name for column in columns_of(by)])
+
+
+def summary_of(episodes: pl.DataFrame, sampling: Sampling, looks: Sequence[str] = ()) -> pl.DataFrame:
+    """Means over episodes with intervals, see `estimate`: the largest effects first.
+
+    Args:
+        episodes: as `RecordedEffects.episodes` gives them.
+        sampling: what intervals are about.
+        looks: columns that tell cells apart.
+
+    Returns:
+        looks, `NAMES`, num_episodes, num_tasks; the values of `episodes`; over_noise, the mean effect / that of another
+        noise seed; gripper_part, the part of the squared effect that is the gripper's. minus_noise_q is adjusted for
+        the conditions of a cell, without those of random keys.
+    """
+    is_random = pl.col("kind") == "random"
+    found = estimate(
+        episodes.with_columns(_random=is_random), [*looks, *NAMES, "_random"], _VALUES, sampling, {"minus_noise": 0.0},
+        [*looks, "_random"], {"over_noise": ("effect", "noise")},
+    )  # fmt: skip
+    squares = episodes.group_by(*looks, *NAMES).agg(
+        gripper_part=pl.col("gripper_square").mean() / pl.col("square").mean()
+    )
+    found = found.join(squares, on=[*looks, *NAMES], how="left", nulls_equal=True, maintain_order="left")
+    found = found.with_columns(minus_noise_q=pl.when(~is_random).then("minus_noise_q")).drop("_random")
+    order = [*looks, "effect", "condition"]
+    return found.sort(order, descending=[name == "effect" for name in order], nulls_last=True)
+
+
+def recorded_effects(
+    question: Question, attention: bool = True, spread: ActionSpread | None = None
+) -> RecordedEffects | None:
+    """The effects that a question's stores recorded; None where they recorded none.
+
+    attention: whether the items' attention is measured too. spread: other units than the stores' own.
+
+    Raises:
+        BadArgument: none that they recorded can be shown; see `units_of_recorded`.
+    """
+    having = [item for item in question.selected if item.episode.attributes.effects is not None]
+    if not having:
+        if all(store.attributes.recording.effects is None for store in question.stores):
+            return None
+        raise BadArgument(_NOT_SHOWN.format(question.stores[0].path, "None was measured in a selected episode."))
+    if spread is None:
+        spread = units_of_recorded(*question.stores, skip_corrupt=question.settings.skip_corrupt)
+    here = replace(question, selected=tuple(having))
+    selectors = _selectors(here) if attention else ()
+    measured = measure(here, partial(_items, selectors=selectors), "effects") if selectors else None
+    each = partial(_arrays, spread=spread, site=question.site, selectors=selectors, selection=question.selection)
+    kept = OnDisk(each_episode(each, having))
+
+    def made(i: int) -> tuple[SelectedEpisode, Mapping[str, NDArray[Any]], Measured | None]:
+        return having[i], kept[i], None if measured is None else measured[i]
+
+    episodes = MadeWhenAsked(made, range(len(having)))
+    found = RecordedEffects(question, spread, episodes, _drift(having, kept))
+    if found.rows().head(1).collect().is_empty():
+        said = found.notes or ("None was measured in a selected replan.",)
+        raise BadArgument(_NOT_SHOWN.format(question.stores[0].path, " ".join(said)))
+    return found
+
+
+_NOT_SHOWN = "No effect that {} holds can be shown. {}"
+
+
+def described(given: Interventions) -> dict[str, str | None]:
+    """What a condition changes: kind, item, item_kind, selector and reader."""
+    changed = [bool(given.keys), bool(given.attention), given.prompt is not None, bool(given.images), bool(given.noise)]
+    kind, item, item_kind = "several", visible(given.describe()), "other"
+    selector = reader = None
+    if not any(changed):
+        kind = "nothing"
+    elif changes_noise_alone(given):
+        kind, item, item_kind = "noise", "another noise seed", "noise"
+    elif sum(changed) == 1 and len(given.keys) == 1:
+        knockout = given.keys[0]
+        kind = "random" if knockout.random_seed is not None else "only" if knockout.keep else "without"
+        item, item_kind = _item_of(knockout.selector)
+        item = {"only": f"all but the {item.removeprefix('all ')}", "random": f"random keys, as many as {item}"}.get(
+            kind, item
+        )
+        selector, reader = visible(knockout.selector), _reader_of(knockout)
+    elif sum(changed) == 1 and given.prompt is not None:
+        kind, item_kind = "prompt", "exchange"
+        if given.prompt.kind == "synonyms":
+            item = visible(", ".join(f"'{word}' as '{other}'" for word, other in given.prompt.synonyms.items()))
+    elif sum(changed) == 1 and len(given.images) == 1:
+        kind, item_kind, image = "image", "exchange", given.images[0]
+        how = {"blank": "grey", "mean": "as the task's mean"}.get(image.kind, image.kind)
+        item = visible(f"{image.camera} {how}")
+    return {"kind": kind, "item": item, "item_kind": item_kind, "selector": selector, "reader": reader}
+
+
+def _item_of(selector: str) -> tuple[str, str]:
+    """What a selector takes: its name, and of which kind it is."""
+    try:
+        atoms = atoms_of(parse_selector(selector))
+    except UserError:  # of another version's grammar: it is named as it stands
+        return visible(selector), "other"
+    kinds = {atom.kind for atom in atoms}
+    if kinds == {"role"} and "role:image" not in selector and len(atoms) > 1:
+        return TEXT, "text"
+    if len(atoms) != 1:
+        return visible(selector), "other"
+    kind, name = atoms[0].kind, visible(atoms[0].argument)
+    if kind == "role":
+        return _PARTS.get(name, name), "pictures" if name == "image" else "part"
+    return (f"'{name}'" if kind == "word" else name), kind
+
+
+def _reader_of(knockout: KeyKnockout) -> str:
+    if knockout.queries == "prefix":
+        return "pictures" if knockout.query_selector == "role:image" else "text"
+    return "total" if knockout.queries == "all" else "direct"
+
+
+def _selectors(question: Question) -> tuple[str, ...]:
+    """The selectors of all items that have a name at the question's site."""
+    texts = dict.fromkeys(
+        knockout.selector
+        for item in question.selected
+        if (effects := item.episode.attributes.effects) is not None
+        for condition in effects.conditions
+        for knockout in condition.keys
+    )
+    layout = question.selected[0].tokens.layout
+    found = []
+    for text in texts:
+        try:
+            check_names(_grouping((text,)), question.vocabulary, layout)
+        except (SelectorError, UnknownName):  # a site of pictures has no words: there is no attention to them there
+            continue
+        found.append(text)
+    return tuple(found)
+
+
+def _grouping(selectors: Sequence[str]) -> Grouping:
+    """Each selector as a group of its own; in brackets, since '*' alone in a group means the rest."""
+    members = {f"item{i}": (f"({text})",) for i, text in enumerate(selectors)}
+    return Grouping("effects", members, overlap=True, allow_empty=tuple(members))
+
+
+def _items(item: SelectedEpisode, selectors: Sequence[str]) -> Items:
+    weights = resolve_episode(_grouping(selectors), item).weights
+    return Items({"selector": pl.Series([visible(text) for text in selectors], dtype=pl.String)}, weights)
+
+
+def _arrays(
+    item: SelectedEpisode, spread: ActionSpread, site: str, selectors: Sequence[str], selection: Selection
+) -> dict[str, NDArray[Any]]:
+    """By entry replan, condition, begin, end, changes (entry, change), gripper; norm (replan, selector)."""
+    effects, base = item.episode.attributes.effects, BaseEpisode.of(item)
+    assert effects is not None
+    replan = np.array(effects.replan, np.int64)
+    at, change = base.at(replan), np.zeros((0, *base.actions.shape[1:]))
+    if item.episode.has(CHANGE):
+        change = item.episode.read(CHANGE).astype(np.float64) * np.array(effects.units)
+    number, gripper = len(spread.used), np.full(len(replan), np.nan)
+    of_gripper = replace(spread, used=spread.used & (np.arange(number) == number + GRIPPER))
+    if of_gripper.used.any() and not item.store.attributes.protocol.of_other_loop:
+        alone = root_mean_square_change(at.actions, at.actions + change, of_gripper, at.executed)
+        gripper = alone / np.sqrt(spread.used.sum())
+    edges = np.append(base.starts, base.num_steps) / base.num_steps
+    norm = np.full((len(base.starts), len(selectors)), np.nan)
+    if selectors and item.store.attributes.recording.contributions:
+        blocks = [i for i in range(len(selection.blocks)) if selection.is_first_of_block(i)]
+        gram = selected_gram(item, site, selection)[:, blocks]
+        parts = whole_segments(item, resolve_episode(_grouping(selectors), item), site)
+        for i in range(len(selectors)):
+            if f"item{i}" in parts:
+                norm[:, i] = joint_norm(gram, parts[f"item{i}"]).mean(axis=(1, 2))
+    return {
+        "replan": replan,
+        "condition": np.array(effects.condition, np.int64),
+        "env_step": base.env_step[replan],
+        "begin": edges[:-1][replan],
+        "end": edges[1:][replan],
+        "changes": changes_of(at, at.actions + change, spread),
+        "gripper": gripper,
+        "norm": norm,
+    }
+
+
+def _rows(one: tuple[SelectedEpisode, Mapping[str, NDArray[Any]], Measured | None]) -> pl.DataFrame:
+    """`RecordedEffects.rows` of one episode."""
+    item, arrays, measured = one
+    effects = item.episode.attributes.effects
+    assert effects is not None
+    named = [{"condition": visible(given.name), **described(given)} for given in effects.conditions]
+    conditions = pl.DataFrame(named, schema=dict.fromkeys(NAMES, pl.String))[arrays["condition"]]
+    keys = {
+        name: column.new_from_index(0, len(conditions)) for name, column in episode_columns([item], _EPISODE).items()
+    }
+    place = {name: arrays[name] for name in ("replan", "env_step", "begin", "end")}
+    values = {name: arrays["changes"][:, i] for i, name in enumerate(CHANGES)} | {"gripper_effect": arrays["gripper"]}
+    rows = pl.DataFrame({**keys, **place, **conditions.to_dict(), **values}).filter(pl.col("kind") != "nothing")
+    if measured is None:
+        return rows.with_columns(
+            pl.col(values.keys()).fill_nan(None), *(pl.lit(None, pl.Float64).alias(name) for name in _ATTENTION)
+        )
+    attention = means(measured, ("replan",)).with_columns(norm=arrays["norm"].ravel())
+    joined = rows.join(
+        attention.select("replan", "selector", *_ATTENTION),
+        on=["replan", "selector"],
+        how="left",
+        maintain_order="left",
+    )
+    return joined.with_columns(pl.col(*values, *_ATTENTION).fill_nan(None))
+
+
+def _means(rows: pl.DataFrame, cells: Sequence[str]) -> pl.DataFrame:
+    """Means over the replans of each episode, condition and cell; of parts of the time by how long a replan lasts."""
+    weight = pl.lit(1.0)
+    if "phase" in cells:
+        edges = np.linspace(0.0, 1.0, TIME_PARTS + 1)
+        parts = pl.DataFrame({"_low": edges[:-1], "_high": edges[1:]}).with_columns(
+            phase=((pl.col("_low") + pl.col("_high")) / 2).round(6)
+        )
+        lasts = pl.min_horizontal("_high", "end") - pl.max_horizontal("_low", "begin")
+        # Rounding can make neighbours overlap by a tiny amount.
+        rows = rows.join(parts, how="cross").with_columns(_weight=lasts).filter(pl.col("_weight") > 1e-12)
+        weight = pl.col("_weight")
+    names = [*_EPISODE, *cells, *NAMES]
+    squares = [
+        weighted(pl.col(of) ** 2, weight).alias(name)
+        for name, of in (("square", "effect"), ("gripper_square", "gripper_effect"))
+    ]
+    return rows.group_by(names, maintain_order=True).agg(
+        pl.len().cast(pl.Int64).alias("num_replans"),
+        *(weighted(pl.col(name), weight).alias(name) for name in (*CHANGES, *_ATTENTION)),
+        *squares,
+    )
+
+
+def _drift(having: Sequence[SelectedEpisode], kept: Sequence[Mapping[str, NDArray[Any]]]) -> tuple[str, ...]:
+    """How far calls without a change are from those that the robot executed, if rounding does not explain it."""
+    most, where = 0.0, ""
+    for item, arrays in zip(having, kept, strict=True):
+        effects = item.episode.attributes.effects
+        assert effects is not None
+        nothing = [i for i, given in enumerate(effects.conditions) if given.is_none]
+        sizes = np.where(np.isin(arrays["condition"], nothing), arrays["changes"][:, CHANGES.index("effect_chunk")], 0)
+        if sizes.size and sizes.max() > most:
+            most = float(sizes.max())
+            where = f"replan {int(arrays['replan'][sizes.argmax()])} of {item.episode.name}"
+    if most <= _MOST_ROUNDING:
+        return ()
+    return (
+        f"Calls that were made again without any change differ from the executed ones by up to {most:.2g} standard "
+        f"deviations ({where}). Effects that are not far above that are none.",
+    )

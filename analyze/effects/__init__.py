@@ -1,1 +1,0 @@
-"""`vla-attention effects`: how much actions change under interventions, beside the attention of the same replans."""
