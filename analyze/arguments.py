@@ -8,13 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.options import Numbers, add_option, add_task, number_range
-from vla_attention.schemas.safe_text import file_part
-from vla_attention.schemas.stores.store_url import store_place
 
 if TYPE_CHECKING:
     from vla_attention.analyze.measures.question import Question
     from vla_attention.analyze.measures.question_settings import AnalysisSettings
-    from vla_attention.analyze.measures.sinks import SinkRule
     from vla_attention.analyze.show.answer import Answer
     from vla_attention.schemas.stores.reader import Store
 
@@ -28,11 +25,6 @@ def output_place(text: str) -> Path:
     except BadArgument as error:
         raise argparse.ArgumentTypeError(str(error).removesuffix(".")) from None
     return Path(text)
-
-
-def add_stores(parser: argparse.ArgumentParser) -> None:
-    """STORE ..., one or several, analysed as one."""
-    parser.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses")
 
 
 def stores_of(arguments: argparse.Namespace) -> list[Store]:
@@ -143,36 +135,6 @@ def add_pdf(output: argparse._ActionsContainer) -> None:
     output.add_argument("--pdf", action="store_true", help="pictures as PDF too (takes twice the time)")
 
 
-def add_sink_rule(parser: argparse._ArgumentGroup) -> None:
-    """--sink-factor, --sink-share, --sink-mass, --sink-heads; their defaults are those of `measures.sinks.SinkRule`."""
-    parser.add_argument(
-        "--sink-factor", type=float, metavar="X", help="a sink takes more than X times its uniform share (default: 10)"
-    )
-    parser.add_argument(
-        "--sink-share", type=float, metavar="F", help="in at least this share of a head's rows (default: 0.5)"
-    )
-    parser.add_argument(
-        "--sink-mass",
-        type=float,
-        metavar="M",
-        help="or on average more than this part of a row, and more than twice its uniform share (default: 0.3)",
-    )
-    parser.add_argument(
-        "--sink-heads",
-        type=float,
-        metavar="H",
-        help="--without-sinks takes out sinks of at least this share of the layers' heads (default: 0.25)",
-    )
-
-
-def sink_rule(arguments: argparse.Namespace) -> SinkRule:
-    """The rule that the four arguments give."""
-    from vla_attention.analyze.measures.sinks import SinkRule
-
-    given = {name: getattr(arguments, f"sink_{name}") for name in ("factor", "share", "mass", "heads")}
-    return SinkRule(**{name: value for name, value in given.items() if value is not None})
-
-
 def settings_of(arguments: argparse.Namespace) -> AnalysisSettings:
     """The settings in the parsed arguments; those that a command has no argument for keep their defaults."""
     from dataclasses import fields
@@ -192,9 +154,3 @@ def settings_of(arguments: argparse.Namespace) -> AnalysisSettings:
 def show(answer: Answer, folder: Path, arguments: argparse.Namespace) -> int:
     """Show an answer as the arguments of `add_output` say; returns the exit code."""
     return answer.show(folder, pictures=not arguments.no_plots)
-
-
-def output_folder(arguments: argparse.Namespace, name: str) -> Path:
-    """The folder of results: `--output`, else results/STORE/NAME."""
-    given: Path | None = arguments.output
-    return given or Path("results") / arguments.stores[0].stem / file_part(name)

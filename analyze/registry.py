@@ -134,8 +134,3 @@ COMMANDS: dict[str, Command] = {
 }
 #: The command of `vla-attention analyze STORE`.
 DEFAULT_COMMAND = "analyze"
-
-
-def list_of_commands() -> str:
-    """The commands as lines for a help text."""
-    return "\n".join(f"  {name:<9} {command.answers}" for name, command in COMMANDS.items())

@@ -14,7 +14,6 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.safe_text import visible
@@ -88,11 +87,6 @@ def _labels(name: str, labels: Sequence[Any] | NDArray[Any] | pl.Series) -> pl.S
     known = next((label for label in given if label is not None), 0)
     kinds = {bool: pl.Boolean, int: pl.Int64, float: pl.Float64, str: pl.String}
     return pl.Series(name, given, dtype=kinds[type(known)])
-
-
-def rows_of_episode(table: pl.DataFrame | TableInParts, item: SelectedEpisode) -> pl.DataFrame:
-    """The rows of one episode."""
-    return table.filter(**dict(zip(EPISODE_ID, episode_id(item), strict=True)))
 
 
 def layer_name(layer: str, average: str = "all layers", noun: str = "layer") -> str:
@@ -267,14 +261,6 @@ def concat_tables(parts: Sequence[Tables]) -> Tables:
     )
 
 
-def tables_of_each(measured: Sequence[Measured], make: Callable[[Measured], Tables]) -> Tables:
-    """Tables with a part for each of `measured`, which `make` makes of it whenever it is asked for; all have cells."""
-    parts = MadeWhenAsked(lambda i: make(measured[i]), range(len(measured)))
-    return Tables(
-        lambda: pl.concat([part.cells for part in parts]), lambda: pl.concat([part.groups for part in parts]), parts
-    )
-
-
 @dataclass(frozen=True)
 class TableInParts:
     """A table in parts of whole episodes with the same columns, each made whenever it is asked for."""
@@ -327,29 +313,3 @@ def in_larger_parts(parts: Iterable[pl.DataFrame]) -> Iterator[pl.DataFrame]:
             batch = []
     if batch:
         yield pl.concat(batch)
-
-
-def cells_in_parts(level: Tables) -> TableInParts:
-    """The cells of a level."""
-    return TableInParts(MadeWhenAsked(lambda i: level.parts[i].cells, range(len(level.parts))))
-
-
-def groups_in_parts(level: Tables) -> TableInParts:
-    """The groups of a level."""
-    return TableInParts(MadeWhenAsked(lambda i: level.parts[i].groups, range(len(level.parts))))
-
-
-def rows_of_layer(level: Tables, layer: str) -> Tables:
-    """The cells and groups of one layer, both kept."""
-    of_layer = pl.col("layer") == layer
-    return Tables(cells_in_parts(level).filter(of_layer), groups_in_parts(level).filter(of_layer))
-
-
-def named_parts(name: str, level: Tables) -> dict[str, TableInParts]:
-    """The two tables of a level as `named_tables` has them, to be written in parts."""
-    return {name: cells_in_parts(level), f"{name}_groups": groups_in_parts(level)}
-
-
-def named_tables(name: str, level: Tables) -> dict[str, pl.DataFrame]:
-    """The two tables of a level by the names of their files, NAME and NAME_groups."""
-    return {name: level.cells, f"{name}_groups": level.groups}

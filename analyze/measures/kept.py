@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.analyze.cache.remembered import CachedQuestion, remembered
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.stores.selection import Selection
-from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 
 
 def measured_once(
@@ -52,12 +49,3 @@ def measured_once(
     own = of_episodes or [None] * len(selected)
     extra = [[item.without, one] for item, one in zip(selected, own, strict=True)]
     return remembered(question, [item.episode for item in selected], measure, extra, progress)
-
-
-def digest_of_weights(resolved: ResolvedGrouping) -> str:
-    """A digest of what numbers depend on of a grouping that was resolved."""
-    digest = hashlib.sha256()
-    for array in (resolved.weights, resolved.num_keys, resolved.num_valid):
-        digest.update(f"{array.dtype.str}{array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()

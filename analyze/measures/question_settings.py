@@ -89,11 +89,6 @@ def check_name(what: str, given: str, known: Collection[str]) -> None:
         raise BadArgument(f"Unknown {what} '{given}'.{did_you_mean(given, known)} Existing: {listing(known)}.")
 
 
-def given_only(**options: int | None) -> dict[str, Any]:
-    """The options that were given."""
-    return {name: value for name, value in options.items() if value is not None}
-
-
 def _whole_numbers(value: int | Sequence[int]) -> tuple[int, ...]:
     items = [value] if isinstance(value, (int, str)) else list(value)
     try:

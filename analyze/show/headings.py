@@ -79,20 +79,3 @@ def run_header(
     ]
     warning = [untrained_warning()] if untrained else []
     return [*title(text), *wrap_all([*warning, *lines])]
-
-
-def note_lines(notes: Iterable[str]) -> list[str]:
-    """One `note: ...` per note."""
-    return wrap_all((f"note: {note}" for note in notes), rest="  ")
-
-
-def interval_note(level: float, about: str, kind: str = "") -> str:
-    """The sentence below tables with intervals.
-
-    Args:
-        level: their level.
-        about: what they are about (`Units.words`): "tasks like these, by 5 families", "these tasks".
-        kind: a property, for instance that they are pointwise.
-    """
-    which = ", ".join(part for part in (f"{100 * level:g}%", kind) if part)
-    return f"Intervals: {which}, about {about} (with one task, episodes like these); - where there can be none."

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Iterable
 
 from vla_attention.schemas.command_line import format_bytes as format_bytes  # shared with capture
 from vla_attention.schemas.errors import plural as plural
@@ -35,12 +34,6 @@ def format_signed(value: float | None) -> str:
 def format_interval(low: float | None, high: float | None) -> str:
     """`[low, high]`; - when there is no interval."""
     return "-" if low is None or high is None else f"[{format_number(low)}, {format_number(high)}]"
-
-
-def row_interval(row: Mapping[str, Any], name: str = "") -> str:
-    """The columns `name_low` and `name_high` of a table's row, or `low` and `high`, as `format_interval`."""
-    prefix = f"{name}_" if name else ""
-    return format_interval(row[f"{prefix}low"], row[f"{prefix}high"])
 
 
 def format_percent(share: float | None, decimals: int = 1) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, NOTE_COLOR
+from vla_attention.analyze.show.plot_colours import BASELINE_COLOR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -81,24 +81,7 @@ def scattered(generator: np.random.Generator, position: float, count: int, sprea
     return np.asarray(position + offsets)
 
 
-def note_at_row(axes: Axes, position: float, text: str, x: float = 1.01, size: float = 7) -> None:
-    """Small print beside a row of a plot, such as `n = 5`; `position` is on the y axis, `x` in widths of the axes."""
-    axes.text(x, position, text, transform=axes.get_yaxis_transform(), va="center", size=size, color=NOTE_COLOR)
-
-
 def legend_above(axes: Axes, columns: int = 1, handles: Sequence[Any] | None = None, **options: Any) -> None:
     """A legend above the right end of the axes."""
     chosen = {} if handles is None else {"handles": handles}
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.1, **chosen, **options)
-
-
-def legend_below(axes: Axes, columns: int, from_top: bool = False) -> None:
-    """A legend below the axes; `from_top`: the last drawn part first, as parts that are stacked are seen."""
-    handles, labels = axes.get_legend_handles_labels()
-    order = -1 if from_top else 1
-    axes.legend(handles[::order], labels[::order], loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=columns)
-
-
-def legend_beside(axes: Axes, **options: Any) -> None:
-    """A legend to the right of the axes, from the top."""
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), **options)

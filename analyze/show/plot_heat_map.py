@@ -66,11 +66,6 @@ def draw_log2_map(
     bar.outline.set_visible(False)
 
 
-def map_height(num_rows: int, num_columns: int) -> float:
-    """Height of the cells of a map in inches: larger where the cells hold numbers."""
-    return num_rows * (0.36 if _has_numbers(num_rows, num_columns) else 0.2)
-
-
 def _has_numbers(num_rows: int, num_columns: int) -> bool:
     return num_rows * num_columns <= _MOST_NUMBERS and num_columns <= _MOST_NUMBERED_COLUMNS
 

@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
-from vla_attention.analyze.show.output_files import replacing
-from vla_attention.analyze.show.picture_formats import picture_formats
-
 if TYPE_CHECKING:
-    import polars as pl
     from matplotlib.figure import Figure
 
 Parameters = ParamSpec("Parameters")
@@ -80,33 +75,3 @@ def find_places(figure: Figure) -> None:
         figure.set_dpi(DPI)
         engine.execute(figure)
         figure.set_layout_engine(None)
-
-
-def save_figure(
-    figure: Figure,
-    folder: Path,
-    stem: str,
-    data: pl.DataFrame | Mapping[str, pl.DataFrame],
-    formats: Sequence[str] | None = None,
-) -> list[Path]:
-    """Save `stem`.png, .pdf and .csv (the plotted data) into a folder, each atomically, and return their paths.
-
-    `data`: one table, or several by what their files' names have after `stem`. `formats`: those of
-    `picture_formats`, PNG and PDF unless a command line says otherwise.
-    """
-    paths = []
-    find_places(figure)
-    for kind in formats or picture_formats():
-        path = folder / f"{stem}.{kind}"
-        # Without a creation date the same data give the same file.
-        metadata = {"CreationDate": None} if kind == "pdf" else None
-        with replacing(path) as temporary:
-            figure.savefig(temporary, format=kind, dpi=DPI, metadata=metadata)
-        paths.append(path)
-    tables = data if isinstance(data, Mapping) else {"": data}
-    for end, table in tables.items():
-        path = folder / f"{stem}{end}.csv"
-        with replacing(path) as temporary:
-            table.write_csv(temporary)
-        paths.append(path)
-    return paths

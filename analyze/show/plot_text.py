@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from vla_attention.analyze.show.plot_axes import hide_frame
 from vla_attention.analyze.show.plot_colours import NOTE_COLOR
@@ -43,15 +42,6 @@ def broken(name: str, width: int) -> str:
         while len(lines[-1]) > width and lines[-1].rstrip() != lines[-1][:width].rstrip():
             lines[-1:] = [lines[-1][:width], lines[-1][width:]]
     return "\n".join(line.rstrip() for line in lines)
-
-
-def task_label(row: Mapping[str, Any], several_suites: bool, few: bool) -> str:
-    """The label of a task's row: number (after its suite where there are several) and instruction.
-
-    The instruction is cut after one line, or with `few` rows in the plot, after two.
-    """
-    number = f"{row['suite']} {row['task_id']}" if several_suites else str(row["task_id"])
-    return wrapped(f"{number}: {row['instruction']}", 52 if few else 60, 2 if few else 1)
 
 
 def explain(axes: Axes, text: str) -> None:

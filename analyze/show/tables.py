@@ -18,7 +18,6 @@ from vla_attention.analyze.show.numbers import (
     format_interval,
     format_number,
     format_percent,
-    format_percent_interval,
     format_signed,
     interval_name,
 )
@@ -114,16 +113,6 @@ def estimate(header: str, name: str, page: str | None = None) -> tuple[Column, C
     return number(header, name, page), interval(name, None if page is None else INTERVAL)
 
 
-def signed_estimate(header: str, name: str) -> tuple[Column, Column]:
-    """As `estimate`, with the number's sign, in texts."""
-    return signed(header, name), interval(name)
-
-
-def percent_interval(name: str, header: str = "interval") -> Column:
-    """As `interval`, of shares in per cent, in texts."""
-    return texts(header, lambda row: format_percent_interval(row[f"{name}_low"], row[f"{name}_high"]))
-
-
 def texts(header: str | None, shown: Shown, left: bool = False, running: bool = False) -> Column:
     """Cells of a text as they are."""
     return words(header, shown, None, left, running)
@@ -207,10 +196,3 @@ class Table:
                     pairs = zip_longest(body[i], beside, fillvalue="")
                     body[i] = [(cells.ljust(indent) + more).rstrip() for cells, more in pairs]
         return head, body
-
-
-def episode_count(several_tasks: bool) -> Column:
-    """The column with `num_episodes` and, where there are several tasks, `num_tasks` in brackets."""
-    if not several_tasks:
-        return count("episodes", "num_episodes")
-    return texts("episodes (tasks)", lambda row: f"{row['num_episodes']} ({row['num_tasks']})")

@@ -138,26 +138,6 @@ def mean_over_episodes(values: ArrayLike, limits: tuple[float, float] = NO_LIMIT
     return EpisodeStatistic(np.where(used, sample, 0.0), used.astype(np.float64), used, limits=limits)
 
 
-def means_over_tasks(values: NDArray[np.float64], tasks: ArrayLike) -> NDArray[np.float64]:
-    """The values of `mean_over_episodes` of many quantities at once, without their errors.
-
-    Args:
-        values: (..., episode, quantity); those that are not finite are left out.
-        tasks: (episode,) labels of the episodes' tasks.
-
-    Returns:
-        (..., quantity); NaN where no episode has a finite value.
-    """
-    task_of = np.unique(np.asarray(tasks), return_inverse=True)[1]
-    member = (np.arange(task_of.max(initial=-1) + 1)[:, None] == task_of).astype(np.float64)  # (task, episode)
-    used = np.isfinite(values)
-    size = member @ used.astype(np.float64)  # (..., task, quantity)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        of_tasks = np.where(size > 0, (member @ np.where(used, values, 0.0)) / size, 0.0)
-        means: NDArray[np.float64] = of_tasks.sum(axis=-2) / (size > 0).sum(axis=-2)
-    return means
-
-
 def ratio_of_means_over_episodes(numerator: ArrayLike, denominator: ArrayLike) -> EpisodeStatistic:
     """Mean numerator mass / mean denominator mass, both (..., episode). It uses episodes with an infinite ratio."""
     above, below = np.asarray(numerator, dtype=np.float64), np.asarray(denominator, dtype=np.float64)
