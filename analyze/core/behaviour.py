@@ -128,7 +128,7 @@ def row_of(
         "touched_at": touched_at,
         "did": None if done is None else visible(done.instruction),
         "did_at": None if done is None else done.first_held,
-        "how": how,
+        "how": None if attributes.success else how,
         "before": None if before is None else visible(before.instruction),
         "goals": [
             {"goal": key_of(goal), "instruction": visible(goal.instruction), "held": goal.first_held}

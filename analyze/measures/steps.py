@@ -202,7 +202,6 @@ def _measured_or_kept(
 
     measured = measured_once(
         "masses",
-        f"masses of grouping {grouping.name}",
         selected,
         selection,
         question.site,

@@ -52,9 +52,9 @@ def mean_difference(values: ArrayLike, is_first: ArrayLike, units: Units, decide
     cells = _TaskCells.of(x, first, units), _TaskCells.of(x, second, units)
     units = units.decided(first, second) if decide else units
     known = all(cell.num_tasks for cell in cells)
-    means = [cell.mean if cell.num_tasks else None for cell in cells]
+    mean_first, mean_second = (cell.mean if cell.num_tasks else None for cell in cells)
     difference = _difference(cells, units) if known else UNKNOWN
-    return MeanDifference(int(first.sum()), int(second.sum()), *means, difference, units.estimand)
+    return MeanDifference(int(first.sum()), int(second.sum()), mean_first, mean_second, difference, units.estimand)
 
 
 @dataclass(frozen=True)
