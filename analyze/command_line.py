@@ -71,15 +71,15 @@ def build_parser(name: str) -> argparse.ArgumentParser:
         parser = import_module(f"vla_attention.analyze.{name}.command").build_parser()
     else:
         parser = question_parser(name)
-    add_threads(
-        parser,
-        "threads that measure episodes, at most 4 (default: OMP_NUM_THREADS, else the cores of this process)",
-    )
-    if name != "cache":
+    if not COMMANDS[name].keeps:
+        add_threads(
+            parser,
+            "threads that measure episodes, at most 4 (default: OMP_NUM_THREADS, else the cores of this process)",
+        )
         parser.add_argument(
             "--no-cache",
             action="store_true",
-            help="measure again what was measured before (see vla-attention cache; VLA_CACHE=off does the same)",
+            help="measure again what was measured before (VLA_CACHE=off does the same)",
         )
     return parser
 
@@ -120,7 +120,7 @@ def _with_way_out(error: UserError, can_skip: bool) -> UserError:
     if not isinstance(error, CorruptEpisode):
         return error
     skip = "; leave such episodes out with --skip-corrupt" if can_skip else ""
-    return CorruptEpisode(f"{error} See all faults with vla-attention verify{skip}.")
+    return CorruptEpisode(f"{error} See all faults with vla-attention store verify{skip}.")
 
 
 def _refuse_misspelt_command(arguments: Sequence[str]) -> None:

@@ -16,7 +16,7 @@ class Command:
         needs: what is said of a store without such a site.
         examples: command lines behind `vla-attention`, for the help of a question.
         folder: whether it is `analyze.NAME.command`, with a parser of its own, instead of a question.
-        keeps: whether it keeps stores instead of asking them.
+        keeps: whether it keeps stores instead of asking them; its parser has all of its options.
         page: whether its function gives several results, which are one HTML file.
         runs: whether it takes runs, each of one or several stores, instead of the stores of one.
     """
@@ -124,13 +124,7 @@ COMMANDS: dict[str, Command] = {
         page=True,
     ),
     "view": Command("a page on which to explore: episodes, words, patches, heads, groups", folder=True),
-    "copy": Command(
-        "a copy of a store: smaller, packed, from or to elsewhere; or one store of several", folder=True, keeps=True
-    ),
-    "verify": Command(
-        "read everything back and check it; --repair moves damaged episodes aside", folder=True, keeps=True
-    ),
-    "cache": Command("what is kept of earlier analyses: where, how much; --clear removes it", folder=True, keeps=True),
+    "store": Command("copy: pack, merge or slim stores; verify: check and repair them", folder=True, keeps=True),
 }
 #: The command of `vla-attention analyze STORE`.
 DEFAULT_COMMAND = "analyze"

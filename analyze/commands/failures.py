@@ -149,7 +149,7 @@ def _attention(question: Question, items: Sequence[SelectedEpisode]) -> pl.DataF
     if not items:
         return found
     part = replace(question, selected=tuple({(item.task, item.episode.name): item for item in items}.values()))
-    lifts = table_of(measure(part, items_of, "words"), {"replan"}).filter(pl.col("kind") == "word").collect()
+    lifts = table_of(measure(part, items_of), {"replan"}).filter(pl.col("kind") == "word").collect()
     most = lifts.drop_nulls("lift").sort("lift", "item", descending=[True, False])
     read = most.group_by(place, maintain_order=True).agg(read=pl.first("item"))
     try:

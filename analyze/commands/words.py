@@ -34,7 +34,7 @@ def words(question: Question, by: Collection[str] = ()) -> Result:
         raise BadArgument(f"Site '{question.site}': {NO_WORDS}.")
     check_axes(by, ("layer", "head", "denoise", "replan", "task", "family", "episode"))
     axes = [axis for axis in OF_ROWS if axis in by]
-    measured = measure(question, items_of, "words", axes)
+    measured = measure(question, items_of, axes)
     instructions = {visible(item.episode.attributes.instruction) for item in question.selected}
     shown = "place" if len(instructions) == 1 else "word"
     kept = columns_of(by)

@@ -70,7 +70,7 @@ class RunValues:
         """
         tables = {"groups": values_of_groups(self.levels), "heads": self._heads()}
         if self.run.question.vocabulary.words:
-            words = table_of(measure(self.run.question, items_of, "words")).filter(pl.col("kind") == "word")
+            words = table_of(measure(self.run.question, items_of)).filter(pl.col("kind") == "word")
             tables["words"] = words.select(*EPISODE_ID, "item", value=pl.col("lift").log(2.0)).collect()
         if any(cameras_of(item) for item in self.run.question.selected):
             objects = object_episodes(measure_objects(with_coverage(self.run.question)))

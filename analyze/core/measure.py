@@ -104,7 +104,6 @@ class Measured:
 def measure(
     question: Question,
     items_of: Callable[[SelectedEpisode], Items],
-    what: str,
     keep: Collection[str] = (),
     check: Callable[[Sequence[Array]], None] = lambda num_keys: None,
 ) -> Sequence[Measured]:
@@ -116,7 +115,6 @@ def measure(
     Args:
         question: stores, selection and site.
         items_of: gives the items of an episode; a function of a module, or a `functools.partial` of one.
-        what: the items in a word or two, for the cache.
         keep: "denoise" and "head" are kept apart where they are here, see `axes.OF_ROWS`.
         check: called before anything is measured with the most keys of the items at a replan, (1, item) per episode.
     """
@@ -133,7 +131,7 @@ def measure(
 
         digests = [one.digest for one in described]
         arrays = measured_once(
-            "items", f"masses of {what}", chosen, selection, question.site, scan, {"denoise": "denoise" in keep},
+            "items", chosen, selection, question.site, scan, {"denoise": "denoise" in keep},
             digests, advance,
         )  # fmt: skip
         kept = OnDisk(arrays)

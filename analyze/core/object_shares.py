@@ -93,7 +93,7 @@ def items_of(item: SelectedEpisode) -> Items:
 
 def measure_objects(question: Question, by: Collection[str] = ()) -> Sequence[Measured]:
     """The masses of `items_of` in every episode of a question `with_coverage`."""
-    return measure(question, items_of, "objects", [axis for axis in OF_ROWS if axis in by])
+    return measure(question, items_of, [axis for axis in OF_ROWS if axis in by])
 
 
 def object_times(measured: Sequence[Measured]) -> pl.LazyFrame:

@@ -27,7 +27,7 @@ def replan_starts(env_step: NDArray[np.int64], wait_steps: int, num_steps: int, 
     if len(starts) == 0 or starts[0] != 0 or (np.diff(starts) <= 0).any() or starts[-1] >= num_steps:
         raise StoreError(
             f"The replans of {name} do not fit into its {num_steps} steps after {wait_steps} steps of waiting; check "
-            "the store with vla-attention verify."
+            "the store with vla-attention store verify."
         )
     return starts
 

@@ -9,13 +9,11 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.cache.remembered import CachedQuestion, remembered
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.stores.selection import Selection
 
 
 def measured_once(
     what: str,
-    about: str,
     selected: Sequence[SelectedEpisode],
     selection: Selection,
     site: str,
@@ -28,7 +26,6 @@ def measured_once(
 
     Args:
         what: the kind of numbers.
-        about: the same in words, for `vla-attention cache`.
         selected: the episodes.
         selection: layers, denoise steps and heads.
         site: the softmax family.
@@ -38,13 +35,10 @@ def measured_once(
         of_episodes: the same that differs between episodes.
         progress: called with the number of episodes that need not be measured.
     """
-    heads = f"{plural(len(selection.heads), 'head')}{' apart' if selection.per_head else ''}"
     axes = {"layers": selection.layers, "denoise": selection.denoise, "heads": selection.heads}
     question = CachedQuestion(
         what,
         {**arguments, **axes, "per_head": selection.per_head, "site": site},
-        f"{about}, site {site}, {plural(len(selection.layers), 'layer')}, "
-        f"{plural(len(selection.denoise), 'denoise step')}, {heads}",
     )
     own = of_episodes or [None] * len(selected)
     extra = [[item.without, one] for item, one in zip(selected, own, strict=True)]

@@ -326,8 +326,8 @@ def search_sinks(question: Question, rule: SinkRule | None = None) -> SinkSearch
             scan = partial(_share_arrays, selection=selection, site=site, rule=rule)
             return each_episode(scan, [selected[i] for i in positions], advance)
 
-        about, arguments = "shares of keys", {"factor": rule.factor}
-        arrays = measured_once("shares", about, selected, selection, site, measure, arguments, progress=advance)
+        arguments = {"factor": rule.factor}
+        arrays = measured_once("shares", selected, selection, site, measure, arguments, progress=advance)
         kept = OnDisk(arrays)
     return search_of(question, MadeWhenAsked(lambda i: KeyShares(**kept[i]), range(len(kept))), rule)
 

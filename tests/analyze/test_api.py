@@ -164,7 +164,7 @@ def test_an_empty_store_can_be_opened_and_says_that_it_is_empty(tmp_path):
 
 def test_a_group_inside_of_a_store_leads_to_the_store(store, capsys):
     for inside in (store / "episodes", store / "episodes" / "task000_episode000"):
-        assert main(["verify", str(inside)]) == 2
+        assert main(["store", "verify", str(inside)]) == 2
         assert f"is a group inside of a store; give the folder above, {store}." in capsys.readouterr().err
 
 

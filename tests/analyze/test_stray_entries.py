@@ -54,14 +54,19 @@ def store(stores) -> Path:
 
 
 #: The stores of a command that takes others than a.zarr, or two.
-STORES = {"effects": ("effects",), "effects of data": ("data",), "copy": ("one", "two"), "overlay": ("one", "two")}
+STORES = {
+    "effects": ("effects",),
+    "effects of data": ("data",),
+    "store copy": ("one", "two"),
+    "overlay": ("one", "two"),
+}
 #: Commands that draw unless they are told not to.
 DRAWING = ("analyze", "words", "objects", "effects", "effects of data", "overlay")
-#: `verify` and `repair` name strays in their own way.
-READING = [command for command in WORDS if command not in ("verify", "repair", "cache")]
+#: `verify` names strays in its own way.
+READING = [command for command in WORDS if command != "store verify"]
 
 
-@pytest.mark.parametrize("command", thorough_except(("analyze list", "words", "copy"), READING))
+@pytest.mark.parametrize("command", thorough_except(("analyze list", "words", "store copy"), READING))
 def test_a_command_names_them_and_goes_on(stores, tmp_path, monkeypatch, capsys, command):
     monkeypatch.setenv("VLA_CACHE", "off")
     first, second = (*STORES.get(command, ("a", "other")), "")[:2]
@@ -85,5 +90,5 @@ def test_the_library_warns(store):
 
 
 def test_a_copy_leaves_them_behind(store, tmp_path):
-    assert analyze(["copy", str(store), str(tmp_path / "copy.zarr")]) == 0
+    assert analyze(["store", "copy", str(store), str(tmp_path / "copy.zarr")]) == 0
     assert sorted(entry.name for entry in (tmp_path / "copy.zarr/episodes").iterdir()) == [*EPISODES, "zarr.json"]

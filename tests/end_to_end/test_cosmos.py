@@ -49,7 +49,7 @@ def cosmos_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_store_is_whole(cosmos_store):
-    assert analyze(["verify", str(cosmos_store)]) == 0
+    assert analyze(["store", "verify", str(cosmos_store)]) == 0
 
 
 def test_rows_of_both_sites_sum_to_one_and_contributions_to_the_update(cosmos_store):
@@ -104,7 +104,7 @@ def test_queries_can_be_pooled_by_action_step(tmp_path):
     assert capture([*ONE_LAYER, "--queries", "steps", "--output", str(store)]) == 0
     rows = zarr.open_group(store / "episodes/task000_episode000", mode="r")["self/rows"]
     assert rows.shape[4] == 16 * 7
-    assert analyze(["verify", str(store)]) == 0
+    assert analyze(["store", "verify", str(store)]) == 0
 
 
 @pytest.mark.parametrize(

@@ -84,7 +84,7 @@ def rows_of(store: Path, site: str) -> np.ndarray:
 @pytest.mark.libero
 @pytest.mark.simulator
 def test_the_store_has_the_published_sizes_and_both_sites(libero_store):
-    assert analyze(["verify", str(libero_store)]) == 0
+    assert analyze(["store", "verify", str(libero_store)]) == 0
     # 20 steps, 16 actions a call: two replans; layers 25 to 27; the first and the last of five calls.
     assert rows_of(libero_store, "self").shape == (2, 3, 2, 2, 1, NUM_KEYS)
     assert rows_of(libero_store, "cross").shape == (2, 3, 2, 2, 1, 512)

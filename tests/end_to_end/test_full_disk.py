@@ -27,7 +27,7 @@ WRITING: dict[str, tuple[str, ...]] = {
     "words": ("words", "STORE", *OUT, "--task", "0"),
     "overlay": ("overlay", "STORE", *OUT, "--video", "gif"),
     "effects": ("effects", "STORE", "RERUN", *OUT),
-    "copy": ("copy", "STORE", "OUT/copy.zarr"),
+    "copy": ("store", "copy", "STORE", "OUT/copy.zarr"),
 }
 #: Bytes of the largest file.
 LIMITS = (4_000, 20_000)

@@ -16,7 +16,7 @@ from tests.kit.small_torch_policy import SmallPolicy, given, small_layout
 from tests.kit.still_scene import capture_without_simulator
 from tests.kit.stores import small_steps, write_store
 from tests.kit.uniform_cases import TABLE, write_case
-from vla_attention.analyze.copy.copying import copy_store
+from vla_attention.analyze.store.copying import copy_store
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.schemas.stores.reader import open_store

@@ -1,7 +1,8 @@
 """Random damage to the files of a store, one file at a time and undone again, and what notices it.
 
-A damage follows from the store, the kind of file and a number. `vla-attention verify` must name the file. An analysis
-that reads the file must refuse or give the same numbers: `tried` says which, and `benchmarks/reliability.py` counts.
+A damage follows from the store, the kind of file and a number. `vla-attention store verify` must name the file. An
+analysis that reads the file must refuse or give the same numbers: `tried` says which, and `benchmarks/reliability.py`
+counts.
 """
 
 from __future__ import annotations
@@ -182,7 +183,7 @@ class Noticed:
     """What came of a damage.
 
     Attributes:
-        verify: what `vla-attention verify` printed, and its exit code.
+        verify: what `vla-attention store verify` printed, and its exit code.
         named: whether it found a fault and named the file.
         analyses: by name: "refused", "same", "different", or the error that is no sentence.
     """
@@ -207,7 +208,8 @@ def make_subjects(folder: Path) -> dict[str, Subject]:
     subjects = {}
     for name, other in (("joint", 0), ("other", 1)):
         write_store(folder / f"{name}.zarr", spec=SPEC, seed=other)
-        assert analyze(["copy", str(folder / f"{name}.zarr"), str(folder / f"{name}-packed.zarr"), "--packed"]) == 0
+        places = [str(folder / f"{name}{packed}.zarr") for packed in ("", "-packed")]
+        assert analyze(["store", "copy", *places, "--packed"]) == 0
         replayed = SiteStoreSpec(episodes=2, replans=2, dataset_actions=0.5, protocol="dataset", seed=other)
         write_site_store(folder / f"{name}-sites.zarr", replayed)
     for name in ("", "-packed", "-sites"):
@@ -327,10 +329,10 @@ def tried(subject: Subject, damage: Damage) -> Noticed:
 
 
 def verified(store: Path) -> tuple[int, str]:
-    """Exit code and text of `vla-attention verify`."""
+    """Exit code and text of `vla-attention store verify`."""
     text = io.StringIO()
     with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text):
-        code = analyze(["verify", str(store)])
+        code = analyze(["store", "verify", str(store)])
     return code, text.getvalue()
 
 

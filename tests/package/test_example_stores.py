@@ -16,7 +16,7 @@ STORES = [CUBES, ONE_COLOUR, NOISE]
 
 @pytest.mark.parametrize("store", STORES, ids=lambda path: path.stem)
 def test_every_store_is_whole(store, capsys):
-    assert analyze(["verify", str(store)]) == 0
+    assert analyze(["store", "verify", str(store)]) == 0
 
 
 def test_they_are_small():

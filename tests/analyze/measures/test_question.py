@@ -40,7 +40,7 @@ def test_a_damaged_episode_ends_the_analysis_with_its_name_and_a_way_out(tmp_pat
     said = capsys.readouterr().err.strip()
     assert "task000_episode001" in said
     assert "--skip-corrupt" in said
-    assert "vla-attention verify" in said
+    assert "vla-attention store verify" in said
     assert "\n" not in said
     assert not (tmp_path / "out").exists()
 

@@ -20,7 +20,7 @@ from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answe
 from tests.kit.http_ranges import serve
 from tests.kit.stores import StoreSpec, root_attributes, write_episode, write_store
 from tests.kit.viewer import ask, ask_target, send, served
-from vla_attention.analyze.copy.copying import copy_store
+from vla_attention.analyze.store.copying import copy_store
 from vla_attention.analyze.view.server import ViewerServer
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument

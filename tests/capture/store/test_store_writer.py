@@ -28,7 +28,7 @@ from tests.kit.stores import (
 )
 from tests.kit.strategies import episode_tokens
 from tests.kit.thorough import thorough_except
-from vla_attention.analyze.copy.copying import copy_store
+from vla_attention.analyze.store.copying import copy_store
 from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.capture.store.codecs import write_whole
 from vla_attention.capture.store.store_writer import open_run

@@ -13,7 +13,7 @@ import pytest
 from tests.kit.http_ranges import Served, serve
 from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.analyze.copy.copying import copy_store
+from vla_attention.analyze.store.copying import copy_store
 from vla_attention.schemas.stores import remote_source
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store

@@ -178,7 +178,7 @@ def test_what_is_said_to_be_removed_is_gone_and_the_rest_is_there(store, tmp_pat
         left.write_text("")
     else:
         left.symlink_to(elsewhere if kind == "link" else tmp_path / "nowhere")
-    assert analyze(["verify", str(store), "--repair", *["--dry-run"] * dry_run]) == 0
+    assert analyze(["store", "verify", str(store), "--repair", *["--dry-run"] * dry_run]) == 0
     line = next(line for line in capsys.readouterr().out.splitlines() if str(left) in line)
     assert ("removed: " in line) == (kind == "folder")
     assert os.path.lexists(left) == (dry_run or kind != "folder")
@@ -299,7 +299,7 @@ def test_resuming_records_what_is_missing_and_says_what_is_damaged(tmp_path, mon
     assert main([*given, "--verify"]) == 2
     assert "Cannot use --verify without --resume" in capsys.readouterr().err
     assert store_status(store).complete
-    assert analyze(["verify", str(store)]) == 0
+    assert analyze(["store", "verify", str(store)]) == 0
 
 
 def test_episodes_of_another_store_are_not_moved(store, tmp_path, capsys):

@@ -25,8 +25,8 @@ from tests.kit.attacks import files_of
 from tests.kit.crashes import before_call, die, run_child
 from tests.kit.examples import examples
 from tests.kit.stores import StoreSpec, expected_arrays, root_attributes, write_episode
-from vla_attention.analyze.copy.copying import copy_store
-from vla_attention.analyze.copy.merging import merge_stores
+from vla_attention.analyze.store.copying import copy_store
+from vla_attention.analyze.store.merging import merge_stores
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.partial_folders import partial_folder, remove_dead_partials

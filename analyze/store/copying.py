@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vla_attention.analyze.copy.packing import Packing
+from vla_attention.analyze.store.packing import Packing
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 from vla_attention.schemas.stores.digest import run_digest, with_digest
 from vla_attention.schemas.stores.durable_files import lock_for_writing, publish

@@ -12,8 +12,8 @@ import pytest
 from tests.kit.attacks import files_of
 from tests.kit.stores import StoreSpec, assert_whole, reseal, root_attributes, write_episode, write_store
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.analyze.copy.copying import copy_store
-from vla_attention.analyze.copy.merging import merge_stores
+from vla_attention.analyze.store.copying import copy_store
+from vla_attention.analyze.store.merging import merge_stores
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.stores.reader import open_store
 
@@ -52,7 +52,7 @@ def inodes(store: Path) -> set[int]:
 
 
 def refused(capsys, *words: object) -> str:
-    assert analyze(["copy", *map(str, words)]) == 2
+    assert analyze(["store", "copy", *map(str, words)]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1
     return said
@@ -61,7 +61,8 @@ def refused(capsys, *words: object) -> str:
 @pytest.mark.parametrize("copy", [False, True])
 def test_the_merged_store_is_the_one_that_one_capture_writes(original, parts, tmp_path, capsys, copy):
     before = [episode_bytes(part) for part in parts]
-    assert analyze(["copy", *map(str, parts), "-o", str(tmp_path / "c.zarr"), *(["--copy"] if copy else [])]) == 0
+    words = ["store", "copy", *map(str, parts), "-o", str(tmp_path / "c.zarr"), *(["--copy"] if copy else [])]
+    assert analyze(words) == 0
     said = capsys.readouterr().out
     assert f"c.zarr: 4 episodes (2 of {parts[0]}, 2 of {parts[1]}), all whole" in said
     assert ("are shared with the given stores" in said) is not copy

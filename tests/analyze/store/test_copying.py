@@ -11,7 +11,7 @@ import pytest
 
 from tests.kit.stores import StoreSpec, reseal, small_effects, small_steps, write_store
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.analyze.copy.copying import PARTS, copy_store, part_sizes
+from vla_attention.analyze.store.copying import PARTS, copy_store, part_sizes
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode, RunMismatch, StoreError
 from vla_attention.schemas.stores.verify import verify_store
@@ -87,13 +87,13 @@ def test_a_copy_is_brought_up_to_date(tmp_path):
 @pytest.mark.parametrize("words", [(), ("--packed",), ("--without", "frames"), ("--packed", "--without", "frames")])
 def test_an_episode_that_was_recorded_again_is_not_taken_for_the_copied_one(tmp_path, capsys, words):
     path, target = write_store(tmp_path / "a.zarr", spec=SPEC), tmp_path / "b.zarr"
-    assert analyze(["copy", str(path), str(target), *words]) == 0
-    assert analyze(["copy", str(path), str(target), *words]) == 0
+    assert analyze(["store", "copy", str(path), str(target), *words]) == 0
+    assert analyze(["store", "copy", str(path), str(target), *words]) == 0
     assert "0 episodes added (2 were there already)" in capsys.readouterr().out
     shutil.rmtree(path / "episodes/task000_episode001")
     write_store(path, mode="resume", spec=SPEC, plant_success=lambda *_: False)
     before = all_bytes(target)
-    assert analyze(["copy", str(path), str(target), *words]) == 2
+    assert analyze(["store", "copy", str(path), str(target), *words]) == 2
     said = capsys.readouterr().err
     assert "task000_episode001 in it is not what" in said
     assert said.count("\n") == 1
@@ -151,11 +151,11 @@ def test_the_seal_of_a_changed_copy_names_the_captured_one(original, tmp_path):
 
 
 def test_command_line(original, tmp_path, capsys):
-    assert analyze(["copy", str(original), "--without", "frames"]) == 0
+    assert analyze(["store", "copy", str(original), "--without", "frames"]) == 0
     said = capsys.readouterr().out
     assert "always copied" in said
     assert "A copy without frames takes" in said
-    assert analyze(["copy", str(original), str(tmp_path / "b.zarr"), "--without", "frames"]) == 0
+    assert analyze(["store", "copy", str(original), str(tmp_path / "b.zarr"), "--without", "frames"]) == 0
     assert "2 episodes added" in capsys.readouterr().out
     (tmp_path / "file").touch()
     for words, expected in (
@@ -167,7 +167,7 @@ def test_command_line(original, tmp_path, capsys):
         ([str(original), str(tmp_path / "file" / "x.zarr")], "Cannot copy to"),
         ([str(tmp_path / "none.zarr")], "There is no store at"),
     ):
-        assert analyze(["copy", *words]) == 2
+        assert analyze(["store", "copy", *words]) == 2
         said = capsys.readouterr().err
         assert expected in said
         assert said.count("\n") == 1

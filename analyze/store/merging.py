@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vla_attention.analyze.copy.copying import copy_store
 from vla_attention.analyze.show.numbers import plural
+from vla_attention.analyze.store.copying import copy_store
 from vla_attention.analyze.stores.checking import reports_of_store
 from vla_attention.schemas.errors import BadArgument, UserError, listing
 from vla_attention.schemas.stores.digest import run_differences, with_digest
@@ -61,7 +61,7 @@ def merge_stores(
     """Make a store of the episodes of others; `progress` is called with 1 after each.
 
     link: files of stores of folders that are here are linked, where the file system can; otherwise they are copied.
-    packed: one zip an episode and an index of them, see `analyze/copy/packing.py`; nothing is shared then.
+    packed: one zip an episode and an index of them, see `analyze/store/packing.py`; nothing is shared then.
 
     Raises:
         BadArgument: fewer than two stores, two that hold the same episode, or a place that cannot be written.

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from tests.kit.stores import StoreSpec, write_store
-from vla_attention.analyze.copy import packing
-from vla_attention.analyze.copy.copying import copy_store
+from vla_attention.analyze.store import packing
+from vla_attention.analyze.store.copying import copy_store
 from vla_attention.schemas.stores.packed_index import INDEX_FILE
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store

@@ -1,4 +1,4 @@
-"""`vla-attention copy`: a copy of a store: smaller, packed, from elsewhere, or uploaded."""
+"""`vla-attention store copy` and `verify`: keeping stores."""
 
 from __future__ import annotations
 
@@ -7,25 +7,26 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vla_attention.analyze.arguments import add_workers
+from vla_attention.analyze.options import add_workers
 from vla_attention.analyze.show.numbers import format_percent, plural
-from vla_attention.schemas.command_line import command_parser, format_bytes
+from vla_attention.schemas.command_line import OneSentenceParser, command_parser, format_bytes
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.store_url import local_path, store_place
+from vla_attention.schemas.stores.verify_command import DESCRIPTION, EXAMPLES, add_verify_arguments, run_verify_command
+from vla_attention.schemas.threads import add_threads
 
 if TYPE_CHECKING:
     from vla_attention.schemas.stores.reader import Store
     from vla_attention.schemas.stores.store_url import StorePlace
 
 _EXAMPLES = """examples:
-  vla-attention copy libero_10.zarr                               how large each part is
-  vla-attention copy libero_10.zarr slim.zarr --without frames
-  vla-attention copy libero_10.zarr slim.zarr --without frames objects contributions effects
-  vla-attention copy libero_10.zarr slim.zarr --without frames    again: adds what was captured meanwhile
-  vla-attention copy libero_10.zarr packed.zarr --packed          one file an episode
-  vla-attention copy libero_10.zarr packed.zarr --packed --push hf://datasets/ORG/NAME/libero_10.zarr
-  vla-attention copy hf://datasets/ORG/NAME/libero_10.zarr here.zarr
-  vla-attention copy node1/libero_10.zarr node2/libero_10.zarr --output libero_10.zarr     one store of several
+  vla-attention store copy libero_10.zarr                               how large each part is
+  vla-attention store copy libero_10.zarr slim.zarr --without frames
+  vla-attention store copy libero_10.zarr slim.zarr --without frames objects contributions effects
+  vla-attention store copy libero_10.zarr slim.zarr --without frames    again: adds what was captured meanwhile
+  vla-attention store copy libero_10.zarr packed.zarr --packed          one file an episode
+  vla-attention store copy hf://datasets/ORG/NAME/libero_10.zarr here.zarr
+  vla-attention store copy node1/libero_10.zarr node2/libero_10.zarr --output libero_10.zarr     one store of several
 
 frames: the cameras' pictures (overlays and reruns need them). objects: what each patch shows (object: groups need it).
 contributions: norms of what keys add. effects: changes of the action without an item. steps: positions and goals.
@@ -39,50 +40,73 @@ of both, and --copy makes files of its own. What comes from a zip or from elsewh
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of `vla-attention copy STORE ... --output DEST`."""
-    parser = command_parser(
-        "vla-attention copy",
-        "Copy a store, for instance without its pictures or packed into few files, or make one store of several of\n"
-        "one run. Without a place to copy to, print how large each part is.",
-        _EXAMPLES,
+    """The parser of `vla-attention store copy STORE ...` and `vla-attention store verify STORE ...`."""
+    parser = command_parser("vla-attention store", "Keep stores: copies, one store of several, checks.")
+    acts = parser.add_subparsers(required=True, metavar="copy|verify", parser_class=OneSentenceParser)
+    copy = acts.add_parser(
+        "copy",
+        help="a copy: smaller, packed, from elsewhere; or one store of several",
+        description="Copy a store, for instance without its pictures or packed into few files, or make one store of "
+        "several of\none run. Without a place to copy to, print how large each part is.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
+    copy.add_argument(
         "stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses; several become one store"
     )
-    parser.add_argument(
+    copy.add_argument(
         "-o",
         "--output",
         type=Path,
         metavar="DEST",
         help="where the copy goes, NAME.zarr; of two names without --output the second one is DEST",
     )
-    parser.add_argument(
+    copy.add_argument(
         "--without",
         nargs="+",
         default=[],
         metavar="PART",
         help="frames, objects, contributions, effects, steps (default: copy all)",
     )
-    parser.add_argument(
+    copy.add_argument(
         "--packed",
         action="store_true",
         help="one zip file an episode and an index of them; every command reads it in place, here and elsewhere",
     )
-    parser.add_argument(
-        "--push",
-        metavar="hf://datasets/ORG/NAME/FILE.zarr",
-        help="upload the packed copy to the Hugging Face hub, with a card that says what it holds",
-    )
-    parser.add_argument(
+    copy.add_argument(
         "--copy", action="store_true", help="of several stores: copy every file, instead of sharing it (hard links)"
     )
-    add_workers(parser)
+    verify = acts.add_parser(
+        "verify",
+        help="read everything back and check it; --repair moves damaged episodes aside",
+        description=DESCRIPTION,
+        epilog=EXAMPLES.replace("NAME", "vla-attention store"),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_verify_arguments(verify)
+    for act, answer in ((copy, _run_copy), (verify, _run_verify)):
+        act.set_defaults(act=answer)
+        add_workers(act)
+        add_threads(act, "threads that read episodes, at most 4 (default: OMP_NUM_THREADS, else the process's cores)")
     return parser
 
 
 def run(arguments: argparse.Namespace) -> int:
+    """Do what was asked; returns the exit code."""
+    code: int = arguments.act(arguments)
+    return code
+
+
+def _run_verify(arguments: argparse.Namespace) -> int:
+    """Verify every store; 1 if anything is wrong, or with --repair if a damaged episode is left."""
+    from vla_attention.analyze.stores.checking import reports_of_store
+
+    return run_verify_command(arguments, reports_of_store)
+
+
+def _run_copy(arguments: argparse.Namespace) -> int:
     """Copy the store, make one of several, or print how large the parts are."""
-    from vla_attention.analyze.copy.copying import check_parts
+    from vla_attention.analyze.store.copying import check_parts
 
     stores, target = list(arguments.stores), arguments.output
     if target is None and len(stores) == 2:
@@ -91,33 +115,26 @@ def run(arguments: argparse.Namespace) -> int:
         raise BadArgument(f"{len(stores)} stores and no place for the one that they become; add --output DEST.zarr.")
     without = check_parts(arguments.without)
     if target is None:
-        if arguments.packed or arguments.push:
-            raise BadArgument("--packed and --push need a DEST: the packed copy is made here first; give DEST.zarr.")
+        if arguments.packed:
+            raise BadArgument("--packed needs a place for the packed copy; give DEST.zarr.")
         from vla_attention.schemas.stores.reader import open_store
 
         print(_sizes_text(open_store(stores[0]), without))
         return 0
     if len(stores) > 1:
-        if without or arguments.push:
-            raise BadArgument("--without and --push are for one store; make one of the several first, then copy that.")
+        if without:
+            raise BadArgument("--without is for one store; make one of the several first, then copy that.")
         return _merge(stores, target, copy=arguments.copy, packed=arguments.packed)
     if arguments.copy:
         raise BadArgument("--copy is for several stores: the copy of one has files of its own anyway.")
-    return _copy(stores[0], target, without, packed=arguments.packed, push=arguments.push)
+    return _copy(stores[0], target, without, packed=arguments.packed)
 
 
-def _copy(place: StorePlace, target: Path, without: Sequence[str], *, packed: bool, push: str | None) -> int:
-    from vla_attention.analyze.copy.copying import copy_store
+def _copy(place: StorePlace, target: Path, without: Sequence[str], *, packed: bool) -> int:
+    from vla_attention.analyze.store.copying import copy_store
     from vla_attention.schemas.progress_bar import progress_bar
     from vla_attention.schemas.stores.reader import open_store
 
-    if push and not packed:
-        raise BadArgument("--push uploads a packed copy: a hub takes few files only; add --packed.")
-    pushed = None
-    if push:
-        from vla_attention.analyze.copy.pushing import check_push
-
-        pushed = check_push(push)
     store = open_store(place)
     with progress_bar(len(store.episodes), "episodes") as advance:
         copied = copy_store(store, target, without, advance, packed=packed)
@@ -125,15 +142,11 @@ def _copy(place: StorePlace, target: Path, without: Sequence[str], *, packed: bo
     left = f", {format_bytes(copied.left_bytes)} left behind: {', '.join(without)}" if without else ""
     added = plural(copied.added, "episode")
     print(f"{target}: {added} added{already}, {format_bytes(copied.copied_bytes)}{left}.")
-    if pushed is not None:
-        from vla_attention.analyze.copy.pushing import push_store
-
-        print(push_store(target, pushed))
     return 0
 
 
 def _merge(places: Sequence[StorePlace], target: Path, *, copy: bool, packed: bool) -> int:
-    from vla_attention.analyze.copy.merging import merge_stores
+    from vla_attention.analyze.store.merging import merge_stores
     from vla_attention.schemas.progress_bar import progress_bar
     from vla_attention.schemas.stores.reader import open_store
 
@@ -148,7 +161,7 @@ def _merge(places: Sequence[StorePlace], target: Path, *, copy: bool, packed: bo
 
 def _sizes_text(store: Store, without: Sequence[str]) -> str:
     """The size of each part of the store, and of a copy without some of them."""
-    from vla_attention.analyze.copy.copying import PARTS, REST, part_sizes
+    from vla_attention.analyze.store.copying import PARTS, REST, part_sizes
 
     sizes = part_sizes(store)
     total = sum(sizes.values())
