@@ -10,10 +10,8 @@ from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.options import Numbers, add_option, add_task, number_range
 
 if TYPE_CHECKING:
-    from vla_attention.analyze.measures.question import Question
     from vla_attention.analyze.measures.question_settings import AnalysisSettings
     from vla_attention.analyze.show.answer import Answer
-    from vla_attention.schemas.stores.reader import Store
 
 
 def output_place(text: str) -> Path:
@@ -25,20 +23,6 @@ def output_place(text: str) -> Path:
     except BadArgument as error:
         raise argparse.ArgumentTypeError(str(error).removesuffix(".")) from None
     return Path(text)
-
-
-def stores_of(arguments: argparse.Namespace) -> list[Store]:
-    """The stores that the arguments name, opened."""
-    from vla_attention.schemas.stores.reader import open_store
-
-    return [open_store(path) for path in arguments.stores]
-
-
-def question_of(arguments: argparse.Namespace) -> Question:
-    """The question that the arguments ask of their stores."""
-    from vla_attention.analyze.measures.question import ask
-
-    return ask(stores_of(arguments), settings_of(arguments))
 
 
 def add_grouping(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
