@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.analyze.effects.action_changes import (
+from vla_attention.analyze.core.action_changes import (
     ActionSpread,
     action_spread,
     noise_of,
@@ -81,7 +81,7 @@ def units_of(policy: Any, store: Store, folder: Path, say: Callable[[str], None]
     spread = spread_of(store)
     again = changed_episodes(policy, store, lambda episode: {"noise": NOISE}, _ALL_REPLANS, folder, say)
     pairs = [(episode.base, episode.actions["noise"]) for episode in again]
-    return with_noise(spread, noise_of(pairs, spread.spread), leave_out=True)
+    return with_noise(spread, noise_of(pairs, spread.spread))
 
 
 def chosen_replans(number: int, count: int) -> NDArray[np.int64]:

@@ -13,7 +13,7 @@ import polars as pl
 from benchmarks.validation.calls import changed_episodes
 from benchmarks.validation.changes import mixing_changes
 from benchmarks.validation.tables import means
-from vla_attention.analyze.effects.action_changes import ActionSpread
+from vla_attention.analyze.core.action_changes import ActionSpread
 from vla_attention.schemas.stores.reader import Store
 
 CUTS = {

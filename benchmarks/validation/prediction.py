@@ -14,7 +14,7 @@ import vla_attention as va
 from benchmarks.validation.calls import ChangedEpisode, changed_episodes
 from benchmarks.validation.changes import LINGUISTIC, VISUAL
 from benchmarks.validation.tables import means, spearman
-from vla_attention.analyze.effects.action_changes import ActionSpread
+from vla_attention.analyze.core.action_changes import ActionSpread
 from vla_attention.analyze.effects.conditions import GroupOfKeys, Place
 from vla_attention.analyze.effects.group_attention import MEASURES, GroupAttention, group_attention
 from vla_attention.analyze.measures.question import Question
