@@ -103,9 +103,9 @@ FAULTS = (
     ),
     Fault(
         "wrong weight of denoise steps: the last one alone",
-        "analyze/measures/episodes.py",
-        "[getattr(one, name) for one in episodes]).mean(axis=(2, 3)))",
-        "[getattr(one, name) for one in episodes])[:, :, -1:].mean(axis=(2, 3)))",
+        "analyze/core/measure.py",
+        "        values = values.mean(axis=averaged, keepdims=True)\n",
+        "        values = values[:, :, -1:].mean(axis=averaged, keepdims=True)\n",
         (MEASURES,),
     ),
     Fault(
