@@ -49,7 +49,8 @@ class Question:
         grouping: the groups of keys.
         vocabulary: the names that selectors may use over the episodes.
         sampling: what intervals over several tasks are about, and which tasks are related.
-        skipped: one line for every episode that was left out because it is damaged or empty (`skip_corrupt`).
+        skipped: a line for all that was left out: what the stores say of foreign and unlisted files among their
+            episodes, and every episode that is damaged or empty (`skip_corrupt`).
         notes: further lines for every result, for instance which denoise steps it is of or which keys were taken out.
     """
 
@@ -119,13 +120,14 @@ def ask(stores: Sequence[Store], settings: AnalysisSettings, known: KnownEpisode
     root = stores[0].attributes
     site = choose_site(root, settings.site)
     selection = select(root, settings.layers, settings.denoise, settings.heads, settings.per_head, site)
-    skipped: list[str] = []
+    skipped = [note for store in stores for note in store.notes]
     if known is not None and not settings.skip_corrupt and (site, settings.tasks) in known:
         selected, vocabulary = known[site, settings.tasks]
     else:
         chosen = [(store, episode) for store in stores for episode in select_episodes(store, settings.tasks)]
         if settings.skip_corrupt:
-            chosen, skipped = _without_faulty(chosen)
+            chosen, faulty = _without_faulty(chosen)
+            skipped += faulty
         _refuse_empty(chosen)
         selected = tuple(load_tokens(chosen, site))
         vocabulary = vocabulary_of(selected)

@@ -81,6 +81,8 @@ def test_a_command_names_them_and_goes_on(stores, tmp_path, monkeypatch, capsys,
         (line,) = [line for line in said.splitlines() if f"Ignored in {path}, " in line]
         assert line.startswith(f"vla-analyze {name}: Ignored in ")
         assert NAMED in line
+        for file in (*(tmp_path / "out").rglob("result.json"), *(tmp_path / "out").rglob("*.html")):
+            assert f"Ignored in {path}, " in file.read_text(), file
 
 
 def test_the_library_warns(store):
