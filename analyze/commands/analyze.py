@@ -9,9 +9,12 @@ from typing import Any
 import polars as pl
 
 from vla_attention.analyze.commands.apart import kept_apart
+from vla_attention.analyze.commands.effects import word_effects
 from vla_attention.analyze.commands.holdings import holdings
+from vla_attention.analyze.commands.language import listens
 from vla_attention.analyze.core.about import about, enough, notes
 from vla_attention.analyze.core.axes import COLUMNS, check_axes
+from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.contributions import Norms, group_norms, side_norms
 from vla_attention.analyze.core.levels import Levels, levels_of, overall, task_cells, task_groups
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
@@ -81,7 +84,7 @@ def analyze(
     return Result(
         "Looks or reads?" if question.grouping.compares_modalities else "Where attention goes",
         about(question),
-        _of_ratio(question, rows, cell) if has_ratio else [_of_fractions(question, rows)],
+        [*(_of_ratio(question, rows, cell) if has_ratio else [_of_fractions(question, rows)]), *_of_words(question)],
         [
             *_shown_tables(question, tasks, groups, shown),
             *_tables_of_norms(question, norms, of_group_norms),
@@ -97,6 +100,14 @@ def analyze(
         [*notes(question), *_notes(levels, cell)],
         files,
     )
+
+
+def _of_words(question: Question) -> list[Finding]:
+    """Whether it listens, and which words decide, as `language` says it; of the question that is asked by default."""
+    if not question.grouping.compares_modalities or not question.vocabulary.words or _without_known_end(question):
+        return []
+    asked = with_choices(behaviour(question.episodes))
+    return [] if asked.is_empty() else [listens(asked), word_effects(question)[0]]
 
 
 def _without_known_end(question: Question) -> bool:
