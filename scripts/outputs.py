@@ -162,9 +162,8 @@ def make(folder: Path, only: str) -> int:
         "OMP_NUM_THREADS": "1", "VLA_CACHE": "off", "SOURCE_DATE_EPOCH": "0", "COLUMNS": "120", "NO_COLOR": "1",
         "MPLBACKEND": "agg", "PYTHONHASHSEED": "0",
     }  # fmt: skip
-    modules = {
-        "vla-capture": "vla_attention.capture", "vla-analyze": "vla_attention.analyze", "vla-attention": "vla_attention",
-    }  # fmt: skip
+    modules = {program: f"vla_attention.{program[4:]}" for program in ("vla-capture", "vla-analyze")}
+    modules["vla-attention"] = "vla_attention"
     (folder / "said").mkdir()
     for name, (program, *words) in commands(folder):
         if only not in name:
