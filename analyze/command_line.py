@@ -103,7 +103,7 @@ def _pictures(parsed: argparse.Namespace) -> AbstractContextManager[None]:
 
 
 def _engine(parsed: argparse.Namespace) -> AbstractContextManager[object]:
-    """Where `arguments.add_workers` says that episodes are worked on; nothing is imported for the default."""
+    """Where `options.add_workers` says that episodes are worked on; nothing is imported for the default."""
     where = getattr(parsed, "scheduler", None)
     where = getattr(parsed, "workers", None) if where is None else where
     if where is None:

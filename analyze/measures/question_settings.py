@@ -13,7 +13,7 @@ from vla_attention.schemas.errors import BadArgument, did_you_mean, listing, unk
 
 @dataclass(frozen=True)
 class AnalysisSettings:
-    """What a user asks for; None means the default. `vla_attention.analyze.arguments` reads it from a command line."""
+    """What a user asks for; None means the default. `vla_attention.analyze.options` reads it from a command line."""
 
     grouping: str | None = None
     groups: tuple[str, ...] = ()

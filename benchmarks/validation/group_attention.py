@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from vla_attention.analyze.measures.steps import MeasuredEpisode, measure_episodes
 
 from vla_attention.analyze.core.contributions import joint_norm, selected_gram, whole_segments
 from vla_attention.analyze.measures.masses import group_measures
 from vla_attention.analyze.measures.question import Question, select_again
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, resolve_all, vocabulary_of
-from vla_attention.analyze.measures.steps import MeasuredEpisode, measure_episodes
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping, check_names
