@@ -6,15 +6,14 @@ stores with recorded effects and of a replayed data set, and `folder` that of an
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Unpack, overload
 
 import polars as pl
 
-from vla_attention.analyze.measures.frames import TableInParts
 from vla_attention.analyze.measures.question import KnownEpisodes, Question, ask
-from vla_attention.analyze.measures.question_settings import SettingKeywords, check_name, settings_from_keywords
+from vla_attention.analyze.measures.question_settings import SettingKeywords, settings_from_keywords
 from vla_attention.analyze.stores.contents import episodes_table, header_lines, one_line
 from vla_attention.analyze.stores.selection import check_combinable
 from vla_attention.schemas.errors import BadArgument
@@ -278,10 +277,3 @@ class OpenStores:
 def _names(given: str | Sequence[str]) -> tuple[str, ...]:
     """One name, several with commas between them, or a sequence of names."""
     return tuple(part.strip() for part in given.split(",")) if isinstance(given, str) else tuple(given)
-
-
-def _chosen(table: str, known: Collection[str], study: Callable[[], object]) -> pl.DataFrame:
-    """A table of a study, which is made once the name is known to exist."""
-    check_name("table", table, known)
-    found: pl.DataFrame | TableInParts = getattr(study(), table)
-    return found if isinstance(found, pl.DataFrame) else found.whole

@@ -79,7 +79,7 @@ def _show(result: Result, folder: Path, given: argparse.Namespace) -> int:
 def _write_page(
     name: str, stores: Sequence[Store], settings: AnalysisSettings, own: Mapping[str, Any], place: Path, opens: bool
 ) -> int:
-    from vla_attention.analyze.show.browser import open_page
+    from vla_attention.analyze.render.browser import open_page
 
     path = write_page(name, stores, settings, own, place)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB.{'' if opens else ' Open it in a browser.'}")
@@ -96,8 +96,8 @@ def write_page(
     place: a file that ends with .html, or a folder, in which NAME.html is written.
     """
     from vla_attention import __version__
+    from vla_attention.analyze.render.output_files import write_text, writing
     from vla_attention.analyze.render.page import page
-    from vla_attention.analyze.show.output_files import write_text, writing
     from vla_attention.schemas.errors import BadArgument
 
     is_page = place.suffix.lower() in (".html", ".htm")

@@ -55,7 +55,7 @@ def _run(name: str, arguments: Sequence[str], program: str) -> int:
     use_threads(parsed.threads)
     os.environ.update(dict.fromkeys(_ONE_THREAD_EACH, "1"))
     try:
-        with _cache_of(parsed), _engine(parsed), _pictures(parsed):
+        with _cache_of(parsed), _engine(parsed):
             if not COMMANDS[name].folder:
                 return run_question(name, parsed)
             code: int = import_module(f"vla_attention.analyze.{name}.command").run(parsed)
@@ -91,15 +91,6 @@ def _cache_of(parsed: argparse.Namespace) -> AbstractContextManager[None]:
     from vla_attention.analyze.cache.places import switched_off
 
     return switched_off()
-
-
-def _pictures(parsed: argparse.Namespace) -> AbstractContextManager[None]:
-    """The formats of pictures: a PDF takes longer than its PNG, and most are never opened."""
-    if getattr(parsed, "pdf", True):
-        return nullcontext()
-    from vla_attention.analyze.show.picture_formats import pictures_saved_as
-
-    return pictures_saved_as(("png",))
 
 
 def _engine(parsed: argparse.Namespace) -> AbstractContextManager[object]:

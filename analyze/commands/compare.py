@@ -21,6 +21,7 @@ from vla_attention.analyze.core.differences import PAIR
 from vla_attention.analyze.core.moved import is_noise, moved, moved_episodes
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
 from vla_attention.analyze.core.runs import Run, check_comparable, noted_differences
+from vla_attention.analyze.core.same_calls import held_by_one
 from vla_attention.analyze.core.words_of_numbers import with_interval
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.task_families import sampling_of
@@ -67,6 +68,7 @@ def compare(runs: Sequence[Run], allow_mismatch: Collection[str] = ()) -> Result
     about += [UNTRAINED] if any(run.question.untrained for run in runs) else []
     beside = dict.fromkeys(line for run in runs for line in notes(run.question) if line not in about)
     of_pairs = [_pairing(part, "seed" in allow_mismatch) for part in parts]
+    of_pairs += [line for run in others if run.repeats(first) for line in _not_compared(first, run)]
     cells, groups = by_themselves(base, rest, sampling)
     columns = [column for column in _RUNS if column.name in cells.columns]
     whole = (pl.col("layer") == LAYERS_AVG) & (pl.col("scope") != "task")
@@ -100,6 +102,21 @@ def _pairing(part: Compared, any_seed: bool) -> str:
         named = [f"task {task} episode {episode}" for _, task, episode in rows.select(EPISODE_ID).iter_rows()]
         text += f" {plural(rows.height, 'episode')} of {run} without a partner: {listing(named, 4)}."
     return text
+
+
+def _not_compared(first: Run, rerun: Run) -> list[str]:
+    """What only one of a run and its rerun holds of a call, and what was therefore not held against the other."""
+    names = {episode.name: (store, episode) for store in first.stores for episode in store.episodes}
+    missing = {
+        name: None
+        for store in rerun.stores
+        for episode in store.episodes
+        if episode.name in names
+        for name in held_by_one(*names[episode.name], store, episode)
+    }
+    if not missing:
+        return []
+    return [f"Only one of {first.name} and {rerun.name} holds the {listing(missing)}: these were not compared."]
 
 
 def _how_far(first: Run, reruns: Sequence[Run], sampling: Sampling) -> tuple[list[Finding], list[Table]]:

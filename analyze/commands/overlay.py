@@ -23,12 +23,12 @@ from vla_attention.analyze.core.camera_maps import (
     stored_picture,
 )
 from vla_attention.analyze.core.levels import levels_of
+from vla_attention.analyze.core.patch_pictures import upright
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, episode_id
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import check_replan, find_episode
 from vla_attention.analyze.render.video import check_video, write_film
-from vla_attention.analyze.show.patch_pictures import upright
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.grouping import Grouping, parse_group_argument, with_groups
 from vla_attention.schemas.groupings.resolve import check_names, resolve

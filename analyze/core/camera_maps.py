@@ -9,11 +9,11 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.core.patch_pictures import upright
 from vla_attention.analyze.measures.frames import Axis, long_table
 from vla_attention.analyze.measures.patch_maps import PictureMap, map_note, mean_rows, mean_uniform, seen_cameras
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, positions_by_task
-from vla_attention.analyze.show.patch_pictures import upright
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.store_format import PolicyCameraView

@@ -9,11 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from vla_attention.analyze.measures.baselines import baseline_notes, contribution_notes
-from vla_attention.analyze.measures.frames import layer_name
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
 from vla_attention.analyze.measures.task_families import sampling_of, units_of
-from vla_attention.analyze.show.headings import run_header
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.units import Units
 from vla_attention.analyze.stores.checking import faults_of_each
@@ -78,11 +76,6 @@ class Question:
         return (*self._remarks_on_numbers, *self.notes)
 
     @property
-    def remarks_on_intervals(self) -> tuple[str, ...]:
-        """`remarks`, for results of before."""
-        return self.remarks
-
-    @property
     def _remarks_on_numbers(self) -> tuple[str, ...]:
         return (
             *self.skipped,
@@ -105,19 +98,6 @@ class Question:
     def untrained(self) -> bool:
         """Whether a store's policy has random weights."""
         return any(store.attributes.policy.untrained for store in self.stores)
-
-    def header(self, title: str, layer: str) -> list[str]:
-        """The first lines of a printed result, see `run_header`; `layer` is a layer's label in tables."""
-        return run_header(
-            title,
-            stores=[store.path for store in self.stores],
-            untrained=self.untrained,
-            site=self.site,
-            layer=layer_name(layer),
-            num_episodes=len(self.selected),
-            num_tasks=self.num_tasks,
-            notes=self.remarks_on_intervals,
-        )
 
 
 #: Site and tasks -> the episodes with their tokens, and their vocabulary.

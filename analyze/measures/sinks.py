@@ -42,11 +42,10 @@ from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, positions_by_task
 from vla_attention.analyze.measures.sink_kinds import value_ratios
-from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
-from vla_attention.schemas.errors import BadArgument, listing, unknown_name
+from vla_attention.schemas.errors import BadArgument, listing, plural, unknown_name
 from vla_attention.schemas.groupings.resolve import describe_key
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.progress_bar import progress_bar

@@ -29,17 +29,17 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.core.result import Figure
 from vla_attention.analyze.render.pictures import pictures
-from vla_attention.analyze.render.style import Style, new_canvas, save_canvas
-from vla_attention.analyze.show.plot_axes import label_positions, ratio_axis, scattered, share_ticks, whole_numbers
-from vla_attention.analyze.show.plot_colours import (
+from vla_attention.analyze.render.plot_axes import label_positions, ratio_axis, scattered, share_ticks, whole_numbers
+from vla_attention.analyze.render.plot_colours import (
     BASELINE_COLOR,
     DOT_COLOR,
     NOTE_COLOR,
     SERIES_COLORS,
     group_styles,
 )
-from vla_attention.analyze.show.plot_heat_map import draw_log2_map, label_axis
-from vla_attention.analyze.show.plot_text import explain, shortened, wrapped
+from vla_attention.analyze.render.plot_heat_map import draw_log2_map, label_axis
+from vla_attention.analyze.render.plot_text import explain, shortened, wrapped
+from vla_attention.analyze.render.style import Style, new_canvas, save_canvas
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -16,9 +16,9 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.result import Figure
+from vla_attention.analyze.render.output_files import replacing
 from vla_attention.analyze.render.pictures import pictures
 from vla_attention.analyze.render.style import Style
-from vla_attention.analyze.show.output_files import replacing
 from vla_attention.schemas.errors import BadArgument, MissingDependency
 from vla_attention.schemas.safe_text import visible
 

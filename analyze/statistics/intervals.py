@@ -79,11 +79,6 @@ class EpisodeStatistic:
     exponentiate: bool = False
     limits: tuple[float, float] = NO_LIMITS
 
-    @property
-    def num_left_out(self) -> int:
-        """Number of episodes that have no finite value and are not used."""
-        return int((~self.used).sum())
-
 
 @dataclass(frozen=True)
 class Estimate:

@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vla_attention.analyze.options import add_workers
-from vla_attention.analyze.show.numbers import format_percent, plural
 from vla_attention.schemas.command_line import OneSentenceParser, command_parser, format_bytes
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.stores.store_url import local_path, store_place
 from vla_attention.schemas.stores.verify_command import DESCRIPTION, EXAMPLES, add_verify_arguments, run_verify_command
 from vla_attention.schemas.threads import add_threads
@@ -168,7 +167,7 @@ def _sizes_text(store: Store, without: Sequence[str]) -> str:
     lines = [f"{store.path}: {plural(len(store.episodes), 'episode')}, {format_bytes(total)}"]
     for name, size in sizes.items():
         purpose = "rows, atoms, roles, actions: always copied" if name == REST else PARTS[name].purpose
-        share = format_percent(size / total if total else 0.0, 0)
+        share = f"{size / total if total else 0.0:.0%}"
         mark = "  left behind" if name in without else ""
         lines.append(f"  {name:<13} {format_bytes(size):>8}  {share:>4}  {purpose}{mark}")
     if without:

@@ -13,10 +13,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.store.copying import copy_store
 from vla_attention.analyze.stores.checking import reports_of_store
-from vla_attention.schemas.errors import BadArgument, UserError, listing
+from vla_attention.schemas.errors import BadArgument, UserError, listing, plural
 from vla_attention.schemas.stores.digest import run_differences, with_digest
 from vla_attention.schemas.stores.durable_files import publish
 from vla_attention.schemas.stores.episode_files import refuse_links

@@ -32,7 +32,6 @@ from vla_attention.__main__ import main as vla_attention
 from vla_attention.analyze.published.parse_results import build_parser as parser_of_results
 from vla_attention.analyze.published.parse_results import main as parse_attention_ratio_results
 from vla_attention.analyze.render import style
-from vla_attention.analyze.show import plot_style
 from vla_attention.capture.commands.arguments import build_evaluate_parser, build_parser
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.published.evaluate import arguments_from_environment
@@ -149,7 +148,6 @@ def _asked(program: Callable[[list[str]], int], words: list[str], folder: Path) 
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setattr(Figure, "savefig", _leave_blank)
-        patch.setattr(plot_style, "find_places", lambda _figure: None)
         patch.setattr(style, "find_places", lambda _canvas, _dpi: None)
         assert program(words) == 0
     return dict(_read(folder / "results"))

@@ -6,11 +6,11 @@ import numpy as np
 import polars as pl
 import pytest
 
+from vla_attention.analyze.core.patch_pictures import upright
 from vla_attention.analyze.core.result import Figure
 from vla_attention.analyze.render.figures import draw
 from vla_attention.analyze.render.pictures import lit, strength
 from vla_attention.analyze.render.style import Style
-from vla_attention.analyze.show.patch_pictures import upright
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.store_format import PolicyCameraView
 

@@ -1,7 +1,4 @@
-"""The colours of plots: groups, single series, heat maps.
-
-Those of attention on pictures are in `overlay/colours.py`.
-"""
+"""The colours of plots: groups, single series, heat maps."""
 
 from __future__ import annotations
 
@@ -33,8 +30,8 @@ LINE_OF_HATCH = {"": "-", "///": "--", "...": ":", "xxx": "-."}
 SERIES_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 #: Colours of a single series, of the value that uniform attention gives, and of small print.
 DATA_COLOR, BASELINE_COLOR, NOTE_COLOR = "#0072B2", "#000000", "#555555"
-#: Single episodes beside their mean, the stripe behind every second row, and lines that lead the eye.
-DOT_COLOR, STRIPE_COLOR, GUIDE_COLOR = "#56B4E9", "#F0F0F0", "#BBBBBB"
+#: Single episodes beside their mean.
+DOT_COLOR = "#56B4E9"
 #: Heat maps: more and less than uniform attention (as the visual and the linguistic group), about as much, and no
 #: value.
 _LESS, _EVEN, _MORE = "#A63C00", "#F7F7F7", "#00507D"

@@ -5,7 +5,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from vla_attention.analyze.show.output_files import write_csv, write_parquet, write_text, writing
+from vla_attention.analyze.render.output_files import write_csv, write_parquet, write_text, writing
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.store_format import StoreNotFound
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import re
 import textwrap
 from typing import TYPE_CHECKING
 
-from vla_attention.analyze.show.plot_axes import hide_frame
-from vla_attention.analyze.show.plot_colours import NOTE_COLOR
+from vla_attention.analyze.render.plot_axes import hide_frame
+from vla_attention.analyze.render.plot_colours import NOTE_COLOR
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.schemas.safe_text import visible
 
@@ -27,21 +26,6 @@ def wrapped(text: str, width: int, lines: int) -> str:
 def shortened(name: str, width: int) -> str:
     """A name that must not be broken at spaces, in at most so many characters, with … where it was cut."""
     return name if len(name) <= width else f"{name[: width - 1]}…"
-
-
-def broken(name: str, width: int) -> str:
-    """A name over as many lines as it needs, of at most so many characters each: nothing of it is cut off.
-
-    Lines end behind `_` and other marks between words, or anywhere where a word is too long.
-    """
-    lines = [""]
-    for word in re.findall(r"[^\W_]+[\W_]?|[\W_]", name):
-        if lines[-1] and len(lines[-1]) + len(word.rstrip()) > width:
-            lines.append("")
-        lines[-1] += word
-        while len(lines[-1]) > width and lines[-1].rstrip() != lines[-1][:width].rstrip():
-            lines[-1:] = [lines[-1][:width], lines[-1][width:]]
-    return "\n".join(line.rstrip() for line in lines)
 
 
 def explain(axes: Axes, text: str) -> None:

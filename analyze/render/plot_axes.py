@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.analyze.show.plot_colours import BASELINE_COLOR
+from vla_attention.analyze.render.plot_colours import BASELINE_COLOR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,14 +7,12 @@ import math
 import operator
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vla_attention.analyze.show.headings import wrap
-from vla_attention.analyze.show.numbers import plural
-from vla_attention.schemas.errors import BadArgument, UserError, listing
+from vla_attention.schemas.errors import BadArgument, UserError
 
 if TYPE_CHECKING:
     import polars as pl
@@ -188,24 +186,3 @@ def _write(
                     write_parts(table, temporary)
             written.append(path)
     return written
-
-
-def files_lines(folder: Path, files: Sequence[Path]) -> list[str]:
-    """How many files were written into a folder, and their names.
-
-    Names that differ in their ending stand once, and of the files in a folder inside it only their number.
-    """
-    endings: dict[str, list[str]] = {}
-    inside: dict[str, int] = {}
-    for file in files:
-        *folders, _ = file.relative_to(folder).parts
-        if folders:
-            inside[f"{folders[0]}/"] = inside.get(f"{folders[0]}/", 0) + 1
-        else:
-            endings.setdefault(file.stem, []).append(file.suffix)
-    names: dict[str, list[str]] = {}
-    for name, kinds in endings.items():
-        names.setdefault(" ".join(kinds), []).append(name)
-    listed = [f"{listing(stems, 4)} ({kinds})" for kinds, stems in names.items()]
-    listed += [f"{count} in {name}" for name, count in inside.items()]
-    return wrap(f"{plural(len(files), 'file')} in {folder}: {'; '.join(listed)}", rest="  ")

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.analyze.show.plot_axes import hide_frame, label_positions
-from vla_attention.analyze.show.plot_colours import diverging_colors
+from vla_attention.analyze.render.plot_axes import hide_frame, label_positions
+from vla_attention.analyze.render.plot_colours import diverging_colors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
