@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from vla_attention.analyze.measures.steps import MeasuredEpisode, measure_episodes
 
 from vla_attention.analyze.core.contributions import joint_norm, selected_gram, whole_segments
 from vla_attention.analyze.core.levels import levels_of

@@ -85,7 +85,7 @@ def test_a_store_alone_is_analysed(store, tmp_path, capsys):
 
 def test_a_ratio_may_name_a_default_group_beside_ones_own(store, tmp_path, capsys):
     words = ["--group", "bowl=word:bowl", "--no-plots", "--output", tmp_path]
-    assert "The ratio of visual to bowl is" in " ".join(
+    assert "The ratio of visual to bowl" in " ".join(
         said(capsys, "analyze", store, "--ratio", "visual/bowl", *words, code=0).split()
     )
     assert "nouns" in said(capsys, "analyze", store, "--ratio", "visual/nouns", *words)
