@@ -18,7 +18,14 @@ from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.contributions import Norms, group_norms, side_norms
 from vla_attention.analyze.core.levels import Levels, levels_of, overall, task_cells, task_groups
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
-from vla_attention.analyze.core.words_of_numbers import GROUP_COLUMNS, RATIO_COLUMNS, inverse, sides, with_interval
+from vla_attention.analyze.core.words_of_numbers import (
+    GROUP_COLUMNS,
+    NORM_COLUMNS,
+    RATIO_COLUMNS,
+    inverse,
+    sides,
+    with_interval,
+)
 from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.sinks import SinkRule, search_sinks
@@ -29,14 +36,6 @@ from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.groupings.builtin_groupings import find_grouping
 
 AVERAGE = pl.col("layer") == LAYERS_AVG
-_OF_NORMS = (
-    Column("layer", "text"),
-    Column("visual_norm", "number", "pictures", "length of the vector that the keys add to the residual stream"),
-    Column("linguistic_norm", "number", "text"),
-    Column("geometric_mean", "factor", "ratio"),
-    Column("uniform_ratio", "number", "if even", "the ratio if attention were shared out evenly between the segments"),
-    Column("ratio_lift", "factor", "over even", "ratio / ratio if even"),
-)
 _NUMBERS = ("geometric_mean", "geometric_mean_low", "geometric_mean_high", "uniform_ratio", "ratio_lift",
             "ratio_lift_low", "ratio_lift_high", "num_episodes", "num_tasks", "episodes_with_ratio",
             "tasks_with_ratio")  # fmt: skip
@@ -141,7 +140,7 @@ def _tables_of_norms(question: Question, norms: Norms | None, of_groups: Norms |
     tables = []
     if norms is not None:
         ratios = norms.ratios(question.sampling)
-        tables = [Table("contributions", ratios, _OF_NORMS, "What the tokens add", AVERAGE)]
+        tables = [Table("contributions", ratios, NORM_COLUMNS, "What the tokens add", AVERAGE)]
         tables.append(Table("contributions_steps", norms.cells()))
     if of_groups is not None:
         tables.append(Table("group_contributions", of_groups.norms()))
