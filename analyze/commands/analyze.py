@@ -79,7 +79,7 @@ def analyze(
     has_ratio = question.grouping.ratio is not None
     part = only(question, episodes.filter(AVERAGE, pl.col("log_ratio_mean").is_finite())) if has_ratio else question
     norms, of_group_norms = side_norms(question), group_norms(question)
-    files = results_files(levels) if has_ratio and not _without_known_end(question) else {}
+    files = results_files(levels) if has_ratio and not question.of_other_loop else {}
     if save_viz:
         files |= evolution_files(levels)
     return Result(
@@ -108,15 +108,10 @@ def analyze(
 
 def _of_words(question: Question) -> list[Finding]:
     """Whether it listens, and which words decide, as `language` says it; of the question that is asked by default."""
-    if not question.grouping.compares_modalities or not question.vocabulary.words or _without_known_end(question):
+    if not question.grouping.compares_modalities or not question.vocabulary.words or question.of_other_loop:
         return []
     asked = with_choices(behaviour(question.episodes))
     return [] if asked.is_empty() else [listens(asked), word_effects(question)[0]]
-
-
-def _without_known_end(question: Question) -> bool:
-    """Whether episodes are of a loop that is not ours: nothing is known of their waiting steps, nor of their end."""
-    return any(store.attributes.protocol.of_other_loop for store in question.stores)
 
 
 def _shown_tables(question: Question, tasks: pl.DataFrame, groups: pl.DataFrame, shown: Collection[str]) -> list[Table]:
