@@ -96,7 +96,7 @@ class Question:
 
     @property
     def of_other_loop(self) -> bool:
-        """Whether episodes are of a loop that is not ours: nothing is known of their waiting steps, nor of their end."""
+        """Whether episodes are of a loop that is not ours: of their waiting steps and their end nothing is known."""
         return any(store.attributes.protocol.of_other_loop for store in self.stores)
 
     @property
