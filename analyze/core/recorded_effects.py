@@ -25,7 +25,7 @@ from vla_attention.analyze.core.action_changes import (
     root_mean_square_change,
     units_of_recorded,
 )
-from vla_attention.analyze.core.axes import columns_of, with_families
+from vla_attention.analyze.core.axes import with_families
 from vla_attention.analyze.core.by_axes import weighted
 from vla_attention.analyze.core.contributions import joint_norm, selected_gram, whole_segments
 from vla_attention.analyze.core.estimate import Scale, estimate
@@ -114,10 +114,6 @@ class RecordedEffects:
         rows = rows.with_columns(noise=pl.when(pl.col("kind") != "noise").then("noise"))
         rows = rows.with_columns(minus_noise=pl.col("effect") - pl.col("noise"))
         return with_families(rows, self.question.sampling)
-
-    def summary(self, by: Collection[str] = ()) -> pl.DataFrame:
-        """`summary_of` the episodes, kept apart by the axes `by`."""
-        return summary_of(self.episodes(by), self.question.sampling, [column.name for column in columns_of(by)])
 
 
 def summary_of(episodes: pl.DataFrame, sampling: Sampling, looks: Sequence[str] = ()) -> pl.DataFrame:
