@@ -86,7 +86,7 @@ package-newest: .venv/capture-installed
 
 # What openpi, OpenVLA and GR00T pin. zarr 3.1.5 is the last that takes it on Python 3.11.
 test-numpy1: .venv-numpy1/installed
-	.venv-numpy1/bin/pytest tests/schemas tests/analyze tests/capture/torch_policies tests/capture/recording tests/capture/store tests/testing $(ARGS)
+	.venv-numpy1/bin/pytest tests/schemas tests/analyze tests/capture/torch_policies tests/capture/recording tests/capture/store tests/kit $(ARGS)
 
 # Layouts of policies on small random models of the real classes. Neither environment fits constraints.txt, nor the other:
 # transformers 5 and LeRobot 0.4.4 want different versions of the same libraries.

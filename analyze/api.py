@@ -6,15 +6,14 @@ stores with recorded effects and of a replayed data set, and `folder` that of an
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Unpack, overload
 
 import polars as pl
 
-from vla_attention.analyze.measures.frames import TableInParts
 from vla_attention.analyze.measures.question import KnownEpisodes, Question, ask
-from vla_attention.analyze.measures.question_settings import SettingKeywords, check_name, settings_from_keywords
+from vla_attention.analyze.measures.question_settings import SettingKeywords, settings_from_keywords
 from vla_attention.analyze.stores.contents import episodes_table, header_lines, one_line
 from vla_attention.analyze.stores.selection import check_combinable
 from vla_attention.schemas.errors import BadArgument
@@ -84,7 +83,7 @@ class OpenStores:
 
     def analyze(
         self,
-        by: Sequence[str] = (),
+        by: str | Sequence[str] = (),
         without_sinks: str | None = None,
         list: bool = False,
         **settings: Unpack[SettingKeywords],
@@ -104,7 +103,7 @@ class OpenStores:
         >>> masses.group_by("group").agg(pl.col("keys").mean()).filter(group="linguistic")["keys"].to_list()
         [5.0]
         """
-        return self._answer("analyze", settings, by=tuple(by), without_sinks=without_sinks, list=list)
+        return self._answer("analyze", settings, by=_names(by), without_sinks=without_sinks, list=list)
 
     @overload
     def to_xarray(self, rows: Literal[False] = False, **settings: Unpack[SettingKeywords]) -> xarray.Dataset: ...
@@ -145,7 +144,7 @@ class OpenStores:
 
         return self._answer("failures", settings, twins=None if twins is None else store_place(str(twins)))
 
-    def words(self, by: Sequence[str] = (), **settings: Unpack[SettingKeywords]) -> Answer:
+    def words(self, by: str | Sequence[str] = (), **settings: Unpack[SettingKeywords]) -> Answer:
         """Which words of the instruction are read; tables "words", "words_scale", "words_episodes".
 
         `by`: keep apart layer, head, denoise, replan, task, family or episode.
@@ -154,7 +153,7 @@ class OpenStores:
         >>> sorted(words.filter(kind="word")["item"].to_list())
         ['bowl', 'on', 'plate', 'put', 'the']
         """
-        return self._answer("words", settings, by=tuple(by))
+        return self._answer("words", settings, by=_names(by))
 
     def _answer(self, name: str, settings: SettingKeywords, **own: Any) -> Answer:
         from vla_attention.analyze.ask import answer_to
@@ -162,55 +161,47 @@ class OpenStores:
 
         return Answer.of(answer_to(name, self.stores, settings_from_keywords(**settings), own, self._known))
 
-    def objects(
-        self,
-        table: Literal["objects", "summary", "times", "pointing", "iou"] = "objects",
-        **settings: Unpack[SettingKeywords],
-    ) -> pl.DataFrame:
-        """Attention on the objects: shares and enrichment, shares over time, pointing game, or IoU with their masks.
+    def objects(self, by: str | Sequence[str] = (), iou: bool = True, **settings: Unpack[SettingKeywords]) -> Answer:
+        """Which objects are looked at; tables "objects", "pointing", "iou", each of them with "_episodes" too.
 
-        "summary" has means over episodes with intervals, and the enrichment over the control.
+        `by`: keep apart layer, head, denoise, replan, time, task, family, episode or camera. `iou`: compare maps with
+        the objects' masks, which takes most of the time.
 
-        >>> objects = va.open(store).objects()
+        >>> objects = va.open(store).objects(iou=False)["objects"]
         >>> "akita_black_bowl_1" in objects["item"].to_list()
         True
 
         Raises:
             BadArgument: the stores hold no object masks.
         """
-        from vla_attention.analyze.objects.object_settings import ObjectSettings
-        from vla_attention.analyze.objects.object_study import study_objects
-
-        check_name("table", table, ("objects", "summary", "times", "pointing", "iou"))
-        options = ObjectSettings(spatial=table in ("pointing", "iou"))
-        study = study_objects(self.stores, settings_from_keywords(**settings), options)
-        return study.summary if table == "summary" else getattr(study.tables, table).whole
+        return self._answer("objects", settings, by=_names(by), iou=iou)
 
     def compare(
         self,
         other: OpenStores | str | Path | Sequence[str | Path],
-        table: Literal["differences", "estimates", "pairs", "unpaired", "effects"] = "differences",
-        allow_mismatch: Sequence[str] = (),
+        allow_mismatch: str | Sequence[str] = (),
         names: tuple[str, str] = ("first", "other"),
         **settings: Unpack[SettingKeywords],
-    ) -> pl.DataFrame:
-        """This run against another: other minus this one, paired where initial states and seeds are shared.
+    ) -> Answer:
+        """What changed from this run to another; paired where initial states and seeds are shared.
 
-        >>> differences = va.open(store).compare(other)
+        Tables "differences", "words", "heads", "behaviour", "pairs", "runs" and more; of a rerun "moved".
+
+        >>> differences = va.open(store).compare(other)["differences"]
         >>> differences.filter(scope="all", layer="layers_avg", quantity="success")["difference"].to_list()
         [0.0]
 
         Raises:
             MixedPolicies, RunsDiffer: the runs differ in more than their weights and `allow_mismatch` does not name it;
-                see `vla_attention.analyze.compare.runs`.
+                see `vla_attention.analyze.core.runs`.
         """
-        from vla_attention.analyze.compare.comparison import compare_stores
-        from vla_attention.analyze.compare.runs import RunArgument
+        from vla_attention.analyze.ask import compared
+        from vla_attention.analyze.core.runs import RunArgument
+        from vla_attention.analyze.render.answer import Answer
 
-        known = ("differences", "estimates", "pairs", "unpaired", "effects")
         both = self, other if isinstance(other, OpenStores) else open_stores(other)
         runs = [RunArgument(name, tuple(one.path for one in run.stores)) for name, run in zip(names, both, strict=True)]
-        return _chosen(table, known, lambda: compare_stores(runs, settings_from_keywords(**settings), allow_mismatch))
+        return Answer.of(compared(runs, settings_from_keywords(**settings), _names(allow_mismatch)))
 
     def effects(self, by: Sequence[str] = (), **settings: Unpack[SettingKeywords]) -> Answer:
         """What the action depends on, as far as the run recorded it (`vla-attention capture --effects`).
@@ -232,40 +223,27 @@ class OpenStores:
 
     def overlay(
         self,
-        task: int | None = None,
         episode: int | None = None,
         replans: int | Sequence[int] | None = None,
         cameras: str | Sequence[str] | None = None,
-        folder: str | Path | None = None,
-        measure: Literal["lift", "share"] = "lift",
-        smooth: bool = False,
+        outline: Sequence[str] = (),
+        video: Literal["gif", "mp4"] | None = None,
         **settings: Unpack[SettingKeywords],
-    ) -> pl.DataFrame:
-        """Attention on the pictures of one episode: one row per (replan, camera, patch).
+    ) -> Answer:
+        """Attention on the pictures of some episodes; tables "overlay" (a row per picture) and "overlay_patches".
 
-        With `folder`, a strip of pictures is drawn there, with outlines around `groups`. Without `task`, `episode` and
-        `replans`: the first episode, every replan. `vla-attention overlay` can also make videos.
+        Without `episode` and `replans`: two episodes, up to eight policy calls of each. `outline`: groups around whose
+        patches lines are drawn, as "bowl=object:akita_black_bowl_1". `video`: with `.save(folder)` also a film.
 
-        >>> patches = va.open(store).overlay(task=1, replans=0, folder=folder)
-        >>> patches.height, sorted(file.suffix for file in folder.iterdir())
-        (16, ['.csv', '.pdf', '.png'])
+        >>> va.open(store).overlay(tasks=1, replans=0)["overlay_patches"].height
+        16
         """
-        from vla_attention.analyze.overlay.overlay_study import study_overlay
-
-        check_name("measure", measure, ("lift", "share"))
-        study = study_overlay(
-            self.stores,
-            settings_from_keywords(**settings),
-            task=task,
-            episode=episode,
-            cameras=[cameras] if isinstance(cameras, str) else cameras,
-            replans=[replans] if isinstance(replans, int) else replans,
-        )
-        if folder is not None:
-            from vla_attention.analyze.overlay.plot_strip import plot_overlay_strip
-
-            plot_overlay_strip(study, Path(folder), measure=measure, smooth=smooth)
-        return study.table
+        own = {
+            "episode": episode,
+            "replans": [replans] if isinstance(replans, int) else replans,
+            "cameras": [cameras] if isinstance(cameras, str) else cameras,
+        }
+        return self._answer("overlay", settings, **own, outline=tuple(outline), video=video)
 
     def report(
         self, path: str | Path, num_episodes: int = 2, num_replans: int = 8, **settings: Unpack[SettingKeywords]
@@ -296,8 +274,6 @@ class OpenStores:
         return "\n  ".join([str(self), *lines])
 
 
-def _chosen(table: str, known: Collection[str], study: Callable[[], object]) -> pl.DataFrame:
-    """A table of a study, which is made once the name is known to exist."""
-    check_name("table", table, known)
-    found: pl.DataFrame | TableInParts = getattr(study(), table)
-    return found if isinstance(found, pl.DataFrame) else found.whole
+def _names(given: str | Sequence[str]) -> tuple[str, ...]:
+    """One name, several with commas between them, or a sequence of names."""
+    return tuple(part.strip() for part in given.split(",")) if isinstance(given, str) else tuple(given)

@@ -21,6 +21,7 @@ from vla_attention.schemas.stores.store_url import store_place
 
 if TYPE_CHECKING:
     from vla_attention.analyze.core.result import Result
+    from vla_attention.analyze.core.runs import RunArgument
     from vla_attention.analyze.measures.question import KnownEpisodes, Question
     from vla_attention.analyze.measures.question_settings import AnalysisSettings
     from vla_attention.schemas.stores.reader import Store
@@ -32,7 +33,11 @@ def question_parser(name: str) -> OneSentenceParser:
     examples = "\n".join(["examples:", *(f"  vla-attention {line}" for line in command.examples)])
     answers = f"{command.answers[0].upper()}{command.answers[1:]}."
     parser = command_parser(f"vla-attention {name}", answers, f"{examples}\n" if command.examples else "")
-    parser.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses")
+    if command.runs:
+        runs = "STORE, or NAME=STORE[,STORE ...] for a run of several stores; two or more"
+        parser.add_argument("runs", nargs="+", metavar="RUN", help=runs)
+    else:
+        parser.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses")
     add_question(parser, command.options)
     add_output(parser, name, command.page)
     return parser
@@ -43,14 +48,25 @@ def run_question(name: str, given: argparse.Namespace) -> int:
     from vla_attention.schemas.stores.reader import open_store
 
     own = {option: getattr(given, option) for option in COMMANDS[name].options if option not in (*_settings(), "open")}
+    if COMMANDS[name].runs:
+        from vla_attention.analyze.core.runs import parse_runs
+
+        runs = parse_runs(given.runs)
+        folder = given.output or results_folder([run.paths[0] for run in runs], name, given)
+        return _show(compared(runs, settings_of(given), **own), folder, given)
     stores = [open_store(place) for place in given.stores]
-    folder = given.output or results_folder(given.stores[0], name, given)
+    folder = given.output or results_folder(given.stores[:1], name, given)
     if COMMANDS[name].page:
         return _write_page(name, stores, settings_of(given), own, folder, given.open)
+    return _show(answer_to(name, stores, settings_of(given), own), folder, given)
+
+
+def _show(result: Result, folder: Path, given: argparse.Namespace) -> int:
+    """Write a result's files, print what fits a screen."""
     from vla_attention.analyze.render.answer import Answer
     from vla_attention.analyze.render.terminal import screen
 
-    answer = Answer.of(answer_to(name, stores, settings_of(given), own))
+    answer = Answer.of(result)
     formats = ("png", "pdf") if given.pdf else ()
     files = answer.save(folder, given.csv, not given.no_plots, given.style, formats)
     endings = sorted({file.suffix for file in files})
@@ -61,7 +77,7 @@ def run_question(name: str, given: argparse.Namespace) -> int:
 def _write_page(
     name: str, stores: Sequence[Store], settings: AnalysisSettings, own: Mapping[str, Any], place: Path, opens: bool
 ) -> int:
-    from vla_attention.analyze.show.browser import open_page
+    from vla_attention.analyze.render.browser import open_page
 
     path = write_page(name, stores, settings, own, place)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB.{'' if opens else ' Open it in a browser.'}")
@@ -78,8 +94,8 @@ def write_page(
     place: a file that ends with .html, or a folder, in which NAME.html is written.
     """
     from vla_attention import __version__
+    from vla_attention.analyze.render.output_files import write_text, writing
     from vla_attention.analyze.render.page import page
-    from vla_attention.analyze.show.output_files import write_text, writing
     from vla_attention.schemas.errors import BadArgument
 
     is_page = place.suffix.lower() in (".html", ".htm")
@@ -120,6 +136,14 @@ def answer_to(
         own["twins"] = _question(command, [open_store(own["twins"])], settings, None)
     result: Result = _function(name)(_question(command, stores, settings, known), **own)
     return result
+
+
+def compared(runs: Sequence[RunArgument], settings: AnalysisSettings, allow_mismatch: Sequence[str] = ()) -> Result:
+    """What changed between runs, see `commands.compare`."""
+    from vla_attention.analyze.commands.compare import compare
+    from vla_attention.analyze.core.runs import open_runs
+
+    return compare(open_runs(runs, settings, allow_mismatch), allow_mismatch)
 
 
 def _question(

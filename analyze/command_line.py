@@ -55,7 +55,7 @@ def _run(name: str, arguments: Sequence[str], program: str) -> int:
     use_threads(parsed.threads)
     os.environ.update(dict.fromkeys(_ONE_THREAD_EACH, "1"))
     try:
-        with _cache_of(parsed), _engine(parsed), _pictures(parsed):
+        with _cache_of(parsed), _engine(parsed):
             if not COMMANDS[name].folder:
                 return run_question(name, parsed)
             code: int = import_module(f"vla_attention.analyze.{name}.command").run(parsed)
@@ -71,15 +71,15 @@ def build_parser(name: str) -> argparse.ArgumentParser:
         parser = import_module(f"vla_attention.analyze.{name}.command").build_parser()
     else:
         parser = question_parser(name)
-    add_threads(
-        parser,
-        "threads that measure episodes, at most 4 (default: OMP_NUM_THREADS, else the cores of this process)",
-    )
-    if name != "cache":
+    if not COMMANDS[name].keeps:
+        add_threads(
+            parser,
+            "threads that measure episodes, at most 4 (default: OMP_NUM_THREADS, else the cores of this process)",
+        )
         parser.add_argument(
             "--no-cache",
             action="store_true",
-            help="measure again what was measured before (see vla-attention cache; VLA_CACHE=off does the same)",
+            help="measure again what was measured before (VLA_CACHE=off does the same)",
         )
     return parser
 
@@ -93,17 +93,8 @@ def _cache_of(parsed: argparse.Namespace) -> AbstractContextManager[None]:
     return switched_off()
 
 
-def _pictures(parsed: argparse.Namespace) -> AbstractContextManager[None]:
-    """The formats of pictures: a PDF takes longer than its PNG, and most are never opened."""
-    if getattr(parsed, "pdf", True):
-        return nullcontext()
-    from vla_attention.analyze.show.picture_formats import pictures_saved_as
-
-    return pictures_saved_as(("png",))
-
-
 def _engine(parsed: argparse.Namespace) -> AbstractContextManager[object]:
-    """Where `arguments.add_workers` says that episodes are worked on; nothing is imported for the default."""
+    """Where `options.add_workers` says that episodes are worked on; nothing is imported for the default."""
     where = getattr(parsed, "scheduler", None)
     where = getattr(parsed, "workers", None) if where is None else where
     if where is None:
@@ -120,7 +111,7 @@ def _with_way_out(error: UserError, can_skip: bool) -> UserError:
     if not isinstance(error, CorruptEpisode):
         return error
     skip = "; leave such episodes out with --skip-corrupt" if can_skip else ""
-    return CorruptEpisode(f"{error} See all faults with vla-attention verify{skip}.")
+    return CorruptEpisode(f"{error} See all faults with vla-attention store verify{skip}.")
 
 
 def _refuse_misspelt_command(arguments: Sequence[str]) -> None:

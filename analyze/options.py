@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,9 +45,19 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "twins": {
         "type": store_place, "metavar": "STORE", "help": "a store in which the same initial states are solved",
     },
+    "allow_mismatch": {
+        "action": "append", "default": [], "metavar": "FIELD",
+        "help": "compare although the runs differ in this field, of family, suite, seed, protocol, image_size, "
+        "wait_steps, replan_steps, max_steps, layers, denoise_steps, heads, queries, depth, layout, cameras, "
+        "processing, simulator; may be repeated",
+    },
     "by": {
         "type": lambda text: tuple(part for part in text.split(",") if part), "default": (), "metavar": "AXIS,...",
         "help": f"keep apart: one or several of {', '.join(AXES)}",
+    },
+    "iou": {
+        "action": argparse.BooleanOptionalAction, "default": True,
+        "help": "pointing game and IoU of maps and objects, which take most of the time (default: yes)",
     },
     "without_sinks": {
         "nargs": "?", "const": "", "metavar": "RULE",
@@ -56,6 +67,15 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "save_viz": {"action": "store_true", "help": "also a picture per episode and layer"},
     "num_episodes": {"type": int, "default": 2, "metavar": "N", "help": "with pictures (default: %(default)s)"},
     "num_replans": {"type": int, "default": 8, "metavar": "N", "help": "of each, at most (default: %(default)s)"},
+    "episode": {"type": int, "metavar": "N", "help": "the one to show"},
+    "replans": {"type": int, "nargs": "+", "metavar": "N", "help": "policy calls to show, from 0"},
+    "cameras": {"nargs": "+", "metavar": "NAME", "help": "cameras to show (default: all that the policy sees)"},
+    "outline": {
+        "action": "append", "default": [], "metavar": "NAME=SELECTOR", "help": "draw a line around a group's patches",
+    },
+    "smooth": {"action": "store_true", "help": "attention changes smoothly between patches"},
+    "video": {"choices": ("gif", "mp4"), "help": "also a film of each episode"},
+    "fps": {"type": float, "default": 4.0, "metavar": "X", "help": "policy calls a second (default: %(default)s)"},
     "open": {"action": "store_true", "help": "show the page in the browser"},
     "list": {"action": "store_true", "help": "what the stores hold, and what the grouping takes of it"},
 }  # fmt: skip
@@ -126,16 +146,14 @@ def settings_of(given: argparse.Namespace) -> AnalysisSettings:
     return AnalysisSettings(**values)
 
 
-def results_folder(store: StorePlace, command: str, given: argparse.Namespace) -> Path:
+def results_folder(stores: Sequence[StorePlace], command: str, given: argparse.Namespace) -> Path:
     """`results/PATH OF STORE/COMMAND`, with the options that change the answer in its name.
 
-    A store outside of the working folder is named by its whole path: results of stores of one name lie apart.
+    A store outside of the working folder is named by its whole path: results of stores of one name lie apart. Further
+    runs of a comparison are named as it is.
     """
-    if isinstance(store, Path):
-        path = store.absolute()
-        path = path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path.relative_to(path.anchor)
-    else:
-        path = Path(*str(store).split("://", 1)[1].split("/"))
+    path, *others = (_path_of(store) for store in stores)
+    command = "-".join([command, *(one.with_suffix("").name for one in others)])
     said = [
         f"{name}-{'-'.join(map(str, value)) if isinstance(value, list | tuple) else value}"
         for name in ("tasks", *OPTIONS)
@@ -145,3 +163,10 @@ def results_folder(store: StorePlace, command: str, given: argparse.Namespace) -
     if len(name) > _LONGEST_NAME:
         name = f"{name[:_LONGEST_NAME]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
     return Path("results", *path.with_suffix("").parts, name)
+
+
+def _path_of(store: StorePlace) -> Path:
+    if not isinstance(store, Path):
+        return Path(*str(store).split("://", 1)[1].split("/"))
+    path = store.absolute()
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path.relative_to(path.anchor)

@@ -16,8 +16,9 @@ class Command:
         needs: what is said of a store without such a site.
         examples: command lines behind `vla-attention`, for the help of a question.
         folder: whether it is `analyze.NAME.command`, with a parser of its own, instead of a question.
-        keeps: whether it keeps stores instead of asking them.
+        keeps: whether it keeps stores instead of asking them; its parser has all of its options.
         page: whether its function gives several results, which are one HTML file.
+        runs: whether it takes runs, each of one or several stores, instead of the stores of one.
     """
 
     answers: str
@@ -28,11 +29,13 @@ class Command:
     folder: bool = False
     keeps: bool = False
     page: bool = False
+    runs: bool = False
 
 
 _ROWS = ("layers", "denoise", "heads", "site", "intervals")
 _GROUPING = ("grouping", "group", "ratio")
 _NO_WORDS = "its keys spell no words; choose a site with text by --site (Cosmos: cross)"
+_NO_PICTURES = "its keys are no patches of pictures; choose a site with cameras by --site (Cosmos: self)"
 
 #: Name -> command. The function NAME of `analyze.commands.NAME` answers a question.
 COMMANDS: dict[str, Command] = {
@@ -67,14 +70,53 @@ COMMANDS: dict[str, Command] = {
         _NO_WORDS,
         ("words runs/libero_10.zarr", "words runs/libero_10.zarr --task 3", "words runs/cosmos.zarr --by layer"),
     ),
-    "objects": Command("which objects are looked at", folder=True),
+    "objects": Command(
+        "which objects are looked at, over their area and over what their place explains; pointing game and IoU",
+        (*_ROWS, "by", "iou"),
+        ("image", "latent"),
+        _NO_PICTURES,
+        ("objects runs/libero_10.zarr", "objects runs/libero_10.zarr --by layer", "objects runs/cubes.zarr --no-iou"),
+    ),
     "effects": Command(
         "what the action depends on: without a word, a picture, an object; or a data set's actions",
         (*_ROWS, "by"),
         examples=("effects runs/cubes.zarr", "effects runs/cubes.zarr --by task", "effects runs/droid.zarr"),
     ),
-    "compare": Command("two or more runs, paired where they share initial states and seeds", folder=True),
-    "overlay": Command("attention on the stored pictures: strips, GIF or MP4", folder=True),
+    "compare": Command(
+        "what changed between runs: success, what was done, actions of reruns, attention",
+        (*_ROWS, *_GROUPING, "allow_mismatch"),
+        examples=(
+            "compare runs/base.zarr runs/tuned.zarr",
+            "compare base=runs/a.zarr,runs/b.zarr tuned=runs/c.zarr,runs/d.zarr",
+            "compare runs/base.zarr runs/without_visual.zarr runs/noise.zarr",
+            "compare runs/libero_spatial.zarr runs/libero_goal.zarr --allow-mismatch suite",
+        ),
+        runs=True,
+    ),
+    "overlay": Command(
+        "attention on the stored pictures: strips, GIF or MP4",
+        (
+            *_ROWS,
+            *_GROUPING,
+            "episode",
+            "replans",
+            "cameras",
+            "outline",
+            "smooth",
+            "video",
+            "fps",
+            "num_episodes",
+            "num_replans",
+        ),
+        ("image", "latent"),
+        _NO_PICTURES,
+        (
+            "overlay runs/libero_10.zarr",
+            "overlay runs/libero_10.zarr --task 3 --episode 1 --layers 13 --heads 5",
+            "overlay runs/libero_10.zarr --outline bowl=object:akita_black_bowl_1 --video gif",
+            "overlay runs/libero_10.zarr --replans 0 5 10 --cameras base_0_rgb",
+        ),
+    ),
     "report": Command(
         "all of it in one HTML file",
         (*_ROWS, *_GROUPING, "num_episodes", "num_replans", "open"),
@@ -82,18 +124,7 @@ COMMANDS: dict[str, Command] = {
         page=True,
     ),
     "view": Command("a page on which to explore: episodes, words, patches, heads, groups", folder=True),
-    "copy": Command(
-        "a copy of a store: smaller, packed, from or to elsewhere; or one store of several", folder=True, keeps=True
-    ),
-    "verify": Command(
-        "read everything back and check it; --repair moves damaged episodes aside", folder=True, keeps=True
-    ),
-    "cache": Command("what is kept of earlier analyses: where, how much; --clear removes it", folder=True, keeps=True),
+    "store": Command("copy: pack, merge or slim stores; verify: check and repair them", folder=True, keeps=True),
 }
 #: The command of `vla-attention analyze STORE`.
 DEFAULT_COMMAND = "analyze"
-
-
-def list_of_commands() -> str:
-    """The commands as lines for a help text."""
-    return "\n".join(f"  {name:<9} {command.answers}" for name, command in COMMANDS.items())

@@ -10,7 +10,7 @@ measures goes to docs/benchmarks/analysis_speed.json; nothing is asserted. The p
                Blosc) and nothing else; masses of words; the whole question from opening the store to tables with
                intervals; the same masses by a loop with zarr-python, and by xarray with dask (`pip install dask`)
     bytes      what the process reads for all layers and for three of eighteen, as Linux counts it
-    processes  whole `vla-analyze` processes without the cache: wall seconds and peak memory
+    processes  whole `vla-attention analyze` processes without the cache: wall seconds and peak memory
     memory     peak memory of whole processes by number of episodes (--sizes 50 500, each a multiple of the first),
                of which the further ones are the first again and again (repeated_store.py)
     masses     the same of processes that compute masses and nothing else
@@ -40,16 +40,16 @@ sys.path.insert(0, str(ROOT))
 
 import numpy as np
 
+from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
-from vla_attention.analyze.measures.steps import measure_episodes
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 
 WORDS = ("--group", "soup=word:soup", "--group", "v=role:image", "--ratio", "v/soup")
 SETTINGS = AnalysisSettings(groups=("soup=word:soup", "v=role:image"), ratio="v/soup")
 #: The command of each row of the part `processes`, after `vla-attention analyze STORE`.
 COMMANDS = {
-    "default: tables, results file, summary, pictures": (),
+    "default: tables, results file, pictures": (),
     "default, --no-plots": ("--no-plots",),
     "spans (--grouping cameras --no-plots)": ("--grouping", "cameras", "--no-plots"),
     "words (--group soup=word:soup ... --no-plots)": (*WORDS, "--no-plots"),
@@ -59,16 +59,14 @@ COMMANDS = {
 MEMORY_COMMANDS = {
     **{kind: ((), given) for kind, given in COMMANDS.items() if given},
     "words STORE": (("words",), ("--no-plots",)),
-    "heads STORE": (("heads",), ("--no-plots",)),
     "objects STORE": (("objects",), ("--no-plots",)),
-    "objects STORE --save-steps": (("objects",), ("--save-steps", "--no-plots")),
 }
 
 
 def make_store(path: Path, episodes: int, replans: int, heads: int) -> None:
     """Write the store; fifty episodes of eight heads take a minute or two."""
-    from vla_attention.testing.stores import StoreSpec, write_store
-    from vla_attention.testing.tokens import libero_tokens
+    from tests.kit.stores import StoreSpec, write_store
+    from tests.kit.tokens import libero_tokens
 
     spec = StoreSpec(
         suite="libero_10",
@@ -132,14 +130,14 @@ def decode_only(store: Path, threads: int) -> Callable[[], None]:
 def scan_of(store: Path) -> Callable[[], None]:
     """Masses of a grouping of words, from a store whose tokens are known."""
     question = ask([open_store(store)], SETTINGS)
-    return lambda: (measure_episodes(question, progress=lambda _: None), None)[1]
+    return lambda: (levels_of(question), None)[1]
 
 
 def whole_question(store: Path) -> None:
     """From opening the store to all tables with intervals."""
-    from vla_attention.analyze.ratios.analysis import analyse
+    from vla_attention.analyze.commands.analyze import analyze
 
-    analyse(ask([open_store(store)], SETTINGS))
+    analyze(ask([open_store(store)], SETTINGS))
 
 
 def zarr_loop(store: Path, weights: np.ndarray[Any, Any]) -> None:
@@ -222,7 +220,7 @@ def measure_bytes(store: Path) -> Table:
 
         before = so_far()
         settings = AnalysisSettings(groups=SETTINGS.groups, ratio=SETTINGS.ratio, layers=layers)
-        measure_episodes(ask([open_store(store)], settings), progress=lambda _: None)
+        levels_of(ask([open_store(store)], settings))
         return so_far() - before
 
     bytes_read((0,))  # modules that are imported on first use
@@ -271,7 +269,7 @@ def measure_masses(stores: Sequence[Path]) -> Table:
 def only_masses(store: Path, kind: str) -> None:
     """Compute the masses of all episodes."""
     settings = SETTINGS if kind == "words" else AnalysisSettings(grouping="objects")
-    measure_episodes(ask([open_store(store)], settings), progress=lambda _: None)
+    levels_of(ask([open_store(store)], settings))
 
 
 def main() -> None:

@@ -257,13 +257,12 @@ def power(num_tasks: int, num_episodes: int, num_stores: int, seed: int, effect:
 
 def through_files(case: Case, num_stores: int, seed: int) -> dict[str, float]:
     """The same with stores on disk: written by the real writer, read back and analysed."""
-    from vla_attention.analyze.ratios.analysis import analyse
-
+    from tests.kit.stores import StoreSpec, write_store
+    from vla_attention.analyze.commands.analyze import analyze
     from vla_attention.analyze.measures.question import ask
     from vla_attention.analyze.measures.question_settings import AnalysisSettings
     from vla_attention.schemas.layout import Role
     from vla_attention.schemas.stores.reader import open_store
-    from vla_attention.testing.stores import StoreSpec, write_store
 
     generator = np.random.default_rng([seed, 1])
     num_tasks, num_episodes = len(case.episodes), case.episodes[0]
@@ -296,7 +295,7 @@ def through_files(case: Case, num_stores: int, seed: int) -> dict[str, float]:
                 ("like", Estimand.TASKS_LIKE_THESE, np.exp(POPULATION)),
                 ("these", Estimand.THESE_TASKS, np.exp(means.mean())),
             ):
-                cells = analyse(ask([store], AnalysisSettings(intervals=estimand))).tasks.cells
+                cells = analyze(ask([store], AnalysisSettings(intervals=estimand)))["tasks"]
                 row = cells.filter(pl.col("layer") == "0", pl.col("scope") == "all").row(0, named=True)
                 held = row["geometric_mean_low"] <= truth <= row["geometric_mean_high"]
                 found.setdefault(name, []).append(float(held))

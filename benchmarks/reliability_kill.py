@@ -3,8 +3,8 @@
 Every case runs the command line in a forked process: a capture, or a rerun or replay where its name says so. Where it
 says "simulator", that is the real one (the suite `cubes`); other captures have a `StillScene`, because they are about
 files only. After each case the episodes that were committed before have to be the same to the byte, and the checks of
-`vla-analyze verify` have to accept the store. Later cases of a series go on with its store; one that is complete has to
-be the undisturbed one, to the byte.
+`vla-attention store verify` have to accept the store. Later cases of a series go on with its store; one that is
+complete has to be the undisturbed one, to the byte.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How often the enrichment over the control finds an object that attention follows, and one that it does not.
+"""How often the enrichment over its place finds an object that attention follows, and one that it does not.
 
 Made-up stores: pictures of 16 x 16 patches, an object of 2 x 2 patches near the middle that stands elsewhere in every
 episode and moves a little, and maps that are a blob in the middle with noise. In "own place" the blob's place differs
@@ -15,7 +15,7 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.analyze.objects.control_masks import control_source, controls
+from vla_attention.analyze.core.object_maps import enrichment_on
 from vla_attention.analyze.statistics.intervals import (
     POSITIVE,
     Interval,
@@ -49,10 +49,10 @@ def covered(path: NDArray[np.float64]) -> NDArray[np.float32]:
 def intervals_of_store(
     generator: np.random.Generator, episodes: int, tasks: int, spread: float, follow: float
 ) -> tuple[Interval | None, Interval | None]:
-    """The intervals of the enrichment and of the enrichment over the control."""
-    enrichment, balanced = [], []
+    """The intervals of the enrichment and of the enrichment over its place."""
+    enrichment, elsewhere = [], []
     for _ in range(tasks):
-        sources, base = [], SIZE / 2 + generator.normal(0, 1.5, 2)
+        means, areas, base = [], [], SIZE / 2 + generator.normal(0, 1.5, 2)
         for _ in range(episodes):
             start = np.clip(base + generator.normal(0, 2.0, 2), 2, SIZE - 2)
             area = covered(start + np.linspace(0, 1, REPLANS)[:, None] * np.clip(generator.normal(0, 1.0, 2), -2, 2))
@@ -61,10 +61,13 @@ def intervals_of_store(
             maps = blob * np.exp(generator.normal(0, 0.3, (REPLANS, SIZE**2))) * (1 + follow * area[..., 0])
             maps /= maps.sum(axis=-1, keepdims=True)
             enrichment.append((maps * area[..., 0]).sum(axis=-1).mean() / area.mean())
-            sources.append(control_source([(maps[:, None, None], area)], episodes - 1))
-        balanced += [control.balanced[0, 0, 0] for control in controls(sources)]
+            means.append(maps.mean(axis=0))
+            areas.append(area.mean(axis=0))
+        total = np.sum(areas, axis=0)
+        pairs = zip(means, areas, strict=True)
+        elsewhere += [enrichment_on(own, total - place, [SIZE**2])[0] for own, place in pairs]
     of_task = np.repeat(np.arange(tasks), episodes)
-    statistics = [mean_over_episodes(enrichment, POSITIVE), ratio_of_means_over_episodes(enrichment, balanced)]
+    statistics = [mean_over_episodes(enrichment, POSITIVE), ratio_of_means_over_episodes(enrichment, elsewhere)]
     plain, over = (one.interval() for one in estimates(statistics, Units.of(of_task)))
     return plain, over
 
@@ -74,7 +77,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--stores", type=int, default=200, help="made-up stores per case (default: 200)")
     stores = parser.parse_args().stores
-    print("maps        episodes x tasks   plain interval above 1   over control: holds 1   above 1")
+    print("maps        episodes x tasks   plain interval above 1   over its place: holds 1   above 1")
     for name, episodes, tasks, spread, follow in CASES:
         generator = np.random.default_rng(0)
         found = [intervals_of_store(generator, episodes, tasks, spread, follow) for _ in range(stores)]

@@ -73,10 +73,10 @@ def scan(settings: str, store: str) -> None:
     if settings == "default":
         parallel.one_blas_thread = contextlib.nullcontext  # type: ignore[assignment]
     import vla_attention as va
-    from vla_attention.analyze.measures.steps import measure_episodes
+    from vla_attention.analyze.core.levels import levels_of
 
     groups = {"soup": "word:soup", "rest": "*"}  # cuts a segment: every row is read and multiplied
-    serve(lambda: measure_episodes(va.open(store).ask(groups=groups)))
+    serve(lambda: levels_of(va.open(store).ask(groups=groups)))
 
 
 def busy() -> None:

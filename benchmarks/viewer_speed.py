@@ -26,9 +26,9 @@ from repeated_store import repeat_store
 sys.path.insert(0, str(ROOT))
 
 from tests.kit.browser import Watched, chromium, watched_page
+from tests.kit.stores import StoreSpec, write_store
+from tests.kit.tokens import libero_tokens
 from tests.kit.viewer import served
-from vla_attention.testing.stores import StoreSpec, write_store
-from vla_attention.testing.tokens import libero_tokens
 
 EPISODES, REPLANS = 50, 40
 

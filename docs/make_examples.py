@@ -1,10 +1,9 @@
-"""Write `docs/examples`: what every command prints about a store without anything to find, and about a planted one.
+"""Write `docs/examples`: what questions print about a store without anything to find, and about a planted one.
 
     python docs/make_examples.py
 
-The stores are those of `benchmarks/null_stores.py`, with all plants in one: the word "the" and the first object get
-more attention than the others, and all pictures more after the gripper closed. `compare` compares two null runs, and a
-null run with the planted one.
+The stores are those of `benchmarks/null_stores.py`, with two plants in one: the word "the" and the first object get
+more attention than the others. `compare` compares two null runs, and a null run with the planted one.
 """
 
 from __future__ import annotations
@@ -21,30 +20,27 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.null_stores import SPEC as NULL_STORE
 from benchmarks.null_stores import Rows, normalised, plant_of
+from tests.kit.stores import write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
-from vla_attention.testing.stores import write_store
 
 FOLDER = Path(__file__).parent / "examples"
-COMMANDS = ("ratios", "groups", "heads", "words", "objects", "time", "overlay")
+COMMANDS = ("analyze", "words", "objects")
 SPEC = replace(NULL_STORE, contributions=True)
 
 
 def plant_all(task: int, episode: int, tokens: EpisodeTokens, rows: Rows) -> Rows:
-    """The plants of words, objects and time, one upon the other."""
+    """The plants of words and objects, one upon the other."""
     made = plant_of("words", 0, planted=True)(task, episode, tokens, rows)
-    for kind in ("objects", "time"):
-        plain = plant_of(kind, 0, planted=False)(task, episode, tokens, rows)
-        made = made * plant_of(kind, 0, planted=True)(task, episode, tokens, rows) / plain.clip(1e-12)
-    return normalised(made)
+    plain = plant_of("objects", 0, planted=False)(task, episode, tokens, rows)
+    return normalised(made * plant_of("objects", 0, planted=True)(task, episode, tokens, rows) / plain.clip(1e-12))
 
 
 def printed(*arguments: str) -> str:
     """What one command prints, without the lines that name the written files."""
     output = io.StringIO()
     with contextlib.redirect_stdout(output):
-        plots = () if arguments[0] == "groups" else ("--no-plots", "--output", "out")
-        code = analyze([*arguments, *plots])
+        code = analyze([*arguments, "--no-plots", "--output", "out"])
     if code:
         raise SystemExit(f"vla-attention analyze {' '.join(arguments)} failed")
     return output.getvalue()

@@ -18,11 +18,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from tests.kit.stores import StoreSpec, write_store
+from tests.kit.tokens import libero_tokens
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
-from vla_attention.testing.stores import StoreSpec, write_store
-from vla_attention.testing.tokens import libero_tokens
 
 #: Task 0 ignores content, task 1 looks (patches get four times as much as words), task 2 reads (the reverse).
 FAVOURS = {0: 1.0, 1: 4.0, 2: 0.25}
@@ -72,11 +72,14 @@ def specialist(task: int, episode: int, tokens: EpisodeTokens, rows: np.ndarray)
     return normalised(weights)
 
 
+SINK = ["overlay", "--cameras", "base_0_rgb", "--episode", "0"]
+
+
 def draw_run(store: Path, scratch: Path, folder: Path) -> None:
     """Draw the pictures of README.md: a strip of one episode, and the layers."""
-    strip = ["overlay", "--task", "10", "--replans", "0", "1", "2", "4"]
-    draw("overlay", store, strip, "overlay_task010_episode000", scratch / "overlay", folder)
-    draw("layers", store, ["ratios"], "layer_profile", scratch / "ratios", folder)
+    strip = ["overlay", "--task", "1", "--episode", "0"]
+    draw("overlay", store, strip, "overlay_task001_episode000", scratch / "overlay", folder)
+    draw("layers", store, ["analyze"], "layer_profile", scratch / "analyze", folder)
 
 
 def draw(name: str, store: Path, command: list[str], picture: str | None, scratch: Path, folder: Path) -> None:
@@ -107,9 +110,14 @@ def main() -> None:
         coverage=False,
     )
     cases = {
-        "baseline": (favour, {"layers": (0, 9, 17), "tasks": (0, 1, 2), "episodes": 6}, ["ratios"], "ratio_per_task"),
-        "sink": (sink, {"layers": (9,), "tasks": (0,), "episodes": 2}, ["overlay", "--camera", "base_0_rgb"], None),
-        "specialist_head": (specialist, {"tasks": (0, 1), "episodes": 3}, ["heads"], "head_grid"),
+        "baseline": (favour, {"layers": (0, 9, 17), "tasks": (0, 1, 2), "episodes": 6}, ["analyze"], "ratio_per_task"),
+        "sink": (sink, {"layers": (9,), "tasks": (0,), "episodes": 2}, SINK, None),
+        "specialist_head": (
+            specialist,
+            {"tasks": (0, 1), "episodes": 3},
+            ["analyze", "--by", "layer,head"],
+            "by_layer_head",
+        ),
     }
     for name, (plant, changes, command, picture) in cases.items():
         store = write_store(scratch / f"{name}.zarr", spec=shape, plant_rows=plant, suite="made_up", **changes)

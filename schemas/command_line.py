@@ -30,7 +30,7 @@ _MAIN_OPTIONS = {
     *("--checkpoint", "--task-suite", "--task", "--num-episodes", "--effects", "--knockout", "--series", "--policy"),
     *("--layers", "--grouping", "--group", "--ratio", "--episode", "--reruns", "--open", "--video", "--accept"),
     *("--csv", "--parquet", "--netcdf", "--table", "--output", "--resume", "--budget", "--repair", "--packed"),
-    *("--without", "--push", "--help-all"),
+    *("--without", "--help-all"),
 }
 
 

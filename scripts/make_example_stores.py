@@ -88,7 +88,7 @@ def pack(store: Path, copy: Path, *options: str) -> None:
     """Put a packed copy of a store into its place."""
     shutil.rmtree(copy, ignore_errors=True)
     copy.parent.mkdir(parents=True, exist_ok=True)
-    must(analyze, "copy", store, copy, "--packed", *options)
+    must(analyze, "store", "copy", store, copy, "--packed", *options)
 
 
 def must(program: object, *arguments: object) -> None:

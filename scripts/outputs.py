@@ -51,7 +51,7 @@ QUESTIONS = {
     "overlay": ("overlay",),
     "report": ("report",),
     "export": ("export", "--csv"),
-    "verify": ("verify",),
+    "verify": ("store", "verify"),
 }
 
 
@@ -93,7 +93,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
     yield "status_json", ["vla-capture", "status", cubes, "--json"]
     yield "tasks", ["vla-capture", "tasks", "cubes"]
     yield "capture_verify", ["vla-capture", "verify", cubes]
-    yield "capture_repair", ["vla-capture", "repair", cubes]
+    yield "capture_repair", ["vla-capture", "verify", cubes, "--repair", "--quick"]
     yield "doctor", ["vla-capture", "doctor", "--no-trial", "--output", cubes, "--threads", "1"]
     for place in _stores(folder):
         kind = place.removeprefix("stores/").replace("/", "_").removesuffix(".zarr")
@@ -114,8 +114,8 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
     yield "export_parquet", [
         "vla-analyze", "export", base, "--parquet", "--netcdf", "--rows", "--output", "results/export_parquet"
     ]  # fmt: skip
-    yield "copy", ["vla-analyze", "copy", base, "stores/copied.zarr", "--without", "frames"]
-    yield "pack", ["vla-analyze", "copy", cubes, "stores/packed.zarr", "--packed"]
+    yield "copy", ["vla-attention", "store", "copy", base, "stores/copied.zarr", "--without", "frames"]
+    yield "pack", ["vla-attention", "store", "copy", cubes, "stores/packed.zarr", "--packed"]
     yield "merge", ["vla-analyze", "merge", "stores/packed.zarr", "stores/task.zarr", "-o", "stores/merged.zarr"]
     yield "merge_refused", ["vla-analyze", "merge", cubes, "stores/two.zarr", "-o", "stores/refused.zarr"]
     for name, words in {

@@ -103,10 +103,10 @@ FAULTS = (
     ),
     Fault(
         "wrong weight of denoise steps: the last one alone",
-        "analyze/measures/episodes.py",
-        "[getattr(one, name) for one in episodes]).mean(axis=(2, 3)))",
-        "[getattr(one, name) for one in episodes])[:, :, -1:].mean(axis=(2, 3)))",
-        (MEASURES,),
+        "analyze/core/measure.py",
+        "        values = values.mean(axis=averaged, keepdims=True)\n",
+        "        values = values[:, :, -1:].mean(axis=averaged, keepdims=True)\n",
+        ("tests/analyze/core", GOLDEN),
     ),
     Fault(
         "wrong degrees of freedom: families less one",

@@ -93,7 +93,7 @@ def command_lines(document: Path) -> Iterator[list[str]]:
 def test_the_parsers_take_every_command_line(document):
     for program, *given in command_lines(document):
         if program == "vla-attention" and given[0] in PROGRAM_COMMANDS and given[0] not in ("analyze", "capture"):
-            continue  # example, completion
+            continue  # example
         if program == "vla-attention" and given[0] in ("analyze", "capture"):
             program, *given = f"vla-{given[0]}", *given[1:]
         if program == "vla-capture":
@@ -111,7 +111,7 @@ def test_the_questions_of_the_readme_run(tmp_path, monkeypatch):
     Path("runs").mkdir()
     lines = re.findall(r"(vla-attention (?:\w+) runs/cubes\.zarr[^`:]*)", " ".join(text_of(ROOT / "README.md").split()))
     questions = [shlex.split(line)[1:] for line in lines if " view " not in line]
-    assert {words[0] for words in questions} == {"analyze", "objects", "effects"}
+    assert {words[0] for words in questions} == {"analyze", "language", "objects", "words", "effects"}
     for words in questions:
         store = STORES["effects" if words[0] == "effects" else "cubes"]
         Path("runs/cubes.zarr").unlink(missing_ok=True)

@@ -14,7 +14,6 @@ BELOW = {
     "schemas": set(),
     "capture": {"schemas"},
     "analyze": {"schemas"},
-    "testing": {"schemas", "capture"},
     "example_stores": {"schemas"},
 }
 

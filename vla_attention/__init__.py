@@ -11,8 +11,7 @@
 Public names: `open`, `workers` and `OpenStores` (stage two); `record`, `inspect`, `check_layout`, `layouts`, the parts
 of a `PolicyLayout` and `EffectSettings` (stage one, from your own code; they need torch); `UserError` (the base of
 every error that a user can cause) and `__version__`. `vla_attention.datasets` reads data sets of robots.
-`vla_attention.testing` makes small stores with known content. This import loads neither torch nor zarr, polars or
-numpy.
+This import loads neither torch nor zarr, polars or numpy.
 """
 
 from __future__ import annotations

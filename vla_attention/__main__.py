@@ -26,7 +26,6 @@ questions to a store (vla-attention COMMAND STORE)
 keeping stores
 {keeping}
 
-  completion         completion of commands and options for a shell
   help, --version
 
 vla-attention COMMAND --help says more, --help-all everything. From Python: import vla_attention as va; va.open(STORE).
@@ -99,18 +98,11 @@ def _example(given: Sequence[str]) -> int:
     return example(given)
 
 
-def _completion(given: Sequence[str]) -> int:
-    from vla_attention.completion import main as completion
-
-    return completion(given)
-
-
 #: Command -> what runs it; besides these, the commands of `vla-analyze`.
 COMMANDS: dict[str, Callable[[Sequence[str]], int]] = {
     "example": _example,
     "analyze": _analyses,
     "capture": _capture,
-    "completion": _completion,
 }
 
 

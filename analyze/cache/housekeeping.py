@@ -1,20 +1,15 @@
-"""What the cache holds, and room for more: files that were not used for longest are removed first."""
+"""Room in the cache: files that were not used for longest are removed first."""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 
-from vla_attention.analyze.cache.kept_files import ENDING, UNFINISHED, question_of
+from vla_attention.analyze.cache.kept_files import ENDING, UNFINISHED
 from vla_attention.analyze.cache.places import CachePlace
-from vla_attention.analyze.show.numbers import format_bytes, plural
-from vla_attention.analyze.show.tables import Table, texts
-from vla_attention.schemas.safe_text import visible
 
 _QUESTION = re.compile(r"[0-9a-f]{32}")
 _FILE = re.compile(rf"[0-9a-f]{{32}}({re.escape(ENDING)}|{re.escape(UNFINISHED)})")
@@ -55,11 +50,6 @@ def make_room(place: CachePlace) -> int:
     return removed
 
 
-def clear(folder: Path) -> int:
-    """Remove every file, and the folders that are empty then; returns how many bytes were removed."""
-    return sum(_remove(file) for file in kept_files(folder))
-
-
 def _remove(file: KeptFile) -> int:
     """Bytes that are gone: 0 for a file that belongs to somebody else."""
     try:
@@ -76,20 +66,3 @@ def _entries(folder: Path) -> list[os.DirEntry[str]]:
         return list(os.scandir(folder))
     except OSError:
         return []
-
-
-def describe_cache(place: CachePlace, files: Sequence[KeptFile]) -> str:
-    """Folder and size, then a line for every question: its size, when it was last used, what it is."""
-    total = sum(one.size for one in files)
-    head = f"{place.folder}: {format_bytes(total)} of at most {format_bytes(place.most_bytes)}"
-    if not files:
-        return f"{head}; nothing is kept yet."
-    questions: dict[Path, list[KeptFile]] = {}
-    for one in files:
-        questions.setdefault(one.path.parent, []).append(one)
-    columns = [
-        texts("kept", lambda kept: visible(question_of(kept[0].path) or "not readable"), left=True),
-        texts("size", lambda kept: format_bytes(sum(one.size for one in kept))),
-        texts("last used", lambda kept: f"{datetime.fromtimestamp(max(one.used for one in kept)):%Y-%m-%d %H:%M}"),
-    ]
-    return f"{head}; {plural(len(questions), 'question')}\n{Table(columns, list(questions.values()))}"

@@ -1,6 +1,6 @@
 """Files of the cache: one for each episode of a question.
 
-    line 1      JSON: what the file is, its key, the question in words, and name, type and shape of the arrays
+    line 1      JSON: what the file is, its key, and name, type and shape of the arrays
     numbers     one array after the other, C order, little endian
     sha256      of all that is before it
 
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 Arrays = dict[str, NDArray[Any]]
 
-FORMAT = "vla-attention cache 2"
+FORMAT = "vla-attention cache 3"
 ENDING = ".masses"
 #: Of a file that is being written, or was when its process ended.
 UNFINISHED = ".partial"
@@ -34,10 +34,10 @@ _LONGEST_LINE = 65_536
 _TYPES = ("<f8", "<f4", "<i8", "<i4", "|u1", "|b1")
 
 
-def kept_bytes(key: bytes, about: str, arrays: Arrays) -> bytes:
+def kept_bytes(key: bytes, arrays: Arrays) -> bytes:
     """Return the content of a file; raises `TypeError` for arrays of another type than `_TYPES`.
 
-    key: digest of question and episode. about: the question in words.
+    key: digest of question and episode.
     """
     described, contents = [], []
     for name, array in arrays.items():
@@ -46,7 +46,7 @@ def kept_bytes(key: bytes, about: str, arrays: Arrays) -> bytes:
             raise TypeError(f"arrays of {array.dtype} are not kept")
         described.append([name, kind, list(array.shape)])
         contents.append(np.ascontiguousarray(array, dtype=kind).tobytes())
-    line = json.dumps({"format": FORMAT, "key": key.hex(), "about": about, "arrays": described}).encode()
+    line = json.dumps({"format": FORMAT, "key": key.hex(), "arrays": described}).encode()
     # Numbers begin at a multiple of 8 bytes.
     content = b"".join((line, b" " * (-(len(line) + 1) % 8), b"\n", *contents))
     return content + hashlib.sha256(content).digest()
@@ -87,16 +87,6 @@ def read_arrays(path: Path, key: bytes) -> Arrays | None:
     except (KeyError, TypeError, ValueError):
         return None  # its digest is right: somebody else wrote it
     return arrays if start == len(content) else None
-
-
-def question_of(path: Path) -> str | None:
-    """Return the question of a file in words; None for what is no file of the cache."""
-    try:
-        with path.open("rb") as file:
-            about = _first_line(file.read(_LONGEST_LINE)).get("about")
-    except OSError:
-        return None
-    return about if isinstance(about, str) else None
 
 
 def _first_line(content: bytes) -> dict[str, Any]:

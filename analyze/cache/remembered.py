@@ -33,9 +33,7 @@ _SOURCES = (
     "schemas/stores/*.py",
     "analyze/stores/*.py",
     "analyze/measures/*.py",
-    "analyze/heads/*.py",
     "analyze/core/*.py",
-    "analyze/commands/*.py",
 )
 
 
@@ -64,12 +62,10 @@ class CachedQuestion:
     Attributes:
         what: the kind of numbers, for instance "masses".
         arguments: all that they depend on besides the episode; JSON values.
-        about: the same in words, for people.
     """
 
     what: str
     arguments: Mapping[str, Any]
-    about: str
 
     @property
     def digest(self) -> bytes:
@@ -128,7 +124,7 @@ class _Files:
     """The files of one question in the cache. Numbers do not depend on whether they can be read or written."""
 
     def __init__(self, question: CachedQuestion, place: CachePlace) -> None:
-        self._digest, self._about = question.digest, question.about
+        self._digest = question.digest
         self._folder = place.folder / self._digest.hex()[:32]
         # A question that alone is larger than the cache keeps its first episodes: dropping them for later ones would
         # leave nothing for the next time.
@@ -154,7 +150,7 @@ class _Files:
         return read_arrays(self._path(key), key)
 
     def keep(self, key: bytes, arrays: Arrays) -> None:
-        content = kept_bytes(key, self._about, arrays)
+        content = kept_bytes(key, arrays)
         self._room -= len(content)
         if self._room >= 0:
             try:

@@ -188,8 +188,10 @@ def _token_by_token(question: Question, cell: Mapping[str, Any], above: str, bel
 
 
 def _notes(levels: Levels, cell: Mapping[str, Any]) -> list[str]:
-    """What the ratio leaves out or counts twice."""
-    said = []
+    """What a named grouping is, and what the ratio leaves out or counts twice."""
+    grouping = levels.grouping
+    named = bool(levels.question.settings.grouping not in (None, "default") and grouping.description)
+    said = [f"Grouping '{grouping.name}': {grouping.description}."] if named else []
     if levels.grouping.overlap:
         said.append("The groups overlap: a token that two of them share counts in both.")
     if levels.grouping.ratio is not None and cell["num_nonfinite"]:

@@ -9,17 +9,16 @@ from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.commands.words import items_of
 from vla_attention.analyze.core.about import about
 from vla_attention.analyze.core.behaviour import OTHER_GOAL, TOLD_SO, UNFINISHED, behaviour
+from vla_attention.analyze.core.camera_maps import stored_picture
 from vla_attention.analyze.core.courses import Leaving, leavings, strip_of
 from vla_attention.analyze.core.measure import measure, table_of
+from vla_attention.analyze.core.object_shares import ALL_CAMERAS, measure_objects, object_times, with_coverage
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
+from vla_attention.analyze.core.word_items import items_of
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.objects.object_attention import object_tables
-from vla_attention.analyze.objects.object_settings import ObjectSettings
-from vla_attention.analyze.objects.object_views import ALL_CAMERAS
 from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.schemas.errors import BadArgument, listing, plural
 from vla_attention.schemas.safe_text import visible
@@ -150,11 +149,11 @@ def _attention(question: Question, items: Sequence[SelectedEpisode]) -> pl.DataF
     if not items:
         return found
     part = replace(question, selected=tuple({(item.task, item.episode.name): item for item in items}.values()))
-    lifts = table_of(measure(part, items_of, "words"), {"replan"}).filter(pl.col("kind") == "word").collect()
+    lifts = table_of(measure(part, items_of), {"replan"}).filter(pl.col("kind") == "word").collect()
     most = lifts.drop_nulls("lift").sort("lift", "item", descending=[True, False])
     read = most.group_by(place, maintain_order=True).agg(read=pl.first("item"))
     try:
-        times = object_tables(part, ObjectSettings(spatial=False)).times
+        times = object_times(measure_objects(with_coverage(part))).collect()
     except BadArgument:  # no object is marked in the pictures: `objects` says why
         return pl.concat([found, read], how="diagonal")
     per_area = times.filter(camera=ALL_CAMERAS, kind="object").with_columns(of=pl.col("share") / pl.col("even_share"))
@@ -227,8 +226,9 @@ def _strip(left: Sequence[Leaving]) -> list[Figure]:
     gone = next((one for one in left if one.replan is not None), None)
     if gone is None or (rows := strip_of(gone)).is_empty():
         return []
-    told = visible(gone.item.episode.attributes.instruction)
-    return [Figure("failure", "pictures", rows, f"'{told}': a failed episode, and a solved one that began like it")]
+    title = f"'{visible(gone.item.episode.attributes.instruction)}': a failed episode, a solved one that began like it"
+    look = {"picture": lambda a: stored_picture((gone.item, gone.twin)[a["row"]], a["camera"], a["replan"])}
+    return [Figure("failure", "pictures", rows, title, options=look)]
 
 
 _PLACES: dict[str, Any] = {

@@ -84,7 +84,7 @@ def listens(asked: pl.DataFrame) -> Finding:
     # Where each task has its own initial states, the pictures say what to do as well as the words.
     shared = shown.select((pl.col("told_goal").n_unique().over("stratum", "state") > 1).mean()).item() >= _HALF
     if found.p_value > NAMED_AT:
-        sentence = f"Not shown to listen: {_whatever(shown)}it did what it was told in {right} of {n} episodes {where}"
+        sentence = f"Not shown to listen: {whatever(shown)}it did what it was told in {right} of {n} episodes {where}"
     elif not shared:
         sentence = f"It did what it was told in {right} of {n} episodes {where}"
     else:
@@ -104,7 +104,7 @@ def listens(asked: pl.DataFrame) -> Finding:
     return Finding(f"{sentence} ({by_chance}).", _LISTENS, numbers, " ".join([*limits, *left]))
 
 
-def _whatever(shown: pl.DataFrame) -> str:
+def whatever(shown: pl.DataFrame) -> str:
     """What was done in most of the episodes, told more than one thing."""
     for column, how in (("touched", "touched the {}"), ("did", "reached the goal of '{}'")):
         for value, count in shown[column].drop_nulls().value_counts(sort=True).head(1).iter_rows():

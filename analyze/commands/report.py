@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from typing import Any
 
 from vla_attention.analyze.ask import answer_to
 from vla_attention.analyze.core.about import about
@@ -27,7 +28,11 @@ def report(question: Question, num_episodes: int = 2, num_replans: int = 8) -> l
         question: stores, selection and grouping.
         num_episodes, num_replans: how many episodes are shown with pictures, and how many of their replans.
     """
-    results = list(_answers(question, {"episodes": num_episodes, "num_replans": num_replans}))
+    own: dict[str, dict[str, Any]] = {
+        "overlay": {"num_episodes": num_episodes, "num_replans": num_replans},
+        "objects": {"iou": False},
+    }
+    results = list(_answers(question, own))
     said = {line for result in results[:1] for line in result.about}
     told: set[str] = set()
     shown: list[Result] = []
@@ -41,13 +46,13 @@ def report(question: Question, num_episodes: int = 2, num_replans: int = 8) -> l
     return shown
 
 
-def _answers(question: Question, pictures: dict[str, int]) -> Iterator[Result]:
+def _answers(question: Question, own: Mapping[str, Mapping[str, Any]]) -> Iterator[Result]:
     bare = replace(question.settings, grouping=None, groups=(), ratio=None)
     names = [name for name in QUESTIONS if name in COMMANDS and not COMMANDS[name].folder]
     for name in names:
         settings = question.settings if name in _OF_GROUPS else bare
         try:
-            yield answer_to(name, question.stores, settings, pictures if name == "overlay" else {})
+            yield answer_to(name, question.stores, settings, own.get(name))
         except UserError as error:
             title = COMMANDS[name].answers
             yield Result(f"{title[0].upper()}{title[1:]}", about(question), [], [], notes=[str(error)])

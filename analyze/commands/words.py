@@ -4,71 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
-from vla_attention.analyze.core.about import about, notes
+from vla_attention.analyze.core.about import about, enough, notes
 from vla_attention.analyze.core.axes import OF_ROWS, check_axes, columns_of, with_families
 from vla_attention.analyze.core.estimate import Scale, estimate
-from vla_attention.analyze.core.measure import Items, measure, table_of
+from vla_attention.analyze.core.measure import measure, table_of
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
+from vla_attention.analyze.core.word_items import LABELS, SCALE, items_of
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.groupings.vocabulary import NO_WORDS
-from vla_attention.schemas.groupings.words import word_class
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.safe_text import visible
 
-#: The roles of language: the linguistic group of the grouping 'default'. State digits are text, but not language.
-LANGUAGE = (Role.BOS, Role.TEMPLATE, Role.INSTRUCTION, Role.TEXT)
-#: Measured beside the words, for scale, where the site has such keys.
-SCALE = {
-    Role.BOS: "first token",
-    Role.TEMPLATE: "fixed words of the prompt",
-    Role.TEXT: "other text",
-    Role.STATE: "state digits",
-    Role.IMAGE: "image patches",
-}
-_LABELS = {"kind": pl.String, "item": pl.String, "place": pl.Int64, "word_class": pl.String}
 _VALUES: dict[str, Scale] = {"keys": "positive", "mass": "positive", "lift": "positive", "share": "share"}
 #: Of the words that are read more than uniform attention would, so many are named.
 _MOST_NAMED = 5
 LIFT = "attention to the word, over what it would get if attention were spread evenly over all tokens"
-
-
-def items_of(item: SelectedEpisode) -> Items:
-    """Every word of the prompts and every place of a word, content and stop words, and the keys of some roles.
-
-    `kind` is "word" (all places of a word together), "place" (a word at its place in the instruction, from 0) or
-    "scale". A share is of the mass of all language; state digits and patches have none.
-    """
-    tokens = item.tokens
-    prompts, num_keys = max(1, len(tokens.prompts)), tokens.layout.num_keys
-    members: dict[tuple[str, str, int | None, str | None], NDArray[np.float32]] = {}
-    for number, words in enumerate(tokens.words):
-        for place, word in enumerate(words):
-            text, of_class = word.text.casefold(), word_class(word.text)
-            for name in (
-                ("word", text, None, of_class),
-                ("place", text, place, of_class),
-                ("scale", f"{of_class} words", None, of_class),
-            ):
-                members.setdefault(name, np.zeros((prompts, num_keys), np.float32))[number, list(word.keys)] = 1.0
-    of_words = np.stack([*members.values()], axis=-1) if members else np.zeros((prompts, num_keys, 0), np.float32)
-    of_words = of_words if prompts == 1 else of_words[tokens.prompt_index]
-    roles = tokens.static_roles
-    named = [role for role in SCALE if (roles == role).any()]
-    of_roles = np.stack([roles == role for role in named], axis=-1).astype(np.float32)
-    replans = max(len(of_words), len(of_roles))
-    weights = np.concatenate([np.broadcast_to(part, (replans, *part.shape[1:])) for part in (of_words, of_roles)], 2)
-    names = [*members, *(("scale", SCALE[role], None, None) for role in named)]
-    labels = {
-        column: pl.Series(column, [name[i] for name in names], dtype=dtype)
-        for i, (column, dtype) in enumerate(_LABELS.items())
-    }
-    return Items(labels, weights, np.isin(roles, [int(role) for role in LANGUAGE]))
 
 
 def words(question: Question, by: Collection[str] = ()) -> Result:
@@ -81,13 +34,13 @@ def words(question: Question, by: Collection[str] = ()) -> Result:
         raise BadArgument(f"Site '{question.site}': {NO_WORDS}.")
     check_axes(by, ("layer", "head", "denoise", "replan", "task", "family", "episode"))
     axes = [axis for axis in OF_ROWS if axis in by]
-    measured = measure(question, items_of, "words", axes)
+    measured = measure(question, items_of, axes)
     instructions = {visible(item.episode.attributes.instruction) for item in question.selected}
     shown = "place" if len(instructions) == 1 else "word"
     kept = columns_of(by)
     looks = [column.name for column in kept]
     rows = with_families(_without_shares(table_of(measured, axes)).collect(), question.sampling)
-    summary = estimate(rows, [*looks, *_LABELS], _VALUES, question.sampling, {"lift": 1.0}, [*looks, "kind"])
+    summary = estimate(rows, [*looks, *LABELS], _VALUES, question.sampling, {"lift": 1.0}, [*looks, "kind"])
     order = ("place", False) if shown == "place" else ("lift", True)
     summary = summary.drop("keys_low", "keys_high").sort(
         *looks, "kind", order[0], descending=[*(False for _ in looks), False, order[1]], nulls_last=True
@@ -152,9 +105,8 @@ def _columns(num_tasks: int) -> list[Column]:
 def _finding(question: Question, words: pl.DataFrame, by: Collection[str]) -> Finding:
     """Which words get more, and which less, than evenly spread attention would give them."""
     effects = f"vla-attention effects {question.stores[0].path}"
-    limit = (
-        "Being read is not deciding: a word that the pictures have read decides with hardly any attention of its own."
-    )
+    limit = "Being read is not deciding: a word that the pictures have read decides with hardly any attention."
+    limit = f"{enough(question)} {limit}".lstrip()
     if by:
         return Finding(
             f"Below, a row for each word and {' and '.join(by)}.", "Which words are read?", {}, limit, effects

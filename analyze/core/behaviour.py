@@ -43,7 +43,6 @@ SCHEMA: dict[str, Any] = {
 }
 OTHER_GOAL, OTHER_TOUCH, NO_TOUCH = "reached another goal", "touched something else first", "touched nothing"
 UNFINISHED, TOLD_SO = "touched what the task names, did not finish", "did what it was told, not its task"
-INSTEAD = (TOLD_SO, OTHER_GOAL, OTHER_TOUCH, NO_TOUCH, UNFINISHED)
 #: Why an episode cannot show whether the policy listens.
 _NO_GOAL = "the told sentence names no goal of the scene"
 _AT_START = "the told goal held at the beginning of an episode"
@@ -66,7 +65,7 @@ def behaviour(episodes: Iterable[tuple[Store, StoredEpisode]]) -> pl.DataFrame:
         outcome, num_steps         success (null: not known) and executed actions
         touched, touched_at        the body that the gripper touched first, and the step; null: none
         did, did_at                instruction of the goal that it reached, see `_done`, and the step; null: none
-        how                        what it did, if its task was not solved: one of `INSTEAD`
+        how                        what it did, if its task was not solved: a sentence without its subject
         before                     a goal like the told one that held before the told one was reached; null: none
         goals                      of the scene: goal, instruction, held (step at which it first held; null: never)
     """
@@ -128,7 +127,7 @@ def row_of(
         "touched_at": touched_at,
         "did": None if done is None else visible(done.instruction),
         "did_at": None if done is None else done.first_held,
-        "how": how,
+        "how": None if attributes.success else how,
         "before": None if before is None else visible(before.instruction),
         "goals": [
             {"goal": key_of(goal), "instruction": visible(goal.instruction), "held": goal.first_held}

@@ -38,7 +38,7 @@ def ratios_by(levels: Levels, by: Collection[str]) -> pl.DataFrame:
             cells = cells.unique(cell, keep="first", maintain_order=True)
         names = [*EPISODE_KEYS, *_names(by, axes)]
         if "time" in by:
-            cells = _with_time(cells, levels.measured)
+            cells = with_time(cells, levels.measured)
         weight = pl.col("weight") if "time" in by else pl.lit(1.0)
         logs = {name: pl.col(name).log() for name in ("ratio", "uniform_ratio", "ratio_lift")}
         plain = ("numerator_fraction", "denominator_fraction", "numerator_mass", "denominator_mass")
@@ -62,7 +62,7 @@ def groups_by(levels: Levels, by: Collection[str]) -> pl.DataFrame:
             rows = rows.filter(pl.col("layer") != LAYERS_AVG)
         if "time" not in by:
             return rows
-        rows = _with_time(rows, levels.measured)
+        rows = with_time(rows, levels.measured)
         names = [*EPISODE_KEYS, *_names(by, axes), "group"]
         return rows.group_by(names, maintain_order=True).agg(
             weighted(pl.col(name), pl.col("weight")).alias(name) for name in ("keys", "mass", "fraction", "lift")
@@ -84,7 +84,7 @@ def weighted(value: pl.Expr, weight: pl.Expr) -> pl.Expr:
     return pl.when(total > 0).then(pl.when(known).then(value * weight).otherwise(0.0).sum() / total)
 
 
-def _with_time(rows: pl.DataFrame, measured: Sequence[Measured]) -> pl.DataFrame:
+def with_time(rows: pl.DataFrame, measured: Sequence[Measured]) -> pl.DataFrame:
     """The rows once for each part of the episode's time that their replan lasts in, with the share as `weight`.
 
     `phase` is the middle of the part. A replan's value holds until the next replan, as its actions do.

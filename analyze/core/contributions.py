@@ -94,12 +94,6 @@ class Norms:
         return ratios_by_layer(frame_of_episodes(self.measured, self._cells, then).collect(), self.above, self.below,
                                sampling)  # fmt: skip
 
-    def norms_by_layer(self) -> pl.DataFrame:
-        """layer ("layers_avg" last), group, norm: mean over episodes of the mean norm."""
-        then = partial(_by_layer, measures=[pl.col("norm").mean()], by=("group",))
-        episodes = frame_of_episodes(self.measured, self._norms, then).collect()
-        return episodes.group_by("layer", "group", maintain_order=True).agg(pl.col("norm").mean())
-
     def _cells(self, one: tuple[SelectedEpisode, Mapping[str, NDArray[Any]]]) -> pl.DataFrame:
         item, arrays = one
         values = {name: array for name, array in arrays.items() if name not in ("layer", "block", "norm", "env_step")}

@@ -118,7 +118,7 @@ def strip_of(one: Leaving) -> pl.DataFrame:
     """Where the pictures around the replan lie at which an episode leaves; none where the store has no pictures.
 
     Returns:
-        One row per picture: row (0: the failed episode, 1: its twin), column, label, store, episode, replan, camera.
+        One row per picture: row (0: the failed episode, 1: its twin), column, above, replan, camera.
     """
     last, rows = one.item.episode.attributes.num_replans - 1, []
     shown = [replan for shift in _SHOWN if 0 <= (replan := (one.replan or 0) + shift) <= last]
@@ -129,13 +129,14 @@ def strip_of(one: Leaving) -> pl.DataFrame:
             mark = ", leaves" if (row, replan) == (0, one.replan) else ""
             own = min(replan, item.episode.attributes.num_replans - 1)
             label = f"{who}, step {int(one.starts[replan])}{mark}" if own == replan else f"{who}, at its end"
-            rows.append((row, column, label, str(item.store.path), item.episode.name, own, camera))
-    return pl.DataFrame(rows, schema=_STRIP, orient="row")
+            rows.append((row, column, label, own, camera))
+    return pl.DataFrame(rows, schema=PICTURES, orient="row")
 
 
-_STRIP = {
+#: Columns of a strip of stored pictures.
+PICTURES = {
     **dict.fromkeys(("row", "column"), pl.Int64),
-    **dict.fromkeys(("label", "store", "episode"), pl.String),
+    "above": pl.String,
     "replan": pl.Int64,
     "camera": pl.String,
 }

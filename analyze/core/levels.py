@@ -127,7 +127,7 @@ def levels_of(question: Question, heads: bool = False) -> Levels:
     def check(num_keys: Sequence[NDArray[np.float64]]) -> None:
         check_not_empty(grouping, [keys[:, :names] for keys in num_keys])
 
-    measured = measure(question, partial(items_of, grouping=grouping), f"grouping {grouping.name}", keep, check)
+    measured = measure(question, partial(items_of, grouping=grouping), keep, check)
     return Levels(question, measured, heads)
 
 

@@ -30,12 +30,12 @@ from vla_attention.analyze.measures.masses import finite_mean, masses
 from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.measures.steps import row_sums, segment_weights, selected_cells
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.groupings.resolve import counted_keys
 from vla_attention.schemas.progress_bar import progress_bar
+from vla_attention.schemas.segments import segment_members, weights_on_segments
 
 Array: TypeAlias = NDArray[np.float64]
 
@@ -104,7 +104,6 @@ class Measured:
 def measure(
     question: Question,
     items_of: Callable[[SelectedEpisode], Items],
-    what: str,
     keep: Collection[str] = (),
     check: Callable[[Sequence[Array]], None] = lambda num_keys: None,
 ) -> Sequence[Measured]:
@@ -116,7 +115,6 @@ def measure(
     Args:
         question: stores, selection and site.
         items_of: gives the items of an episode; a function of a module, or a `functools.partial` of one.
-        what: the items in a word or two, for the cache.
         keep: "denoise" and "head" are kept apart where they are here, see `axes.OF_ROWS`.
         check: called before anything is measured with the most keys of the items at a replan, (1, item) per episode.
     """
@@ -133,7 +131,7 @@ def measure(
 
         digests = [one.digest for one in described]
         arrays = measured_once(
-            "items", f"masses of {what}", chosen, selection, question.site, scan, {"denoise": "denoise" in keep},
+            "items", chosen, selection, question.site, scan, {"denoise": "denoise" in keep},
             digests, advance,
         )  # fmt: skip
         kept = OnDisk(arrays)
@@ -175,9 +173,9 @@ def _measured(
     weights = items.with_totals(item)
     replans, steps = item.tokens.num_replans, len(selection.denoise)
     heads = len(selection.heads) if selection.per_head else 1
-    of_segments = segment_weights(item, weights, site)
+    of_segments = _segment_weights(item, weights, site)
     if of_segments is not None:
-        atoms = selected_cells(item.episode.read(f"{site}/atoms"), selection).mean(axis=-2)
+        atoms = _selected_cells(item.episode.read(f"{site}/atoms"), selection).mean(axis=-2)
         mass = masses(atoms if selection.per_head else atoms.mean(axis=3, keepdims=True), of_segments)
         mass = mass if denoise else mass.mean(axis=2, keepdims=True)
     else:
@@ -194,15 +192,41 @@ def _measured(
         "keys": counted_keys(weights, item.tokens.existing)[:, :-2],
         "uniform": uniform[..., :-2],
         "uniform_valid": uniform[..., -1],
-        "row_sum": row_sums(item, selection, site)
+        "row_sum": _row_sums(item, selection, site)
         if denoise
-        else row_sums(item, selection, site).mean(2, keepdims=True),
+        else _row_sums(item, selection, site).mean(2, keepdims=True),
         "num_valid": item.num_valid,
         "env_step": item.episode.read("env_step").astype(np.int64),
         "denoise_time": item.episode.read("denoise_time")[list(selection.denoise)].astype(np.float64),
     }
     # In C order, as they come from the cache and from other processes: numpy's sums depend on the order in memory.
     return {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+
+
+def _row_sums(item: SelectedEpisode, selection: Selection, site: str) -> NDArray[np.float64]:
+    """Stored sums of the rows (replan, layer, denoise, head or 1), as they were before storage rounded the rows."""
+    return _reduce(_selected_cells(item.episode.read(f"{site}/row_sum"), selection), selection).astype(np.float64)
+
+
+def _segment_weights(item: SelectedEpisode, weights: NDArray[np.float32], site: str) -> NDArray[np.float32] | None:
+    """Weights (replan or 1, key, group) as weights (replan or 1, segment, group); None where a group cuts a segment."""
+    tokens, segments = item.tokens, item.episode.attributes.segments[site]
+    roles = tokens.static_roles
+    # The first replan alone tells most groups that cut a segment.
+    if weights_on_segments(weights[:1], segment_members(tokens.layout, roles[:1], segments)) is None:
+        return None
+    return weights_on_segments(weights, segment_members(tokens.layout, roles, segments))
+
+
+def _selected_cells(values: NDArray[np.float32], selection: Selection) -> NDArray[np.float32]:
+    """The selected layers, denoise steps and heads of an array whose axes begin with (replan, layer, denoise, head)."""
+    return values[:, list(selection.layers)][:, :, list(selection.denoise)][:, :, :, list(selection.heads)]
+
+
+def _reduce(values: NDArray[np.float32], selection: Selection, axis: int = -1) -> NDArray[np.float32]:
+    """Average over queries (the given axis) and, unless heads are kept apart, over heads (the axis before it)."""
+    values = values.mean(axis=axis)
+    return values if selection.per_head else values.mean(axis=axis, keepdims=True)
 
 
 def means(measured: Measured, by: Collection[str] = (), more: Collection[str] = ()) -> pl.DataFrame:

@@ -6,7 +6,7 @@ is null in a table; infinite ratios stay infinite.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -14,7 +14,6 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.safe_text import visible
@@ -28,10 +27,6 @@ LAYERS_AVG = "layers_avg"
 
 #: What tables are made of, one for each episode.
 Measured = TypeVar("Measured")
-#: A few megabytes.
-_ROWS_OF_LARGER_PARTS = 20_000
-#: Each such part takes reading all episodes.
-_ROWS_OF_ALL_EPISODES = 40_000
 #: One axis: the columns that label it, each with a value per position.
 Axis = Mapping[str, Sequence[Any] | NDArray[Any] | pl.Series]
 
@@ -88,11 +83,6 @@ def _labels(name: str, labels: Sequence[Any] | NDArray[Any] | pl.Series) -> pl.S
     known = next((label for label in given if label is not None), 0)
     kinds = {bool: pl.Boolean, int: pl.Int64, float: pl.Float64, str: pl.String}
     return pl.Series(name, given, dtype=kinds[type(known)])
-
-
-def rows_of_episode(table: pl.DataFrame | TableInParts, item: SelectedEpisode) -> pl.DataFrame:
-    """The rows of one episode."""
-    return table.filter(**dict(zip(EPISODE_ID, episode_id(item), strict=True)))
 
 
 def layer_name(layer: str, average: str = "all layers", noun: str = "layer") -> str:
@@ -179,177 +169,3 @@ class LayerAxis:
             return values
         average = mean(np.take(values, self.once, axis=axis), axis)
         return np.concatenate([values, np.expand_dims(average, axis)], axis=axis)
-
-
-class Tables:
-    """Tables of one level: steps, replans, episodes or tasks.
-
-    Attributes:
-        cells: one row per cell, with the measures of the whole row and of the ratio. Of steps and replans it is made at
-            every access, and not kept.
-        groups: one row per cell and group: cells in the same order as in `cells`, groups in that of the grouping;
-            column `group`. Of steps and replans it is made at every access, and not kept: it is several times as large
-            as the masses.
-    """
-
-    def __init__(
-        self,
-        cells: pl.DataFrame | Callable[[], pl.DataFrame],
-        groups: pl.DataFrame | Callable[[], pl.DataFrame],
-        parts: Sequence[Tables] = (),
-    ) -> None:
-        self._cells = cells
-        self._groups = groups
-        self._parts = parts
-
-    @property
-    def cells(self) -> pl.DataFrame:
-        """See the class."""
-        return self._cells() if callable(self._cells) else self._cells
-
-    @property
-    def parts(self) -> Sequence[Tables]:
-        """The same rows in parts of whole episodes; aggregating or writing them part by part saves memory."""
-        return self._parts or (self,)
-
-    @property
-    def groups(self) -> pl.DataFrame:
-        """See the class."""
-        return self._groups() if callable(self._groups) else self._groups
-
-    def kept(self) -> Tables:
-        """The same with `groups` made once and kept."""
-        return Tables(self.cells, self.groups)
-
-    def filter(self, *conditions: pl.Expr) -> Tables:
-        """The cells for which conditions on the columns of both tables hold."""
-        if self._parts:
-            return concat_tables([part.filter(*conditions) for part in self._parts])
-        return Tables(self.cells.filter(*conditions), lambda: self.groups.filter(*conditions))
-
-    def values(self, measure: str) -> NDArray[np.float64]:
-        """A column of `groups` as an array (cell, group); NaN for null."""
-        return float_values(self.groups[measure]).reshape(self.cells.height, -1)
-
-    def of_group(self, name: str) -> pl.DataFrame:
-        """The rows of one group, one per cell, in the order of the cells."""
-        return self.groups.filter(pl.col("group") == name)
-
-    def groups_with_mass(self) -> tuple[str, ...]:
-        """The groups that have mass in a cell, in the order of the grouping."""
-        return self.groups_with("mass")
-
-    def groups_with_keys(self) -> tuple[str, ...]:
-        """The groups that have a key in a cell or an unknown number of keys, in the order of the grouping."""
-        unknown = self.groups.filter(pl.col("keys").is_null())["group"].unique()
-        having = {*self.groups_with("keys"), *unknown}
-        return tuple(name for name in self.group_names() if name in having)
-
-    def group_names(self) -> tuple[str, ...]:
-        """The groups, in the order of the grouping."""
-        return tuple(self.parts[0].groups["group"].unique(maintain_order=True))
-
-    def groups_with(self, column: str) -> tuple[str, ...]:
-        """The groups that have more than 0 in a column of a cell, in the order of the grouping."""
-        having = {name for part in self.parts for name in part.groups.filter(pl.col(column) > 0)["group"].unique()}
-        return tuple(name for name in self.group_names() if name in having)
-
-    def by_group(self, *by: str) -> dict[tuple[Any, ...], dict[str, Any]]:
-        """Rows of `groups` by the columns `by` and the group, as in `tables.by_group("layer")[layer, name]`."""
-        return {(*(row[name] for name in by), row["group"]): row for row in self.groups.iter_rows(named=True)}
-
-
-def concat_tables(parts: Sequence[Tables]) -> Tables:
-    """The rows of all parts, in order; `groups` is made when it is asked for. Parts without a cell are dropped."""
-    filled = [part for part in parts if part.cells.height] or parts[:1]
-    return Tables(
-        pl.concat([part.cells for part in filled]), lambda: pl.concat([part.groups for part in filled]), filled
-    )
-
-
-def tables_of_each(measured: Sequence[Measured], make: Callable[[Measured], Tables]) -> Tables:
-    """Tables with a part for each of `measured`, which `make` makes of it whenever it is asked for; all have cells."""
-    parts = MadeWhenAsked(lambda i: make(measured[i]), range(len(measured)))
-    return Tables(
-        lambda: pl.concat([part.cells for part in parts]), lambda: pl.concat([part.groups for part in parts]), parts
-    )
-
-
-@dataclass(frozen=True)
-class TableInParts:
-    """A table in parts of whole episodes with the same columns, each made whenever it is asked for."""
-
-    parts: Sequence[pl.DataFrame]
-
-    def __iter__(self) -> Iterator[pl.DataFrame]:
-        """The parts, in order."""
-        return iter(self.parts)
-
-    def __len__(self) -> int:
-        """Number of parts."""
-        return len(self.parts)
-
-    @property
-    def whole(self) -> pl.DataFrame:
-        """The rows of all parts."""
-        return pl.concat(self.parts)
-
-    def filter(self, *conditions: pl.Expr, **values: Any) -> pl.DataFrame:
-        """The rows of all parts for which conditions hold and columns have these values."""
-        return pl.concat([_copied(part.filter(*conditions, **values)) for part in self.parts])
-
-    def select(self, columns: Sequence[str], *conditions: pl.Expr) -> pl.DataFrame:
-        """Some columns of the rows of all parts for which conditions hold."""
-        return pl.concat([_copied(part.filter(*conditions).select(columns)) for part in self.parts])
-
-    def by(self, column: str) -> Iterator[pl.DataFrame]:
-        """The rows in other parts, each with some values of a column that has the same ones in every episode."""
-        first = self.parts[0]
-        values = first[column].unique(maintain_order=True).to_list()
-        together = max(1, _ROWS_OF_ALL_EPISODES * len(values) // max(1, first.height * len(self.parts)))
-        for start in range(0, len(values), together):
-            chosen = pl.col(column).is_in(values[start : start + together])
-            yield pl.concat([_copied(part.filter(chosen)) for part in in_larger_parts(self.parts)])
-
-
-def _copied(rows: pl.DataFrame) -> pl.DataFrame:
-    """The same rows in memory of their own: `filter` gives a view of consecutive rows, with which the others stay."""
-    return rows[np.arange(rows.height)]
-
-
-def in_larger_parts(parts: Iterable[pl.DataFrame]) -> Iterator[pl.DataFrame]:
-    """The same rows in fewer parts: whatever polars is asked takes a millisecond, of an episode as of a dozen."""
-    batch: list[pl.DataFrame] = []
-    for part in parts:
-        batch.append(part)
-        if sum(table.height for table in batch) >= _ROWS_OF_LARGER_PARTS:
-            yield pl.concat(batch)
-            batch = []
-    if batch:
-        yield pl.concat(batch)
-
-
-def cells_in_parts(level: Tables) -> TableInParts:
-    """The cells of a level."""
-    return TableInParts(MadeWhenAsked(lambda i: level.parts[i].cells, range(len(level.parts))))
-
-
-def groups_in_parts(level: Tables) -> TableInParts:
-    """The groups of a level."""
-    return TableInParts(MadeWhenAsked(lambda i: level.parts[i].groups, range(len(level.parts))))
-
-
-def rows_of_layer(level: Tables, layer: str) -> Tables:
-    """The cells and groups of one layer, both kept."""
-    of_layer = pl.col("layer") == layer
-    return Tables(cells_in_parts(level).filter(of_layer), groups_in_parts(level).filter(of_layer))
-
-
-def named_parts(name: str, level: Tables) -> dict[str, TableInParts]:
-    """The two tables of a level as `named_tables` has them, to be written in parts."""
-    return {name: cells_in_parts(level), f"{name}_groups": groups_in_parts(level)}
-
-
-def named_tables(name: str, level: Tables) -> dict[str, pl.DataFrame]:
-    """The two tables of a level by the names of their files, NAME and NAME_groups."""
-    return {name: level.cells, f"{name}_groups": level.groups}

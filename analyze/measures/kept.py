@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.analyze.cache.remembered import CachedQuestion, remembered
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.stores.selection import Selection
-from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 
 
 def measured_once(
     what: str,
-    about: str,
     selected: Sequence[SelectedEpisode],
     selection: Selection,
     site: str,
@@ -31,7 +26,6 @@ def measured_once(
 
     Args:
         what: the kind of numbers.
-        about: the same in words, for `vla-attention cache`.
         selected: the episodes.
         selection: layers, denoise steps and heads.
         site: the softmax family.
@@ -41,23 +35,11 @@ def measured_once(
         of_episodes: the same that differs between episodes.
         progress: called with the number of episodes that need not be measured.
     """
-    heads = f"{plural(len(selection.heads), 'head')}{' apart' if selection.per_head else ''}"
     axes = {"layers": selection.layers, "denoise": selection.denoise, "heads": selection.heads}
     question = CachedQuestion(
         what,
         {**arguments, **axes, "per_head": selection.per_head, "site": site},
-        f"{about}, site {site}, {plural(len(selection.layers), 'layer')}, "
-        f"{plural(len(selection.denoise), 'denoise step')}, {heads}",
     )
     own = of_episodes or [None] * len(selected)
     extra = [[item.without, one] for item, one in zip(selected, own, strict=True)]
     return remembered(question, [item.episode for item in selected], measure, extra, progress)
-
-
-def digest_of_weights(resolved: ResolvedGrouping) -> str:
-    """A digest of what numbers depend on of a grouping that was resolved."""
-    digest = hashlib.sha256()
-    for array in (resolved.weights, resolved.num_keys, resolved.num_valid):
-        digest.update(f"{array.dtype.str}{array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()

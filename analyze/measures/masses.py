@@ -112,12 +112,6 @@ def uniform_ratio(uniform_mass: NDArray[np.float64], grouping: Grouping) -> NDAr
     return ratio(*sides(uniform_mass, grouping))
 
 
-def relative_to_uniform(value: NDArray[np.float64], uniform: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
-    """`ratio_lift`, the ratio / the uniform ratio, and `log2_ratio`, of arrays of one shape."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return {"ratio_lift": value / uniform, "log2_ratio": np.log2(value)}
-
-
 def finite_mean(values: NDArray[np.float64], axis: int | tuple[int, ...] = 0) -> NDArray[np.float64]:
     """Mean over the finite values along one axis or several; NaN where there is none."""
     finite = np.isfinite(values)

@@ -9,11 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from vla_attention.analyze.measures.baselines import baseline_notes, contribution_notes
-from vla_attention.analyze.measures.frames import layer_name
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
 from vla_attention.analyze.measures.task_families import sampling_of, units_of
-from vla_attention.analyze.show.headings import run_header
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.units import Units
 from vla_attention.analyze.stores.checking import faults_of_each
@@ -51,7 +49,8 @@ class Question:
         grouping: the groups of keys.
         vocabulary: the names that selectors may use over the episodes.
         sampling: what intervals over several tasks are about, and which tasks are related.
-        skipped: one line for every episode that was left out because it is damaged or empty (`skip_corrupt`).
+        skipped: a line for all that was left out: what the stores say of foreign and unlisted files among their
+            episodes, and every episode that is damaged or empty (`skip_corrupt`).
         notes: further lines for every result, for instance which denoise steps it is of or which keys were taken out.
     """
 
@@ -77,11 +76,6 @@ class Question:
         return (*self._remarks_on_numbers, *self.notes)
 
     @property
-    def remarks_on_intervals(self) -> tuple[str, ...]:
-        """`remarks`, for results of before."""
-        return self.remarks
-
-    @property
     def _remarks_on_numbers(self) -> tuple[str, ...]:
         return (
             *self.skipped,
@@ -105,19 +99,6 @@ class Question:
         """Whether a store's policy has random weights."""
         return any(store.attributes.policy.untrained for store in self.stores)
 
-    def header(self, title: str, layer: str) -> list[str]:
-        """The first lines of a printed result, see `run_header`; `layer` is a layer's label in tables."""
-        return run_header(
-            title,
-            stores=[store.path for store in self.stores],
-            untrained=self.untrained,
-            site=self.site,
-            layer=layer_name(layer),
-            num_episodes=len(self.selected),
-            num_tasks=self.num_tasks,
-            notes=self.remarks_on_intervals,
-        )
-
 
 #: Site and tasks -> the episodes with their tokens, and their vocabulary.
 KnownEpisodes = dict[tuple[str, tuple[int | str, ...] | None], tuple[tuple[SelectedEpisode, ...], Vocabulary]]
@@ -139,13 +120,14 @@ def ask(stores: Sequence[Store], settings: AnalysisSettings, known: KnownEpisode
     root = stores[0].attributes
     site = choose_site(root, settings.site)
     selection = select(root, settings.layers, settings.denoise, settings.heads, settings.per_head, site)
-    skipped: list[str] = []
+    skipped = [note for store in stores for note in store.notes]
     if known is not None and not settings.skip_corrupt and (site, settings.tasks) in known:
         selected, vocabulary = known[site, settings.tasks]
     else:
         chosen = [(store, episode) for store in stores for episode in select_episodes(store, settings.tasks)]
         if settings.skip_corrupt:
-            chosen, skipped = _without_faulty(chosen)
+            chosen, faulty = _without_faulty(chosen)
+            skipped += faulty
         _refuse_empty(chosen)
         selected = tuple(load_tokens(chosen, site))
         vocabulary = vocabulary_of(selected)

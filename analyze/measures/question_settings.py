@@ -13,7 +13,7 @@ from vla_attention.schemas.errors import BadArgument, did_you_mean, listing, unk
 
 @dataclass(frozen=True)
 class AnalysisSettings:
-    """What a user asks for; None means the default. `vla_attention.analyze.arguments` reads it from a command line."""
+    """What a user asks for; None means the default. `vla_attention.analyze.options` reads it from a command line."""
 
     grouping: str | None = None
     groups: tuple[str, ...] = ()
@@ -87,11 +87,6 @@ def check_name(what: str, given: str, known: Collection[str]) -> None:
     """Raise `BadArgument` unless the name exists."""
     if given not in known:
         raise BadArgument(f"Unknown {what} '{given}'.{did_you_mean(given, known)} Existing: {listing(known)}.")
-
-
-def given_only(**options: int | None) -> dict[str, Any]:
-    """The options that were given."""
-    return {name: value for name, value in options.items() if value is not None}
 
 
 def _whole_numbers(value: int | Sequence[int]) -> tuple[int, ...]:

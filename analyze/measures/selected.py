@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import EmptyGroup, ResolvedGrouping, check_names, counted_keys, resolve
@@ -114,16 +113,6 @@ def resolve_all(
     ]
 
 
-def resolve_each(
-    grouping: Grouping, selected: Sequence[SelectedEpisode], vocabulary: Vocabulary
-) -> Sequence[ResolvedGrouping]:
-    """`resolve_all`, but that an episode is resolved whenever it is asked for: weights of objects are megabytes."""
-    check_names(grouping, vocabulary, selected[0].tokens.layout)
-    num_keys = [resolve(grouping, item.tokens).num_keys.max(axis=0, keepdims=True) for item in selected]
-    check_not_empty(grouping, num_keys)
-    return MadeWhenAsked(lambda i: resolve_episode(grouping, selected[i]), range(len(selected)))
-
-
 def resolve_episode(grouping: Grouping, item: SelectedEpisode) -> ResolvedGrouping:
     """The grouping on one episode, without the checks that need all of them."""
     resolved = resolve(grouping, item.tokens)
@@ -139,17 +128,6 @@ def check_not_empty(grouping: Grouping, num_keys: Sequence[NDArray[np.float64]])
                 f"Group '{name}' ({selectors}) has no key in any of the {len(num_keys)} selected episodes; change its "
                 f'selector, or add allow_empty = ["{name}"] to the grouping.'
             )
-
-
-def refuse_empty_groups(grouping: Grouping, selected: Sequence[SelectedEpisode]) -> None:
-    """Raise `EmptyGroup` as `resolve_all` does; resolves no more episodes than it needs, and keeps none."""
-    found: list[NDArray[np.float64]] = []
-    for item in selected:
-        found.append(resolve(grouping, item.tokens).num_keys.max(axis=0, keepdims=True))
-        present = np.any(np.concatenate(found) > 0, axis=0)
-        if all(there or name in grouping.allow_empty for name, there in zip(grouping.names, present, strict=True)):
-            return
-    check_not_empty(grouping, found)
 
 
 def _without(resolved: ResolvedGrouping, item: SelectedEpisode) -> ResolvedGrouping:

@@ -49,13 +49,6 @@ def value_ratios(question: Question, heads: pl.DataFrame) -> pl.DataFrame:
     return pl.DataFrame(ratios, schema=schema, orient="row")
 
 
-def kind_name(value_ratio: float | None) -> str:
-    """`small` or `large` values; `?` where it cannot be told."""
-    if value_ratio is None:
-        return "?"
-    return "small" if value_ratio < SMALL_VALUES else "large"
-
-
 def may_be_empty(role: str, value_ratio: float | None) -> bool:
     """Whether a sink may carry no information: its values are small, or not known and its role is without content."""
     if value_ratio is None:

@@ -40,13 +40,12 @@ from vla_attention.analyze.measures.baselines import uniform_keys
 from vla_attention.analyze.measures.kept import measured_once
 from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.selected import SelectedEpisode, positions_by_task, resolve_episode
+from vla_attention.analyze.measures.selected import SelectedEpisode, positions_by_task
 from vla_attention.analyze.measures.sink_kinds import value_ratios
-from vla_attention.analyze.show.numbers import plural
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
-from vla_attention.schemas.errors import BadArgument, listing, unknown_name
+from vla_attention.schemas.errors import BadArgument, listing, plural, unknown_name
 from vla_attention.schemas.groupings.resolve import describe_key
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.progress_bar import progress_bar
@@ -326,8 +325,8 @@ def search_sinks(question: Question, rule: SinkRule | None = None) -> SinkSearch
             scan = partial(_share_arrays, selection=selection, site=site, rule=rule)
             return each_episode(scan, [selected[i] for i in positions], advance)
 
-        about, arguments = "shares of keys", {"factor": rule.factor}
-        arrays = measured_once("shares", about, selected, selection, site, measure, arguments, progress=advance)
+        arguments = {"factor": rule.factor}
+        arrays = measured_once("shares", selected, selection, site, measure, arguments, progress=advance)
         kept = OnDisk(arrays)
     return search_of(question, MadeWhenAsked(lambda i: KeyShares(**kept[i]), range(len(kept))), rule)
 
@@ -362,24 +361,6 @@ def without_sinks(question: Question, sinks: pl.DataFrame, rule: SinkRule) -> Qu
     num_valid = max(float(item.num_valid.mean()) for item in question.selected)
     notes = (*question.notes, describe_sinks(sinks, question.num_tasks, rule, num_valid))
     return replace(question, selected=selected, grouping=grouping, notes=notes)
-
-
-def sinks_of_sides(question: Question, sinks: pl.DataFrame) -> pl.DataFrame:
-    """The sinks that are keys of a side of the question's ratio; all of them where it has none."""
-    ratio = question.grouping.ratio
-    if ratio is None:
-        return sinks
-    names = question.grouping.names
-    sides = [names.index(name) for name in (*ratio.numerator, *ratio.denominator)]
-    counted: set[tuple[str, int, int]] = set()
-    of_task = positions_by_task(question.selected)
-    for suite, task in sinks.select("suite", "task_id").unique().iter_rows():
-        for i in of_task[suite, task]:
-            weights = resolve_episode(question.grouping, question.selected[i]).weights
-            keys = np.flatnonzero((weights[:, :, sides] > 0).any(axis=(0, 2)))
-            counted.update((suite, task, int(key)) for key in keys)
-    of_sides = [row in counted for row in sinks.select("suite", "task_id", "key").iter_rows()]
-    return sinks.filter(pl.Series(of_sides, dtype=pl.Boolean))
 
 
 def merged_sinks(sinks: pl.DataFrame) -> pl.DataFrame:

@@ -17,8 +17,7 @@ from vla_attention.analyze.core.measure import Measured, means
 from vla_attention.analyze.measures.frames import LAYERS_AVG, float_values, layer_name
 from vla_attention.analyze.measures.masses import ratio
 from vla_attention.analyze.render.numbers import format_number
-from vla_attention.analyze.render.style import Style, new_canvas
-from vla_attention.analyze.show.plot_axes import (
+from vla_attention.analyze.render.plot_axes import (
     BASELINE_LABEL,
     legend_above,
     ratio_axis,
@@ -26,8 +25,15 @@ from vla_attention.analyze.show.plot_axes import (
     uniform_line,
     whole_numbers,
 )
-from vla_attention.analyze.show.plot_colours import BASELINE_COLOR, DATA_COLOR, LINE_OF_HATCH, NOTE_COLOR, group_styles
-from vla_attention.analyze.show.plot_text import explain, ratio_name, title, wrapped
+from vla_attention.analyze.render.plot_colours import (
+    BASELINE_COLOR,
+    DATA_COLOR,
+    LINE_OF_HATCH,
+    NOTE_COLOR,
+    group_styles,
+)
+from vla_attention.analyze.render.plot_text import explain, ratio_name, title, wrapped
+from vla_attention.analyze.render.style import Style, new_canvas
 from vla_attention.analyze.statistics.summaries import geometric_mean, summarize
 from vla_attention.schemas.errors import plural
 from vla_attention.schemas.groupings.grouping import Grouping

@@ -12,6 +12,8 @@ The options of a figure, by kind:
     scatter       x, y, label: points with names, NAME_low and NAME_high as bars. log (both axes), xlabel, ylabel.
     pictures      none; see `pictures.pictures` for the columns.
 
+    pictures      see `render.pictures`.
+
 NAME_low and NAME_high of a value are its interval; `num_episodes`, if the frame has it, is said.
 """
 
@@ -27,17 +29,17 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.core.result import Figure
 from vla_attention.analyze.render.pictures import pictures
-from vla_attention.analyze.render.style import Style, new_canvas, save_canvas
-from vla_attention.analyze.show.plot_axes import label_positions, ratio_axis, scattered, share_ticks, whole_numbers
-from vla_attention.analyze.show.plot_colours import (
+from vla_attention.analyze.render.plot_axes import label_positions, ratio_axis, scattered, share_ticks, whole_numbers
+from vla_attention.analyze.render.plot_colours import (
     BASELINE_COLOR,
     DOT_COLOR,
     NOTE_COLOR,
     SERIES_COLORS,
     group_styles,
 )
-from vla_attention.analyze.show.plot_heat_map import draw_log2_map, label_axis
-from vla_attention.analyze.show.plot_text import explain, shortened, wrapped
+from vla_attention.analyze.render.plot_heat_map import draw_log2_map, label_axis
+from vla_attention.analyze.render.plot_text import explain, shortened, wrapped
+from vla_attention.analyze.render.style import Style, new_canvas, save_canvas
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -171,8 +173,9 @@ def _legend(axes: Axes, rows: pl.DataFrame, o: Any) -> None:
 
 
 def _legend_above(axes: Axes, handles: Sequence[Any], labels: Sequence[str]) -> None:
-    ncols = 4 if axes.figure.bbox.width > 5 * axes.figure.dpi else 2
-    axes.legend(handles, labels, loc="lower left", bbox_to_anchor=(0, 1), ncols=ncols, borderaxespad=0.1,
+    figure = axes.get_figure(root=True)
+    columns = 4 if figure is None or figure.get_figwidth() > 4 else 2
+    axes.legend(handles, labels, loc="lower left", bbox_to_anchor=(0, 1), ncols=columns, borderaxespad=0.1,
                 handlelength=1.4, columnspacing=1.0)  # fmt: skip
 
 

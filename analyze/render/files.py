@@ -11,7 +11,7 @@ from pathlib import Path
 import polars as pl
 
 from vla_attention.analyze.core.result import Result
-from vla_attention.analyze.show.output_files import replacing, write_text, writing
+from vla_attention.analyze.render.output_files import replacing, write_text, writing
 
 #: Rows that a Parquet file holds together. The writer keeps as many in memory, some 400 bytes each, and 75 kB of
 #: each such group until the file ends.

@@ -48,14 +48,15 @@ def _environment() -> Iterator[jinja2.Environment]:
 
 
 def _picture(figure: Figure) -> str:
-    """The address of a picture that stands in the page itself."""
+    """The address of a picture that stands in the page itself; photographs as WebP, half the bytes of PNG."""
     style = Style()
     canvas = draw(figure, style)
     style_module.find_places(canvas, style.dpi)
     content = BytesIO()
+    kind, options = ("webp", {"quality": 85}) if figure.kind == "pictures" else ("png", {})
     with style.settings():
-        canvas.savefig(content, format="png", dpi=style.dpi)
-    return f"data:image/png;base64,{base64.b64encode(content.getvalue()).decode()}"
+        canvas.savefig(content, format=kind, dpi=style.dpi, pil_kwargs=options)
+    return f"data:image/{kind};base64,{base64.b64encode(content.getvalue()).decode()}"
 
 
 def _sort_key(row: dict[str, object], column: Column) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from vla_attention.analyze.core.result import Figure
-from vla_attention.analyze.show.output_files import replacing, write_text
+from vla_attention.analyze.render.output_files import replacing, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas

@@ -148,32 +148,3 @@ def _of_what_is_left(statistic: EpisodeStatistic, row: int, given: Units) -> Est
         statistic.limits,
     )  # fmt: skip
     return estimates([part], left.decided())[0]
-
-
-def means_of_all_and_of_tasks(
-    table: pl.DataFrame,
-    by: Sequence[str],
-    values: Mapping[str, tuple[float, float]],
-    sampling: Sampling,
-    *,
-    quotients: Mapping[str, tuple[str, str]] | None = None,
-    nulls: Mapping[str, float] | None = None,
-) -> pl.DataFrame:
-    """`means_with_intervals` of all episodes, then of each task; the arguments are those of it.
-
-    table: has `suite`, `task_id` and `instruction` besides `by` and the values.
-
-    Returns:
-        scope ("all" or "task"), suite, task_id and instruction (null for "all"), then the columns of
-        `means_with_intervals`.
-    """
-    of_task = ["suite", "task_id", "instruction"]
-    whole = means_with_intervals(table, by, values, sampling, quotients=quotients, nulls=nulls).select(
-        pl.lit("all").alias("scope"),
-        *(pl.lit(None, dtype=table.schema[name]).alias(name) for name in of_task),
-        pl.all(),
-    )
-    tasks = means_with_intervals(table, [*of_task, *by], values, sampling, quotients=quotients, nulls=nulls).select(
-        pl.lit("task").alias("scope"), pl.all()
-    )
-    return pl.concat([whole, tasks.select(whole.columns)])

@@ -79,11 +79,6 @@ class EpisodeStatistic:
     exponentiate: bool = False
     limits: tuple[float, float] = NO_LIMITS
 
-    @property
-    def num_left_out(self) -> int:
-        """Number of episodes that have no finite value and are not used."""
-        return int((~self.used).sum())
-
 
 @dataclass(frozen=True)
 class Estimate:
@@ -136,26 +131,6 @@ def mean_over_episodes(values: ArrayLike, limits: tuple[float, float] = NO_LIMIT
     sample = np.asarray(values, dtype=np.float64)
     used = np.isfinite(sample)
     return EpisodeStatistic(np.where(used, sample, 0.0), used.astype(np.float64), used, limits=limits)
-
-
-def means_over_tasks(values: NDArray[np.float64], tasks: ArrayLike) -> NDArray[np.float64]:
-    """The values of `mean_over_episodes` of many quantities at once, without their errors.
-
-    Args:
-        values: (..., episode, quantity); those that are not finite are left out.
-        tasks: (episode,) labels of the episodes' tasks.
-
-    Returns:
-        (..., quantity); NaN where no episode has a finite value.
-    """
-    task_of = np.unique(np.asarray(tasks), return_inverse=True)[1]
-    member = (np.arange(task_of.max(initial=-1) + 1)[:, None] == task_of).astype(np.float64)  # (task, episode)
-    used = np.isfinite(values)
-    size = member @ used.astype(np.float64)  # (..., task, quantity)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        of_tasks = np.where(size > 0, (member @ np.where(used, values, 0.0)) / size, 0.0)
-        means: NDArray[np.float64] = of_tasks.sum(axis=-2) / (size > 0).sum(axis=-2)
-    return means
 
 
 def ratio_of_means_over_episodes(numerator: ArrayLike, denominator: ArrayLike) -> EpisodeStatistic:
@@ -218,22 +193,6 @@ def estimates(statistics: Sequence[EpisodeStatistic], units: Units) -> list[Esti
     kinds = [statistic for statistic in statistics for _ in range(statistic.used.size // len(task_of))]
     each = zip(*(part.tolist() for part in (quotient, variance, degrees, scale)), kinds, strict=True)
     return [_estimate(*one) for one in each]
-
-
-def quotient_by_episode(numerator: ArrayLike, denominator: ArrayLike, tasks: ArrayLike) -> NDArray[np.float64]:
-    """One value per episode, whose mean over tasks is the quotient of means, with the quotient's variance (episode,).
-
-    quotient + (numerator - quotient * denominator) / mean denominator: the quotient to first order. It makes quotients
-    of different items comparable episode by episode.
-    """
-    above, below = np.asarray(numerator, dtype=np.float64), np.asarray(denominator, dtype=np.float64)
-    quotient, mean_below = (
-        one.value
-        for one in estimates([ratio_of_means_over_episodes(above, below), mean_over_episodes(below)], Units.of(tasks))
-    )
-    if quotient is None or not mean_below:
-        return np.full(len(above), np.nan)
-    return quotient + (above - quotient * below) / mean_below
 
 
 def strata_error(

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 
 @dataclass(frozen=True)
@@ -42,16 +42,6 @@ def summarize(values: ArrayLike) -> SampleSummary:
         max=float(finite.max()),
         num_nonfinite=left_out,
     )
-
-
-def summarize_rows(values: NDArray[np.float64]) -> list[SampleSummary]:
-    """`summarize` of each row (row, n)."""
-    if values.size == 0 or not np.isfinite(values).all():
-        return [summarize(row) for row in values]
-    columns = (of(values, axis=1).tolist() for of in (np.mean, np.std, np.median, np.min, np.max))
-    return [
-        SampleSummary(mean, std, median, low, high, 0) for mean, std, median, low, high in zip(*columns, strict=True)
-    ]
 
 
 def geometric_mean(ratios: ArrayLike) -> tuple[float | None, int]:

@@ -8,10 +8,9 @@ from dataclasses import dataclass, field, replace
 
 import polars as pl
 
-from vla_attention.analyze.show.numbers import of_tasks, plural, solved_text
 from vla_attention.analyze.stores.read_ahead import read_ahead
 from vla_attention.analyze.stores.selection import select_episodes
-from vla_attention.schemas.errors import listing
+from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Names
 from vla_attention.schemas.groupings.words import words_of
@@ -63,11 +62,19 @@ def one_line(stores: Sequence[Store]) -> str:
         success.append(episode.attributes.success)
         replans += episode.attributes.num_replans
     tasks = {(store.suite, task) for store in stores for task in store.task_ids}
-    return (
-        f"{plural(len(stores), 'store')}: {of_tasks(len(success), len(tasks))} ({solved_text(success)}), "
-        f"{replans} replans, "
-        f"suite {listing(dict.fromkeys(store.suite for store in stores))}"
-    )
+    held = f"{plural(len(success), 'episode')} of {plural(len(tasks), 'task')} ({_solved_text(success)})"
+    suites = listing(dict.fromkeys(store.suite for store in stores))
+    return f"{plural(len(stores), 'store')}: {held}, {replans} replans, suite {suites}"
+
+
+def _solved_text(outcomes: Iterable[bool | None]) -> str:
+    """`3 solved`; `3 of 5 with a known outcome solved` where some are not known, `outcomes not known` where all are."""
+    given = list(outcomes)
+    known = [outcome for outcome in given if outcome is not None]
+    if given and not known:
+        return "outcomes not known"
+    solved = sum(known)
+    return f"{solved} solved" if len(known) == len(given) else f"{solved} of {len(known)} with a known outcome solved"
 
 
 def header_lines(stores: Sequence[Store]) -> list[str]:
@@ -96,7 +103,7 @@ def lines_of_store(store: Store, tasks: Sequence[int | str] | None = None) -> It
     if root.data_set is not None:
         yield "data set", root.data_set.describe()
     summary = _EpisodeSummary.of(root, episodes)
-    yield "episodes", f"{len(episodes)} ({solved_text(summary.success)}), tasks {listing(store.task_ids, 100)}"
+    yield "episodes", f"{len(episodes)} ({_solved_text(summary.success)}), tasks {listing(store.task_ids, 100)}"
     labels = [
         f"{label} (block {block})" if label != block else str(block)
         for label, block in zip(

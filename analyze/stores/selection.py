@@ -104,11 +104,6 @@ def _other_sites(root: RootAttributes, site: str) -> str:
     return f"; other sites (--site) have {'; '.join(others)}" if others else ""
 
 
-def heads_text(selection: Selection, num_heads: int) -> str:
-    """The selected heads in words; `num_heads` is how many the policy has."""
-    return "all heads" if len(selection.heads) == num_heads else f"heads {listing(selection.head_numbers, 40)}"
-
-
 def denoise_text(steps: Sequence[int], num_steps: int) -> str:
     """Denoise steps in words; `num_steps` is how many the policy has."""
     if len(steps) == 1:

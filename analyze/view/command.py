@@ -114,7 +114,7 @@ def _notes(stores: Sequence[Store]) -> tuple[str, ...]:
 
 
 def _serve(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None:
-    from vla_attention.analyze.show.browser import open_in_browser
+    from vla_attention.analyze.render.browser import open_in_browser
     from vla_attention.analyze.view.server import ViewerServer
 
     with ViewerServer(stores, arguments.port, allow_hosts=arguments.allow_host, keep_link=True) as server:

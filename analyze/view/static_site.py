@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 
-from vla_attention.analyze.show.output_files import write_text, writing
+from vla_attention.analyze.render.output_files import write_text, writing
 from vla_attention.analyze.view.paths import PAGE_FILES, STORES_DOCUMENT
 from vla_attention.analyze.view.served_stores import ServedStore, stores_document
 from vla_attention.schemas.errors import BadArgument, listing
@@ -47,8 +47,8 @@ def check_uploads(folder: Path, stores: Sequence[Store]) -> None:
         if more := beyond_the_format(store):
             raise BadArgument(
                 f"Cannot write a site of {store.path}: {listing(more, 5)} would be published with it, and "
-                f"{'is' if len(more) == 1 else 'are'} no part of the store. vla-attention copy {store.path} NAME.zarr "
-                "makes a store without such files and links; or remove them."
+                f"{'is' if len(more) == 1 else 'are'} no part of the store. vla-attention store copy {store.path} "
+                "NAME.zarr makes a store without such files and links; or remove them."
             )
     links = [
         entry.name if place == folder else f"{place.name}/{entry.name}"
@@ -76,7 +76,7 @@ def web_address(place: StoreUrl) -> str:
         return f"{place.url.rstrip('/')}/"
     raise BadArgument(
         f"Browsers cannot read {place}: give its address as https://..., or copy the store here "
-        f"(vla-attention copy {place} NAME.zarr) and upload it with the site."
+        f"(vla-attention store copy {place} NAME.zarr) and upload it with the site."
     )
 
 

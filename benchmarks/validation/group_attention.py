@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.contributions import joint_norm, selected_gram, whole_segments
-from vla_attention.analyze.measures.masses import group_measures
+from vla_attention.analyze.core.levels import levels_of
+from vla_attention.analyze.core.measure import Measured
 from vla_attention.analyze.measures.question import Question, select_again
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, resolve_all, vocabulary_of
-from vla_attention.analyze.measures.steps import MeasuredEpisode, measure_episodes
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping, check_names
@@ -149,7 +149,7 @@ def _measured(question: Question, groups: Sequence[GroupOfKeys]) -> dict[GroupOf
     grouping = _grouping(groups)
     resolved = resolve_all(grouping, question.selected, question.vocabulary)
     per_head = any(group.place.heads is not None for group in groups)
-    measured = measure_episodes(replace(question, grouping=grouping), resolved, per_head=per_head)
+    measured = levels_of(replace(question, grouping=grouping), per_head).measured
     with_norms = all(store.attributes.recording.contributions for store in question.stores)
     values: dict[GroupOfKeys, dict[str, Array]] = {group: {} for group in groups}
     for item, weights, one in zip(question.selected, resolved, measured, strict=True):
@@ -166,7 +166,7 @@ def _places(chosen: Sequence[int], wanted: Sequence[int] | None) -> list[int]:
 
 
 def _of_group(
-    measured: MeasuredEpisode, resolved: ResolvedGrouping, group: GroupOfKeys, number: int, norm: Array | None
+    measured: Measured, resolved: ResolvedGrouping, group: GroupOfKeys, number: int, norm: Array | None
 ) -> Array:
     """`MEASURES` of one group (replan, measure). Masses are averaged over layers, denoise steps and heads first."""
     selection, place = measured.selection, group.place
@@ -180,19 +180,20 @@ def _of_group(
         return np.full((replans, len(MEASURES)), np.nan)
     cells = np.ix_(range(replans), layers, denoise, heads)
     mass, valid, uniform_mass, uniform_valid = (
-        np.broadcast_to(values, measured.valid_mass.shape)[cells].mean(axis=(1, 2, 3))
+        np.broadcast_to(values, measured.valid.shape)[cells].mean(axis=(1, 2, 3))
         for values in (
             measured.mass[..., number],
-            measured.valid_mass,
-            measured.uniform_mass[..., number],
+            measured.valid,
+            measured.uniform[..., number],
             measured.uniform_valid,
         )
     )
     keys = resolved.num_keys[:, number : number + 1]
-    measures = group_measures(mass[:, None], valid, keys, uniform_mass[:, None], uniform_valid)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        lift = np.where(uniform_mass > 0, mass / uniform_mass, np.nan) / (valid / uniform_valid)
     columns = (
         mass,
-        measures.lift[:, 0],
+        lift,
         np.full(replans, np.nan) if norm is None else norm,
         np.broadcast_to(keys[:, 0], replans),
     )
@@ -200,7 +201,7 @@ def _of_group(
 
 
 def _norm(
-    item: SelectedEpisode, measured: MeasuredEpisode, group: GroupOfKeys, taken: NDArray[np.bool_], site: str
+    item: SelectedEpisode, measured: Measured, group: GroupOfKeys, taken: NDArray[np.bool_], site: str
 ) -> Array | None:
     """Norm of the group's contribution (replan,), mean over its layers and denoise steps; contributions have no heads.
 

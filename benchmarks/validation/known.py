@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from vla_attention.analyze.ratios.analysis import analyse
 
 import vla_attention as va
 from benchmarks.validation.calls import NOTHING, changed_episodes
@@ -18,7 +17,6 @@ from benchmarks.validation.changes import BASE_CAMERA, WRIST_CAMERA, colour_word
 from benchmarks.validation.policies import KnownPolicy
 from benchmarks.validation.tables import SCALES, means
 from vla_attention.analyze.core.action_changes import ActionSpread
-from vla_attention.analyze.measures.sinks import SinkRule
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import Store
 
@@ -91,7 +89,7 @@ _ID = ["suite", "task_id", "episode_index"]
 
 
 def attention_numbers(store: Store) -> Iterator[pl.DataFrame]:
-    """Tables of suite, task_id, episode_index, number, value: what `vla-analyze` says of each episode's attention."""
+    """Tables of suite, task_id, episode_index, number, value: what `vla-attention` says of each episode's attention."""
     run = va.open(store.path)
     overall = pl.col("layer") == "layers_avg"
 
@@ -107,7 +105,7 @@ def attention_numbers(store: Store) -> Iterator[pl.DataFrame]:
     words = run.analyze(**own)["episodes_groups"].filter(overall, group="linguistic")
     yield of(words, "instruction_mass", "mass")
     yield of(words, "instruction_lift", "lift")
-    cleaned = analyse(run.ask(), SinkRule()).episodes.cells.filter(overall)
+    cleaned = run.analyze(without_sinks="")["episodes"].filter(overall)
     yield of(cleaned, "ratio_lift_without_sinks", "ratio_lift")
     norms = run.analyze()["contributions_steps"].with_columns(pl.col("contribution_ratio", "ratio_lift").log())
     episodes = norms.group_by(_ID, maintain_order=True).agg(pl.col("contribution_ratio", "ratio_lift").mean().exp())
@@ -132,11 +130,11 @@ def attention_numbers(store: Store) -> Iterator[pl.DataFrame]:
         | dict.fromkeys(["colour", "verb", "named"], pl.String),
         orient="row",
     )
-    read = run.words("episodes").filter(overall, kind="word").join(wanted, on=_ID)
-    yield of(read.filter(pl.col("item") == pl.col("colour")), "colour_lift", "lift")
+    read = run.words()["words_episodes"].filter(overall).join(wanted, on=_ID)
+    yield of(read.filter(pl.col("item") == pl.col("colour"), kind="word"), "colour_lift", "lift")
     if wanted["colour"].is_not_null().any():
-        yield of(read.filter(pl.col("place") == 0), "verb_lift", "lift")
-    seen = run.objects("objects").filter(overall, kind="object").join(wanted, on=_ID)
+        yield of(read.filter(kind="place", place=0), "verb_lift", "lift")
+    seen = run.objects(iou=False)["objects_episodes"].filter(overall, kind="object").join(wanted, on=_ID)
     yield of(seen.filter(pl.col("item") == pl.col("named"), camera="all"), "named_enrichment", "enrichment")
     yield of(seen.filter(item="mark", camera=BASE_CAMERA), "mark_enrichment", "enrichment")
 

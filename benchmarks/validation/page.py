@@ -11,7 +11,7 @@ from benchmarks.validation.known import CONTRASTS, NUMBERS, OTHER
 from benchmarks.validation.mixing import CUTS, GROUPS, READ, READERS
 from benchmarks.validation.policies import SHIPPED, TITLES
 from benchmarks.validation.prediction import ATTENTION, BASELINE, FAMILIES
-from vla_attention.analyze.show.numbers import format_number
+from vla_attention.analyze.render.numbers import format_number
 from vla_attention.schemas.errors import BadArgument
 
 Results = Mapping[str, Any]

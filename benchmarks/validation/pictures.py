@@ -15,9 +15,10 @@ from benchmarks.validation.known import NUMBERS
 from benchmarks.validation.mixing import CUTS, GROUPS
 from benchmarks.validation.policies import TITLES
 from benchmarks.validation.prediction import ATTENTION, FAMILIES
-from vla_attention.analyze.show.plot_axes import ratio_axis
-from vla_attention.analyze.show.plot_style import DPI, drawn_in_our_style, new_figure
+from vla_attention.analyze.render.plot_axes import ratio_axis
+from vla_attention.analyze.render.style import Style, new_canvas
 
+STYLE = Style()
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#999999")
 #: The panels of the first picture.
 SHOWN = {
@@ -34,11 +35,11 @@ SHOWN = {
 }
 
 
-@drawn_in_our_style
+@STYLE.settings()
 def draw_known(results: Mapping[str, Any], path: Path) -> None:
     """Numbers of the policies whose dependence is known, one point per training with its interval over tasks."""
     controls = [name for name in TITLES if any(policy["control"] == name for policy in results["policies"])]
-    figure = new_figure(10.0, 4.8)
+    figure = new_canvas(10.0, 4.8)
     axes = figure.subplots(2, (len(SHOWN) + 1) // 2)
     for axis, name in zip(axes.flat, SHOWN, strict=False):
         for place, control in enumerate(controls):
@@ -60,13 +61,13 @@ def draw_known(results: Mapping[str, Any], path: Path) -> None:
         axis.set_xticks(range(len(controls)), [TITLES[name] for name in controls], fontsize=6, rotation=60)
         axis.set_xlim(-0.6, len(controls) - 0.4)
     figure.suptitle(_sample(results).replace("\n", " "), fontsize=8, x=0.01, ha="left")
-    figure.savefig(path, dpi=DPI)
+    figure.savefig(path, dpi=STYLE.dpi)
 
 
-@drawn_in_our_style
+@STYLE.settings()
 def draw_prediction(results: Mapping[str, Any], path: Path) -> None:
     """Rank correlations with intervals, and mass against effect for the action queries and for all queries."""
-    figure = new_figure(10.5, 4.2)
+    figure = new_canvas(10.5, 4.2)
     forest, direct, everywhere = figure.subplots(1, 3, width_ratios=[1.2, 1, 1])
     families = [name for name in FAMILIES if any(row["family"] == name for row in results["prediction"])]
     for j, measure in enumerate(ATTENTION):
@@ -106,7 +107,7 @@ def draw_prediction(results: Mapping[str, Any], path: Path) -> None:
         found = [item for item in results["items"] if item["family"] == "groups" and item["mass"] and item[column]]
         _name_points(axis, [(item["item"], item["mass"], item[column]) for item in found])
     forest.set_title(_sample(results))
-    figure.savefig(path, dpi=DPI)
+    figure.savefig(path, dpi=STYLE.dpi)
 
 
 def _sample(results: Mapping[str, Any]) -> str:
@@ -141,11 +142,11 @@ def _name_points(axes: Axes, points: Sequence[tuple[str, float, float]]) -> None
         taken.append(best[3])
 
 
-@drawn_in_our_style
+@STYLE.settings()
 def draw_mixing(results: Mapping[str, Any], path: Path) -> None:
     """Effects of knocking out words and pictures under each cut of the prefix."""
     of = {(row["cut"], row["group"]): row for row in results["mixing"]}
-    figure = new_figure(8.0, 3.2)
+    figure = new_canvas(8.0, 3.2)
     axis = figure.subplots()
     for j, (cut, what) in enumerate(CUTS.items()):
         for i, group in enumerate(GROUPS):
@@ -160,7 +161,7 @@ def draw_mixing(results: Mapping[str, Any], path: Path) -> None:
     axis.set_ylabel("effect on the action")
     axis.set_title(_sample(results).replace("\n", " "), fontsize=8, loc="left")
     axis.legend(fontsize=7)
-    figure.savefig(path, dpi=DPI)
+    figure.savefig(path, dpi=STYLE.dpi)
 
 
 def draw(results: Mapping[str, Any], folder: Path) -> list[Path]:

@@ -108,7 +108,7 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
         "verify",
         help="read stores back and check every file, digest and row sum",
         description=verify_command.DESCRIPTION,
-        epilog=verify_command.EXAMPLES.replace("NAME", "vla-attention"),
+        epilog=verify_command.EXAMPLES.replace("NAME", "vla-attention capture"),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     verify_command.add_verify_arguments(verify)

@@ -317,6 +317,6 @@ class EpisodeWriter:
         self.write("dataset_actions", stacked, ("replan", "horizon", "action_dim"))
 
     def _read_back(self, run: str) -> None:
-        """Read everything back from disk, with the checks of `vla-attention verify`."""
+        """Read everything back from disk, with the checks of `vla-attention store verify`."""
         for problem in content_problems(self.run, StoredEpisode(self.folder, self.name, run, self.run.store_version)):
             raise CorruptEpisode(f"Episode {self.name}, read back from {self.folder}, is damaged: {problem.text}.")

@@ -29,7 +29,9 @@ INDEX_FILE = "index.json"
 INDEX_FORMAT = "vla-attention-index"
 INDEX_VERSION = 1
 #: What to do about episodes that an index does not list.
-LIST_AGAIN = "A copy that still packs lists it when it ends; otherwise run the same vla-attention copy --packed again"
+LIST_AGAIN = (
+    "A copy that still packs lists it when it ends; otherwise run the same vla-attention store copy --packed again"
+)
 #: Episodes of one task in one folder: a hub takes at most 10,000 files in one.
 _IN_A_FOLDER = 1000
 _DIGEST = re.compile(r"[0-9a-f]{64}")
@@ -171,8 +173,8 @@ def read_index(source: ByteSource, store: object, run: str) -> PackedIndex | Non
         index = from_json(PackedIndex, document)
     except (MalformedDocument, ValueError) as error:
         raise StoreError(
-            f"The store {store} cannot be read: its {INDEX_FILE} is damaged ({error}). vla-attention copy --packed "
-            "writes it again."
+            f"The store {store} cannot be read: its {INDEX_FILE} is damaged ({error}). vla-attention store copy "
+            "--packed writes it again."
         ) from None
     if index.run != run:
         raise StoreError(

@@ -84,6 +84,11 @@ class StoredEpisode:
     place: ByteSource | None = None
     indexed: str = ""
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """A pickle holds where the episode is and nothing that was read; another process may run in another folder."""
+        given = (_from_anywhere(self.folder), self.name, self.run, self.version, self.place, self.indexed)
+        return StoredEpisode, given
+
     @cached_property
     def source(self) -> ByteSource:
         """The episode's files as they are found, not yet compared with the seal."""
@@ -367,13 +372,20 @@ class _StoredCoverage(Mapping[str, NDArray[np.float32]]):
 class Store:
     """A store opened for reading: its run, and the episodes that were committed when it was opened.
 
-    `run` is the digest of the run's configuration.
+    Attributes:
+        run: the digest of the run's configuration.
+        notes: what lies among the episodes and is not read, a sentence each; opening the store says them as `Note`.
     """
 
     path: StorePlace
     attributes: RootAttributes
     run: str
     episodes: tuple[StoredEpisode, ...]
+    notes: tuple[str, ...] = ()
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """A pickle is without the episodes: it travels with each of them, of which there may be thousands."""
+        return Store, (_from_anywhere(self.path), self.attributes, self.run, ())
 
     @property
     def suite(self) -> str:
@@ -384,6 +396,10 @@ class Store:
     def task_ids(self) -> tuple[int, ...]:
         """Ids of the tasks that have at least one episode."""
         return tuple(sorted({parse_episode_name(episode.name)[0] for episode in self.episodes}))
+
+
+def _from_anywhere(place: StorePlace) -> StorePlace:
+    return place.absolute() if isinstance(place, Path) else place
 
 
 def open_store(path: str | StorePlace) -> Store:
@@ -405,39 +421,39 @@ def open_store(path: str | StorePlace) -> Store:
     source, version = source_of(path), root.store_version
     index = read_index(source, path, run)
     if index is not None:
-        _name_unlisted(path, index)
+        notes = _said(_unlisted(path, index))
         in_order = sorted(index.episodes.items(), key=lambda item: parse_episode_name(item[0]))
         members = {
             name: ZipMembers(source.bound_to(entry.seal), entry.file, entry.bytes, entry.tail, entry.frame)
             for name, entry in in_order
         }
         packed = (StoredEpisode(path / e.file, name, run, version, members[name], e.seal) for name, e in in_order)
-        return Store(path, root, run, tuple(packed))
+        return Store(path, root, run, tuple(packed), notes)
     folders, strays = list_episodes(path)
-    if strays:
-        warnings.warn(
-            f"Ignored in {path}, among its episodes: {visible(listing(strays))}; they are no episodes. Move them out "
-            "of the store.",
-            Note,
-            stacklevel=2,
-        )
+    stray = (
+        f"Ignored in {path}, among its episodes: {visible(listing(strays))}; they are no episodes. Move them out of "
+        "the store."
+    )
+    notes = _said(stray if strays else "")
     folders.sort(key=lambda folder: parse_episode_name(folder.name))
-    return Store(path, root, run, tuple(StoredEpisode(folder, folder.name, run, version) for folder in folders))
+    return Store(path, root, run, tuple(StoredEpisode(folder, folder.name, run, version) for folder in folders), notes)
 
 
-def _name_unlisted(path: StorePlace, index: PackedIndex) -> None:
+def _said(note: str) -> tuple[str, ...]:
+    """Say a note of an opened store, if there is one."""
+    if note:
+        warnings.warn(note, Note, stacklevel=3)
+    return (note,) if note else ()
+
+
+def _unlisted(path: StorePlace, index: PackedIndex) -> str:
+    """What the index of a packed store does not list, as a sentence; empty where it lists everything."""
     try:
         unlisted = unlisted_episodes(path, index)
     except NotListed as error:
-        note = f"Whether the {INDEX_FILE} of {path} lists every episode of it was not checked: {error}."
-        warnings.warn(note, Note, stacklevel=3)
-        return
-    if unlisted:
-        warnings.warn(
-            f"Left out of {path}: what its {INDEX_FILE} does not list, {listing(unlisted)}. {LIST_AGAIN}.",
-            Note,
-            stacklevel=3,
-        )
+        return f"Whether the {INDEX_FILE} of {path} lists every episode of it was not checked: {error}."
+    left = f"Left out of {path}: what its {INDEX_FILE} does not list, {listing(unlisted)}. {LIST_AGAIN}."
+    return left if unlisted else ""
 
 
 def _holds_missing(values: NDArray[Any]) -> bool:

@@ -75,7 +75,7 @@ def _lines(path: Path, findings: Sequence[Finding], total: int, verify: bool, dr
             lines.append(f"    left in the store, because it is claimed: {finding.holder.describe()}")
     if not dry_run and any(finding.moved_to is not None for finding in findings):
         lines.append(
-            "Run the same vla-attention copy --packed to pack what was moved aside again."
+            "Run the same vla-attention store copy --packed to pack what was moved aside again."
             if is_packed(path)
             else "Run the same capture with --resume to record what was moved aside again."
         )

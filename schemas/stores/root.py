@@ -107,13 +107,13 @@ def list_episodes(path: StorePlace) -> tuple[list[StorePlace], list[str]]:
         except (OSError, NotImplementedError) as error:
             raise StoreError(
                 f"The episodes of {path} cannot be listed ({str(error).rstrip('.')}), and it has no index; "
-                "vla-attention copy --packed makes a store that is read without listing."
+                "vla-attention store copy --packed makes a store that is read without listing."
             ) from None
         is_episode_of = {name: is_episode_name(name) for name in names}
     elif (path / INDEX_FILE).is_file():
         raise StoreError(
-            f"{path} is packed: its episodes are zip files, and nothing is added to them or moved. vla-attention copy "
-            f"{path} NAME.zarr makes a store of folders."
+            f"{path} is packed: its episodes are zip files, and nothing is added to them or moved. vla-attention store "
+            f"copy {path} NAME.zarr makes a store of folders."
         )
     else:
         refuse_linked_group(path)

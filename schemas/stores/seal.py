@@ -1,8 +1,9 @@
 """Seals: a seal lists every file of an episode, and binds them to the episode's name and to its run.
 
-Capture seals an episode when all of it is written, `vla-attention copy` when it has left something out. The reader
-(`reader.py`, `sealed_files.py`) compares what it reads with the seal. Its digests find accidents and partial edits:
-files that were damaged, exchanged, cut off or changed. They are no signature: who can compute them can make a new seal.
+Capture seals an episode when all of it is written, `vla-attention store copy` when it has left something out. The
+reader (`reader.py`, `sealed_files.py`) compares what it reads with the seal. Its digests find accidents and partial
+edits: files that were damaged, exchanged, cut off or changed. They are no signature: who can compute them
+can make a new seal.
 """
 
 from __future__ import annotations

@@ -98,7 +98,7 @@ def local_path(place: StorePlace) -> Path:
     """
     if isinstance(place, StoreUrl):
         raise BadArgument(
-            f"{place} is elsewhere, and this command needs a store here: vla-attention copy {place} NAME.zarr."
+            f"{place} is elsewhere, and this command needs a store here: vla-attention store copy {place} NAME.zarr."
         )
     return place
 

@@ -160,4 +160,4 @@ def _problems_of_bytes(episode: StoredEpisode, known: Container[str | None]) -> 
                 yield Problem(f"Episode {episode.name} is damaged: {error}.", file)
     zipped, source = episode.place, episode.source
     if isinstance(zipped, ZipMembers) and isinstance(source, ZipMembers) and source.frame_digest() != zipped.frame:
-        yield Problem("its zip has other bytes around its files than vla-attention copy --packed wrote")
+        yield Problem("its zip has other bytes around its files than vla-attention store copy --packed wrote")

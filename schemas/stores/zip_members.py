@@ -1,9 +1,9 @@
 """The files of an episode in one zip file without compression, read in place.
 
-A store packed by `vla-attention copy --packed` has a zip an episode. The small files and all metadata are at the zip's
-end, just before its directory, so that one request for the tail opens an episode that is elsewhere. A zip's directory
-is not believed more than any other bytes: it says where a file begins, and what is found there has to be what the
-episode's seal lists.
+A store packed by `vla-attention store copy --packed` has a zip an episode. The small files and all metadata are at the
+zip's end, just before its directory, so that one request for the tail opens an episode that is elsewhere. A zip's
+directory is not believed more than any other bytes: it says where a file begins, and what is found there has to be what
+the episode's seal lists.
 """
 
 from __future__ import annotations
@@ -169,8 +169,8 @@ class ZipMembers:
             plain = stored and not stat.S_ISLNK(member.external_attr >> 16)  # what unpacks it would make a link
             if not plain or member.flag_bits & (_ENCRYPTED | _DESCRIPTOR) or first < header or until > self.length:
                 raise DamagedZip(
-                    f"its zip {self.file} holds {member.filename!r} in another way than vla-attention copy --packed "
-                    "writes it; pack the store again"
+                    f"its zip {self.file} holds {member.filename!r} in another way than vla-attention store copy "
+                    "--packed writes it; pack the store again"
                 )
             yield member.filename, (first, member.file_size)
 

@@ -15,19 +15,18 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from vla_attention.analyze.render import style
-from vla_attention.analyze.show import plot_style
 
 HERE, DRAW = Path(__file__).parent, Figure.savefig
 
 
-def white_pixel() -> bytes:
+def white_pixel(kind: str) -> bytes:
     buffer = io.BytesIO()
-    Image.new("RGB", (1, 1), "white").save(buffer, format="PNG")
+    Image.new("RGB", (1, 1), "white").save(buffer, format=kind)
     return buffer.getvalue()
 
 
 #: Whole files, and what PDF files begin with.
-BLANK = {"png": white_pixel(), "pdf": b"%PDF-1.4\n"}
+BLANK = {"png": white_pixel("PNG"), "pdf": b"%PDF-1.4\n", "webp": white_pixel("WEBP")}
 
 
 def leave_blank(_figure: Figure, file: Any, **options: Any) -> None:
@@ -54,6 +53,5 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
         if item.path.is_relative_to(HERE) and not (thorough and drawn):
             draws = thorough or drawn
             patch.setattr(Figure, "savefig", draw_quickly if draws else leave_blank)
-            patch.setattr(plot_style, "find_places", plot_style.find_places if draws else lambda _figure: None)
             patch.setattr(style, "find_places", style.find_places if draws else lambda _canvas, _dpi: None)
         return (yield)

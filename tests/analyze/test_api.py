@@ -16,15 +16,15 @@ import vla_attention as va
 import vla_attention.analyze.api
 import vla_attention.analyze.measures.question_settings
 from tests.kit.planted_effects import planted_effects
+from tests.kit.site_stores import write_site_store
+from tests.kit.stores import StoreSpec, write_store
+from tests.kit.tokens import small_layout
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.api import OpenStores
 from vla_attention.analyze.measures.question_settings import AnalysisSettings, settings_from_keywords
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.precision import mass_error_bound
 from vla_attention.schemas.stores.store_format import StoreError, StoreNotFound
-from vla_attention.testing.site_stores import write_site_store
-from vla_attention.testing.stores import StoreSpec, write_store
-from vla_attention.testing.tokens import small_layout
 
 MODULES = (va, vla_attention.analyze.api, vla_attention.analyze.measures.question_settings)
 
@@ -138,7 +138,7 @@ def test_keywords_become_settings(given, expected):
     ],
 )
 def test_mistakes_say_what_exists(run, call, message):
-    with pytest.raises(BadArgument, match=message):
+    with pytest.raises((BadArgument, UnknownName), match=message):
         call(run)
 
 
@@ -164,7 +164,7 @@ def test_an_empty_store_can_be_opened_and_says_that_it_is_empty(tmp_path):
 
 def test_a_group_inside_of_a_store_leads_to_the_store(store, capsys):
     for inside in (store / "episodes", store / "episodes" / "task000_episode000"):
-        assert main(["verify", str(inside)]) == 2
+        assert main(["store", "verify", str(inside)]) == 2
         assert f"is a group inside of a store; give the folder above, {store}." in capsys.readouterr().err
 
 

@@ -14,14 +14,14 @@ from typing import Any
 import pytest
 
 from tests.kit.planted_effects import planted_effects
+from tests.kit.site_stores import SiteStoreSpec, write_site_store
+from tests.kit.stores import StoreSpec, reseal, reseal_root, write_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.published.parse_results import main as parse
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.layout import SiteLayout, Span
 from vla_attention.schemas.stores.digest import bytes_digest, seal_digest
-from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
-from vla_attention.testing.stores import StoreSpec, reseal, reseal_root, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, contributions=True)
 #: Clears a screen, moves the cursor, reverses the direction of writing, begins a line, is markup, and is a formula.
@@ -123,9 +123,8 @@ WORDS: dict[str, tuple[str, ...]] = {
     "overlay": ("STORE", "OTHER", "--output", "OUT"),
     "report": ("STORE", "--output", "OUT", "--num-episodes", "1", "--task", "0", "--layers", "0"),
     "view": ("STORE", "--output", "OUT"),
-    "copy": ("STORE", "OUT/copy.zarr", "--without", "frames"),
-    "verify": ("STORE",),
-    "cache": (),
+    "store copy": ("copy", "STORE", "OUT/copy.zarr", "--without", "frames"),
+    "store verify": ("verify", "STORE"),
 }
 
 
@@ -316,8 +315,8 @@ CONTROL, PATH = "a\x1b[2J\u202e", "../../../x"
 def test_a_run_whose_names_are_paths_or_control_a_terminal_is_refused(store, tmp_path, capsys, make, name):
     change(store / "zarr.json", lambda attributes: make(attributes, name))
     before = files_under(tmp_path)
-    for command in ((), ("verify",), ("words",), ("report",)):
-        more = () if command == ("verify",) else ("--output", str(tmp_path / "out" / "report.html"))
+    for command in ((), ("store", "verify"), ("words",), ("report",)):
+        more = () if "verify" in command else ("--output", str(tmp_path / "out" / "report.html"))
         assert analyze([*command, str(store), *more]) == 2
         assert "cannot be read" in check_output(capsys)
     assert capture(["status", str(store)]) == 2
@@ -332,9 +331,9 @@ def test_an_episode_whose_names_are_paths_or_control_a_terminal_is_refused(store
     before = files_under(tmp_path)
     assert analyze([str(store), "--output", str(tmp_path / "out")]) == 2
     assert "its attributes are damaged" in check_output(capsys)
-    assert analyze(["copy", str(store), str(tmp_path / "copy.zarr")]) == 2
+    assert analyze(["store", "copy", str(store), str(tmp_path / "copy.zarr")]) == 2
     check_output(capsys)
-    assert analyze(["verify", str(store)]) == 1
+    assert analyze(["store", "verify", str(store)]) == 1
     check_output(capsys)
     assert not {path for path in files_under(tmp_path) - before if path.name != "zarr.json"}
 
@@ -349,6 +348,6 @@ def test_a_seal_that_lists_files_outside_of_its_episode_copies_none(store, tmp_p
         seal["digest"] = seal_digest(seal)
 
     change(folder / "seal" / "zarr.json", list_outside)
-    assert analyze(["copy", str(store), str(tmp_path / "deep" / "er" / "copy.zarr")]) == 2
+    assert analyze(["store", "copy", str(store), str(tmp_path / "deep" / "er" / "copy.zarr")]) == 2
     assert "its seal is damaged" in check_output(capsys)
     assert list(tmp_path.rglob("secret")) == [tmp_path / "secret"]

@@ -5,15 +5,11 @@ The masses are means over denoise steps, heads and queries. Expected values are 
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 import polars as pl
 import pytest
 
 import vla_attention as va
-from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.show.numbers import format_number
 from vla_attention.example_stores import CUBES
 
 EPISODE = {"task_id": 0, "episode_index": 0}
@@ -45,16 +41,6 @@ def test_tables_have_it_and_the_published_mean_by_its_name(ratios):
     assert episode["geometric_mean"][0] == pytest.approx(np.exp(np.log(ratios).mean()), rel=1e-6)
 
 
-def test_overlay_prints_and_writes_it(ratios, tmp_path, capsys):
-    words = ["overlay", str(CUBES), "--task", "0", "--episode", "0", "--output", str(tmp_path)]
-    assert main(words) == 0
-    printed = capsys.readouterr().out
-    assert "ratio: geometric mean of the layers." in printed
-    for replan, ratio in enumerate(ratios):
-        assert re.search(rf"^ *{replan} +\d+ +{re.escape(format_number(ratio))} ", printed, re.MULTILINE), printed
-    (table,) = tmp_path.glob("*.csv")
-    written = pl.read_csv(table).select("replan", "ratio").unique().sort("replan")
-    assert written["ratio"].to_list() == pytest.approx(ratios, rel=1e-6)
-    # Of one layer there is nothing to say.
-    assert main([*words, "--layers", "2", "--no-plots"]) == 0
-    assert "geometric mean of the layers" not in capsys.readouterr().out
+def test_overlay_has_it(ratios):
+    table = va.open(CUBES).overlay(tasks=0, episode=0)["overlay"]
+    assert table["ratio"].to_list() == pytest.approx(ratios * 2, rel=1e-6)  # on both cameras

@@ -10,13 +10,13 @@ import polars as pl
 import pytest
 
 from tests.kit.questions import question_about
+from tests.kit.site_stores import write_site_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.commands.analyze import analyze as ask_analyze
 from vla_attention.analyze.core.contributions import side_norms
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.testing.site_stores import write_site_store
 
 KINDS = ("alternating", "split", "growing")
 
@@ -108,7 +108,7 @@ SAYS = {
     "analyze --by time": "",
     "words": "",
     "overlay": "",
-    "verify": "all whole",
+    "store verify": "all whole",
     "report": "",
 }
 #: Every command once, and every store with the default question.
@@ -118,9 +118,10 @@ FAST += [("analyze", name) for name in (*KINDS, "bare")]
 
 @pytest.mark.parametrize(("command", "name"), thorough_except(FAST, product(SAYS, (*KINDS, "bare")), several=True))
 def test_commands(stores, tmp_path, capsys, command, name):
-    name_of_command, *more = command.split()
-    given = [name_of_command, str(stores[name]), *more]
-    if command != "verify":
+    words = command.split()
+    at = 1 + (words[0] == "store")
+    given = [*words[:at], str(stores[name]), *words[at:]]
+    if command != "store verify":
         given += ["--output", str(tmp_path / "out")]
     assert analyze(given) == 0
     printed = capsys.readouterr()

@@ -9,12 +9,12 @@ import pytest
 
 from tests.analyze.test_hostile_stores import WORDS
 from tests.kit.planted_effects import planted_effects
+from tests.kit.site_stores import SiteStoreSpec, write_site_store
+from tests.kit.stores import StoreSpec, write_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.schemas.errors import Note
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
-from vla_attention.testing.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, contributions=True)
 NAMED = "among its episodes: README.md, notes, task000_episode007, task0_episode1, task1\\x1b; they are no episodes."
@@ -54,14 +54,19 @@ def store(stores) -> Path:
 
 
 #: The stores of a command that takes others than a.zarr, or two.
-STORES = {"effects": ("effects",), "effects of data": ("data",), "copy": ("one", "two"), "overlay": ("one", "two")}
+STORES = {
+    "effects": ("effects",),
+    "effects of data": ("data",),
+    "store copy": ("one", "two"),
+    "overlay": ("one", "two"),
+}
 #: Commands that draw unless they are told not to.
 DRAWING = ("analyze", "words", "objects", "effects", "effects of data", "overlay")
-#: `verify` and `repair` name strays in their own way.
-READING = [command for command in WORDS if command not in ("verify", "repair", "cache")]
+#: `verify` names strays in its own way.
+READING = [command for command in WORDS if command != "store verify"]
 
 
-@pytest.mark.parametrize("command", thorough_except(("analyze list", "words", "copy"), READING))
+@pytest.mark.parametrize("command", thorough_except(("analyze list", "words", "store copy"), READING))
 def test_a_command_names_them_and_goes_on(stores, tmp_path, monkeypatch, capsys, command):
     monkeypatch.setenv("VLA_CACHE", "off")
     first, second = (*STORES.get(command, ("a", "other")), "")[:2]
@@ -76,6 +81,8 @@ def test_a_command_names_them_and_goes_on(stores, tmp_path, monkeypatch, capsys,
         (line,) = [line for line in said.splitlines() if f"Ignored in {path}, " in line]
         assert line.startswith(f"vla-analyze {name}: Ignored in ")
         assert NAMED in line
+        for file in (*(tmp_path / "out").rglob("result.json"), *(tmp_path / "out").rglob("*.html")):
+            assert f"Ignored in {path}, " in file.read_text(), file
 
 
 def test_the_library_warns(store):
@@ -85,5 +92,5 @@ def test_the_library_warns(store):
 
 
 def test_a_copy_leaves_them_behind(store, tmp_path):
-    assert analyze(["copy", str(store), str(tmp_path / "copy.zarr")]) == 0
+    assert analyze(["store", "copy", str(store), str(tmp_path / "copy.zarr")]) == 0
     assert sorted(entry.name for entry in (tmp_path / "copy.zarr/episodes").iterdir()) == [*EPISODES, "zarr.json"]

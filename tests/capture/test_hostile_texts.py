@@ -15,11 +15,11 @@ from typing import Any
 
 import pytest
 
+from tests.kit.stores import StoreSpec, reseal, reseal_root, write_store
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.schemas.command_line import run_command
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.testing.stores import StoreSpec, reseal, reseal_root, write_store
 
 FORGED = "FORGED: all whole"
 #: Clears a screen, reverses the direction of writing, sets a title (C1), ends a line in five ways.
@@ -89,7 +89,7 @@ def damage(store: Path) -> None:
 
 @pytest.mark.parametrize(
     "command",
-    [("status", "--verify"), ("verify",), ("repair",)],
+    [("status", "--verify"), ("verify",), ("verify", "--repair", "--quick")],
 )
 @pytest.mark.parametrize("damaged", [False, True])
 def test_what_looks_at_a_store(
@@ -99,7 +99,7 @@ def test_what_looks_at_a_store(
         damage(store)
     assert run(*command, store) in (0, 1)
     said = check_output(capsys)
-    if command[0] == "verify" and not damaged:
+    if command == ("verify",) and not damaged:
         assert r"a\x1b[2J\nFORGED" in said
     if command[0] == "status":
         assert r"x\x1b[2J\u202e" in said

@@ -16,8 +16,8 @@ import pytest
 from tests.kit.boundaries import end_before
 from tests.kit.crashes import run_child
 from tests.kit.durable_stores import SPEC, leftovers, store_bytes, write_store
-from vla_attention.analyze.copy.copying import copy_store
-from vla_attention.analyze.copy.merging import merge_stores
+from vla_attention.analyze.store.copying import copy_store
+from vla_attention.analyze.store.merging import merge_stores
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 

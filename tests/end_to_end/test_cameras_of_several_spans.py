@@ -19,10 +19,12 @@ from tests.kit.examples import examples
 from tests.kit.questions import question_about
 from tests.kit.small_torch_policy import HORIZON, SmallPolicy, small_layout
 from tests.kit.small_torch_policy import given as policy_inputs
+from tests.kit.stores import StoreSpec, write_store
+from tests.kit.strategies import episode_tokens
+from tests.kit.tokens import OBJECTS, small_prompt, tokens_of
 from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.commands.objects import objects
 from vla_attention.analyze.measures.patch_maps import PictureMap
-from vla_attention.analyze.objects.object_attention import object_tables
-from vla_attention.analyze.objects.object_settings import ObjectSettings
 from vla_attention.capture.effects.arguments import EffectSettings
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_picture, patch_pixels
 from vla_attention.capture.torch_policies.policy_layout import RecordedSite
@@ -36,9 +38,6 @@ from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, SceneObjec
 from vla_attention.schemas.interventions import ImageChange
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, camera_grids
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing.stores import StoreSpec, write_store
-from vla_attention.testing.strategies import episode_tokens
-from vla_attention.testing.tokens import OBJECTS, small_prompt, tokens_of
 
 WHOLE, TOP, LEFT = (0.0, 0.0, 1.0, 1.0), (0.0, 0.0, 0.5, 1.0), (0.0, 0.0, 1.0, 0.5)
 
@@ -185,10 +184,9 @@ def test_masses_and_overlay_of_a_store_are_of_all_keys(made, tmp_path, capsys):
     masses = va.open(path).analyze(grouping="cameras")["episodes_groups"].filter(pl.col("episode_index") == 0)
     own = masses.filter((pl.col("group") == "front") & (pl.col("layer") == "layers_avg"))
     np.testing.assert_allclose(own["mass"], rows[:, keys].sum(axis=1).mean(), rtol=1e-4)
-    assert (
-        main(["overlay", str(path), "--output", str(tmp_path), "--replans", "0", "2", "--group", "f=camera:front"]) == 0
-    )
-    table = pl.read_csv(next(tmp_path.glob("*.csv"))).filter(pl.col("camera") == "front")
+    words = ["--replans", "0", "2", "--outline", "f=camera:front"]
+    assert main(["overlay", str(path), "--output", str(tmp_path), *words]) == 0
+    table = pl.read_parquet(tmp_path / "overlay_patches.parquet").filter(pl.col("camera") == "front")
     placed = [
         key for span in layout.spans if span.camera == "front" and span.grid for key in range(span.start, span.stop)
     ]
@@ -196,7 +194,7 @@ def test_masses_and_overlay_of_a_store_are_of_all_keys(made, tmp_path, capsys):
         own = table.filter(pl.col("replan") == replan)
         np.testing.assert_allclose(own["mass"].sum(), rows[replan, placed].sum(), rtol=1e-5)
         image = rows[replan, [*keys, *keys_of(layout, "wrist")]].sum()
-        np.testing.assert_allclose(own["share_percent"].sum(), 100 * rows[replan, placed].sum() / image, rtol=1e-5)
+        np.testing.assert_allclose(own["share"].sum(), rows[replan, placed].sum() / image, rtol=1e-5)
     printed = " ".join(capsys.readouterr().out.split())
     beside = [key for key in keys if key not in placed]
     names = [span.name for span in layout.camera_spans("front") if span.grid is not None]
@@ -225,19 +223,18 @@ def test_runs_whose_spans_are_of_other_cameras_are_not_compared(tmp_path, capsys
 
 def test_objects_of_a_camera_are_measured_on_all_its_patches(made):
     path, layout = made
-    tables = object_tables(question_about(path), ObjectSettings(spatial=True))
+    tables = objects(question_about(path))
     group = zarr.open_group(path / "episodes/task000_episode000", mode="r")
     covered, rows = np.asarray(group["objects/front"], np.float64), raw(path)[:, layout.patch_keys("front")]
-    own = tables.objects.whole.filter(
+    own = tables["objects_episodes"].filter(
         (pl.col("camera") == "front") & (pl.col("episode_index") == 0) & (pl.col("layer") == "layers_avg")
     )
     for number, thing in enumerate(OBJECTS):
         row = own.filter((pl.col("kind") == "object") & (pl.col("item") == thing.name))
         np.testing.assert_allclose(row["mass"], (rows * covered[..., number]).sum(axis=1).mean(), rtol=1e-5)
         np.testing.assert_allclose(row["area_share"], covered[..., number].mean(), rtol=1e-5)
-    assert tables.pointing is not None
-    shares = tables.pointing.whole.filter(pl.col("camera") == "front")["centre_row_share"]
-    assert shares.is_between(0, 1).all()
+    rows = tables["pointing_episodes"].filter(pl.col("camera") == "front")["centre_row"]
+    assert rows.is_between(0, PictureMap.of(layout, "front").rows).all()
 
 
 PARTS = (

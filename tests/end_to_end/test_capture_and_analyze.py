@@ -19,7 +19,7 @@ pytestmark = pytest.mark.simulator
 
 
 def test_capture_makes_a_complete_store_and_resume_adds_the_missing_episodes(captured_store, capsys):
-    assert analyze(["verify", str(captured_store)]) == 0
+    assert analyze(["store", "verify", str(captured_store)]) == 0
     assert "4 episodes, all whole" in capsys.readouterr().out
     names = sorted(path.name for path in (captured_store / "episodes").iterdir() if path.is_dir())
     assert names == [f"task{task:03d}_episode{episode:03d}" for task in (0, 1) for episode in (0, 1)]

@@ -80,7 +80,7 @@ def test_a_checkpoint_drives_the_simulator_and_its_store_is_analysed(name, small
         prompt_read = dict(episode.attrs)["prompts"][0]
         assert prompt_read["pieces"][-1]["stop"] < len(prompt_read["text"])
     assert analyze([str(store), "--output", str(tmp_path / "results"), "--no-plots"]) == 0
-    assert analyze(["verify", str(store)]) == 0
+    assert analyze(["store", "verify", str(store)]) == 0
     covered = episode[f"objects/{camera}"][:]
     np.testing.assert_allclose(covered.sum(axis=-1), 1, atol=1e-5)
 

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from tests.kit.planted_effects import planted_effects
-from vla_attention.testing.stores import StoreSpec, write_store
+from tests.kit.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, contributions=True, plant_effects=planted_effects())
 OUT = ("--output", "OUT", "--no-cache")
@@ -26,7 +26,7 @@ WRITING: dict[str, tuple[str, ...]] = {
     "words": ("words", "STORE", *OUT, "--task", "0"),
     "overlay": ("overlay", "STORE", *OUT, "--video", "gif"),
     "effects": ("effects", "STORE", *OUT),
-    "copy": ("copy", "STORE", "OUT/copy.zarr"),
+    "copy": ("store", "copy", "STORE", "OUT/copy.zarr"),
 }
 #: Bytes of the largest file.
 LIMITS = (4_000, 20_000)

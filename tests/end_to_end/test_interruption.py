@@ -67,7 +67,7 @@ def test_sigterm_drops_the_episode_in_flight_and_resuming_completes_the_store(tm
     assert f"process {process.pid}" in task.last_by
 
     assert capture([*arguments, "--resume"]) == 0
-    assert analyze(["verify", str(store)]) == 0
+    assert analyze(["store", "verify", str(store)]) == 0
     assert store_status(store).complete
 
 

@@ -128,7 +128,7 @@ def test_an_array_interrupted_in_episodes_equals_a_single_process(tmp_path, monk
     assert [task.committed for task in status.tasks] == [EPISODES] * len(TASKS)
     assert status.writing == ()
     assert not store.with_name(store.name + PARTIAL_SUFFIX).exists()
-    assert analyze(["verify", str(store)]) == 0
+    assert analyze(["store", "verify", str(store)]) == 0
     assert "requeued 1 times" in log_of(0)
     assert "requeued 1 times" in log_of(1)
     assert "requeued" not in log_of(2)

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.kit.stores import write_store
 from vla_attention.analyze.__main__ import main
-from vla_attention.testing.stores import write_store
 
 ROOT = Path(__file__).parents[2]
 #: Seconds after which a job that has not started will not start.

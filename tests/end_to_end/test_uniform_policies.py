@@ -35,7 +35,7 @@ def test_a_policy_that_generates_tokens(tmp_path, tokens):
     np.testing.assert_allclose(groups["lift"].to_numpy(), 1.0, rtol=1e-5)
     cells = opened.analyze()["steps"]
     np.testing.assert_allclose(cells["ratio"].to_numpy(), cells["uniform_ratio"].to_numpy(), rtol=1e-5)
-    np.testing.assert_allclose(opened.words("episodes").filter(kind="word")["lift"].to_numpy(), 1.0, rtol=1e-5)
+    np.testing.assert_allclose(opened.words()["words_episodes"].filter(kind="word")["lift"].to_numpy(), 1.0, rtol=1e-5)
 
 
 def test_sites_in_different_blocks(tmp_path):

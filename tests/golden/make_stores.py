@@ -14,13 +14,13 @@ import pytest
 from tests.kit.golden_stores import STORES, write_tables
 from tests.kit.small_torch_policy import SmallPolicy, given, small_layout
 from tests.kit.still_scene import capture_without_simulator
+from tests.kit.stores import small_steps, write_store
 from tests.kit.uniform_cases import TABLE, write_case
-from vla_attention.analyze.copy.copying import copy_store
+from vla_attention.analyze.store.copying import copy_store
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import STORE_VERSION
-from vla_attention.testing.stores import small_steps, write_store
 
 _WHERE = ("--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", "0", "1", "--num-episodes", "1")
 

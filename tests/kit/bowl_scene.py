@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.kit.stores import StoreSpec, write_store
+from tests.kit.tokens import OBJECTS, SpelledPrompt, site_layout, spell_prompt, tokens_of
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role, SiteLayout
-from vla_attention.testing.stores import StoreSpec, write_store
-from vla_attention.testing.tokens import OBJECTS, SpelledPrompt, site_layout, spell_prompt, tokens_of
 
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb")
 INSTRUCTION = "put the black bowl on the plate"

@@ -14,7 +14,7 @@ from zarr.storage import LocalStore
 
 #: Processes that have imported everything and started no thread yet, so that a child is there at once.
 PROCESSES = multiprocessing.get_context("forkserver")
-PROCESSES.set_forkserver_preload(["vla_attention.testing.stores", "vla_attention.analyze.copy.merging"])
+PROCESSES.set_forkserver_preload(["tests.kit.stores", "vla_attention.analyze.store.merging"])
 
 
 @contextmanager

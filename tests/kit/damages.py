@@ -1,7 +1,8 @@
 """Random damage to the files of a store, one file at a time and undone again, and what notices it.
 
-A damage follows from the store, the kind of file and a number. `vla-attention verify` must name the file. An analysis
-that reads the file must refuse or give the same numbers: `tried` says which, and `benchmarks/reliability.py` counts.
+A damage follows from the store, the kind of file and a number. `vla-attention store verify` must name the file. An
+analysis that reads the file must refuse or give the same numbers: `tried` says which, and `benchmarks/reliability.py`
+counts.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ import numpy as np
 import polars as pl
 
 import vla_attention as va
+from tests.kit.site_stores import SiteStoreSpec, write_site_store
+from tests.kit.stores import StoreSpec, small_effects, small_steps, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.api import OpenStores
 from vla_attention.analyze.core.contributions import group_norms
@@ -28,8 +31,6 @@ from vla_attention.schemas.effects import CHANGE, CUT
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.seal import SEAL_FILE
-from vla_attention.testing.site_stores import SiteStoreSpec, write_site_store
-from vla_attention.testing.stores import StoreSpec, small_effects, small_steps, write_store
 
 #: Small enough that every analysis takes some hundredths of a second.
 SPEC = StoreSpec(
@@ -182,7 +183,7 @@ class Noticed:
     """What came of a damage.
 
     Attributes:
-        verify: what `vla-attention verify` printed, and its exit code.
+        verify: what `vla-attention store verify` printed, and its exit code.
         named: whether it found a fault and named the file.
         analyses: by name: "refused", "same", "different", or the error that is no sentence.
     """
@@ -207,7 +208,8 @@ def make_subjects(folder: Path) -> dict[str, Subject]:
     subjects = {}
     for name, other in (("joint", 0), ("other", 1)):
         write_store(folder / f"{name}.zarr", spec=SPEC, seed=other)
-        assert analyze(["copy", str(folder / f"{name}.zarr"), str(folder / f"{name}-packed.zarr"), "--packed"]) == 0
+        places = [str(folder / f"{name}{packed}.zarr") for packed in ("", "-packed")]
+        assert analyze(["store", "copy", *places, "--packed"]) == 0
         replayed = SiteStoreSpec(episodes=2, replans=2, dataset_actions=0.5, protocol="dataset", seed=other)
         write_site_store(folder / f"{name}-sites.zarr", replayed)
     for name in ("", "-packed", "-sites"):
@@ -327,10 +329,10 @@ def tried(subject: Subject, damage: Damage) -> Noticed:
 
 
 def verified(store: Path) -> tuple[int, str]:
-    """Exit code and text of `vla-attention verify`."""
+    """Exit code and text of `vla-attention store verify`."""
     text = io.StringIO()
     with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text):
-        code = analyze(["verify", str(store)])
+        code = analyze(["store", "verify", str(store)])
     return code, text.getvalue()
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import functools
 from pathlib import Path
 
+from tests.kit.stores import StoreSpec
+from tests.kit.stores import write_store as write_made_up_store
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing.stores import StoreSpec
-from vla_attention.testing.stores import write_store as write_made_up_store
 
 #: Flushes files to the disk, as captures do.
 write_store = functools.partial(write_made_up_store, durable=True)

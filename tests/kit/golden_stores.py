@@ -49,10 +49,7 @@ def numbers_of(path: Path) -> dict[str, pl.DataFrame]:
         }
     if run.stores[0].attributes.recording.effects is not None:
         kept = ["task_id", "episode_index", "condition", "num_replans", "effect", "effect_chunk", "keys", "lift"]
-        rows = run.effects()["effects_episodes"]
-        order = {name: i for i, name in enumerate(rows["condition"].unique(maintain_order=True))}
-        by_condition = pl.col("condition").replace_strict(order, return_dtype=pl.Int64)
-        tables["effects"] = rows.sort(by_condition, maintain_order=True).select(kept)
+        tables["effects"] = run.effects()["effects_episodes"].select(kept)
     return {name: table for name, table in tables.items() if table.width}
 
 

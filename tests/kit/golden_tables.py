@@ -17,6 +17,7 @@ import shutil
 import subprocess
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,6 @@ from vla_attention.__main__ import main as vla_attention
 from vla_attention.analyze.published.parse_results import build_parser as parser_of_results
 from vla_attention.analyze.published.parse_results import main as parse_attention_ratio_results
 from vla_attention.analyze.render import style
-from vla_attention.analyze.show import plot_style
 from vla_attention.capture.commands.arguments import build_evaluate_parser, build_parser
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.published.evaluate import arguments_from_environment
@@ -64,6 +64,7 @@ CASES: dict[str, tuple[tuple[str, ...], ...]] = {
     "cubes_export": (("analyze", "cubes.zarr"),),
     "cubes_per_head": (("analyze", "cubes.zarr", "--by", "head", "--task", "0"),),
     "pair_compare": (("compare", "cubes.zarr", "one_colour.zarr"),),
+    "reruns_compare": (("compare", "cubes.zarr", "RERUNS"),),
     "noise_compare": (("compare", "cubes.zarr", "RERUN"),),
     "effects_effects": (("effects", "effects.zarr"), ("effects", "effects.zarr", "--by", "task")),
     "effects_analyze": (("analyze", "effects.zarr"),),
@@ -147,7 +148,6 @@ def _asked(program: Callable[[list[str]], int], words: list[str], folder: Path) 
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.setattr(Figure, "savefig", _leave_blank)
-        patch.setattr(plot_style, "find_places", lambda _figure: None)
         patch.setattr(style, "find_places", lambda _canvas, _dpi: None)
         assert program(words) == 0
     return dict(_read(folder / "results"))
@@ -235,13 +235,15 @@ class Form:
         keys: the columns by which rows are matched.
         rows: today's rows, in the kept columns, from all tables of the results.
         gone: kept columns that are given no more.
-        still: the kept rows that are given still.
+        still: the kept rows that are still given; all unless it is given.
+        absolute: difference that is allowed whatever the size of a number.
     """
 
     keys: tuple[str, ...]
     rows: Callable[[Mapping[str, pl.DataFrame]], pl.DataFrame]
     gone: tuple[str, ...] = ()
     still: pl.Expr | None = None
+    absolute: float = 1e-8
 
     def differences(self, tables: Mapping[str, pl.DataFrame], kept: pl.DataFrame) -> list[str]:
         """Where today's rows differ from the kept ones."""
@@ -255,7 +257,7 @@ class Form:
             .join(kept, on=self.keys, how="semi", nulls_equal=True)
         )
         found, expected = (table.sort(self.keys, nulls_last=True) for table in (rows, kept))
-        return differences(found, expected, alike)
+        return differences(found, expected, partial(alike, absolute=self.absolute))
 
 
 def _renamed(table: pl.DataFrame, **names: str) -> pl.DataFrame:
@@ -299,6 +301,44 @@ def _time_course(tables: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
     return pl.concat([*parts, of_groups], how="diagonal")
 
 
+def _runs(tables: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
+    """A row for each quantity of a run and layer."""
+    place, ends = ["run", "suite", "layer"], ("", "_low", "_high")
+    cells = tables["runs"].filter(scope="all")
+    counts = ["num_tasks", "num_families", "intervals", "num_episodes"]
+    of = {"ratio": "geometric_mean", "ratio_lift": "ratio_lift", "success": "success_rate"}
+    parts = [
+        cells.select(
+            *place, *counts, pl.lit(quantity).alias("quantity"), pl.col(name).alias("value"),
+            *(pl.col(f"{name}{end}").alias(end[1:]) for end in ends[1:] if f"{name}{end}" in cells.columns),
+            *(["uniform_ratio", "num_nonfinite", "episodes_without_ratio"] if quantity == "ratio" else []),
+        )
+        for quantity, name in of.items()
+    ]  # fmt: skip
+    groups = tables["runs_groups"].filter(scope="all")
+    fractions = groups.select(
+        *place, pl.format("{}_fraction", "group").alias("quantity"), value="fraction", low="fraction_low",
+        high="fraction_high",
+    ).join(cells.select(*place, *counts), on=place)  # fmt: skip
+    return pl.concat([*parts, fractions], how="diagonal")
+
+
+def _compared(tables: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
+    names = {"low": "difference_low", "high": "difference_high", "q": "difference_q", "num_pairs": "num_first"}
+    return _renamed(tables["differences"], **names)
+
+
+def _conditions(name: str) -> Callable[[Mapping[str, pl.DataFrame]], pl.DataFrame]:
+    return lambda tables: tables[name].with_columns(condition="run")
+
+
+#: A rerun has no success of its own.
+_NO_OUTCOME = ~((pl.col("run") == "noise") & (pl.col("quantity") == "success"))
+#: Differences of numbers that are equal to many digits keep few of them.
+_OF_DIFFERENCES = 5e-6
+_OF_MOVES = ("kind", "group", "selector", "phase", "mass", "lift", "norm", "keys", "random", "minus_random")
+_ENDS = ("", "_low", "_high", "_episodes")
+_CHANGED = ("effect", "effect_chunk", "angle", "gripper_flips", "noise", "minus_noise", "over_noise")
 _COURSE = ("alignment", "outcome", "position_low", "position_high", "curve_low", "curve_high")
 _OF_DENOISE = (
     "denoise_time", "scope", "suite", "task_id", "instruction", "layer", "layer_number", "block", "num_replans",
@@ -306,14 +346,14 @@ _OF_DENOISE = (
     "geometric_left_out", "nonfinite_layers", "numerator_mass", "denominator_mass", "ratio_mean", "ratio_mean_low",
     "ratio_mean_high", "ratio_of_means_low", "ratio_of_means_high",
 )  # fmt: skip
-_CHANGED = ("effect", "effect_chunk", "angle", "gripper_flips", "mass", "lift", "norm", "keys", "noise")
+_OF_EFFECTS = ("effect", "effect_chunk", "angle", "gripper_flips", "mass", "lift", "norm", "keys", "noise")
 _WHOLE = pl.col("phase") == "all"
-_ENDS = ("", "_low", "_high", "_episodes", "_q", "_p")
+_WITH_ENDS = ("", "_low", "_high", "_episodes", "_q", "_p")
 
 
 def _gone(*names: str) -> tuple[str, ...]:
     """The columns of values, with all that is said of them."""
-    return tuple(f"{name}{end}" for name in names for end in _ENDS)
+    return tuple(f"{name}{end}" for name in names for end in _WITH_ENDS)
 
 
 def _effects(tables: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
@@ -322,7 +362,7 @@ def _effects(tables: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
     return pl.concat([whole, tasks], how="diagonal")
 
 
-#: (Command, or the end of a case's name; kept table) -> how it is found.
+#: (Case, the end of its name, or its command; kept table) -> how it is found.
 FORMS: dict[tuple[str, str], Form] = {
     ("words", "words_summary"): Form(
         ("kind", "item"),
@@ -340,6 +380,53 @@ FORMS: dict[tuple[str, str], Form] = {
             .filter(pl.col("kind") != "word")
             .with_columns(pl.col("kind").replace("place", "word"), pl.col("item").replace(_SCALE))
         ),
+    ),
+    ("objects", "objects"): Form(
+        (*_EPISODE, "layer", "camera", "kind", "item"),
+        lambda tables: tables["objects_episodes"],
+        ("control_enrichment", "control_balanced", "control_overlap"),
+    ),
+    ("objects", "object_times"): Form(
+        (*_EPISODE, "camera", "replan", "kind", "item"), lambda tables: tables["object_times"]
+    ),
+    ("objects", "objects_summary"): Form(
+        ("camera", "kind", "item"),
+        lambda tables: tables["objects"],
+        (
+            *(
+                f"{name}{end}"
+                for name in ("control_enrichment", "control_overlap", "enrichment_over_control")
+                for end in ("", "_low", "_high", "_episodes")
+            ),
+            "enrichment_over_control_q",
+            "share_episodes",
+            "area_share_episodes",
+            "enrichment_episodes",
+        ),
+    ),
+    ("objects", "pointing"): Form(
+        (*_EPISODE, "layer", "camera", "kind", "item"),
+        lambda tables: tables["pointing_episodes"],
+        ("centre_row_share", "centre_column_share"),
+    ),
+    ("objects", "pointing_summary"): Form(
+        ("camera", "kind", "item"),
+        lambda tables: tables["pointing"],
+        tuple(
+            f"{name}_episodes"
+            for name in ("mask_patches", "distance", "distance_uniform", "pointing", "pointing_chance")
+        ),
+    ),
+    ("objects", "iou"): Form(
+        (*_EPISODE, "layer", "camera", "threshold", "kind", "item"),
+        lambda tables: tables["iou_episodes"],
+        still=pl.col("threshold") != "otsu",
+    ),
+    ("objects", "iou_summary"): Form(
+        ("camera", "kind", "item", "threshold"),
+        lambda tables: tables["iou"],
+        ("iou_episodes", "iou_chance_episodes"),
+        pl.col("threshold") != "otsu",
     ),
     ("analyze", "contributions"): Form(
         (*_EPISODE, "replan", "layer", "block", "denoise_step"), lambda tables: tables["contributions_steps"]
@@ -368,6 +455,41 @@ FORMS: dict[tuple[str, str], Form] = {
     ),
     ("heads", "sinks"): Form((*_EPISODE[:2], "key"), lambda tables: tables["2/sinks"]),
     ("heads", "sink_heads"): Form((*_EPISODE[:2], "key", "layer", "head"), lambda tables: tables["2/sink_heads"]),
+    ("compare", "comparison"): Form(
+        ("run", "scope", "suite", "task_id", "layer", "quantity"),
+        _compared,
+        ("block", "p", "d_z", "d_z_low", "d_z_high", "hedges_g", "hedges_g_low", "hedges_g_high", "layers_q"),
+        _NO_OUTCOME,
+        _OF_DIFFERENCES,
+    ),
+    ("compare", "pairs"): Form(
+        ("run", "suite", "task_id", "episode_first", "layer", "quantity"),
+        lambda tables: tables["pairs"],
+        ("block",),
+        _NO_OUTCOME,
+        _OF_DIFFERENCES,
+    ),
+    ("compare", "runs"): Form(("run", "layer", "quantity"), _runs, ("block",), _NO_OUTCOME),
+    ("reruns_compare", "effects"): Form(
+        (*_EPISODE, "condition"), _conditions("moved_episodes"), (*_OF_MOVES, "instruction"), pl.col("phase") == "all"
+    ),
+    ("reruns_compare", "effects_summary"): Form(
+        ("condition",),
+        _conditions("moved"),
+        (
+            *_OF_MOVES[:4],
+            "scope",
+            "suite",
+            "task_id",
+            "instruction",
+            "over_random",
+            "minus_random_q",
+            "minus_noise_q",
+            *(f"{name}{end}" for name in (*_OF_MOVES[4:], "over_random") for end in _ENDS),
+            *(f"{name}_episodes" for name in _CHANGED),
+        ),
+        (pl.col("phase") == "all") & (pl.col("scope") == "all"),
+    ),
     ("effects", "effects"): Form(
         (*_EPISODE, "condition"),
         lambda tables: tables["effects_episodes"],
@@ -381,7 +503,7 @@ FORMS: dict[tuple[str, str], Form] = {
             "phase",
             "group",
             *_gone("random", "minus_random", "over_random"),
-            *(f"{name}_episodes" for name in (*_CHANGED, "over_noise", "minus_noise")),
+            *(f"{name}_episodes" for name in (*_OF_EFFECTS, "over_noise", "minus_noise")),
         ),
         _WHOLE,
     ),
@@ -417,18 +539,18 @@ FORMS: dict[tuple[str, str], Form] = {
 def form_of(case: str, table: str) -> Form | None:
     """How a kept table of a case is found; None where today's has its name and form."""
     kind = case.rsplit("_", 1)[1]
-    return FORMS.get((kind, table)) or FORMS.get((CASES[case][0][0], table))
+    return FORMS.get((case, table)) or FORMS.get((kind, table)) or FORMS.get((CASES[case][0][0], table))
 
 
-def alike(one: object, other: object) -> bool:
+def alike(one: object, other: object, absolute: float = 1e-8) -> bool:
     """Whether two values are: numbers, also in text, to a hundred-thousandth; everything else exactly.
 
     Matrix products of other processors move effective numbers of keys by 2e-6.
     """
     if isinstance(one, list) and isinstance(other, list):
-        return len(one) == len(other) and all(map(alike, one, other))
+        return len(one) == len(other) and all(map(partial(alike, absolute=absolute), one, other))
     try:
         first, second = (float(value) for value in (one, other))  # type: ignore[arg-type]
     except (TypeError, ValueError):
         return one == other
-    return (math.isnan(first) and math.isnan(second)) or math.isclose(first, second, rel_tol=1e-5, abs_tol=1e-8)
+    return (math.isnan(first) and math.isnan(second)) or math.isclose(first, second, rel_tol=1e-5, abs_tol=absolute)

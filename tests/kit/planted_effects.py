@@ -1,4 +1,4 @@
-"""Recorded effects of planted sizes, for stores of `vla_attention.testing`."""
+"""Recorded effects of planted sizes, for stores of `tests.kit.stores`."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 
+from tests.kit.stores import PlantEffects
+from tests.kit.tokens import INSTRUCTIONS
 from vla_attention.capture.interventions.condition_name import knockout_of_group
 from vla_attention.capture.store.replan_records import ReplanEffects
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.groupings.words import words_of
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange
 from vla_attention.schemas.layout import Role
-from vla_attention.testing.stores import PlantEffects
-from vla_attention.testing.tokens import INSTRUCTIONS
 
 READERS = {"total": ("all", ""), "direct": ("action", ""), "pictures": ("prefix", "role:image")}
 WORDS = tuple(dict.fromkeys(word for text in INSTRUCTIONS for word in text.split()))

@@ -42,7 +42,7 @@ class Round:
         changed: files of these that were not the same at the end.
         exit_codes: of every process; -9 for the victim, 0 if it had ended before.
         twice: episodes that two processes say they committed.
-        faults: what `vla-attention verify` finds.
+        faults: what `vla-attention store verify` finds.
         unlike: files that differ from those of a store that one process filled, or are in one of both only.
         left: what was beside the store after one more `--resume`, other than the records of the workers.
         tracebacks: what the processes wrote, where it has one.
@@ -89,7 +89,7 @@ def unlike(one: Path, other: Path) -> tuple[str, ...]:
 
 
 def faults_of(store: Path) -> list[str]:
-    """What `vla-attention verify` finds, without the imports of its command; for a process of its own."""
+    """What `vla-attention store verify` finds, without the imports of its command; for a process of its own."""
     from vla_attention.schemas.stores.reader import open_store
     from vla_attention.schemas.stores.verify import verify_store
 

@@ -11,11 +11,11 @@ import zarr
 from hypothesis import HealthCheck, Phase, settings
 
 from tests.kit.examples import examples
+from tests.kit.stores import StoreSpec
+from tests.kit.tokens import valid_keys
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import resolve
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
-from vla_attention.testing.stores import StoreSpec
-from vla_attention.testing.tokens import valid_keys
 
 #: Every example writes a store: shrinking one would take minutes.
 FEW = settings(

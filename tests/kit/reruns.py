@@ -9,10 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.store.replan_records import ReplanRecord
-from vla_attention.capture.store.store_writer import open_run
-from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange, PromptChange
-from vla_attention.testing.stores import (
+from tests.kit.stores import (
     PlantActions,
     StoreSpec,
     commit,
@@ -22,6 +19,9 @@ from vla_attention.testing.stores import (
     root_attributes,
     write_store,
 )
+from vla_attention.capture.store.replan_records import ReplanRecord
+from vla_attention.capture.store.store_writer import open_run
+from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange, PromptChange
 
 TASKS, EPISODES, REPLANS = (0, 1, 2), 2, 6
 STEPS, DIMENSIONS = 5, 7

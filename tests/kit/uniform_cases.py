@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.kit.paths import ROOT
+from tests.kit.stores import StoreSpec, write_store
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.jsonable import from_json
 from vla_attention.schemas.layout import Prompt, SiteLayout
-from vla_attention.testing.stores import StoreSpec, write_store
 
 TABLE: dict[str, Any] = json.loads((ROOT / "tests/schemas/groupings/uniform_cases.json").read_text(encoding="utf-8"))
 #: Layers, denoise steps, heads and action queries of the cases `stored`.

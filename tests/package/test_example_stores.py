@@ -16,7 +16,7 @@ STORES = [CUBES, ONE_COLOUR, NOISE]
 
 @pytest.mark.parametrize("store", STORES, ids=lambda path: path.stem)
 def test_every_store_is_whole(store, capsys):
-    assert analyze(["verify", str(store)]) == 0
+    assert analyze(["store", "verify", str(store)]) == 0
 
 
 def test_they_are_small():
@@ -27,7 +27,7 @@ def test_the_second_run_differs_in_its_weights_alone():
     cubes, one_colour = va.open(CUBES), va.open(ONE_COLOUR)
     assert cubes.attributes.policy.digest != one_colour.attributes.policy.digest
     assert cubes.attributes.protocol == one_colour.attributes.protocol
-    assert cubes.compare(one_colour, "unpaired").height == 0
+    assert cubes.compare(one_colour)["unpaired"].height == 0
     assert cubes.episodes["success"].all()
     assert one_colour.episodes.filter(success=True)["instruction"].unique().to_list() == ["touch the blue cube"]
 

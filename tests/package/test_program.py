@@ -27,7 +27,6 @@ def test_capture_is_vla_capture(capsys):
         (["anlyze"], "There is no command 'anlyze'. Did you mean 'analyze'?"),
         (["nothing\x1b[31m"], "There is no command 'nothing\\x1b[31m'. Commands: example, analyze"),
         (["analyze", "nowhere.zarr"], "nowhere.zarr"),
-        (["completion", "csh"], "invalid choice: 'csh'"),
     ],
 )
 def test_a_mistake_is_one_sentence(words, said):

@@ -13,13 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.kit.examples import examples
+from tests.kit.stores import StoreSpec, expected_arrays, reseal, small_steps, write_store
 from vla_attention.schemas.episode_steps import HAND, POSES, EpisodeSteps, TaskGoal
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.jsonable import from_json, to_json
 from vla_attention.schemas.stores.content_rules import step_problems
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import StoreSpec, expected_arrays, reseal, small_steps, write_store
 
 GOAL = TaskGoal(0, "lift", "lift the bowl", ("up bowl",), None)
 STEPS = EpisodeSteps((HAND, "bowl", "plate"), (None, 4, None), (GOAL,))

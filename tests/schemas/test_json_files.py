@@ -14,10 +14,10 @@ from tests.kit.made_up_steps import (
     replans_of,
     write_results_of_suites,
 )
+from tests.kit.stores import write_store
 from vla_attention.schemas.json_files import FOLDER, schema_documents, schema_text
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing.stores import write_store
 
 DOCUMENTS = schema_documents()
 

@@ -4,9 +4,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.kit.strategies import episode_tokens, groupings
 from vla_attention.schemas.groupings.resolve import resolve
 from vla_attention.schemas.segments import segment_members, segments_of, weights_on_segments
-from vla_attention.testing.strategies import episode_tokens, groupings
 
 
 def by_loop(weights: np.ndarray, members: np.ndarray) -> np.ndarray | None:

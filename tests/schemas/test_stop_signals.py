@@ -10,8 +10,8 @@ import sys
 import pytest
 
 from tests.kit.stopped_programs import after_call, at_import, run_stopped
+from tests.kit.stores import StoreSpec, write_store
 from vla_attention.schemas.stop_signals import run_until_stopped, stops_kept_from_children
-from vla_attention.testing.stores import StoreSpec, write_store
 
 pytestmark = pytest.mark.usefixtures("usual_signals")
 
@@ -69,14 +69,14 @@ def store(tmp_path_factory):
     return write_store(tmp_path_factory.mktemp("stopped") / "a.zarr", spec=StoreSpec(tasks=(0,), episodes=2, replans=2))
 
 
-WORKERS = "vla_attention.analyze.stores.worker_processes"
+IN_A_POOL = ("concurrent.futures.process", "ProcessPoolExecutor", "submit")
 
 
 @pytest.mark.parametrize(
     ("moment", "words"),
     [
         (at_import("numpy"), []),
-        pytest.param(after_call(WORKERS, "WorkerProcesses", "_submit"), ["--workers", "2"], marks=pytest.mark.thorough),
+        pytest.param(after_call(*IN_A_POOL), ["--workers", "2"], marks=pytest.mark.thorough),
         (after_call("os", "", "replace"), ["--no-plots"]),
     ],
     ids=["numpy", "workers", "first file"],
@@ -84,7 +84,7 @@ WORKERS = "vla_attention.analyze.stores.worker_processes"
 def test_an_analysis_that_is_stopped_says_one_sentence(store, tmp_path, moment, words):
     given = [str(store), "--output", str(tmp_path / "out"), "--no-cache", *words]
     done = run_stopped("vla_attention.analyze", given, moment)
-    assert done.stderr.strip() == "vla-analyze: stopped; nothing was left half written."
+    assert done.stderr.strip() == "vla-analyze analyze: stopped; nothing was left half written."
     assert done.returncode == 130
     assert not [file for file in tmp_path.rglob("*") if file.name.endswith(".partial")]
 
@@ -92,7 +92,7 @@ def test_an_analysis_that_is_stopped_says_one_sentence(store, tmp_path, moment, 
 def test_an_analysis_that_gets_sigterm_says_one_sentence(store, tmp_path):
     given = [str(store), "--output", str(tmp_path / "out"), "--no-cache"]
     done = run_stopped("vla_attention.analyze", given, after_call("os", "", "replace"), "SIGTERM")
-    assert done.stderr == "vla-analyze: stopped by SIGTERM; nothing was left half written.\n"
+    assert done.stderr == "vla-analyze analyze: stopped by SIGTERM; nothing was left half written.\n"
     assert done.returncode == 143
     assert not [file for file in tmp_path.rglob("*") if file.name.endswith(".partial")]
 

@@ -21,6 +21,8 @@ import numpy as np
 
 from tests.kit.attacks import with_checksum
 from tests.kit.lerobot_data_sets import encoded, made_up_episodes, numbered_picture, write_data_set
+from tests.kit.stores import StoreSpec, small_effects, small_steps, write_store
+from tests.kit.tokens import small_tokens
 from tests.thorough.hostile_data_sets.mp4_boxes import samples_of_a_video
 from vla_attention.analyze.published.results_reader import read_results_file
 from vla_attention.capture.foreign_files.mp4_files import Mp4Refused, check_mp4
@@ -41,8 +43,6 @@ from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.seal import SEAL_FILE, read_seal
 from vla_attention.schemas.stores.seal_content import FileRecord
 from vla_attention.schemas.stores.shards import SealedShard, ShardedLayers, index_size
-from vla_attention.testing.stores import StoreSpec, small_effects, small_steps, write_store
-from vla_attention.testing.tokens import small_tokens
 
 SPEC = StoreSpec(
     tasks=(0,),

@@ -21,9 +21,11 @@ _QUESTIONS = """\
 {noise}: the first policy calls of {cubes} again, with other noise
 
 Try:
+  vla-attention language {cubes}
   vla-attention analyze {cubes}
-  vla-attention words {cubes}
-  vla-attention effects {cubes} --dimensions 0 1 2
+  vla-attention objects {cubes}
+  vla-attention effects {cubes}
+  vla-attention failures {one_colour} --twins {cubes}
   vla-attention compare {cubes} {one_colour}
   vla-attention report {cubes}
   vla-attention view {cubes}

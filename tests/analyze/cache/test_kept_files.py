@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vla_attention.analyze.cache.kept_files import kept_bytes, question_of, read_arrays, write_file
+from vla_attention.analyze.cache.kept_files import kept_bytes, read_arrays, write_file
 
 KEY, OTHER = b"k" * 32, b"o" * 32
 ARRAYS = {
@@ -22,7 +22,7 @@ ARRAYS = {
 
 def test_arrays_come_back_as_they_were(tmp_path: Path) -> None:
     path = tmp_path / "question" / "a.masses"
-    write_file(path, kept_bytes(KEY, "a question", ARRAYS))
+    write_file(path, kept_bytes(KEY, ARRAYS))
     found = read_arrays(path, KEY)
     assert found is not None
     assert list(found) == list(ARRAYS)
@@ -30,15 +30,14 @@ def test_arrays_come_back_as_they_were(tmp_path: Path) -> None:
         assert found[name].dtype == array.dtype
         assert found[name].shape == array.shape
         assert found[name].tobytes() == array.tobytes()
-    assert question_of(path) == "a question"
     assert [file.name for file in path.parent.iterdir()] == ["a.masses"]
     with pytest.raises(TypeError):
-        kept_bytes(KEY, "a question", {"text": np.array(["a"])})
+        kept_bytes(KEY, {"text": np.array(["a"])})
 
 
 def test_no_changed_or_missing_byte_gives_other_arrays(tmp_path: Path) -> None:
     path = tmp_path / "a.masses"
-    whole = kept_bytes(KEY, "a question", {"mass": np.arange(6.0)})
+    whole = kept_bytes(KEY, {"mass": np.arange(6.0)})
     for position in range(len(whole)):
         for bit in (1, 0x80):
             path.write_bytes(whole[:position] + bytes([whole[position] ^ bit]) + whole[position + 1 :])
@@ -49,10 +48,9 @@ def test_no_changed_or_missing_byte_gives_other_arrays(tmp_path: Path) -> None:
 
 def test_files_of_other_episodes_and_questions_are_not_taken(tmp_path: Path) -> None:
     path = tmp_path / "a.masses"
-    write_file(path, kept_bytes(OTHER, "another question", ARRAYS))
+    write_file(path, kept_bytes(OTHER, ARRAYS))
     assert read_arrays(path, KEY) is None
     assert read_arrays(tmp_path / "none", KEY) is None
     for content in (b"", b"\n", b"{}\n", b"[]\n", b"\xff" * 5000):
         path.write_bytes(content)
         assert read_arrays(path, KEY) is None
-        assert question_of(path) is None

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -16,18 +17,18 @@ import pytest
 
 import vla_attention as va
 from tests.kit.attacks import attacks, files_of, first, two
+from tests.kit.stores import StoreSpec, write_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.cache import fingerprints, remembered
 from vla_attention.analyze.cache.housekeeping import kept_files
-from vla_attention.analyze.measures import steps
+from vla_attention.analyze.core import measure
+from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.question_settings import settings_from_keywords
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.measures.steps import measure_episodes
 from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
-from vla_attention.testing.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=9, contributions=True, prompts="same")
 ARRAYS = (
@@ -60,13 +61,13 @@ def stores(originals, tmp_path) -> tuple[Path, Path]:
 def measured(monkeypatch) -> list[str]:
     """The names of the episodes that are measured from now on."""
     names: list[str] = []
-    measure = steps.measure_episode
+    one = measure._measured
 
-    def watched(item: SelectedEpisode, *rest: object) -> steps.MeasuredEpisode:
+    def watched(item: SelectedEpisode, **settings: Any) -> dict[str, Any]:
         names.append(item.episode.name)
-        return measure(item, *rest)  # type: ignore[arg-type]
+        return one(item, **settings)
 
-    monkeypatch.setattr(steps, "measure_episode", watched)
+    monkeypatch.setattr(measure, "_measured", watched)
     return names
 
 
@@ -148,7 +149,7 @@ def test_masses_without_some_keys_are_kept_apart(cache, originals, measured):
     found = {}
     for without in ((), (0, 1), (0, 2), (0, 1)):
         selected = tuple(replace(item, without=without) for item in question.selected)
-        masses = [one.valid_mass for one in measure_episodes(replace(question, selected=selected))]
+        masses = [one.valid for one in levels_of(replace(question, selected=selected)).measured]
         if without in found:
             assert all(np.array_equal(*pair) for pair in zip(masses, found[without], strict=True))
         found[without] = masses

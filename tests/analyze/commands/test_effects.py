@@ -15,13 +15,13 @@ import vla_attention as va
 from benchmarks.null_stores import names_a_word
 from tests.kit.planted_effects import FIRST, ITEMS, READERS, WORDS, planted_effects
 from tests.kit.questions import question_about
+from tests.kit.site_stores import write_site_store
+from tests.kit.stores import StoreSpec, expected_arrays, write_store
+from tests.kit.tokens import INSTRUCTIONS
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.effects import effects, word_effects
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import Role
-from vla_attention.testing.site_stores import write_site_store
-from vla_attention.testing.stores import StoreSpec, expected_arrays, write_store
-from vla_attention.testing.tokens import INSTRUCTIONS
 
 REPLANS = 4
 SPEC = StoreSpec(tasks=(0, 1, 2), episodes=4, replans=REPLANS, contributions=True, mantissa_bits=23)

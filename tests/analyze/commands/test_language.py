@@ -16,12 +16,12 @@ from benchmarks.null_stores import says_it_listens
 from tests.kit.made_up_behaviour import COLOURS, did, goals_of
 from tests.kit.paths import ROOT
 from tests.kit.questions import question_about
+from tests.kit.stores import rerun_source, small_steps, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.commands.language import language, listens
 from vla_attention.analyze.core.behaviour import with_choices
 from vla_attention.analyze.statistics.exact_tests import mcnemar, shuffled
 from vla_attention.schemas.interventions import Interventions, PromptChange
-from vla_attention.testing.stores import rerun_source, small_steps, write_store
 
 SHIPPED = ROOT / "vla_attention/example_stores"
 EIGHT = [task for task in range(3) for _ in range(8)]

@@ -12,12 +12,12 @@ import zarr
 
 from tests.kit.bowl_scene import write_bowl_store
 from tests.kit.questions import question_about
+from tests.kit.stores import write_store
+from tests.kit.tokens import random_rows
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.words import words
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
-from vla_attention.testing.stores import write_store
-from vla_attention.testing.tokens import random_rows
 
 AVERAGE = pl.col("layer") == "layers_avg"
 

@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.questions import question_about
+from tests.kit.stores import StoreSpec, contribution_vectors, expected_arrays, write_store
+from tests.kit.tokens import small_tokens
 from vla_attention.analyze.core.contributions import LINGUISTIC_ROLES, VISUAL_ROLES, Norms, joint_norm, side_norms
 from vla_attention.schemas.segments import segment_members, segments_of
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import StoreSpec, contribution_vectors, expected_arrays, write_store
-from vla_attention.testing.tokens import small_tokens
 
 SPEC = StoreSpec(contributions=True, replans=3, tasks=(0, 1), episodes=2)
 

@@ -10,13 +10,13 @@ import polars as pl
 import pytest
 
 from tests.kit.questions import question_about
+from tests.kit.stores import StoreSpec, contribution_vectors, write_store
+from tests.kit.tokens import small_tokens
 from vla_attention.analyze.core.contributions import group_norms, whole_segments
 from vla_attention.analyze.measures.question import Question
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 from vla_attention.schemas.segments import Segment, segments_of
-from vla_attention.testing.stores import StoreSpec, contribution_vectors, write_store
-from vla_attention.testing.tokens import small_tokens
 
 SPEC = StoreSpec(contributions=True, layers=(0, 2, 3), denoise_steps=(0, 4, 9), queries="all")
 GROUPS = {

@@ -16,6 +16,8 @@ from polars.testing import assert_frame_equal
 from tests.kit.examples import examples
 from tests.kit.made_up_steps import steps_of
 from tests.kit.questions import question_about
+from tests.kit.stores import StoreSpec, root_attributes, write_store
+from tests.kit.strategies import episode_tokens, groupings
 from vla_attention.analyze.commands.analyze import analyze
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.measures.selected import load_tokens, vocabulary_of
@@ -27,8 +29,6 @@ from vla_attention.schemas.groupings.resolve import EmptyGroup, resolve
 from vla_attention.schemas.precision import mass_error_bound
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import StoreError
-from vla_attention.testing.stores import StoreSpec, root_attributes, write_store
-from vla_attention.testing.strategies import episode_tokens, groupings
 
 #: Every example writes a store (and flushes it to disk): shrinking one would take minutes.
 QUICK = settings(

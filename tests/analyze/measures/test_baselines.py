@@ -15,15 +15,13 @@ from hypothesis import strategies as st
 import vla_attention as va
 from tests.kit.questions import question_about
 from tests.kit.raw_rows import FEW
+from tests.kit.stores import StoreSpec, write_store
+from tests.kit.strategies import episode_tokens
 from tests.kit.uniform_cases import TABLE, tokens_of_case, write_case
+from vla_attention.analyze.core.camera_maps import camera_names, episode_maps
 from vla_attention.analyze.measures.baselines import uniform_keys
-from vla_attention.analyze.measures.question_settings import settings_from_keywords
 from vla_attention.analyze.measures.sinks import SinkRule, search_sinks
-from vla_attention.analyze.overlay.overlay_data import episode_overlay, ratios_of
-from vla_attention.analyze.overlay.overlay_study import study_overlay
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
-from vla_attention.testing.stores import StoreSpec, write_store
-from vla_attention.testing.strategies import episode_tokens
 
 #: Stored in float32.
 CLOSE = 2e-6
@@ -105,14 +103,13 @@ def test_uniform_attention_has_lift_1_everywhere(data):
         # Others take nothing at some replans, which their mean counts.
         always = np.flatnonzero(tokens.valid.all(axis=0)).tolist()
         all_one(search.keys.filter(pl.col("key").is_in(always)), "times_uniform")
-        study = study_overlay(run.stores, settings_from_keywords(grouping="default"))
-        item = study.question.selected[0]
-        overlay = episode_overlay(study.question, item, list(study.overlay.maps), ratios_of(study.question, item))
-        lifts = np.concatenate([values.ravel() for values in overlay.values("lift").values()])
+        question = question_about(path)
+        maps = episode_maps(question, question.selected[0], camera_names(question)).cameras.values()
+        lifts = np.concatenate([one.lift.ravel() for one in maps])
         np.testing.assert_allclose(lifts[~np.isnan(lifts)], 1.0, rtol=CLOSE)
         # What nobody sees has none.
         means = uniform.mean(axis=(1, 2, 3, 4))
-        seen_at = [picture.spread(means[:, picture.keys]) for picture in overlay.pictures.values()]
+        seen_at = [picture.spread(means[:, picture.keys]) for picture in (one.picture for one in maps)]
         image = np.concatenate([cells.ravel() for cells in seen_at])
         assert np.isnan(lifts).sum() == (image == 0).sum() * (len(lifts) // len(image))
 

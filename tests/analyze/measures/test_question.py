@@ -10,11 +10,11 @@ import pytest
 
 from tests.kit.attacks import files_of
 from tests.kit.questions import question_about
+from tests.kit.stores import write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.analyze import analyze
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.store_format import StoreError
-from vla_attention.testing.stores import write_store
 
 
 def damage_rows(store: Path, episode: str) -> None:
@@ -40,7 +40,7 @@ def test_a_damaged_episode_ends_the_analysis_with_its_name_and_a_way_out(tmp_pat
     said = capsys.readouterr().err.strip()
     assert "task000_episode001" in said
     assert "--skip-corrupt" in said
-    assert "vla-attention verify" in said
+    assert "vla-attention store verify" in said
     assert "\n" not in said
     assert not (tmp_path / "out").exists()
 

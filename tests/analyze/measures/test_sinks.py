@@ -14,6 +14,9 @@ from hypothesis import strategies as st
 from tests.kit.made_up_steps import steps_of
 from tests.kit.questions import question_about
 from tests.kit.raw_rows import FEW, RawEpisode, leaky, raw_episodes, weights_of
+from tests.kit.stores import StoreSpec, every_key_seen, write_store
+from tests.kit.strategies import episode_tokens, groupings
+from tests.kit.tokens import small_layout
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.measures.sink_kinds import may_be_empty
 from vla_attention.analyze.measures.sinks import (
@@ -26,9 +29,6 @@ from vla_attention.analyze.measures.sinks import (
 from vla_attention.example_stores import CUBES
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import Role
-from vla_attention.testing.stores import StoreSpec, every_key_seen, write_store
-from vla_attention.testing.strategies import episode_tokens, groupings
-from vla_attention.testing.tokens import small_layout
 
 BOS = small_layout().span("prompt").start
 

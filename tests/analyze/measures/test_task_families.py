@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 import vla_attention as va
+from tests.kit.stores import write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
@@ -15,7 +16,6 @@ from vla_attention.analyze.measures.task_families import (
     alike_instructions,
 )
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing.stores import write_store
 
 #: Seven tasks in four families.
 FAMILIES = {0: "put A on B", 1: "put A on B", 2: "open A", 3: "open A", 4: "turn on A", 5: "push A", 6: "put A on B"}

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import pytest
 
+from tests.kit.stores import StoreSpec, root_attributes
 from vla_attention.analyze.published.results_writer import frame_proxy
 from vla_attention.schemas.groupings.builtin_groupings import BUILTIN_GROUPINGS
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.schemas.groupings.vocabulary import Vocabulary
 from vla_attention.schemas.layout import SiteLayout, Span
 from vla_attention.schemas.results import FrameProxy
-from vla_attention.testing.stores import StoreSpec, root_attributes
 
 FRAMES = ("blank", "proprio", "wrist", "primary", "action")
 SELF = SiteLayout(

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import vla_attention.testing.stores as kit
+import tests.kit.stores as kit
 from tests.kit.questions import question_about
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.analyze import analyze

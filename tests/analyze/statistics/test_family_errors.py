@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import linalg, stats
 
-from vla_attention.analyze.statistics.effect_sizes import contrast, mean_difference
 from vla_attention.analyze.statistics.family_errors import family_error
 from vla_attention.analyze.statistics.intervals import (
     estimates,
     mean_over_episodes,
     ratio_of_means_over_episodes,
 )
+from vla_attention.analyze.statistics.two_samples import mean_difference
 from vla_attention.analyze.statistics.units import Estimand, Units
 
 SIZES = (3, 6, 3, 3, 2)
@@ -133,7 +133,7 @@ def test_the_difference_of_two_classes_is_the_regression_on_both():
     values, is_first, tasks = classes(shared=True)
     columns = np.stack([is_first, ~is_first], axis=1).astype(float)
     variance, degrees = by_definition(values, FAMILIES[tasks], columns)
-    one = mean_difference(values, is_first, Units.of(tasks, families=FAMILIES[tasks]))
+    one = mean_difference(values, is_first, Units.of(tasks, families=FAMILIES[tasks])).difference
     assert one.error == pytest.approx(np.sqrt(variance))
     # Both classes have the same families, and neither more degrees than one of them alone.
     assert one.degrees == pytest.approx(by_definition(values[is_first], FAMILIES)[1])
@@ -144,10 +144,10 @@ def test_classes_of_few_families_are_compared_in_these_tasks():
     values, is_first, tasks = classes(shared=False)
     twice = np.concatenate([values, values + GENERATOR.normal(size=len(values))])
     units = Units.of(np.tile(tasks, 2), families=FAMILIES[np.tile(tasks, 2)])
-    found = contrast(twice, np.tile(is_first, 2), units)
+    found = mean_difference(twice, np.tile(is_first, 2), units, decide=True)
     assert found.estimand == Estimand.THESE_TASKS
-    these = contrast(twice, np.tile(is_first, 2), Units.of(np.tile(tasks, 2), Estimand.THESE_TASKS))
+    these = mean_difference(twice, np.tile(is_first, 2), Units.of(np.tile(tasks, 2), Estimand.THESE_TASKS))
     assert found.difference == these.difference
     assert found.difference.error is not None
     # About tasks like these nothing can be said.
-    assert mean_difference(twice, np.tile(is_first, 2), units).error is None
+    assert mean_difference(twice, np.tile(is_first, 2), units).difference.error is None

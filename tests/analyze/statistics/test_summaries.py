@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy import stats
 
-from vla_attention.analyze.statistics.summaries import geometric_mean, summarize, summarize_rows
+from vla_attention.analyze.statistics.summaries import geometric_mean, summarize
 
 SAMPLE = np.random.default_rng(3).lognormal(1.0, 0.6, 25)
 POSITIVE_SAMPLES = hnp.arrays(np.float64, st.integers(2, 12), elements=st.floats(0.01, 1000.0))
@@ -24,14 +24,6 @@ def test_summary_of_nothing_finite_is_none_not_zero():
     summary = summarize([np.inf, np.nan])
     assert (summary.mean, summary.std, summary.median, summary.min, summary.max) == (None,) * 5
     assert summary.num_nonfinite == 2
-
-
-@pytest.mark.parametrize("missing", [False, True])
-def test_summaries_of_rows_are_those_of_each_row(missing):
-    values = np.random.default_rng(0).lognormal(size=(5, 7))
-    if missing:
-        values[1, 2], values[3] = np.inf, np.nan
-    assert summarize_rows(values) == [summarize(row) for row in values]
 
 
 def test_geometric_mean_agrees_with_scipy_and_counts_what_has_no_logarithm():

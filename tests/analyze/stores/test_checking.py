@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
+from tests.kit.stores import write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.stores.checking import faults_of_each
 from vla_attention.analyze.stores.parallel import workers
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import write_store
 
 
 @pytest.fixture
@@ -39,7 +39,7 @@ def test_what_was_read_of_an_episode_is_not_kept(damaged):
 def test_damaged_episodes_are_left_out_by_workers_too(damaged, tmp_path, capsys):
     printed = []
     for options in ([], ["--workers", "2"]):
-        assert main(["verify", str(damaged), *options]) == 1
+        assert main(["store", "verify", str(damaged), *options]) == 1
         assert main([str(damaged), "--skip-corrupt", "--no-plots", "--output", str(tmp_path / "out"), *options]) == 0
         printed.append(capsys.readouterr().out)
     assert "1 fault" in printed[0] or "faults" in printed[0]

@@ -9,13 +9,12 @@ import pytest
 from polars.testing import assert_frame_equal
 
 import vla_attention as va
-from tests.kit.questions import question_about
+from tests.analyze.stores.episode_work import slow_square
+from tests.kit.stores import write_store
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.measures.steps import measure_episodes
-from vla_attention.analyze.stores import dask_scheduler
-from vla_attention.analyze.stores.parallel import Threads, episodes_with, workers
+from vla_attention.analyze.stores import parallel
+from vla_attention.analyze.stores.parallel import map_episodes, workers
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.testing.stores import write_store
 
 pytestmark = pytest.mark.thorough
 
@@ -45,13 +44,7 @@ def cluster():
         yield cluster
 
 
-@pytest.fixture
-def on_cluster(cluster):
-    with workers(cluster.scheduler_address):
-        yield
-
-
-def test_every_question_has_the_same_answer_to_the_last_bit(on_cluster, store):
+def test_every_question_has_the_same_answer_to_the_last_bit(cluster, store, monkeypatch):
     def tables():
         run = va.open(store)
         return [
@@ -59,20 +52,18 @@ def test_every_question_has_the_same_answer_to_the_last_bit(on_cluster, store):
             run.analyze()["tasks_groups"],
             run.analyze()["contributions_steps"],
             run.words()["words"],
-            run.objects("iou"),
+            run.objects()["iou"],
         ]
 
-    there = tables()
-    with episodes_with(Threads()):
-        here = tables()
+    monkeypatch.setenv("VLA_CACHE", "off")
+    here = tables()
+    with workers(cluster.scheduler_address):
+        there = tables()
     for one, other in zip(here, there, strict=True):
         assert_frame_equal(one, other, check_exact=True)
 
 
-def test_a_worker_that_is_killed_in_the_middle_is_replaced(cluster, on_cluster, store):
-    question = question_about(store)
-    with episodes_with(Threads()):
-        here = measure_episodes(question)
+def test_a_worker_that_is_killed_in_the_middle_is_replaced(cluster):
     killed = []
 
     def kill_once(_: int) -> None:
@@ -80,11 +71,9 @@ def test_a_worker_that_is_killed_in_the_middle_is_replaced(cluster, on_cluster, 
             killed.append(cluster.workers[0].pid)
             os.kill(killed[0], signal.SIGKILL)
 
-    there = measure_episodes(question, progress=kill_once)
+    with workers(cluster.scheduler_address):
+        assert map_episodes(slow_square, range(12), kill_once) == [i * i for i in range(12)]
     assert killed
-    for one, other in zip(here, there, strict=True):
-        assert other.item is one.item
-        assert one.mass.tobytes() == other.mass.tobytes()
 
 
 def test_the_command_line_takes_an_address(cluster, store, tmp_path, capsys):
@@ -98,7 +87,7 @@ def test_the_command_line_takes_an_address(cluster, store, tmp_path, capsys):
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "no address", "http://127.0.0.1:1"])
 def test_an_address_without_a_scheduler_is_a_sentence(store, tmp_path, capsys, monkeypatch, address):
-    monkeypatch.setattr(dask_scheduler, "_ANSWER_WITHIN", 0.2)
+    monkeypatch.setattr(parallel, "_ANSWER_WITHIN", 0.2)
     assert main([str(store), "--no-plots", "--output", str(tmp_path), "--scheduler", address]) == 2
     assert f"No scheduler answers at '{address}'" in capsys.readouterr().err
     with pytest.raises(BadArgument), workers(address):

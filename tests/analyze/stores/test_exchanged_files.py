@@ -12,15 +12,15 @@ import pytest
 
 import vla_attention as va
 from tests.kit.attacks import attacks, edit_root, encode_again, first, root_leaves
+from tests.kit.stores import StoreSpec, reseal_root, write_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.api import OpenStores
-from vla_attention.analyze.copy.copying import copy_store
+from vla_attention.analyze.store.copying import copy_store
 from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import StoreSpec, reseal_root, write_store
 
 #: Both episodes of a task have arrays of the same shapes; rows are in three blocks.
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=9, contributions=True, prompts="same")
@@ -43,13 +43,13 @@ QUESTIONS: dict[str, Callable[[OpenStores, Path], pl.DataFrame | list[pl.DataFra
     "heads": lambda run, other: [run.analyze(by=("layer", "head"))["by"], run.analyze(by=("denoise",))["by"]],
     "sinks": lambda run, other: run.analyze(without_sinks="")["sinks"],
     "words": lambda run, other: [run.words()["words"], run.words()["words_episodes"]],
-    "objects": lambda run, other: [run.objects(), run.objects("iou")],
+    "objects": lambda run, other: [run.objects()["objects_episodes"], run.objects()["iou_episodes"]],
     "time": lambda run, other: run.analyze(by=("time",))["by"],
     "compare": lambda run, other: run.compare(other, allow_mismatch=["seed"]),
     "export": lambda run, other: [
         pl.DataFrame(one["rows"].to_series().reset_index()) for one in run.to_xarray(rows=True)
     ],
-    "overlay": lambda run, other: run.overlay(replans=0),
+    "overlay": lambda run, other: run.overlay(replans=0)["overlay_patches"],
 }
 
 

@@ -11,6 +11,7 @@ import polars as pl
 import pytest
 import zarr
 
+from tests.kit.stores import reseal, write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import select
@@ -18,7 +19,6 @@ from vla_attention.schemas.precision import round_mantissa
 from vla_attention.schemas.stores.content_rules import add_up, row_sum_bound
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
-from vla_attention.testing.stores import reseal, write_store
 
 
 def raw_rows(path: Path) -> np.ndarray:

@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 
 from tests.kit.planted_effects import planted_effects
+from tests.kit.stores import StoreSpec, write_store
+from tests.kit.tokens import small_tokens
 from vla_attention.analyze.__main__ import main
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, PromptChange
-from vla_attention.testing.stores import StoreSpec, write_store
-from vla_attention.testing.tokens import small_tokens
 
 SPEC = StoreSpec(tasks=(0,), episodes=3, plant_effects=planted_effects())
 #: A store's spec, and what must be said of it.

@@ -1,24 +1,21 @@
-"""Processes of this machine give what threads give, to the last bit; those that die are replaced."""
+"""Processes of this machine give what threads give, to the last bit; one that dies is a sentence."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 
 import pytest
 from polars.testing import assert_frame_equal
 
 import vla_attention as va
-from tests.analyze.stores.episode_work import damaged, defect, process_of, square
+from tests.analyze.stores.episode_work import damaged, defect, killed_at_two, process_of, square
 from tests.kit.planted_effects import planted_effects
-from tests.kit.questions import question_about
+from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.measures.steps import measure_episodes
-from vla_attention.analyze.stores.parallel import Threads, each_episode, episodes_with, map_episodes, workers
+from vla_attention.analyze.stores.parallel import WorkersLost, each_episode, map_episodes, workers
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.store_format import CorruptEpisode
-from vla_attention.testing.stores import StoreSpec, write_store
 
 #: The ends of the folders' names in the files.
 OWN, OTHERS = b"/a/", b"/b/"
@@ -55,38 +52,24 @@ def tables(path):
     yield run.words()["words"]
     yield from (run.analyze(by=by)["by"] for by in (("layer", "head"), ("denoise",)))
     yield run.analyze(without_sinks="")["sinks"]
-    yield from (run.objects(table) for table in ("objects", "pointing", "iou"))
+    yield from (run.objects()[f"{table}_episodes"] for table in ("objects", "pointing", "iou"))
     yield run.analyze(by=("time",))["by"]
     yield run.effects()["effects"]
 
 
-def test_every_question_has_the_same_answer_to_the_last_bit(two, store):
-    there = list(tables(store))
-    with episodes_with(Threads()):
-        here = list(tables(store))
+def test_every_question_has_the_same_answer_to_the_last_bit(store, monkeypatch):
+    monkeypatch.setenv("VLA_CACHE", "off")
+    here = list(tables(store))
+    with workers(2):
+        there = list(tables(store))
     for one, other in zip(here, there, strict=True):
         assert_frame_equal(one, other, check_exact=True)
 
 
 @pytest.mark.thorough
-def test_a_process_that_is_killed_in_the_middle_is_replaced(store):
-    question = question_about(store)
-    with episodes_with(Threads()):
-        here = measure_episodes(question)
-    killed = []
-    before = set(multiprocessing.active_children())
-
-    def kill_once(_: int) -> None:
-        if not killed:
-            killed.append((set(multiprocessing.active_children()) - before).pop().pid)
-            os.kill(killed[0], signal.SIGKILL)
-
-    with workers(2):
-        there = measure_episodes(question, progress=kill_once)
-    assert killed
-    for one, other in zip(here, there, strict=True):
-        assert other.item is one.item
-        assert one.mass.tobytes() == other.mass.tobytes()
+def test_a_process_that_is_killed_in_the_middle_is_a_sentence():
+    with workers(2), pytest.raises(WorkersLost, match="A worker process ended"):
+        map_episodes(killed_at_two, range(6))
 
 
 def test_errors_are_raised_as_in_this_process(two):

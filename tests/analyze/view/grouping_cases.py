@@ -12,17 +12,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
 from tests.analyze.view.grouping_episodes import NUM_EPISODES, made_up_episode
+from vla_attention.analyze.core.levels import MORE, items_of, replan_cells
+from vla_attention.analyze.core.measure import Measured, means
 from vla_attention.analyze.measures.baselines import uniform_masses
-from vla_attention.analyze.measures.episodes import replan_values
+from vla_attention.analyze.measures.frames import EPISODE_KEYS, float_values
 from vla_attention.analyze.measures.masses import masses
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
-from vla_attention.analyze.measures.steps import MeasuredEpisode, with_valid
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.groupings.builtin_groupings import BUILTIN_GROUPINGS, find_grouping
@@ -33,6 +36,7 @@ from vla_attention.schemas.groupings.grouping import (
     with_groups,
 )
 from vla_attention.schemas.groupings.key_counts import uniform_of_version_1, uniform_rows
+from vla_attention.schemas.groupings.resolve import counted_keys
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vocabulary
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.layout import Role
@@ -261,15 +265,21 @@ def _expected(
     uniform: NDArray[np.float32] | None,
 ) -> dict[str, Any]:
     """What Python makes of a case; `uniform`: what a store of version 2 holds, None for one of version 1."""
-    item = SelectedEpisode(None, None, tokens)  # type: ignore[arg-type] - nothing of them is needed
+    attributes = SimpleNamespace(task_id=0, instruction="", episode_index=0, success=None, num_steps=0)
+    store, episode = SimpleNamespace(suite="made_up"), SimpleNamespace(attributes=attributes)
+    item = SelectedEpisode(store, episode, tokens)  # type: ignore[arg-type] - no more of them is needed
     try:
         vocabulary = collect_vocabulary(others)
         grouping = chosen_grouping(given, vocabulary)
         (resolved,) = resolve_all(grouping, [item], vocabulary)
     except UserError as error:
         return {"error": str(error)}
-    weights = with_valid(resolved.weights, item.valid)
-    mass = masses(rows, weights.astype(np.float64))  # type: ignore[arg-type] - in float64, as the page
+    items = items_of(item, grouping)
+    weights = items.with_totals(item).astype(np.float64)  # as the page; so are the sums of both sides of the ratio
+    if grouping.ratio is not None:
+        for i, side in enumerate((grouping.ratio.numerator, grouping.ratio.denominator), len(grouping.names)):
+            weights[..., i] = weights[..., [grouping.names.index(name) for name in side]].sum(axis=-1)
+    mass = masses(rows, weights)  # type: ignore[arg-type]
     layers, denoise, heads = (tuple(range(length)) for length in AXES)
     selection = Selection(layers, layers, layers, denoise, denoise, heads, heads, per_head=False)
     mean = mass.mean(axis=3, keepdims=True)
@@ -279,15 +289,17 @@ def _expected(
     else:
         of_cells = uniform.mean(axis=(3, 4), dtype=np.float64)[:, :, :, None]
     expected = uniform_masses(of_cells, weights)
-    counts = (resolved.num_keys, resolved.num_valid)
-    measured = MeasuredEpisode(
-        item, selection, mean[..., :-1], mean[..., -1], mean[..., -1], *counts, expected[..., :-1], expected[..., -1]
-    )
-    values = replan_values(measured, grouping)
-    shape = (tokens.num_replans, len(layers) + 1)
+    names = len(grouping.names)
+    measured = Measured(
+        item, selection, items.labels, items.absent, mean[..., :-2], mean[..., :names].sum(axis=-1), mean[..., -1],
+        counted_keys(weights, tokens.existing)[:, :-2], expected[..., :-2], expected[..., -1], mean[..., -1],
+        item.num_valid, np.arange(tokens.num_replans), np.zeros(len(denoise)),
+    )  # fmt: skip
+    found = means(measured, ("replan", "layer"), MORE)
+    groups, cells = found.filter(kind="group").rename({"share": "fraction"}), replan_cells(found, grouping)
     segments = segments_of(tokens.layout, tokens.key_role)
     members = segment_members(tokens.layout, tokens.static_roles, segments)
-    on_segments = weights_on_segments(weights, members)
+    on_segments = weights_on_segments(_with_valid(resolved.weights, item.valid), members)
     return {
         "names": list(grouping.names),
         "name": grouping.name,
@@ -297,9 +309,23 @@ def _expected(
         "num_valid": _every(np.asarray(resolved.num_valid, dtype=np.float64), tokens),
         "segments": to_json(segments),
         "on_segments": None if on_segments is None else _every(on_segments.swapaxes(1, 2), tokens),
-        "groups": {name: _numbers(array) for name, array in values.groups().items() if name != "keys"},
-        "cells": {name: _numbers(np.broadcast_to(array, shape)) for name, array in values.cells.items()},
+        "groups": {name: _column(groups, name) for name in ("mass", "fraction", "density", "lift")},
+        "cells": {name: _column(cells, name) for name in cells.columns if name not in _PLACES},
     }
+
+
+_PLACES = (*EPISODE_KEYS, "replan", "env_step", "layer", "layer_number", "block")
+
+
+def _column(rows: pl.DataFrame, name: str) -> list[float | str]:
+    return _numbers(float_values(rows[name]))
+
+
+def _with_valid(weights: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Weights (replan or 1, key, group) with one more group: the valid keys (replan or 1, key)."""
+    replans = max(len(weights), len(valid))
+    parts = (weights, valid[:, :, None].astype(np.float32))
+    return np.concatenate([np.broadcast_to(part, (replans, *part.shape[1:])) for part in parts], axis=2)
 
 
 def _every(array: NDArray[Any], tokens: EpisodeTokens) -> list[float | str]:

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from tests.kit.tokens import libero_tokens, small_tokens
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, ObjectKind, SceneObject
 from vla_attention.schemas.layout import PatchGrid, Piece, Prompt, Role, SiteLayout, Span
-from vla_attention.testing.tokens import libero_tokens, small_tokens
 
 #: Episodes of different layouts, prompts and scenes.
 NUM_EPISODES = 30

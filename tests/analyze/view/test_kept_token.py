@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.view import kept_token as module
 from vla_attention.analyze.view.kept_token import kept_token
 from vla_attention.analyze.view.served_stores import ServedStore
@@ -16,7 +17,6 @@ from vla_attention.analyze.view.server import ViewerServer
 from vla_attention.analyze.view.summaries import Summary
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_url import StoreUrl
-from vla_attention.testing.stores import StoreSpec, write_store
 
 PLACES = (Path("/runs/a.zarr"), StoreUrl("hf://datasets/a/b@0123/c.zarr"))
 

@@ -56,7 +56,7 @@ def golden(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def found(golden: Path) -> list[Any]:
     """The page's effects of the golden store, of it packed, and of a store without effects."""
     packed = golden.with_name("packed.zarr")
-    assert main(["copy", str(golden), str(packed), "--packed"]) == 0
+    assert main(["store", "copy", str(golden), str(packed), "--packed"]) == 0
     shutil.copytree(folder_of(2) / "joint.zarr", golden.with_name("joint.zarr"))
     stores = [golden, packed, golden.with_name("joint.zarr")]
     return [answer["effects"] for answer in answers_of(stores, [False, True, False])]

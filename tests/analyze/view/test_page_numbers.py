@@ -14,18 +14,17 @@ from urllib.parse import parse_qs
 import numpy as np
 import polars as pl
 import pytest
+from matplotlib import colormaps
 
 import vla_attention as va
 from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answers
 from tests.end_to_end.test_cameras_of_several_spans import write_spans_store
 from tests.kit.golden_stores import FOLDER
 from tests.kit.http_ranges import serve
+from vla_attention.analyze.core.camera_maps import camera_names, episode_maps, scale_end, stored_picture
+from vla_attention.analyze.core.patch_pictures import NO_PICTURE, enlarge, upright
 from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.question_settings import settings_from_keywords
-from vla_attention.analyze.overlay.colours import Scale, overlay_image, scale_for
-from vla_attention.analyze.overlay.overlay_data import episode_overlay, ratios_of
-from vla_attention.analyze.overlay.overlay_study import study_overlay
-from vla_attention.analyze.show.patch_pictures import upright
 from vla_attention.analyze.stores.rows import layer_rows
 
 pytestmark = needs_node
@@ -158,34 +157,42 @@ def test_rows_patches_words_and_their_readers(answers, stores, name, query):
         np.testing.assert_allclose([reader["mass"] for reader in answer["readers"]], best, rtol=CLOSE)
 
 
+def in_inferno(frame: np.ndarray | None, values: np.ndarray, smooth: bool, shape: tuple[int, ...]) -> np.ndarray:
+    """What the page draws: a third of the picture's colour, and on it inferno, the denser the higher, 3 at the end."""
+    picture = np.full((*shape[:2], 3), NO_PICTURE, dtype=float) if frame is None else frame.astype(float)
+    grey = (picture @ np.array([0.299, 0.587, 0.114]))[..., None]
+    place = np.clip(enlarge(values, shape[0], shape[1], smooth) / 3.0, 0.0, 1.0)
+    opacity = np.nan_to_num(0.8 * place)[..., None]
+    colours = 255 * colormaps["inferno"](np.nan_to_num(place))[..., :3]
+    return np.clip(np.round((1 - opacity) * (0.35 * picture + 0.65 * grey) + opacity * colours), 0, 255)
+
+
 @each_case
-def test_pictures_have_the_pixels_of_vla_analyze_overlay(answers, stores, name, query):
+def test_pictures_have_the_attention_of_their_patches_in_inferno(answers, stores, name, query):
     answer = answers[name, query]
     if not answer["cameras"]:
         assert answer["site"] == "cross"
         return
     asked, replan = settings_of(query, answer["site"])
-    study = study_overlay(va.open(stores / f"{name}.zarr").stores, settings_from_keywords(grouping="default", **asked))
-    item = study.question.selected[0]
-    overlay = episode_overlay(study.question, item, list(study.overlay.maps), ratios_of(study.question, item))
-    assert [camera["camera"] for camera in answer["cameras"]] == list(overlay.maps)
-    lifts = overlay.values("lift")
+    question = va.open(stores / f"{name}.zarr").ask(grouping="default", **asked)
+    maps = episode_maps(question, question.selected[0], camera_names(question))
+    assert [camera["camera"] for camera in answer["cameras"]] == list(maps.cameras)
     for camera in answer["cameras"]:
         values = np.array(camera["values"], dtype=float)
-        lift, mass = lifts[camera["camera"]][replan], overlay.maps[camera["camera"]][replan]
+        one = maps.cameras[camera["camera"]]
+        lift, mass = one.lift[replan], one.mass[replan]
         measure = parse_qs(query.removeprefix("?")).get("measure", ["lift"])[0]
         if measure == "lift":
             np.testing.assert_allclose(values, lift.ravel(), rtol=CLOSE)
-            np.testing.assert_allclose(camera["high"], scale_for(lift, "lift", 1).high)
+            np.testing.assert_allclose(camera["high"], scale_end(lift))
         elif measure == "raw":
             np.testing.assert_allclose(values, 100 * mass.ravel(), rtol=CLOSE)
         else:
             assert (np.argsort(values, kind="stable") == np.argsort(mass.ravel(), kind="stable")).all()
         shape = (camera["height"], camera["width"], 4)
         pixels = np.array(camera["pixels"], dtype=np.uint8).reshape(shape)[..., :3]
-        frame = study.overlay.item.episode.read(f"frames/{camera['camera']}", replan) if camera["stored"] else None
-        expected = overlay_image(frame, values.reshape(lift.shape), Scale(3.0, ""), "smooth=1" in query, shape[:2])
-        turned = upright(expected, overlay.views[camera["camera"]])
+        frame = stored_picture(question.selected[0], one.view.name, replan)
+        turned = in_inferno(frame, upright(values.reshape(lift.shape), one.view), "smooth=1" in query, shape)
         # The page has colours of whole numbers, and a value at the border of two of the 256 may have either.
         difference = np.abs(pixels.astype(int) - turned.astype(int))
         assert difference.max() <= 4

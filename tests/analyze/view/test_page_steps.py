@@ -8,8 +8,8 @@ from typing import Any
 
 from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answers
 from tests.kit.http_ranges import serve
+from tests.kit.stores import StoreSpec, small_steps, write_store
 from vla_attention.capture.store.replan_records import RecordedSteps
-from vla_attention.testing.stores import StoreSpec, small_steps, write_store
 
 pytestmark = needs_node
 EPISODE = "task000_episode001"

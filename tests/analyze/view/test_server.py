@@ -18,13 +18,13 @@ import pytest
 
 from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answers
 from tests.kit.http_ranges import serve
+from tests.kit.stores import StoreSpec, root_attributes, write_episode, write_store
 from tests.kit.viewer import ask, ask_target, send, served
-from vla_attention.analyze.copy.copying import copy_store
+from vla_attention.analyze.store.copying import copy_store
 from vla_attention.analyze.view.server import ViewerServer
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing.stores import StoreSpec, root_attributes, write_episode, write_store
 
 SPEC = StoreSpec(tasks=(0,), episodes=2, replans=2)
 

@@ -11,12 +11,12 @@ import pytest
 
 import vla_attention as va
 from tests.kit.stopped_programs import after_call, run_stopped
+from tests.kit.stores import StoreSpec, write_store
 from tests.kit.viewer import ask, served
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.view.paths import PAGE_FILES
 from vla_attention.analyze.view.summary_process import summary_parts
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2)
 

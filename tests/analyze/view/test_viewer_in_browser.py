@@ -13,11 +13,11 @@ import pytest
 import vla_attention as va
 from tests.kit.browser import Watched, needs_chromium, watched_page
 from tests.kit.http_ranges import serve
+from tests.kit.stores import StoreSpec, rerun_source, write_store
 from tests.kit.viewer import served
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.view.server import ViewerServer
 from vla_attention.schemas.interventions import Interventions, PromptChange
-from vla_attention.testing.stores import StoreSpec, rerun_source, write_store
 
 pytestmark = needs_chromium
 
@@ -157,7 +157,7 @@ def test_a_damaged_chunk_is_a_sentence_and_no_number(browser, store, tmp_path):
 @pytest.mark.thorough
 def test_a_static_site_shows_the_same_and_a_packed_store_too(browser, server, store, tmp_path, capsys):
     packed = tmp_path / "packed.zarr"
-    assert main(["copy", str(store), str(packed), "--packed"]) == 0
+    assert main(["store", "copy", str(store), str(packed), "--packed"]) == 0
     assert main(["view", str(store), str(packed), "--site", str(tmp_path / "site")]) == 0
     found = []
     with serve(tmp_path / "site") as site, watched_page(browser) as watched:

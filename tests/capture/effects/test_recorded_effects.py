@@ -11,10 +11,10 @@ import pytest
 
 from tests.capture.rerun.conftest import capture
 from tests.capture.rerun.conftest import pi_store as pi_store
+from tests.kit.stores import reseal
 from vla_attention.capture.__main__ import main
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import reseal
 
 EFFECTS = ("--effects", "text,cameras", "--effects-readers", "all", "action", "pictures", "text")
 

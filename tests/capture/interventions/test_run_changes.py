@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.kit.policy_inputs import make_observation
+from tests.kit.stores import write_store
 from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.interventions.run_changes import RunChanges, check_stored_replans
 from vla_attention.capture.policies.pi.embedded import dummy_policy
@@ -14,7 +15,6 @@ from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, PromptChange
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing import write_store
 
 BOWL = SceneObject("bowl_1", "object", True)
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.kit.stores import StoreSpec, write_store
+from tests.kit.tokens import INSTRUCTIONS
 from vla_attention.capture.__main__ import main
 from vla_attention.capture.jobs.status import store_status
 from vla_attention.capture.jobs.worker_records import (
@@ -19,8 +21,6 @@ from vla_attention.capture.jobs.worker_records import (
 from vla_attention.schemas.errors import Note
 from vla_attention.schemas.stores.claims import jobs_folder
 from vla_attention.schemas.stores.worker import Worker
-from vla_attention.testing.stores import StoreSpec, write_store
-from vla_attention.testing.tokens import INSTRUCTIONS
 
 SPEC = StoreSpec(tasks=(0, 2), episodes=2, replans=1, layers=(0,), heads=(0,), frames=False)
 NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2", 0)

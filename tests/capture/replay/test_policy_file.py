@@ -82,7 +82,7 @@ def test_any_torch_policy_on_a_data_set(tmp_path, data, file, capsys):
     with torch.no_grad():
         expected = SmallPolicy().act(picture[None], [TASKS[1]], state, _noise(seed))[0]
     np.testing.assert_array_equal(episode["actions"][1], expected.double().numpy())
-    assert analyze(["verify", str(store)]) == 0
+    assert analyze(["store", "verify", str(store)]) == 0
     assert analyze([str(store), "--output", str(tmp_path / "results"), "--no-plots"]) == 0
 
 

@@ -61,7 +61,7 @@ def test_pictures_of_a_run_give_the_rows_of_that_run(tmp_path, monkeypatch, vers
     assert_same_calls(tmp_path / "run.zarr", tmp_path / "replay.zarr")
     replayed = episode(tmp_path / "replay.zarr", 0, 1)
     assert replayed.attrs["env_step"] == [0, every, 2 * every, 3 * every]
-    assert analyze(["verify", str(tmp_path / "replay.zarr")]) == 0
+    assert analyze(["store", "verify", str(tmp_path / "replay.zarr")]) == 0
 
 
 @pytest.mark.parametrize("case", ["pi05_batch2", "pi0_batch2"])
@@ -139,7 +139,7 @@ def test_the_store_says_what_was_replayed(tmp_path, capsys):
     assert "exists already" in capsys.readouterr().err
     assert run("replay", data, *TINY, *cameras, "--every", 2, "--output", store, "--resume") == 2
     assert "protocol.replan_steps is 3, this run's is 2" in capsys.readouterr().err
-    assert analyze(["verify", str(store)]) == 0
+    assert analyze(["store", "verify", str(store)]) == 0
 
 
 def test_another_instruction_and_known_outcomes(tmp_path):

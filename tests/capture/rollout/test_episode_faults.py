@@ -124,7 +124,7 @@ def spoil(scene: Any, kind: type[Any], times: int) -> list[int]:
 def check_nothing_is_left(store: Path) -> None:
     assert not store.with_name(f"{store.name}.partial").exists()
     assert holders(store) == []
-    assert analyze(["verify", str(store)]) == 0
+    assert analyze(["store", "verify", str(store)]) == 0
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.kit.stores import StoreSpec, root_attributes, write_episode
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Terminated, Termination
 from vla_attention.capture.jobs.worker_records import read_records
@@ -23,7 +24,6 @@ from vla_attention.capture.rollout.progress import Unit
 from vla_attention.capture.rollout.simulation import SimulationFailed
 from vla_attention.capture.store.store_writer import RunStore, open_run
 from vla_attention.schemas.stores.claims import holders
-from vla_attention.testing.stores import StoreSpec, root_attributes, write_episode
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=3, replans=1, layers=(0,), heads=(0,), frames=False)
 TASKS = [Task("made_up", number, f"task_{number}", f"lift cube {number}", 0) for number in range(2)]

@@ -66,7 +66,7 @@ def test_more_simulators_give_the_same_episodes(scene, tmp_path, capsys):
     assert not (tmp_path / "three.zarr.partial").exists()
     assert holders(tmp_path / "three.zarr") == []
     assert store_status(tmp_path / "three.zarr").complete
-    assert analyze(["verify", str(tmp_path / "three.zarr")]) == 0
+    assert analyze(["store", "verify", str(tmp_path / "three.zarr")]) == 0
 
 
 def test_an_episode_whose_simulator_died_begins_again(scene, tmp_path, capsys):
@@ -186,7 +186,7 @@ def test_the_first_replan_of_a_batch_is_that_of_single_calls_but_for_rounding(
             np.testing.assert_array_equal(four[path][:], one[path][:])
         for name in ("noise_seed", "env_step"):
             assert four.attrs[name] == one.attrs[name]
-    assert analyze(["verify", str(tmp_path / "four.zarr")]) == 0
+    assert analyze(["store", "verify", str(tmp_path / "four.zarr")]) == 0
 
 
 # --------------------------------------------------------------------------------------------- real simulators
@@ -301,5 +301,5 @@ def test_a_killed_simulator_is_replaced(tmp_path):
     assert run.process.wait(600) == 0, run.log.read_text()
     assert run.log.read_text().count("its simulator ended (killed by signal 9); the episode begins again.") == 1
     assert store_status(run.store).complete
-    assert analyze(["verify", str(run.store)]) == 0
+    assert analyze(["store", "verify", str(run.store)]) == 0
     assert list(run.temporary.glob("vla-*")) == []

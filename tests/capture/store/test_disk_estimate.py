@@ -7,6 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.kit.stores import (
+    StoreSpec,
+    root_attributes,
+    write_store,
+)
+from tests.kit.tokens import OBJECTS, small_prompt
 from vla_attention.capture.store.disk_estimate import (
     EPISODE_OVERHEAD,
     DiskEstimate,
@@ -15,12 +21,6 @@ from vla_attention.capture.store.disk_estimate import (
 )
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import PatchGrid, SiteLayout, Span
-from vla_attention.testing.stores import (
-    StoreSpec,
-    root_attributes,
-    write_store,
-)
-from vla_attention.testing.tokens import OBJECTS, small_prompt
 
 
 def large_tokens(replans: int, pixels: int = 56) -> EpisodeTokens:

@@ -14,12 +14,12 @@ import pytest
 from tests.kit.attacks import files_of
 from tests.kit.lerobot_data_sets import episodes_of_store, write_data_set
 from tests.kit.still_scene import capture_without_simulator
-from vla_attention.analyze.copy.copying import copy_store
+from tests.kit.stores import write_store
+from vla_attention.analyze.store.copying import copy_store
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.capture.store.disk_estimate import estimate_disk
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing.stores import write_store
 
 MOST_FILES = 49
 WHERE = ("--task-suite", "robosuite", "--task-id", "0", "--num-episodes", "1", "--max-steps", "30")

@@ -10,6 +10,12 @@ from pathlib import Path
 import pytest
 
 from tests.kit.durable_stores import SPEC, store_bytes, write_store
+from tests.kit.stores import (
+    denoise_times,
+    episode_records,
+    root_attributes,
+    write_episode,
+)
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.claims import Claims, jobs_folder
@@ -21,12 +27,6 @@ from vla_attention.schemas.stores.store_format import (
     StoreExists,
 )
 from vla_attention.schemas.stores.worker import this_worker
-from vla_attention.testing.stores import (
-    denoise_times,
-    episode_records,
-    root_attributes,
-    write_episode,
-)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.kit.stores import StoreSpec, commit, denoise_times, episode_records, root_attributes
 from tests.kit.thorough import thorough_except
 from vla_attention.capture.store.episode_writer import EpisodeWriter, ReplanRefused
 from vla_attention.capture.store.replan_records import ReplanRecord
@@ -17,7 +18,6 @@ from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import StoreSpec, commit, denoise_times, episode_records, root_attributes
 
 #: Recorded layers 4 and 7, denoise steps 3 and 9, heads 1 and 5: no number is its own position.
 SPEC = StoreSpec(layers=(4, 7), num_layers=9, denoise_steps=(3, 9), heads=(1, 5), contributions=True, replans=3)

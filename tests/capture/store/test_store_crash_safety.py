@@ -25,6 +25,13 @@ from zarr.storage import LocalStore
 from tests.kit.crashes import PROCESSES, before_call, die, run_child
 from tests.kit.durable_stores import SPEC, leftovers, names, store_bytes, write_store
 from tests.kit.examples import examples
+from tests.kit.stores import (
+    commit,
+    denoise_times,
+    episode_records,
+    root_attributes,
+    write_episode,
+)
 from tests.kit.thorough import thorough_except
 from vla_attention.capture.store.episode_writer import StoreWriteFailed
 from vla_attention.capture.store.store_writer import open_run
@@ -38,13 +45,6 @@ from vla_attention.schemas.stores.store_format import (
     episode_name,
 )
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import (
-    commit,
-    denoise_times,
-    episode_records,
-    root_attributes,
-    write_episode,
-)
 
 
 def write_and_die(path: Path, kind: str, number: int) -> None:

@@ -18,8 +18,17 @@ from hypothesis import strategies as st
 
 from tests.kit.attacks import files_of
 from tests.kit.examples import examples
+from tests.kit.stores import (
+    StoreSpec,
+    denoise_times,
+    episode_records,
+    root_attributes,
+    write_episode,
+    write_store,
+)
+from tests.kit.strategies import episode_tokens
 from tests.kit.thorough import thorough_except
-from vla_attention.analyze.copy.copying import copy_store
+from vla_attention.analyze.store.copying import copy_store
 from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.capture.store.codecs import write_whole
 from vla_attention.capture.store.store_writer import open_run
@@ -29,15 +38,6 @@ from vla_attention.schemas.segments import segment_members
 from vla_attention.schemas.stores import store_format as contract
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import (
-    StoreSpec,
-    denoise_times,
-    episode_records,
-    root_attributes,
-    write_episode,
-    write_store,
-)
-from vla_attention.testing.strategies import episode_tokens
 
 
 def check_equals_spec(path: Path, spec: StoreSpec) -> None:

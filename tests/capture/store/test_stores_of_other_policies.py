@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.kit.site_stores import SiteStoreSpec, site_records, site_root, write_site_store
 from vla_attention.capture.store.episode_writer import ReplanRefused
 from vla_attention.capture.store.replan_records import ReplanRecord
 from vla_attention.capture.store.store_writer import open_run
@@ -16,7 +17,6 @@ from vla_attention.schemas.layout import SiteLayout, prompt_at
 from vla_attention.schemas.stores import episode_checks
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.site_stores import SiteStoreSpec, site_records, site_root, write_site_store
 
 Change = Callable[[ReplanRecord], ReplanRecord]
 

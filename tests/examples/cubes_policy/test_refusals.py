@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from examples.cubes_policy.__main__ import main
-from vla_attention.testing import write_store
+from tests.kit.stores import write_store
 
 
 @pytest.mark.parametrize(

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.kit.tokens import small_tokens
 from vla_attention.schemas.groupings.builtin_groupings import BUILTIN_GROUPINGS, find_grouping
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio, with_groups
 from vla_attention.schemas.groupings.resolve import check_names, resolve
 from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vocabulary
 from vla_attention.schemas.layout import Piece, Prompt, Role, SiteLayout, Span
-from vla_attention.testing.tokens import small_tokens
 
 INSTRUCTION = "put the bowl on the plate"
 CROSS = SiteLayout("cross", (Span("text", "text", 0, 10),))

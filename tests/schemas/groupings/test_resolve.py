@@ -5,6 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.kit.strategies import episode_tokens, groupings
+from tests.kit.tokens import random_rows
 from vla_attention.schemas.groupings.builtin_groupings import BUILTIN_GROUPINGS, find_grouping
 from vla_attention.schemas.groupings.grouping import Grouping, GroupingError
 from vla_attention.schemas.groupings.resolve import OverlappingGroups, check_names, resolve
@@ -12,8 +14,6 @@ from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, SceneObject, collect_vocabulary
 from vla_attention.schemas.layout import PatchGrid, Piece, Prompt, Role, SiteLayout, Span
 from vla_attention.schemas.segments import segment_masses, segment_members, segments_of, weights_on_segments
-from vla_attention.testing.strategies import episode_tokens, groupings
-from vla_attention.testing.tokens import random_rows
 
 
 @pytest.fixture

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from tests.kit.tokens import small_tokens
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import check_names, resolve
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS, SelectorError, SelectorKind, no_keys
 from vla_attention.schemas.groupings.vocabulary import collect_vocabulary
-from vla_attention.testing.tokens import small_tokens
 
 
 def test_a_new_kind_is_one_entry_of_the_table(monkeypatch):

@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.bowl_scene import bowl_tokens
+from tests.kit.strategies import episode_tokens as random_tokens
+from tests.kit.strategies import groupings
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import check_names, memberships, resolve, shared_keys
 from vla_attention.schemas.groupings.selector_parser import Atom, parse_selector
 from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vocabulary
-from vla_attention.testing.strategies import episode_tokens as random_tokens
-from vla_attention.testing.strategies import groupings
 
 
 def keys(tokens: EpisodeTokens, selector: str, replan: int) -> list[int]:

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from tests.kit.durable_stores import write_store
+from tests.kit.stores import StoreSpec
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.testing.stores import StoreSpec
 
 SPEC = StoreSpec(tasks=(0, 2), episodes=2, replans=2)
 
@@ -55,7 +55,7 @@ def store(tmp_path) -> Path:
 def test_copies_are_on_the_disk(store, tmp_path, monkeypatch, words):
     command, *options = words
     disk = Disk(monkeypatch)
-    assert analyze([command, str(store), str(tmp_path / "b.zarr"), *options]) == 0
+    assert analyze(["store", command, str(store), str(tmp_path / "b.zarr"), *options]) == 0
     assert not disk.owed
     names = [name for name in disk.renamed if name.startswith("task")]
     assert len(names) == 4
@@ -68,12 +68,12 @@ def test_copies_are_on_the_disk(store, tmp_path, monkeypatch, words):
 def test_merged_stores_are_on_the_disk(store, tmp_path, monkeypatch):
     more = write_store(tmp_path / "more.zarr", spec=StoreSpec(tasks=(1,), episodes=1, replans=2))
     disk = Disk(monkeypatch)
-    assert analyze(["copy", str(store), str(more), "-o", str(tmp_path / "all.zarr"), "--copy"]) == 0
+    assert analyze(["store", "copy", str(store), str(more), "-o", str(tmp_path / "all.zarr"), "--copy"]) == 0
     assert (disk.renamed, disk.owed) == (["all.zarr"], set())
 
 
 def test_what_repair_writes_again_is_on_the_disk(store, monkeypatch):
     (store / "episodes/zarr.json").unlink()
     disk = Disk(monkeypatch)
-    assert analyze(["repair", str(store)]) == 0
+    assert analyze(["store", "verify", str(store), "--repair", "--quick"]) == 0
     assert (disk.renamed, disk.owed) == (["zarr.json"], set())

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.kit.stores import StoreSpec, write_store
 from vla_attention.schemas.stores.episode_files import check_presence
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import STORE_VERSION
-from vla_attention.testing.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0,), episodes=2, replans=2, layers=(0,), heads=(0,), contributions=True)
 ROWS = "joint/rows/c.0.0.0.0.0.0"

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.analyze.copy.copying import copy_store
-from vla_attention.analyze.copy.packing import write_zip
+from vla_attention.analyze.store.copying import copy_store
+from vla_attention.analyze.store.packing import write_zip
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.digest import seal_digest
 from vla_attention.schemas.stores.packed_index import INDEX_FILE
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.testing.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0,), episodes=2, replans=2, layers=(0, 2), denoise_steps=(0, 9), heads=(0,))
 FIRST, SECOND = (f"episodes/task000_000/task000_episode00{i}.zip" for i in (0, 1))
@@ -90,7 +90,7 @@ def check_refused(path: Path, recorded: Values, *, by_command: bool = True) -> l
     said = wrong_or_refused(path, recorded)
     assert said
     if by_command:
-        assert analyze(["verify", str(path)]) in (1, 2)
+        assert analyze(["store", "verify", str(path)]) in (1, 2)
         assert analyze([str(path), "--no-plots", "--output", str(path.parent / "out")]) == 2
         assert not list((path.parent / "out").rglob("*.json"))
     return said
@@ -154,7 +154,7 @@ def swap(folder: Path, one: str, other: str) -> None:
 def test_members_that_were_swapped_renamed_or_removed_are_refused(path, recorded, change):
     packed_again(path, FIRST, change)
     check_refused(path, recorded, by_command=False)
-    assert analyze(["verify", str(path)]) == 1
+    assert analyze(["store", "verify", str(path)]) == 1
 
 
 def test_zips_of_other_episodes_and_other_stores_are_refused(path, other, recorded):

@@ -13,19 +13,19 @@ import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from tests.kit.attacks import exchange, files_of
+from tests.kit.stores import (
+    StoreSpec,
+    episode_records,
+    reseal,
+    root_attributes,
+    write_store,
+)
 from vla_attention.schemas.errors import Note
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import (
     CorruptEpisode,
     StoreError,
     StoreNotFound,
-)
-from vla_attention.testing.stores import (
-    StoreSpec,
-    episode_records,
-    reseal,
-    root_attributes,
-    write_store,
 )
 
 SPEC = StoreSpec(tasks=(1, 12), episodes=2, replans=2)

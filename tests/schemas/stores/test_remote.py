@@ -14,13 +14,13 @@ pytest.importorskip("aiohttp", reason="needs the extra remote: pip install 'vla-
 
 
 from tests.kit.http_ranges import Served, serve
+from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.analyze.copy.copying import copy_store
+from vla_attention.analyze.store.copying import copy_store
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_url import StoreUrl, store_place
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import StoreSpec, write_store
 
 pytestmark = pytest.mark.filterwarnings("ignore:Whether the index.json")
 

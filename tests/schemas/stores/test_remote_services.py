@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from tests.kit.http_ranges import Served, serve
+from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.analyze.copy.copying import copy_store
+from vla_attention.analyze.store.copying import copy_store
 from vla_attention.schemas.stores import remote_source
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.testing.stores import StoreSpec, write_store
 
 pytestmark = pytest.mark.thorough
 
@@ -86,8 +86,8 @@ def test_stores_in_s3_give_the_same_tables(bucket, stores, tmp_path, capsys):
     for name in ("packed", "folder"):  # S3 lists folders: a store need not be packed
         assert csv_of(f"{bucket}/{name}.zarr", tmp_path / name).keys() == expected.keys()
         assert verify_store(open_store(f"{bucket}/{name}.zarr")) == []
-        text = (tmp_path / name / "summary.txt").read_text()
-        assert text.replace(f"{bucket}/{name}.zarr", "S") == (tmp_path / "here" / "summary.txt").read_text().replace(
+        text = (tmp_path / name / "result.json").read_text()
+        assert text.replace(f"{bucket}/{name}.zarr", "S") == (tmp_path / "here" / "result.json").read_text().replace(
             str(stores[0]), "S"
         )
     capsys.readouterr()
@@ -129,7 +129,7 @@ def hub(stores, tmp_path, monkeypatch) -> Iterator[Served]:
 def test_a_store_on_the_hub_is_read_by_ranges(hub, stores, tmp_path, capsys):
     url = "hf://datasets/org/name/runs/a.zarr"
     assert csv_of(url, tmp_path / "there").keys() == csv_of(str(stores[1]), tmp_path / "here").keys()
-    for name in ("summary.txt",):
+    for name in ("result.json",):
         there, here = (tmp_path / "there" / name).read_text(), (tmp_path / "here" / name).read_text()
         assert there.replace(url.replace("name/", f"name@{COMMIT}/"), "S") == here.replace(str(stores[1]), "S")
     assert all(wanted for path, wanted in hub.requests if path.endswith(".zip"))

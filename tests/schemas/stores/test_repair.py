@@ -1,4 +1,4 @@
-"""`vla-capture repair`, and what `status` and `--resume` say of damaged episodes."""
+"""`vla-capture verify --repair`, and what `status` and `--resume` say of damaged episodes."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ import pytest
 from tests.kit.attacks import files_of
 from tests.kit.crashes import before_call, die, run_child
 from tests.kit.still_scene import capture_without_simulator
+from tests.kit.stores import StoreSpec, write_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main
@@ -29,7 +30,6 @@ from vla_attention.schemas.stores.repair import damaged_folder, repair_store
 from vla_attention.schemas.stores.store_format import StoreError
 from vla_attention.schemas.stores.verify import verify_store
 from vla_attention.schemas.stores.worker import Worker, this_worker
-from vla_attention.testing.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0, 2), episodes=2, replans=1, layers=(0,), heads=(0,), frames=False)
 DAMAGED, WHOLE = "task000_episode001", ["task000_episode000", "task002_episode000", "task002_episode001"]
@@ -103,14 +103,14 @@ def test_a_damaged_episode_is_listed_moved_aside_and_missing(store, episode, ori
     assert "missing" not in printed
     assert f"moved aside by: vla-attention capture verify {store} --repair" in printed
 
-    assert main(["repair", str(store), "--dry-run"]) == 1
+    assert main(["verify", str(store), "--repair", "--quick", "--dry-run"]) == 1
     printed = capsys.readouterr().out
     assert f"{store}: 1 of 4 episodes is damaged." in printed
     assert problem in printed
     assert names(store) == sorted([*WHOLE, DAMAGED])
     assert list(store.parent.iterdir()) == [store]
 
-    assert main(["repair", str(store)]) == 0
+    assert main(["verify", str(store), "--repair", "--quick"]) == 0
     printed = capsys.readouterr().out
     assert problem in printed
     assert "Run the same capture with --resume" in printed
@@ -126,7 +126,7 @@ def test_a_damaged_episode_is_listed_moved_aside_and_missing(store, episode, ori
     assert verify_store(open_store(store)) == []
     assert [task.missing for task in store_status(store, expected=2).tasks] == [(1,), ()]
     assert sorted(path.name for path in store.parent.iterdir()) == ["a.zarr", "a.zarr.damaged"]  # no claims are left
-    assert main(["repair", str(store)]) == 0
+    assert main(["verify", str(store), "--repair", "--quick"]) == 0
     assert f"{store}: none of 3 episodes is damaged" in capsys.readouterr().out
     write_store(store, mode="resume", spec=SPEC)
     assert files(store) == files(original)
@@ -138,13 +138,13 @@ def test_damage_that_only_reading_shows_needs_verify(store, episode, capsys):
     content[30] ^= 1
     file.write_bytes(content)
     assert main(["status", str(store), "--expected", "2", "--check"]) == 0
-    assert main(["repair", str(store)]) == 0
+    assert main(["verify", str(store), "--repair", "--quick"]) == 0
     assert "seals, presence and sizes; without --quick every byte is read" in capsys.readouterr().out
     assert main(["status", str(store), "--expected", "2", "--check", "--verify"]) == 1
     assert f"damaged: Array joint/rows of episode {DAMAGED} cannot be read" in capsys.readouterr().out
-    assert main(["repair", str(store), "--verify"]) == 0
+    assert main(["verify", str(store), "--repair"]) == 0
     assert names(store) == WHOLE
-    assert main(["repair", str(store), "--verify"]) == 0
+    assert main(["verify", str(store), "--repair"]) == 0
     assert "(every byte was read)" in capsys.readouterr().out
 
 
@@ -152,14 +152,14 @@ def test_a_claimed_episode_is_left_alone(store, episode, capsys):
     empty(episode)
     claims = Claims(store, NODE)
     assert claims.acquire(DAMAGED) is None
-    assert main(["repair", str(store)]) == 1
+    assert main(["verify", str(store), "--repair", "--quick"]) == 1
     printed = capsys.readouterr().out
     assert "left in the store, because it is claimed: task000_episode001 by node7 (job 98_2)" in printed
     assert "--resume" not in printed
     assert episode.is_dir()
     assert [holder.worker for holder in holders(store)] == [NODE]
     claims.release(DAMAGED)
-    assert main(["repair", str(store)]) == 0
+    assert main(["verify", str(store), "--repair", "--quick"]) == 0
     assert names(store) == WHOLE
 
 
@@ -178,7 +178,7 @@ def test_what_is_said_to_be_removed_is_gone_and_the_rest_is_there(store, tmp_pat
         left.write_text("")
     else:
         left.symlink_to(elsewhere if kind == "link" else tmp_path / "nowhere")
-    assert analyze(["verify", str(store), "--repair", *["--dry-run"] * dry_run]) == 0
+    assert analyze(["store", "verify", str(store), "--repair", *["--dry-run"] * dry_run]) == 0
     line = next(line for line in capsys.readouterr().out.splitlines() if str(left) in line)
     assert ("removed: " in line) == (kind == "folder")
     assert os.path.lexists(left) == (dry_run or kind != "folder")
@@ -293,13 +293,13 @@ def test_resuming_records_what_is_missing_and_says_what_is_damaged(tmp_path, mon
     # An episode that was not asked for is no business of this capture.
     assert main([*given, "--resume", "--num-episodes", "1"]) == 2
     assert "1 of the episodes asked for is damaged" in capsys.readouterr().err
-    assert main(["repair", str(store), "--verify"]) == 0
+    assert main(["verify", str(store), "--repair"]) == 0
     assert main([*given, "--resume", "--verify"]) == 0
     assert files(store) == reference
     assert main([*given, "--verify"]) == 2
     assert "Cannot use --verify without --resume" in capsys.readouterr().err
     assert store_status(store).complete
-    assert analyze(["verify", str(store)]) == 0
+    assert analyze(["store", "verify", str(store)]) == 0
 
 
 def test_episodes_of_another_store_are_not_moved(store, tmp_path, capsys):
@@ -309,10 +309,10 @@ def test_episodes_of_another_store_are_not_moved(store, tmp_path, capsys):
     before = files(other)
     shutil.rmtree(store / "episodes")
     (store / "episodes").symlink_to(other / "episodes")
-    assert main(["repair", str(store)]) == 2
+    assert main(["verify", str(store), "--repair", "--quick"]) == 2
     assert "its group 'episodes' is a link, and what lies elsewhere is no part of it" in capsys.readouterr().err
     (store / "episodes").unlink()
     (store / "episodes").symlink_to(other)  # its zarr.json is no group of episodes
     shutil.copyfile(other / "zarr.json", store / "zarr.json")
-    assert main(["repair", str(store)]) == 2
+    assert main(["verify", str(store), "--repair", "--quick"]) == 2
     assert files(other) == before

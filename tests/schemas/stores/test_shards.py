@@ -11,6 +11,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 
 from tests.kit.attacks import files_of, with_checksum
 from tests.kit.examples import examples
+from tests.kit.stores import write_store
 from vla_attention.schemas.stores.array_metadata import describe_array
 from vla_attention.schemas.stores.byte_source import Folder
 from vla_attention.schemas.stores.reader import open_store
@@ -18,7 +19,6 @@ from vla_attention.schemas.stores.seal import seal_episode
 from vla_attention.schemas.stores.sealed_files import SealedFiles
 from vla_attention.schemas.stores.shards import SealedShard, ShardedLayers
 from vla_attention.schemas.stores.store_format import STORE_VERSION, CorruptEpisode
-from vla_attention.testing.stores import write_store
 
 AXES = ["replan", "layer", "denoise", "head", "query", "key"]
 

@@ -24,8 +24,9 @@ from hypothesis.stateful import (
 from tests.kit.attacks import files_of
 from tests.kit.crashes import before_call, die, run_child
 from tests.kit.examples import examples
-from vla_attention.analyze.copy.copying import copy_store
-from vla_attention.analyze.copy.merging import merge_stores
+from tests.kit.stores import StoreSpec, expected_arrays, root_attributes, write_episode
+from vla_attention.analyze.store.copying import copy_store
+from vla_attention.analyze.store.merging import merge_stores
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.partial_folders import partial_folder, remove_dead_partials
@@ -33,7 +34,6 @@ from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.repair import damaged_folder, repair_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode, StoreExists, episode_name
 from vla_attention.schemas.stores.verify import episode_report, store_faults
-from vla_attention.testing.stores import StoreSpec, expected_arrays, root_attributes, write_episode
 
 SPEC = StoreSpec(tasks=(0,), episodes=3, replans=1, layers=(0,), heads=(0,), frames=False)
 EPISODES = range(3)

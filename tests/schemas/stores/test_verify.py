@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 
 from tests.kit.attacks import files_of, with_checksum
 from tests.kit.examples import examples
+from tests.kit.stores import StoreSpec, reseal, small_steps, write_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 from vla_attention.schemas.stores.verify import Fault, verify_store
-from vla_attention.testing.stores import StoreSpec, reseal, small_steps, write_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=1, replans=3, heads=(0,), plant_steps=small_steps)
 EPISODE = "task000_episode000"
@@ -261,14 +261,14 @@ def test_a_random_bit_flip_is_noticed_or_changes_nothing(victim, data):
 
 
 def test_the_command_line_says_it_and_fails(path, capsys):
-    assert main(["verify", str(path)]) == 0
+    assert main(["store", "verify", str(path)]) == 0
     assert "2 episodes, all whole" in capsys.readouterr().out
     flip(chunk_file(path, "joint/rows"), 30)
-    assert main(["verify", str(path)]) == 1
+    assert main(["store", "verify", str(path)]) == 1
     output = capsys.readouterr().out
     assert f"{EPISODE}: Array joint/rows" in output
     assert "Traceback" not in output
-    assert main(["verify", str(path.with_name("b.zarr"))]) == 2
+    assert main(["store", "verify", str(path.with_name("b.zarr"))]) == 2
     assert "Did you mean" in capsys.readouterr().err
 
 
@@ -334,7 +334,9 @@ def test_bytes_of_a_shard_that_are_in_no_chunk_are_compared_too(path):
     assert "its joint/rows/c.0.0.0.0.0.0 does not agree with its seal" in only_fault_of(path)
 
 
-@pytest.mark.parametrize("program", [main, capture], ids=["vla-analyze", "vla-capture"])
+@pytest.mark.parametrize(
+    "program", [lambda words: main(["store", *words]), capture], ids=["vla-analyze", "vla-capture"]
+)
 @pytest.mark.parametrize("options", [[], ["--quick"]])
 def test_a_link_that_no_seal_lists_is_a_fault(path, tmp_path, capsys, program, options):
     """A copy that follows links would publish what it leads to."""
@@ -349,5 +351,5 @@ def test_a_link_that_no_seal_lists_is_a_fault(path, tmp_path, capsys, program, o
     assert "no part of the store" not in said
     assert f"{path}: 2 episodes, 2 faults" in said
     assert main([str(path), "--no-plots", "--no-cache", "--output", str(tmp_path / "out")]) == 0  # no number is of it
-    assert program(["repair", str(path)]) == 0
+    assert program(["verify", str(path), "--repair", "--quick"]) == 0
     assert [episode.name for episode in open_store(path).episodes] == ["task001_episode000"]

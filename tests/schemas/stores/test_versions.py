@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from tests.kit.paths import GOLDEN
+from tests.kit.stores import StoreSpec, write_store
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import STORE_VERSION, FormatTooNew, RunMismatch, StoreError
-from vla_attention.testing.stores import StoreSpec, write_store
 
 SPEC = StoreSpec(tasks=(0,), episodes=1, replans=1, layers=(0,), heads=(0,), frames=False)
 

@@ -11,9 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.kit.examples import examples
+from tests.kit.strategies import layouts
 from tests.thorough.fuzz_targets import run, seeds
 from vla_attention.schemas.jsonable import to_json
-from vla_attention.testing.strategies import layouts
 
 #: Parsers of JSON.
 DOCUMENTS = ("roots", "seals", "attributes", "arrays", "sharded_arrays", "results", "data_set_infos")

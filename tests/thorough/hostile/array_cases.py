@@ -13,6 +13,7 @@ from numcodecs import blosc
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from tests.kit.attacks import files_of, with_checksum
+from tests.kit.stores import reseal
 from tests.thorough.hostile.changes import (
     VERIFY,
     Case,
@@ -25,7 +26,6 @@ from tests.thorough.hostile.changes import (
     seal_again,
 )
 from vla_attention.schemas.stores.digest import bytes_digest
-from vla_attention.testing.stores import reseal
 
 ROWS = "Array joint/rows of episode task000_episode000 cannot be read: "
 ATOMS = "Array joint/atoms of episode task000_episode000 cannot be read: "

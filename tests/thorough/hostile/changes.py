@@ -15,7 +15,7 @@ from vla_attention.schemas.stores.digest import bytes_digest, run_digest, seal_d
 
 #: The words of an analysis that reads roles, sums, masses and the rows of one word.
 WORDS = ("STORE", "--group", "noun=word:bowl", "--output", "OUT", "--no-cache")
-VERIFY = ("verify", "STORE")
+VERIFY = ("store", "verify", "STORE")
 
 
 @dataclass(frozen=True)

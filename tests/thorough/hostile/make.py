@@ -7,12 +7,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from tests.kit.stores import write_store
 from tests.thorough.hostile.array_cases import ARRAY_CASES
 from tests.thorough.hostile.changes import Case
 from tests.thorough.hostile.document_cases import GROUPING_CASES, RESULTS_CASES
 from tests.thorough.hostile.episode_cases import EPISODE_CASES
 from tests.thorough.hostile.root_cases import ROOT_CASES
-from vla_attention.testing.stores import write_store
 
 #: Cases by what they change: a store, or nothing but a file.
 CASES: dict[str, list[Case]] = {

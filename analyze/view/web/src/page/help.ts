@@ -25,7 +25,7 @@ const MEANING: readonly (readonly [string, string])[] = [
   ["What it cannot mean", "That the policy used what it looked at, or would act differently without it. In a deep layer a patch's key also carries words, and a word's key pictures. Only an intervention shows an effect."],
   ["Effect", "How far the executed actions change when nobody reads a word, a part of the prompt or a picture: root mean square, each dimension in units of its spread over all actions of the store. Without it the policy sees what it never saw in training. What another noise seed changes is the floor: an effect below it is none. Effects do not add up."],
   ["Means", "A mean over layers or heads may describe none of them: look at the grid. Some heads put their attention on keys that hold little (sinks)."],
-  ["Checksums", "Every chunk is compared with its checksum (crc32c). The page does not compare seals: run vla-analyze verify before you believe a store from somebody else."],
+  ["Checksums", "Every chunk is compared with its checksum (crc32c). The page does not compare seals: run vla-attention store verify before you believe a store from somebody else."],
 ];
 
 export class Help {

@@ -2,7 +2,7 @@
  * The files of a packed episode: members of a zip without compression, read by ranges.
  *
  * The zip's directory is believed no more than any other bytes (docs/store.md, "Packed stores"): every member has to
- * lie between its header and the next one, and zips that `vla-analyze copy --packed` would not write are refused.
+ * lie between its header and the next one, and zips that `vla-attention store copy --packed` would not write are refused.
  */
 import type { ByteSource, Range } from "./byte_source";
 import { NotThere, StoreError, visible } from "./errors";
@@ -75,7 +75,7 @@ function entryAt(view: DataView, at: number): { entry: Entry; next: number } {
     field += 4 + length;
   }
   if (method !== 0 || size !== packed || flags & ENCRYPTED_OR_DESCRIPTOR) {
-    throw new StoreError(`it holds ${visible(name)} in another way than vla-analyze copy --packed writes it`);
+    throw new StoreError(`it holds ${visible(name)} in another way than vla-attention store copy --packed writes it`);
   }
   return { entry: { name, nameBytes, header, size }, next };
 }

@@ -1,0 +1,243 @@
+"""What changed between runs? Success, whose goal, the actions of a rerun; then what is looked at and read."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import polars as pl
+
+from vla_attention.analyze.commands.compare_tables import ALL, figures_of, tables_of
+from vla_attention.analyze.commands.language import listens, whatever
+from vla_attention.analyze.core.about import UNTRAINED, notes, solved
+from vla_attention.analyze.core.behaviour import behaviour, with_choices
+from vla_attention.analyze.core.compared import (
+    Compared,
+    RunValues,
+    by_themselves,
+    compared,
+)
+from vla_attention.analyze.core.differences import PAIR
+from vla_attention.analyze.core.moved import is_noise, moved, moved_episodes
+from vla_attention.analyze.core.result import Column, Finding, Result, Table
+from vla_attention.analyze.core.runs import Run, check_comparable, noted_differences
+from vla_attention.analyze.core.same_calls import held_by_one
+from vla_attention.analyze.core.words_of_numbers import with_interval
+from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
+from vla_attention.analyze.measures.task_families import sampling_of
+from vla_attention.analyze.statistics.episode_intervals import Sampling
+from vla_attention.analyze.statistics.exact_tests import mcnemar
+from vla_attention.analyze.statistics.many_looks import NAMED_AT
+from vla_attention.analyze.stores.run_notes import run_notes
+from vla_attention.schemas.errors import listing, plural
+from vla_attention.schemas.safe_text import visible
+
+_BETTER, _LISTEN, _MOVED, _ATTENTION = (
+    "Which does better?", "Do they listen?", "How far do the actions move?", "And the attention?",
+)  # fmt: skip
+#: Differences of four kinds are named: groups, objects, words and heads.
+_SURE = pl.col("difference_q") <= NAMED_AT / 4
+#: So many differences of a kind are named.
+_MOST_NAMED = 3
+
+
+def compare(runs: Sequence[Run], allow_mismatch: Collection[str] = ()) -> Result:
+    """Every other run against the first one.
+
+    Args:
+        runs: two or more, of `core.runs.open_runs`.
+        allow_mismatch: in which fields they may differ, of `core.runs.FIELDS`.
+
+    Raises:
+        MixedPolicies, RunsDiffer: see `core.runs.check_comparable`.
+    """
+    allowed = [*check_comparable(runs, list(allow_mismatch)), *noted_differences(runs)]
+    first, *others = runs
+    selected = [item for run in runs for item in run.question.selected]
+    sampling = sampling_of(first.question.settings.intervals, selected)
+    base, *rest = (RunValues.of(run, "seed" in allow_mismatch) for run in runs)
+    parts = [compared(base, one, sampling) for one in rest]
+    findings, tables = _how_far(first, [run for run in others if run.repeats(first)], sampling)
+    told = {run.name: with_choices(behaviour(run.question.episodes)) for run in runs}
+    for part in parts:
+        if not part.other.run.repeats(first):
+            findings += _behaved(part, told[first.name], told[part.name])
+        findings.append(_attention(part))
+    about = [f"{run.name}: {_outcome(run, first)}." for run in runs]
+    about += dict.fromkeys(line for run in runs for line in run_notes(run.question.episodes))
+    about += [UNTRAINED] if any(run.question.untrained for run in runs) else []
+    beside = dict.fromkeys(line for run in runs for line in notes(run.question) if line not in about)
+    of_pairs = [_pairing(part, "seed" in allow_mismatch) for part in parts]
+    of_pairs += [line for run in others if run.repeats(first) for line in _not_compared(first, run)]
+    cells, groups = by_themselves(base, rest, sampling)
+    columns = [column for column in _RUNS if column.name in cells.columns]
+    whole = (pl.col("layer") == LAYERS_AVG) & (pl.col("scope") != "task")
+    tables += [*tables_of(parts, told), Table("runs", cells, columns, "Each run", whole), Table("runs_groups", groups)]
+    figures = [figure for part in parts for figure in figures_of(part, told)]
+    return Result("What changed between runs", about, findings, tables, figures, [*of_pairs, *allowed, *beside])
+
+
+def _outcome(run: Run, first: Run) -> str:
+    """What a run is, and how many episodes were solved; a rerun has no outcome of its own."""
+    if run is not first and run.repeats(first):
+        calls = f"the policy calls of {plural(len(run.question.selected), 'episode')} of {first.name} again"
+        return f"{calls}, with {run.changed}; outcome not run"
+    outcomes = [item.episode.attributes.success for item in run.question.selected]
+    policy = run.stores[0].attributes.policy.name
+    return f"{policy} on {listing(run.suites)}, {solved(outcomes, run.question.num_tasks)}"
+
+
+def _pairing(part: Compared, any_seed: bool) -> str:
+    """How episodes were paired, and which have no partner."""
+    first, other = part.first.run, part.other.run
+    what = "the same policy calls" if other.repeats(first) else "the same task, initial state and seed"
+    what = "the same task and initial state; seeds may differ" if any_seed else what
+    if part.pairs.is_empty():
+        return (
+            f"NOT PAIRED: no episode of {other.name} has {what} as one of {first.name}, so means of independent "
+            "episodes are compared; differences between scenes are in them."
+        )
+    text = f"{plural(part.pairs.height, 'pair')} of episodes of {other.name} and {first.name} with {what}."
+    for (run,), rows in part.alone().group_by("run", maintain_order=True):
+        named = [f"task {task} episode {episode}" for _, task, episode in rows.select(EPISODE_ID).iter_rows()]
+        text += f" {plural(rows.height, 'episode')} of {run} without a partner: {listing(named, 4)}."
+    return text
+
+
+def _not_compared(first: Run, rerun: Run) -> list[str]:
+    """What only one of a run and its rerun holds of a call, and what was therefore not held against the other."""
+    names = {episode.name: (store, episode) for store in first.stores for episode in store.episodes}
+    missing = {
+        name: None
+        for store in rerun.stores
+        for episode in store.episodes
+        if episode.name in names
+        for name in held_by_one(*names[episode.name], store, episode)
+    }
+    if not missing:
+        return []
+    return [f"Only one of {first.name} and {rerun.name} holds the {listing(missing)}: these were not compared."]
+
+
+def _how_far(first: Run, reruns: Sequence[Run], sampling: Sampling) -> tuple[list[Finding], list[Table]]:
+    """How far the actions of reruns are from the base's, in units of their spread, beside another noise seed."""
+    if not reruns:
+        return [], []
+    episodes = moved_episodes(first, reruns)
+    table, findings = moved(episodes, sampling), []
+    for run, row in zip(reruns, table.iter_rows(named=True), strict=True):
+        said = f"{run.name}: by {with_interval(row, 'effect')} standard deviations of the actions of {first.name}"
+        limit, times = "", row["over_noise"]
+        if is_noise(run):
+            said += ", which is what another noise seed does"
+        elif times is None:
+            limit = "How much of it is chance, a rerun with another noise seed says (--noise-seed)."
+        elif times < 1:
+            said += f"; that is smaller than what another noise seed does ({with_interval(row, 'noise')})"
+        else:
+            shown = "" if (row["minus_noise_q"] or 1.0) <= NAMED_AT else ", which is not shown to be more"
+            said += f"; another noise seed moves them by {with_interval(row, 'noise')}{shown}"
+        if (row["gripper_flips"] or 0.0) >= 0.5:
+            said += f". The gripper is told the opposite in {row['gripper_flips']:.0%} of the steps"
+        findings.append(Finding(f"{said}.", _MOVED, {**row}, limit))
+    return findings, [Table("moved", table, _MOVES, "How far the actions move"), Table("moved_episodes", episodes)]
+
+
+def _behaved(part: Compared, told_first: pl.DataFrame, told_other: pl.DataFrame) -> list[Finding]:
+    """Which run solves more, and whether both do what they are told; the deaf one is told first."""
+    success = _success(part)
+    heard = [listens(asked).numbers if not asked.is_empty() else {} for asked in (told_first, told_other)]
+    if not all("p" in numbers for numbers in heard):
+        return [success]
+    first, name = part.first.run.name, part.name
+    does = [float(str(numbers["p"])) <= NAMED_AT for numbers in heard]
+    said = []
+    for run, asked, numbers, hears in zip((first, name), (told_first, told_other), heard, does, strict=True):
+        p = "p < 0.001" if float(str(numbers["p"])) < 0.001 else f"p = {numbers['p']:.2g}"
+        counts = f"{numbers['right']} of {numbers['n']} episodes, shuffled instructions: {p}"
+        often = whatever(asked.filter(pl.col("left_out").is_null())).removesuffix("; ")
+        said.append(f"{run} does what it is told ({counts})" if hears else
+                    f"{run} is not shown to listen ({counts}){f': {often}' if often else ''}")  # fmt: skip
+    verdict = f"{said[0]}; {said[1]}." if does != [False, True] else f"{said[1]}; {said[0]}."
+    listening = Finding(verdict, _LISTEN, {f"{key}_{side}": value for side, numbers in zip(("first", "other"), heard,
+                        strict=True) for key, value in numbers.items()})  # fmt: skip
+    return [listening, success] if does[0] != does[1] else [success, listening]
+
+
+def _success(part: Compared) -> Finding:
+    """Won and lost with the exact test, and what the pairs could have shown; without pairs, both shares."""
+    first, name = part.first.run.name, part.name
+    if part.pairs.is_empty():
+        row = part.rows["groups"].filter(ALL, quantity="success").head(1).to_dicts()
+        if not row:
+            return Finding("Of one of the runs no outcome is known.", _BETTER)
+        shares = f"{name} solves {row[0]['mean_other']:.0%} of {row[0]['num_other']} episodes, {first} "
+        shares += f"{row[0]['mean_first']:.0%} of {row[0]['num_first']}"
+        shown = (row[0]["difference_q"] or 1.0) <= NAMED_AT
+        return Finding(f"{'' if shown else 'Not shown to differ: '}{shares}.", _BETTER, row[0])
+    pairs = part.values["groups"].filter(pl.col("difference").is_not_null(), quantity="success").unique(PAIR)
+    if pairs.is_empty():
+        return Finding("Of one of the runs no outcome is known.", _BETTER)
+    lost, won = int((pairs["difference"] < 0).sum()), int((pairs["difference"] > 0).sum())
+    n, p, fewest = pairs.height, mcnemar(won, lost), next(k for k in range(1, 99) if mcnemar(0, k) <= NAMED_AT)
+    verdict = "Not shown to differ" if p > NAMED_AT else f"{name} does {'better' if won > lost else 'worse'}"
+    said = f"{verdict}: {name} solves {pairs['other'].sum():.0f} of {n} episodes, {first} {pairs['first'].sum():.0f}"
+    said += f"; {lost} lost, {won} won (exact p = {p:.2g})."
+    limit = "" if p <= NAMED_AT else f"Pairs show a difference once {fewest} change, all one way; there are {n}."
+    return Finding(said, _BETTER, {"won": won, "lost": lost, "n": n, "p": p}, limit)
+
+
+def _attention(part: Compared) -> Finding:
+    """The groups, words and heads whose attention is shown to differ, the largest differences first."""
+    groups = _overall(part).filter(pl.col("quantity") != "success")
+    said = [_of_group(row) for row in _largest(groups).iter_rows(named=True)]
+    for kind, quote in (("objects", ""), ("words", "'")):
+        items = _largest(part.rows[kind].filter(ALL)) if kind in part.rows else groups.clear()
+        for row in items.iter_rows(named=True):
+            named = f"{quote}{visible(row['item'].replace('_', ' '))}{quote}"
+            said.append(f"{2.0 ** row['difference']:.2g} times as much on {named}")
+    heads = part.rows["heads"].filter(ALL)
+    if sure := heads.filter(_SURE).height:
+        top = _largest(heads).row(0, named=True)
+        most = f"most in layer {top['layer']}, head {top['head']}: {100 * top['difference']:+.1f} points"
+        said.append(f"{sure} of {plural(heads.height, 'head')} differ ({most})")
+    against = f"{part.name} against {part.first.run.name}"
+    numbers = {kind: rows.filter(ALL, _SURE).height for kind, rows in part.rows.items()}
+    limit = "Equal attention is not equal use: a word may change the action without more attention."
+    return Finding(f"{against}: {'; '.join(said) if said else 'no difference is shown'}.", _ATTENTION, numbers, limit)
+
+
+def _largest(rows: pl.DataFrame) -> pl.DataFrame:
+    return rows.filter(_SURE).sort(pl.col("difference").abs(), descending=True, nulls_last=True).head(_MOST_NAMED)
+
+
+def _of_group(row: Mapping[str, Any]) -> str:
+    if row["quantity"] == "log2_ratio":
+        return f"the ratio is {2.0 ** row['difference']:.2g} times as high"
+    name = row["quantity"].removesuffix("_fraction")
+    return f"{100 * row['difference']:+.1f} points of the attention on {name}"
+
+
+def _overall(part: Compared) -> pl.DataFrame:
+    """The differences of groups over all tasks, and over all layers or in the only one."""
+    rows = part.rows["groups"].filter(ALL)
+    average = rows.filter(layer=LAYERS_AVG)
+    return average if average.height else rows
+
+
+_MOVES = [
+    Column("run", "text"),
+    Column("effect", "number", "moved by", "standard deviations of the first run's actions, over the executed steps"),
+    Column("noise", "number", "another noise"),
+    Column("over_noise", "factor", "times noise"),
+    Column("angle", "number", "turn", "of the direction of the hand's movement, degrees"),
+    Column("gripper_flips", "percent", "gripper", "steps in which it is told the opposite"),
+    Column("num_episodes", "count", "episodes"),
+]
+_RUNS = [
+    Column("run", "text"),
+    Column("num_episodes", "count", "episodes"),
+    Column("success_rate", "percent", "solved"),
+    Column("geometric_mean", "factor", "ratio"),
+    Column("ratio_lift", "factor", "per token", "the ratio over what evenly spread attention would give"),
+]

@@ -1,0 +1,119 @@
+"""The tables and pictures of `compare`: what was done, attention of groups, words and heads, single pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import polars as pl
+
+from vla_attention.analyze.core.camera_maps import stored_picture
+from vla_attention.analyze.core.compared import KINDS, Compared, side_by_side, strip_of_pair
+from vla_attention.analyze.core.result import Column, Figure, Table
+from vla_attention.analyze.measures.frames import LAYERS_AVG
+from vla_attention.schemas.errors import shortened
+from vla_attention.schemas.safe_text import visible
+
+ALL = pl.col("scope") == "all"
+
+
+def tables_of(parts: Sequence[Compared], told: Mapping[str, pl.DataFrame]) -> list[Table]:
+    """What was told and done; differences of groups, words, heads, layers and tasks; then single pairs."""
+    several = [Column("run", "text")] if len(parts) > 1 else []
+    names = {"first": parts[0].first.run.name, "other": parts[0].name if len(parts) == 1 else "other"}
+    did, both = ([_named_after(column, names) for column in columns] for columns in (_DID, _BOTH))
+    behaved = [rows for part in parts if (rows := side_by_side(part, told)) is not None]
+    found = [Table("behaviour", pl.concat(behaved), [*several, *did], "Told and did", rows=6)] if behaved else []
+    rows_of = {kind: [_of_run(part, part.rows[kind]) for part in parts if kind in part.rows] for kind in KINDS}
+    each = {kind: pl.concat(rows) for kind, rows in rows_of.items() if rows}
+    groups, main = each["groups"], each["groups"]["quantity"][0]
+    average = pl.col("layer") == (LAYERS_AVG if (groups["layer"] == LAYERS_AVG).any() else groups["layer"][0])
+    for kind, columns, title in _EACH:
+        if kind in each:
+            rows = each[kind].sort(pl.col("difference").abs(), descending=True, nulls_last=True, maintain_order=True)
+            found.append(Table(kind, rows, [*several, *columns, *both], title, ALL, rows=5))
+    shown = ALL & average & (pl.col("quantity") != "success")
+    # Behind objects and words, before the heads.
+    at = len(found) - ("heads" in each)
+    found.insert(at, Table("differences", groups, [*several, Column("quantity", "text"), *both], "Attention", shown))
+    of_main = pl.col("quantity") == main
+    layers, tasks = [*several, Column("layer", "text"), *both], [*several, Column("task_id", "count", "task"), *both]
+    found.append(Table("layers", groups, layers, f"{main} by layer", ALL & ~average & of_main, of="differences"))
+    by_task = (pl.col("scope") == "task") & average & of_main
+    found.append(
+        Table("tasks", groups, [*tasks, Column("instruction", "text")], f"{main} by task", by_task, 6, "differences")
+    )
+    values = [_of_run(part, part.values["groups"]) for part in parts if part.pairs.height]
+    return [*found, *([Table("pairs", pl.concat(values))] if values else []),
+            Table("unpaired", pl.concat([part.alone() for part in parts]))]  # fmt: skip
+
+
+def _named_after(column: Column, names: Mapping[str, str]) -> Column:
+    """A column of one of the runs with the run's name in its title."""
+    for side, name in names.items():
+        if column.name.endswith(f"_{side}") and column.name != "num_first":
+            return replace(column, header=f"{shortened(name, 18)}{column.header.removeprefix(side)}")
+    return column
+
+
+def _of_run(part: Compared, rows: pl.DataFrame) -> pl.DataFrame:
+    return rows.select(pl.lit(part.name).alias("run"), pl.all())
+
+
+def figures_of(part: Compared, told: Mapping[str, pl.DataFrame]) -> list[Figure]:
+    """The ratio's differences by layer, the words', and pictures of a pair that ended otherwise."""
+    first, name = part.first.run.name, part.name
+    groups, found = part.rows["groups"].filter(ALL), []
+    main = groups["quantity"][0]
+    layer = pl.when(pl.col("layer") == LAYERS_AVG).then(pl.lit("all layers")).otherwise(pl.format("layer {}", "layer"))
+    of_layers = groups.filter(quantity=main).with_columns(layer)
+    if main == "log2_ratio":
+        title, looks = "The ratio", _TIMES | {"xlabel": "times the ratio (logarithmic)"}
+        of_layers = _as_factors(of_layers)
+    else:
+        title, looks = main.removesuffix("_fraction"), _POINTS
+    title = f"{title} by layer, {name} against {first}"
+    found.append(Figure(f"layers_{name}", "forest", of_layers, title, _BARS, {**looks, "label": "layer"}))
+    if "words" in part.rows:
+        looks = {**_TIMES, "label": "item", "xlabel": "times the attention (logarithmic)"}
+        title = f"Attention to words, {name} against {first}"
+        words = _as_factors(part.rows["words"].filter(ALL))
+        found.append(Figure(f"words_{name}", "forest", words, title, _BARS, looks))
+    if part.pairs.height:
+        items, rows = strip_of_pair(part, told[first], told[name])
+        title = f"Told '{visible(items[0].episode.attributes.instruction)}' from one beginning: {first} and {name}"
+        look = {"picture": lambda a: stored_picture(items[a["row"]], a["camera"], a["replan"])}
+        found += [Figure(f"pair_{name}", "pictures", rows, title, options=look)] if rows.height else []
+    return found
+
+
+def _as_factors(rows: pl.DataFrame) -> pl.DataFrame:
+    """Differences of logarithms to base 2 as factors."""
+    ends = ("difference", "difference_low", "difference_high")
+    return rows.with_columns((2.0 ** pl.col(end)).alias(end) for end in ends)
+
+
+_POINTS = {"value": "difference", "baseline": 0.0, "baseline_name": "the same", "xlabel": "difference of the shares"}
+_TIMES = {**_POINTS, "baseline": 1.0, "log": True}
+_BARS = "Points: means over episodes, every task weighing the same; bars: 95% intervals."
+_DID = [
+    Column("told", "text"),
+    Column("touched_first", "text", "first: touched"),
+    Column("did_first", "text", "first: reached"),
+    Column("touched_other", "text", "other: touched"),
+    Column("did_other", "text", "other: reached"),
+    Column("episodes", "count"),
+]
+_BOTH = [
+    Column("mean_first", "number", "first"),
+    Column("mean_other", "number", "other"),
+    Column("difference", "signed", "other - first", "of a log2, 1 is twice as much"),
+    Column("difference_q", "p", "q", "p of no difference, adjusted for the number of rows (Benjamini-Hochberg)"),
+    Column("num_first", "count", "n", "pairs of episodes, or episodes of the first run"),
+]
+_WORD, _LAYER, _HEAD = Column("item", "text", "word"), Column("layer", "count"), Column("head", "count")
+_EACH = (
+    ("objects", [Column("item", "text", "object")], "Objects: log2 of their attention over that of their area"),
+    ("words", [_WORD], "Words: log2 of their attention over evenly spread"),
+    ("heads", [_LAYER, _HEAD], "Heads: their attention on the first side of the ratio"),
+)

@@ -1,0 +1,229 @@
+"""Which objects are looked at, and whether that is for the objects or for the places where they stand."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+import polars as pl
+
+from vla_attention.analyze.core.about import about, enough, notes
+from vla_attention.analyze.core.axes import COLUMNS, check_axes, columns_of, with_families
+from vla_attention.analyze.core.estimate import Scale, estimate
+from vla_attention.analyze.core.lazy_frames import frame_of_episodes
+from vla_attention.analyze.core.object_maps import enrichment_elsewhere, object_maps
+from vla_attention.analyze.core.object_shares import (
+    CLASSES,
+    ITEM,
+    measure_objects,
+    object_episodes,
+    object_times,
+    with_coverage,
+)
+from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
+from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
+from vla_attention.analyze.measures.question import Question
+from vla_attention.schemas.errors import plural
+
+_AVERAGE = pl.col("layer") == LAYERS_AVG
+_OBJECT = ITEM[:3]
+#: The threshold that texts and pictures show.
+_SHOWN = "p90"
+#: Axes along which maps are compared with objects; the others have shares only.
+_OF_MAPS = ("layer", "head", "task", "family", "episode", "camera")
+_SHARES: dict[str, Scale] = {"share": "share", "area_share": "share", "enrichment": "positive"}
+_POINTING: dict[str, Scale] = {
+    "mask_patches": "positive", "distance": "positive", "distance_uniform": "positive", "pointing": "share",
+    "pointing_chance": "share",
+}  # fmt: skip
+_IOU: dict[str, Scale] = {"iou": "share", "iou_chance": "share"}
+_OVER_PLACE = ("enrichment", "enrichment_elsewhere")
+_ASKS = "At what?"
+
+
+def objects(question: Question, by: Collection[str] = (), iou: bool = True) -> Result:
+    """Share of the image attention by object and class, over their area and over what their places explain.
+
+    Args:
+        question: stores, selection and a site with cameras.
+        by: axes that are kept apart, of `axes.COLUMNS` and "camera".
+        iou: also pointing game and IoU of maps with the objects' masks, with chance; it takes most of the time.
+
+    Raises:
+        BadArgument: no episode has object coverage, or an axis cannot be kept.
+    """
+    check_axes(by, (*COLUMNS, "camera"))
+    given, question = len(question.selected), with_coverage(question)
+    sampling, kept, of_layers = question.sampling, columns_of(by), "layer" in by
+    looks = [*(["layer_number"] if of_layers else []), *(column.name for column in kept)]
+    of_maps = not set(by) - set(_OF_MAPS)
+    found = object_maps(question, "head" in by, of_layers, iou) if of_maps else []
+    measured = measure_objects(question, by)
+    episodes, values, quotients = object_episodes(measured, by), _SHARES, {}
+    if of_maps:
+        place, keys = enrichment_elsewhere(question, found).lazy(), [*EPISODE_ID, "layer", "head", *_OBJECT]
+        episodes = episodes.join(place, keys, "left", nulls_equal=True, maintain_order="left")
+        values, quotients = {**values, "enrichment_elsewhere": "positive"}, {"over_place": _OVER_PLACE}
+    shown_layer = ~_AVERAGE if of_layers else _AVERAGE
+    rows = with_families(episodes.filter(shown_layer).collect(), sampling)
+    nulls = dict.fromkeys(quotients, 1.0)
+    summary = estimate(rows, [*looks, *_OBJECT], values, sampling, nulls, [*looks, *_OBJECT[:2]], quotients)
+    summary = _ordered(summary, looks, "enrichment")
+    together = pl.lit(True) if "camera" in by else pl.col("camera") == summary["camera"][0]
+    known = of_maps and summary["over_place"].null_count() < summary.height
+    columns = [*kept, *([_CAMERA] if "camera" in by else []), *_columns(known, question.num_tasks)]
+    is_class = pl.col("kind") == "class"
+    tables = [
+        Table("objects", summary, columns, "Kinds of objects", is_class & together),
+        Table("objects_each", summary, columns, "Objects", ~is_class & together & ~_IS_WHOLE_CLASS, of="objects"),
+    ]
+    findings = [_finding(question, summary.filter(is_class & together), by)]
+    bars = summary.filter(together & ~_IS_WHOLE_CLASS)
+    figures = [Figure("objects_enrichment", "forest", bars, *_BARS_SAY, _BARS)]
+    if iou and of_maps:
+        pointing, overlaps = (
+            frame_of_episodes(found, lambda one: one.pointing), frame_of_episodes(found, lambda one: one.iou)
+        )  # fmt: skip
+        seen = with_families(pointing.filter(shown_layer & (pl.col("mask_replans") > 0)).collect(), sampling)
+        pointed = _ordered(estimate(seen, [*looks, *_OBJECT], _POINTING, sampling), looks, "pointing")
+        seen = with_families(overlaps.filter(shown_layer & pl.col("iou").is_not_null()).collect(), sampling)
+        regions = _ordered(estimate(seen, [*looks, *_OBJECT, "threshold"], _IOU, sampling), looks, "iou")
+        shown = pl.col("threshold") == _SHOWN
+        tables += [
+            Table("pointing", pointed, [*kept, _CAMERA, *_POINTED], "The patch with the most attention", is_class),
+            Table("iou", regions, [*kept, _CAMERA, *_OVERLAPS], "The attended region", shown & is_class),
+            Table("pointing_episodes", pointing),
+            Table("iou_episodes", overlaps),
+        ]
+        findings += [] if by else _of_pointing(pointed)
+        bars = regions.filter(shown & ~_IS_WHOLE_CLASS)
+        figures.append(Figure("objects_iou", "forest", bars, *_IOU_SAYS, _IOU_BARS))
+    tables += [Table("objects_episodes", episodes), *([] if by else [Table("object_times", object_times(measured))])]
+    left_out = given - len(question.selected)
+    none = [f"No object is marked in the pictures of {plural(left_out, 'more episode')}."] if left_out else []
+    return Result(
+        "Which objects are looked at", about(question), findings, tables, [] if by else figures,
+        [*notes(question), *none],
+    )  # fmt: skip
+
+
+def _ordered(summary: pl.DataFrame, looks: list[str], by: str) -> pl.DataFrame:
+    """Cameras in their order, all together first; in each the classes in theirs, then objects by falling values."""
+    cameras = summary["camera"].unique(maintain_order=True).to_list()
+    rank = pl.when(pl.col("kind") == "class").then(pl.col("item").replace_strict(_RANKS, default=None)).otherwise(9)
+    keys = [*looks, pl.col("camera").replace_strict({name: i for i, name in enumerate(cameras)}), rank, by]
+    falling = [*(False for _ in looks), False, False, True]
+    return summary.sort(keys, descending=falling, nulls_last=True, maintain_order=True)
+
+
+_RANKS = {name: i for i, name in enumerate(CLASSES)}
+
+
+#: An object that is a whole class of the same name: the robot, the background.
+_IS_WHOLE_CLASS = (pl.col("kind") == "object") & pl.col("item").is_in(CLASSES)
+_CAMERA = Column("camera", "text")
+
+
+def _columns(known: bool, num_tasks: int) -> list[Column]:
+    place = (
+        Column("over_place", "factor", "over its place",
+               "attention over what the same maps give the places where the object stands in other episodes of the "
+               "task; near 1 for an object that hardly moves, whatever attention does"),
+        Column("over_place_q", "p", "q", "p of 1 over its place, adjusted for the number of rows (Benjamini-Hochberg)"),
+    )  # fmt: skip
+    return [
+        Column("item", "text", "object"),
+        Column("share", "percent", "of image attention"),
+        Column("area_share", "percent", "of the area"),
+        Column("enrichment", "factor", "over its area",
+               "share of the attention to each picture over the part of it that the object covers"),
+        *(place if known else ()),
+        Column("num_episodes", "count", "episodes"),
+        *([Column("num_tasks", "count", "tasks", screen=False)] if num_tasks > 1 else []),
+    ]  # fmt: skip
+
+
+_POINTED = (
+    Column("item", "text", "object"),
+    Column("pointing", "percent", "on the object", "how often the patch with the most attention is the object's or one "
+           "beside it, mean over layers"),
+    Column("pointing_chance", "percent", "by chance"),
+    Column("distance", "number", "", "from the centre of attention to the object's, in picture sides", False),
+    Column("distance_uniform", "number", "from the middle", screen=False),
+    Column("mask_patches", "number", "patches"),
+)  # fmt: skip
+_OVERLAPS = (
+    Column("item", "text", "object"),
+    Column("iou", "number", "IoU", "of the object's patches and the tenth of the patches with the most attention, mean "
+           "over layers"),
+    Column("iou_chance", "number", "by chance", "the same with the map moved about the picture"),
+)  # fmt: skip
+
+
+def _finding(question: Question, classes: pl.DataFrame, by: Collection[str]) -> Finding:
+    """How much attention the objects get that the task names, and whether more than their place explains."""
+    step = f"vla-attention overlay {question.stores[0].path}"
+    if by:
+        rows = f"Below, a row for each kind of object and {' and '.join(by)}."
+        return Finding(rows, _ASKS, {}, enough(question), step)
+    of_interest = classes.filter(pl.col("item") == CLASSES[0])
+    if of_interest.is_empty() or of_interest["enrichment"][0] is None:
+        top = classes.drop_nulls("enrichment").sort("enrichment").row(-1, named=True)
+        said = f"For its area, the {top['item']} gets most: {_times(top, 'enrichment')} what its area would give"
+        return Finding(f"{said}. The task names no object that is in sight.", _ASKS, {"estimate": top["enrichment"]},
+                       enough(question), step)  # fmt: skip
+    row = of_interest.row(0, named=True)
+    numbers = {name: row[name] for name in row if name.startswith(("share", "enrichment", "over_place", "num_"))}
+    gets = f"{row['share']:.1%} of the attention to the pictures, {_times(row, 'enrichment')} what its area would give"
+    if row["over_place"] is None:
+        limit = "No task has two episodes: whether it is for the object or for its place cannot be told."
+        return Finding(f"What the instruction names gets {gets}.", _ASKS, numbers, limit, step)
+    place = f"and {_times(row, 'over_place')} what its place would explain"
+    low = row["over_place_low"]
+    verdict = "What the instruction names: it gets"
+    if not question.untrained and (low is None or low <= 1):
+        verdict = "It is not shown to look for what the instruction names, which gets"
+    return Finding(f"{verdict} {gets}, {place}.", _ASKS, numbers, enough(question), step)
+
+
+def _times(row: dict[str, Any], name: str) -> str:
+    low, high = row[f"{name}_low"], row[f"{name}_high"]
+    return f"{row[name]:.2g} times" + ("" if low is None else f" [{low:.2g}, {high:.2g}]")
+
+
+def _of_pointing(pointed: pl.DataFrame) -> list[Finding]:
+    """How often the highest patch is on what the instruction names, by camera."""
+    rows = pointed.filter(item=CLASSES[0], kind="class").drop_nulls("pointing").to_dicts()
+    if not rows:
+        return []
+    said = [f"{row['pointing']:.0%} on {row['camera']} (by chance {row['pointing_chance']:.0%})" for row in rows]
+    numbers = {f"{row['camera']}_{name}": row[name] for row in rows for name in ("pointing", "pointing_chance")}
+    return [Finding(f"The patch with the most attention is on what the instruction names, or beside it, in "
+                    f"{' and '.join(said)} of the layers and calls.", "Does it hit it?", numbers)]  # fmt: skip
+
+
+_BARS_SAY = (
+    "Attention to each object, over what its area would give",
+    "Points: means over episodes, every task weighing the same; bars: 95% intervals. Dashed: attention that is even "
+    "over each picture.",
+)
+_BARS = {
+    "value": "enrichment",
+    "label": "item",
+    "color": "kind",
+    "colors": {"class": "#0072B2", "object": "#9A9A9A"},
+    "names": {"class": "kind of object", "object": "object"},
+    "baseline": 1.0,
+    "baseline_name": "even over each picture",
+    "log": True,
+    "xlabel": "attention / area (logarithmic)",
+}
+_IOU_SAYS = (
+    "How well the attended region is the object",
+    "Points: IoU of the object's patches with the tenth of the patches that get the most attention, mean over layers "
+    "and episodes; bars: 95% intervals. Dashed: the same with the map moved about the picture.",
+)
+_IOU_BARS = {
+    "value": "iou", "label": "item", "color": "camera", "uniform": "iou_chance", "baseline_name": "by chance",
+    "xlabel": "IoU",
+}  # fmt: skip

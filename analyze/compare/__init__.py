@@ -1,1 +1,0 @@
-"""`vla-attention compare`: runs paired by initial state and seed."""

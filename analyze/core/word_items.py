@@ -1,0 +1,57 @@
+"""Every word of the instructions as an item that is measured."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from vla_attention.analyze.core.measure import Items
+from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.schemas.groupings.words import word_class
+from vla_attention.schemas.layout import Role
+
+#: The roles of language: the linguistic group of the grouping 'default'. State digits are text, but not language.
+LANGUAGE = (Role.BOS, Role.TEMPLATE, Role.INSTRUCTION, Role.TEXT)
+#: Measured beside the words, for scale, where the site has such keys.
+SCALE = {
+    Role.BOS: "first token",
+    Role.TEMPLATE: "fixed words of the prompt",
+    Role.TEXT: "other text",
+    Role.STATE: "state digits",
+    Role.IMAGE: "image patches",
+}
+LABELS = {"kind": pl.String, "item": pl.String, "place": pl.Int64, "word_class": pl.String}
+
+
+def items_of(item: SelectedEpisode) -> Items:
+    """Every word of the prompts and every place of a word, content and stop words, and the keys of some roles.
+
+    `kind` is "word" (all places of a word together), "place" (a word at its place in the instruction, from 0) or
+    "scale". A share is of the mass of all language; state digits and patches have none.
+    """
+    tokens = item.tokens
+    prompts, num_keys = max(1, len(tokens.prompts)), tokens.layout.num_keys
+    members: dict[tuple[str, str, int | None, str | None], NDArray[np.float32]] = {}
+    for number, words in enumerate(tokens.words):
+        for place, word in enumerate(words):
+            text, of_class = word.text.casefold(), word_class(word.text)
+            for name in (
+                ("word", text, None, of_class),
+                ("place", text, place, of_class),
+                ("scale", f"{of_class} words", None, of_class),
+            ):
+                members.setdefault(name, np.zeros((prompts, num_keys), np.float32))[number, list(word.keys)] = 1.0
+    of_words = np.stack([*members.values()], axis=-1) if members else np.zeros((prompts, num_keys, 0), np.float32)
+    of_words = of_words if prompts == 1 else of_words[tokens.prompt_index]
+    roles = tokens.static_roles
+    named = [role for role in SCALE if (roles == role).any()]
+    of_roles = np.stack([roles == role for role in named], axis=-1).astype(np.float32)
+    replans = max(len(of_words), len(of_roles))
+    weights = np.concatenate([np.broadcast_to(part, (replans, *part.shape[1:])) for part in (of_words, of_roles)], 2)
+    names = [*members, *(("scale", SCALE[role], None, None) for role in named)]
+    labels = {
+        column: pl.Series(column, [name[i] for name in names], dtype=dtype)
+        for i, (column, dtype) in enumerate(LABELS.items())
+    }
+    return Items(labels, weights, np.isin(roles, [int(role) for role in LANGUAGE]))

@@ -1,1 +1,0 @@
-"""`vla-attention overlay`: attention on the stored pictures, as strips and videos."""

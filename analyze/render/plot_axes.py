@@ -1,0 +1,87 @@
+"""What the axes of plots share: scales, labels, legends, notes beside rows, the line of uniform attention."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.analyze.render.plot_colours import BASELINE_COLOR
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+
+#: Legend entry of the line that uniform attention gives.
+BASELINE_LABEL = "uniform attention"
+
+
+def ratio_axis(axis: Any, values: Any) -> None:
+    """Make an x or y axis logarithmic around finite positive values, with decimal numbers (0.5, 20) as labels.
+
+    A ratio and its inverse are equally far from 1 on such an axis; on a linear axis the denominator's side is squeezed.
+    """
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+
+    shown = np.asarray(values, dtype=np.float64)
+    shown = shown[np.isfinite(shown) & (shown > 0)]
+    low, high = (shown.min(), shown.max()) if shown.size else (0.5, 2.0)
+    # At least half a factor of two on either side, so that tiny differences do not look large.
+    margin = max(0.06 * np.log(high / low), 0.5 * (np.log(2.0) - np.log(high / low)), 0.05)
+    low, high = low * np.exp(-margin), high * np.exp(margin)
+    decades = np.log10(high / low)
+    digits = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0) if decades < 1.0 else (1.0, 2.0, 5.0) if decades < 3 else (1.0,)
+    is_x = axis.axis_name == "x"
+    (axis.axes.set_xscale if is_x else axis.axes.set_yscale)("log")
+    (axis.axes.set_xlim if is_x else axis.axes.set_ylim)(low, high)
+    axis.set_major_locator(LogLocator(subs=digits, numticks=20))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}"))
+    axis.set_minor_locator(LogLocator(subs=tuple(range(1, 10)), numticks=20) if decades < 3 else NullLocator())
+    axis.set_minor_formatter(NullFormatter())
+
+
+def whole_numbers(axis: Axis) -> None:
+    """Ticks of a linear axis at whole numbers only, for counts and steps."""
+    from matplotlib.ticker import MaxNLocator
+
+    axis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+
+
+def share_ticks(axis: Axis, count: int) -> None:
+    """Ticks from 0% to 100% on an axis of shares, `count` of them."""
+    shares = np.linspace(0, 1, count)
+    axis.set_ticks(shares, [f"{share:.0%}" for share in shares])
+
+
+def label_positions(axis: Axis, labels: Sequence[str], most: int) -> None:
+    """Labels at the positions 0, 1, 2 ...; every second, third ... label where more than `most` would touch."""
+    positions = range(0, len(labels), max(1, -(-len(labels) // most)))
+    axis.set_ticks(list(positions), [labels[i] for i in positions])
+
+
+def hide_frame(axes: Axes) -> None:
+    """Hide the four lines around the axes."""
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+
+
+def uniform_line(
+    axes: Axes, value: float = 1.0, along: str = "y", linewidth: float = 1.0, label: str | None = None
+) -> None:
+    """A dashed line across the axes at the value of uniform attention on the y axis (or with `along`, the x axis)."""
+    line = axes.axhline if along == "y" else axes.axvline
+    line(value, color=BASELINE_COLOR, linestyle="--", linewidth=linewidth, label=label)
+
+
+def scattered(generator: np.random.Generator, position: float, count: int, spread: float = 0.22) -> NDArray[np.float64]:
+    """`count` positions around the middle of a row, at most `spread` from it, so that points do not hide each other."""
+    offsets = generator.uniform(-spread, spread, count) if count > 1 else np.zeros(count)
+    return np.asarray(position + offsets)
+
+
+def legend_above(axes: Axes, columns: int = 1, handles: Sequence[Any] | None = None, **options: Any) -> None:
+    """A legend above the right end of the axes."""
+    chosen = {} if handles is None else {"handles": handles}
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.1, **chosen, **options)

@@ -1,0 +1,172 @@
+"""Pictures as a moving one: GIF through pillow, MP4 through the ffmpeg of imageio-ffmpeg. Each file appears whole."""
+
+from __future__ import annotations
+
+import subprocess
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from vla_attention.analyze.core.result import Figure
+from vla_attention.analyze.render.output_files import replacing
+from vla_attention.analyze.render.pictures import pictures
+from vla_attention.analyze.render.style import Style
+from vla_attention.schemas.errors import BadArgument, MissingDependency
+from vla_attention.schemas.safe_text import visible
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+VideoFormat = Literal["gif", "mp4"]
+#: Colours in a GIF, which has one table for all pictures.
+_GIF_COLORS = 255
+#: Quality of H.264, from 0 to 51, the worst.
+_CRF = 15
+
+
+class FfmpegFailed(Exception):
+    """ffmpeg ended with an error, of which this is the last line."""
+
+
+def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, kind: VideoFormat) -> Path:
+    """Write pictures (row, column, 3) uint8 of one size, `fps` of them a second; returns the path.
+
+    Raises:
+        BadArgument: no picture, pictures of different sizes, or a rate outside 0.1 to 50 pictures a second.
+        MissingDependency: MP4 without imageio-ffmpeg.
+        OSError: the file cannot be written.
+    """
+    if not 0.1 <= fps <= 50:
+        raise BadArgument(f"Cannot write {fps} pictures a second; expected --fps from 0.1 to 50.")
+    try:
+        with replacing(path) as temporary:
+            (write_gif if kind == "gif" else write_mp4)(temporary, frames, fps)
+    except FfmpegFailed as error:
+        raise BadArgument(f"ffmpeg could not write {path}: {visible(str(error))}; choose --video gif.") from None
+    return path
+
+
+def write_film(path: Path, figure: Figure, fps: float, kind: VideoFormat) -> None:
+    """A figure of kind `pictures` as a film: for each of its columns the rows side by side, all of one size."""
+    write_video(path, _film(figure), fps, kind)
+
+
+def _film(figure: Figure) -> Iterator[NDArray[np.uint8]]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    style, frame = Style(), figure.frame.with_columns(pl.col("row").cast(pl.String))
+    named = frame["row"].n_unique() > 1
+    above = pl.format("{}\n{}", "row", "above") if named else pl.col("above")
+    with style.settings():
+        for part in frame.partition_by("column", maintain_order=True):
+            side_by_side = part.with_columns(row=pl.lit(0), column="row", above=above)
+            canvas = pictures(replace(figure, frame=side_by_side), style).canvas
+            assert isinstance(canvas, FigureCanvasAgg)
+            canvas.draw()  # type: ignore[no-untyped-call]
+            yield np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
+
+
+def check_video(kind: VideoFormat) -> None:
+    """Raise `MissingDependency` when that kind cannot be written here; before anything is computed."""
+    if kind == "mp4":
+        try:
+            import imageio_ffmpeg  # noqa: F401
+        except ImportError:
+            raise MissingDependency(
+                "Writing MP4 needs imageio-ffmpeg, which is not installed; pip install 'vla-attention[video]', or "
+                "choose --video gif."
+            ) from None
+
+
+def write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> None:
+    """Write an endless GIF. Its colours are chosen for all pictures together, so that a small cube stays green."""
+    from PIL import Image
+
+    drawn = [Image.fromarray(frame) for frame in _same_size(frames)]
+    sheet = Image.fromarray(_colours_of(drawn))
+    palette = sheet.quantize(_GIF_COLORS, method=Image.Quantize.MEDIANCUT, kmeans=1)
+    # Without dithering: noise would change from picture to picture, look like content, and triple the file.
+    indexed = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in drawn]
+    indexed[0].save(
+        path, format="GIF", save_all=True, append_images=indexed[1:], duration=round(1000 / fps), loop=0, optimize=False
+    )
+
+
+def _colours_of(pictures: Sequence[Image]) -> NDArray[np.uint8]:
+    """A picture (1, number, 3) of the colours of all pictures; the more pixels one has, the more often, by root."""
+    counts: Counter[int] = Counter()
+    for picture in pictures:
+        coarse = np.asarray(picture, dtype=np.uint32) >> 2
+        codes, numbers = np.unique((coarse[..., 0] << 12) | (coarse[..., 1] << 6) | coarse[..., 2], return_counts=True)
+        counts.update(dict(zip(codes.tolist(), numbers.tolist(), strict=True)))
+    codes = np.array(list(counts))
+    colours = np.stack([codes >> 12, (codes >> 6) & 63, codes & 63], axis=-1) * 255 // 63
+    often = np.ceil(np.sqrt(np.array(list(counts.values())))).clip(1, 8).astype(int)
+    return np.repeat(colours, often, axis=0)[None].astype(np.uint8)
+
+
+def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> None:
+    """Write H.264 that every player shows (4:2:0, even sides: an odd last row or column is repeated).
+
+    ffmpeg is started here and not by imageio-ffmpeg, which does not tell that it has failed: on a full disk, a part of
+    a video would pass for all of it.
+
+    Raises:
+        FfmpegFailed: ffmpeg ended with an error.
+    """
+    check_video("mp4")
+    drawn = _same_size(frames)
+    first = next(drawn)
+    height, width = (side + side % 2 for side in first.shape[:2])
+    program = subprocess.Popen(
+        _ffmpeg(path, width, height, fps),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        process_group=0,  # Ctrl-C is for this process, which then ends ffmpeg
+    )
+    with program:
+        assert program.stdin is not None
+        try:
+            for picture in chain((first,), drawn):
+                margins = ((0, height - picture.shape[0]), (0, width - picture.shape[1]), (0, 0))
+                program.stdin.write(np.pad(picture, margins, mode="edge").tobytes())
+            said = program.communicate()[1]
+        except BrokenPipeError:  # it has ended; why is in what it says
+            said = program.communicate()[1]
+        except BaseException:
+            program.kill()
+            raise
+    if program.returncode != 0:
+        lines = said.decode(errors="replace").strip().splitlines() or [f"exit code {program.returncode}"]
+        raise FfmpegFailed(lines[-1])
+
+
+def _ffmpeg(path: Path, width: int, height: int, fps: float) -> list[str]:
+    """The command that makes a video of raw pictures from its standard input."""
+    import imageio_ffmpeg
+
+    rate = str(Fraction(fps).limit_denominator())
+    given = f"-f rawvideo -vcodec rawvideo -s {width}x{height} -pix_fmt rgb24 -r {rate} -i -"
+    made = f"-an -vcodec libx264 -pix_fmt yuv420p -crf {_CRF} -v error -f mp4 -movflags +faststart"
+    return [imageio_ffmpeg.get_ffmpeg_exe(), "-y", *given.split(), *made.split(), str(path)]
+
+
+def _same_size(frames: Iterable[NDArray[np.uint8]]) -> Iterator[NDArray[np.uint8]]:
+    first: tuple[int, ...] | None = None
+    for frame in frames:
+        if first is None:
+            first = frame.shape
+        if frame.shape != first:
+            raise BadArgument(f"A video's pictures have one size; got {frame.shape} after {first}.")
+        yield frame
+    if first is None:
+        raise BadArgument("A video needs at least one picture.")

@@ -1,0 +1,1 @@
+"""`vla-attention store`: copies of stores, one store of several, checks."""

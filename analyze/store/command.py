@@ -1,0 +1,176 @@
+"""`vla-attention store copy` and `verify`: keeping stores."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vla_attention.analyze.options import add_workers
+from vla_attention.schemas.command_line import OneSentenceParser, command_parser, format_bytes
+from vla_attention.schemas.errors import BadArgument, plural
+from vla_attention.schemas.stores.store_url import local_path, store_place
+from vla_attention.schemas.stores.verify_command import DESCRIPTION, EXAMPLES, add_verify_arguments, run_verify_command
+from vla_attention.schemas.threads import add_threads
+
+if TYPE_CHECKING:
+    from vla_attention.schemas.stores.reader import Store
+    from vla_attention.schemas.stores.store_url import StorePlace
+
+_EXAMPLES = """examples:
+  vla-attention store copy libero_10.zarr                               how large each part is
+  vla-attention store copy libero_10.zarr slim.zarr --without frames
+  vla-attention store copy libero_10.zarr slim.zarr --without frames objects contributions effects
+  vla-attention store copy libero_10.zarr slim.zarr --without frames    again: adds what was captured meanwhile
+  vla-attention store copy libero_10.zarr packed.zarr --packed          one file an episode
+  vla-attention store copy hf://datasets/ORG/NAME/libero_10.zarr here.zarr
+  vla-attention store copy node1/libero_10.zarr node2/libero_10.zarr --output libero_10.zarr     one store of several
+
+frames: the cameras' pictures (overlays and reruns need them). objects: what each patch shows (object: groups need it).
+contributions: norms of what keys add. effects: changes of the action without an item. steps: positions and goals.
+Rows, and everything else that groupings of keys, words, cameras and roles need, are always copied. The copy passes
+verify, and its provenance names the omitted parts.
+
+Several stores have to be of one run configuration: what differs is named. No two of them may hold the same episode. The
+one store shares the files of the given ones (hard links), so that it takes no space; a damage of one is then a damage
+of both, and --copy makes files of its own. What comes from a zip or from elsewhere is always copied.
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of `vla-attention store copy STORE ...` and `vla-attention store verify STORE ...`."""
+    parser = command_parser("vla-attention store", "Keep stores: copies, one store of several, checks.")
+    acts = parser.add_subparsers(required=True, metavar="copy|verify", parser_class=OneSentenceParser)
+    copy = acts.add_parser(
+        "copy",
+        help="a copy: smaller, packed, from elsewhere; or one store of several",
+        description="Copy a store, for instance without its pictures or packed into few files, or make one store of "
+        "several of\none run. Without a place to copy to, print how large each part is.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    copy.add_argument(
+        "stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses; several become one store"
+    )
+    copy.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="DEST",
+        help="where the copy goes, NAME.zarr; of two names without --output the second one is DEST",
+    )
+    copy.add_argument(
+        "--without",
+        nargs="+",
+        default=[],
+        metavar="PART",
+        help="frames, objects, contributions, effects, steps (default: copy all)",
+    )
+    copy.add_argument(
+        "--packed",
+        action="store_true",
+        help="one zip file an episode and an index of them; every command reads it in place, here and elsewhere",
+    )
+    copy.add_argument(
+        "--copy", action="store_true", help="of several stores: copy every file, instead of sharing it (hard links)"
+    )
+    verify = acts.add_parser(
+        "verify",
+        help="read everything back and check it; --repair moves damaged episodes aside",
+        description=DESCRIPTION,
+        epilog=EXAMPLES.replace("NAME", "vla-attention store"),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_verify_arguments(verify)
+    for act, answer in ((copy, _run_copy), (verify, _run_verify)):
+        act.set_defaults(act=answer)
+        add_workers(act)
+        add_threads(act, "threads that read episodes, at most 4 (default: OMP_NUM_THREADS, else the process's cores)")
+    return parser
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Do what was asked; returns the exit code."""
+    code: int = arguments.act(arguments)
+    return code
+
+
+def _run_verify(arguments: argparse.Namespace) -> int:
+    """Verify every store; 1 if anything is wrong, or with --repair if a damaged episode is left."""
+    from vla_attention.analyze.stores.checking import reports_of_store
+
+    return run_verify_command(arguments, reports_of_store)
+
+
+def _run_copy(arguments: argparse.Namespace) -> int:
+    """Copy the store, make one of several, or print how large the parts are."""
+    from vla_attention.analyze.store.copying import check_parts
+
+    stores, target = list(arguments.stores), arguments.output
+    if target is None and len(stores) == 2:
+        target = local_path(stores.pop())
+    if target is None and len(stores) > 2:
+        raise BadArgument(f"{len(stores)} stores and no place for the one that they become; add --output DEST.zarr.")
+    without = check_parts(arguments.without)
+    if target is None:
+        if arguments.packed:
+            raise BadArgument("--packed needs a place for the packed copy; give DEST.zarr.")
+        from vla_attention.schemas.stores.reader import open_store
+
+        print(_sizes_text(open_store(stores[0]), without))
+        return 0
+    if len(stores) > 1:
+        if without:
+            raise BadArgument("--without is for one store; make one of the several first, then copy that.")
+        return _merge(stores, target, copy=arguments.copy, packed=arguments.packed)
+    if arguments.copy:
+        raise BadArgument("--copy is for several stores: the copy of one has files of its own anyway.")
+    return _copy(stores[0], target, without, packed=arguments.packed)
+
+
+def _copy(place: StorePlace, target: Path, without: Sequence[str], *, packed: bool) -> int:
+    from vla_attention.analyze.store.copying import copy_store
+    from vla_attention.schemas.progress_bar import progress_bar
+    from vla_attention.schemas.stores.reader import open_store
+
+    store = open_store(place)
+    with progress_bar(len(store.episodes), "episodes") as advance:
+        copied = copy_store(store, target, without, advance, packed=packed)
+    already = f" ({copied.present} were there already)" if copied.present else ""
+    left = f", {format_bytes(copied.left_bytes)} left behind: {', '.join(without)}" if without else ""
+    added = plural(copied.added, "episode")
+    print(f"{target}: {added} added{already}, {format_bytes(copied.copied_bytes)}{left}.")
+    return 0
+
+
+def _merge(places: Sequence[StorePlace], target: Path, *, copy: bool, packed: bool) -> int:
+    from vla_attention.analyze.store.merging import merge_stores
+    from vla_attention.schemas.progress_bar import progress_bar
+    from vla_attention.schemas.stores.reader import open_store
+
+    stores = [open_store(path) for path in places]
+    with progress_bar(sum(len(store.episodes) for store in stores), "episodes") as advance:
+        merged = merge_stores(stores, target, advance, link=not copy, packed=packed)
+    parts = ", ".join(f"{len(store.episodes)} of {store.path}" for store in stores)
+    shared = f"; {format_bytes(merged.linked_bytes)} are shared with the given stores" if merged.linked_bytes else ""
+    print(f"{target}: {plural(merged.episodes, 'episode')} ({parts}), all whole{shared}.")
+    return 0
+
+
+def _sizes_text(store: Store, without: Sequence[str]) -> str:
+    """The size of each part of the store, and of a copy without some of them."""
+    from vla_attention.analyze.store.copying import PARTS, REST, part_sizes
+
+    sizes = part_sizes(store)
+    total = sum(sizes.values())
+    lines = [f"{store.path}: {plural(len(store.episodes), 'episode')}, {format_bytes(total)}"]
+    for name, size in sizes.items():
+        purpose = "rows, atoms, roles, actions: always copied" if name == REST else PARTS[name].purpose
+        share = f"{size / total if total else 0.0:.0%}"
+        mark = "  left behind" if name in without else ""
+        lines.append(f"  {name:<13} {format_bytes(size):>8}  {share:>4}  {purpose}{mark}")
+    if without:
+        rest = format_bytes(total - sum(sizes[name] for name in without))
+        lines.append(f"A copy without {', '.join(without)} takes {rest}.")
+    return "\n".join(lines)

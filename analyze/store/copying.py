@@ -1,0 +1,303 @@
+"""Copies of stores without some of their arrays. A copy is a whole store: `verify` accepts it.
+
+An episode's attributes list its arrays, and its seal lists its files. Deleting folders therefore gives a damaged store.
+A copy has attributes that list the arrays it has, a root that names the omitted parts and the run it was copied from,
+and a new seal that names the one under which the episode was captured. A copy without omissions is the same to the
+byte, its seals too; the root of one from the hub names the commit that it was copied from. Every file is compared with
+the seal when it is copied, so a damaged episode is refused.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import shutil
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vla_attention.analyze.store.packing import Packing
+from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
+from vla_attention.schemas.stores.digest import run_digest, with_digest
+from vla_attention.schemas.stores.durable_files import lock_for_writing, publish
+from vla_attention.schemas.stores.episode_files import files_of_no_array, refuse_links
+from vla_attention.schemas.stores.partial_folders import partial_of, remove_dead_partials
+from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
+from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
+from vla_attention.schemas.stores.root import episode_folders, group_attributes, group_document, without_other_fields
+from vla_attention.schemas.stores.seal import SEAL_FILE, seal_episode
+from vla_attention.schemas.stores.store_format import (
+    EPISODES_DOCUMENT,
+    EPISODES_GROUP,
+    CorruptEpisode,
+    RunMismatch,
+)
+from vla_attention.schemas.stores.store_place import check_place
+from vla_attention.schemas.stores.store_url import HUB_PROTOCOL, MAIN, HubAddress, StoreUrl
+
+
+@dataclass(frozen=True)
+class Part:
+    """Arrays that a copy may omit: their purpose, and a pattern of their names and of their files' names."""
+
+    purpose: str
+    pattern: str
+
+
+EFFECTS, STEPS = "effects", "steps"
+#: The parts that may be omitted. Rows, atoms, roles and the small arrays are always copied.
+PARTS: dict[str, Part] = {
+    "frames": Part("the cameras' pictures; overlays and reruns need them", r"^(camera_)?frames/"),
+    "objects": Part("what each patch shows; object: groups need it", r"^objects/"),
+    "contributions": Part("value-weighted contributions; their norms need them", r"/contribution(/|$)"),
+    EFFECTS: Part("changes of the action without an item; effects needs them", r"^effects/|/cut(/|$)"),
+    STEPS: Part("positions, touches and goals; what was done and why it failed need them", r"^steps/"),
+}
+REST = "rest"
+#: What a copy's provenance calls the address on the hub that it was copied from, with its commit.
+FETCHED_FROM = "fetched_from"
+
+
+@dataclass(frozen=True)
+class Copied:
+    """What a copy did: episodes added, episodes that were there already, bytes copied and bytes omitted."""
+
+    added: int
+    present: int
+    copied_bytes: int
+    left_bytes: int
+
+
+def part_sizes(store: Store) -> dict[str, int]:
+    """Bytes of each part of a store, as the seals list them; `rest` is everything else."""
+    sizes = dict.fromkeys((*PARTS, REST), 0)
+    for episode in store.episodes:
+        for file, record in episode.files.records.items():
+            sizes[_part_of(file) or REST] += record.size
+        sizes[REST] += len(episode.source.whole(SEAL_FILE))
+    return sizes
+
+
+def check_parts(names: Sequence[str]) -> tuple[str, ...]:
+    """Raise `UnknownName` for a part that does not exist; returns each once, in a fixed order."""
+    for name in names:
+        if name not in PARTS:
+            raise unknown_name("part", name, PARTS)
+    return tuple(name for name in PARTS if name in names)
+
+
+def copy_store(
+    store: Store,
+    target: Path,
+    without: Sequence[str],
+    progress: Callable[[int], object] | None = None,
+    *,
+    packed: bool = False,
+) -> Copied:
+    """Copy every episode of a store; `progress` is called with 1 after each. A copy that exists is brought up to date.
+
+    packed: one zip an episode and an index of them, see `packing.py`; otherwise a folder each, whatever the store has.
+
+    Raises:
+        BadArgument: the target cannot be written, or is the store itself.
+        RunMismatch: the target is a store of another run, or a copy without other parts.
+        CorruptEpisode: an episode is damaged. Episodes that were copied before it stay.
+    """
+    without = check_parts(without)
+    check_place(target, "copy to")
+    if isinstance(store.path, Path) and target.resolve() == store.path.resolve():
+        raise BadArgument(f"Cannot copy {store.path} to itself; give another name.")
+    try:
+        return _copy(store, target, without, progress, packed)
+    except OSError as error:
+        if isinstance(error, UserError) or error.errno is None:
+            raise
+        raise BadArgument(f"Cannot copy to {target}: {error.strerror or error}; give another place.") from None
+
+
+def _copy(
+    store: Store, target: Path, without: tuple[str, ...], progress: Callable[[int], object] | None, packed: bool
+) -> Copied:
+    root = _root_document(store, without)
+    run = run_digest(group_attributes(root))
+    target.parent.mkdir(parents=True, exist_ok=True)
+    remove_dead_partials(target)
+    pack: Packing | None = None
+    lock: int | None = None
+    with partial_of(target, "copy") as building:
+        try:
+            _ensure_root(store, target, root, building)
+            lock = lock_for_writing(target, packing=packed)
+            pack = Packing(target, run, building) if packed else None
+            present = {folder.name for folder in episode_folders(target)} if pack is None else pack.present()
+            _refuse_others(store, target, present)
+            added = copied = left = 0
+            for episode in store.episodes:
+                if episode.name not in present:
+                    folder = building / episode.name
+                    sizes = _copy_episode(store, episode, folder, without, run)
+                    copied, left, added = copied + sizes[0], left + sizes[1], added + 1
+                    if pack is None:
+                        _rename_new(folder, target / EPISODES_GROUP / episode.name)
+                    else:
+                        pack.add(episode.name, folder)
+                        shutil.rmtree(folder)
+                if progress is not None:
+                    progress(1)
+        finally:
+            try:
+                if pack is not None:
+                    pack.write_index()
+            finally:
+                if lock is not None:
+                    os.close(lock)
+    return Copied(added, len(store.episodes) - added, copied, left)
+
+
+def _ensure_root(store: Store, target: Path, root: bytes, building: Path) -> None:
+    """Make the empty copy in one step, or check that the target is a copy of the same run without the same parts."""
+    if not target.exists():
+        empty = building / "root"
+        (empty / EPISODES_GROUP).mkdir(parents=True)
+        (empty / "zarr.json").write_bytes(root)
+        (empty / EPISODES_DOCUMENT).write_bytes(_episodes_document(store))
+        _rename_new(empty, target)
+    if (target / "zarr.json").read_bytes() != root if (target / "zarr.json").is_file() else True:
+        source = open_store(target).attributes.provenance.get(FETCHED_FROM)  # raises when it is no store
+        here = group_attributes(root)["provenance"].get(FETCHED_FROM)
+        if source and here and HubAddress.of(source).at(MAIN) == HubAddress.of(here).at(MAIN) and source != here:
+            raise RunMismatch(
+                f"Cannot continue the copy {target}: it is of {source}, and the repository is at another commit now "
+                f"({here}). Give the first address to go on with it, or another name for a new copy."
+            )
+        raise RunMismatch(
+            f"Cannot continue the copy {target}: it is of another run than {store.path}, or leaves other parts behind; "
+            "give another name."
+        )
+
+
+def _refuse_others(store: Store, target: Path, present: Collection[str]) -> None:
+    """Raise `RunMismatch` where the copy has an episode by its name that is another recording than the store's.
+
+    One that was recorded again (`--overwrite`, after `repair`) has the name and the configuration of the first.
+    """
+    if not present:
+        return
+    copied = {episode.name: episode for episode in open_store(target).episodes}
+    others = []
+    for episode in store.episodes:
+        if episode.name not in present:
+            continue
+        try:
+            captured = _captured(copied[episode.name])
+        except CorruptEpisode as error:
+            raise CorruptEpisode(f"Cannot continue the copy {target}: {error}") from None
+        if captured != _captured(episode):
+            others.append(episode.name)
+    if others:
+        raise RunMismatch(
+            f"Cannot continue the copy {target}: {listing(others, 4)} in it {'is' if len(others) == 1 else 'are'} not "
+            f"what {store.path} has under the same name, which was recorded again since; give another name."
+        )
+
+
+def _captured(episode: StoredEpisode) -> str:
+    """The digest of the seal under which an episode was captured."""
+    return episode.seal.copied_from or episode.seal.digest
+
+
+def _copy_episode(
+    store: Store, episode: StoredEpisode, folder: Path, without: tuple[str, ...], run: str
+) -> tuple[int, int]:
+    """Write the copy of one episode; returns (bytes copied, bytes omitted)."""
+    if beyond := files_of_no_array(store.attributes, episode.attributes, episode.files.records):
+        raise CorruptEpisode(
+            f"Episode {episode.name} has files that belong to no array: {listing(beyond, 5)}. They are not copied, and "
+            "without them its seal would not fit."
+        )
+    refuse_links(episode)
+    for name in episode.attributes.arrays:
+        if _part_of(name) not in without and f"{name}/zarr.json" not in episode.files.records:
+            raise CorruptEpisode(f"Episode {episode.name} lacks the array {name}: its files are gone.")
+    copied = left = 0
+    for file, record in episode.files.records.items():
+        if _part_of(file) in without:
+            left += record.size
+            continue
+        place = folder / file
+        place.parent.mkdir(parents=True, exist_ok=True)
+        if file == "zarr.json" and without:
+            copied += place.write_bytes(_without_arrays(episode.sealed(file), without))
+        else:
+            copied += episode.copy_file(file, place)
+    seal = folder / SEAL_FILE
+    if without:
+        seal_episode(folder, episode.name, run, episode.version, copied_from=_captured(episode))
+    else:
+        seal.parent.mkdir()
+        seal.write_bytes(without_other_fields(episode.source.whole(SEAL_FILE)))
+    return copied + seal.stat().st_size, left
+
+
+def _root_document(store: Store, without: tuple[str, ...]) -> bytes:
+    """The copy's `zarr.json`: that of the run, in the version that it has, with the omitted parts."""
+    content = without_other_fields(source_of(store.path).whole("zarr.json"))
+    from_hub = isinstance(store.path, StoreUrl) and store.path.url.startswith(HUB_PROTOCOL)
+    if not without and not from_hub:
+        return content
+    attributes = group_attributes(content)
+    recording, provenance = attributes["recording"], attributes["provenance"]
+    if from_hub:
+        provenance[FETCHED_FROM] = str(store.path)
+    if without:
+        _leave_out(recording, provenance, without, store.run)
+    return group_document(with_digest(attributes))
+
+
+def _leave_out(recording: dict[str, Any], provenance: dict[str, str], without: Sequence[str], run: str) -> None:
+    """State in a root that a copy has no such parts, and of which run it is."""
+    recording.update({name: None if name == EFFECTS else False for name in without if name in recording})
+    before = provenance.get("copied_without", "").split(", ")
+    provenance["copied_without"] = ", ".join(name for name in PARTS if name in without or name in before)
+    # A copy of a copy names the store that was captured, not the copy.
+    provenance.setdefault("copied_from", run)
+
+
+def _episodes_document(store: Store) -> bytes:
+    """The `zarr.json` of the group of episodes: the store's own, or a new one where that is lost or damaged."""
+    try:
+        content = source_of(store.path).whole(EPISODES_DOCUMENT)
+        stated = group_attributes(content)
+    except RemoteFailure:
+        raise
+    except (OSError, ValueError):
+        return group_document({})
+    return group_document({}) if stated else without_other_fields(content)
+
+
+def _without_arrays(document: bytes, without: tuple[str, ...]) -> bytes:
+    """An episode's `zarr.json` that does not list the arrays of these parts."""
+    changed = json.loads(document)
+    arrays = changed["attributes"]["arrays"]
+    changed["attributes"]["arrays"] = {name: arrays[name] for name in arrays if _part_of(name) not in without}
+    for part in (EFFECTS, STEPS):
+        if part in without and part in changed["attributes"]:
+            changed["attributes"][part] = None
+    return json.dumps(changed, indent=2).encode()
+
+
+def _part_of(path: str) -> str | None:
+    """The part that an array, or a file of the episode, belongs to."""
+    return next((name for name, part in PARTS.items() if re.search(part.pattern, path)), None)
+
+
+def _rename_new(source: Path, target: Path) -> None:
+    """Publish a folder, durably. When another copy was faster, its folder has the same content and stays."""
+    try:
+        publish(source, target, durable=True)
+    except OSError as error:
+        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
+            raise

@@ -1,0 +1,213 @@
+"""One store of the episodes of several stores of one run.
+
+The seal of an episode binds it to the configuration of its run and not to a store, so that episodes of one
+configuration may lie in one store. The merged store is made beside its place, read back, and renamed into it when it is
+whole. The given stores are only read.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from vla_attention.analyze.store.copying import copy_store
+from vla_attention.analyze.stores.checking import reports_of_store
+from vla_attention.schemas.errors import BadArgument, UserError, listing, plural
+from vla_attention.schemas.stores.digest import run_differences, with_digest
+from vla_attention.schemas.stores.durable_files import publish
+from vla_attention.schemas.stores.episode_files import refuse_links
+from vla_attention.schemas.stores.partial_folders import partial_of, remove_dead_partials
+from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
+from vla_attention.schemas.stores.remote_source import source_of
+from vla_attention.schemas.stores.root import group_attributes, group_document
+from vla_attention.schemas.stores.seal import SEAL_FILE
+from vla_attention.schemas.stores.store_format import (
+    EPISODES_DOCUMENT,
+    EPISODES_GROUP,
+    CorruptEpisode,
+    RunMismatch,
+    StoreExists,
+)
+from vla_attention.schemas.stores.store_place import check_place
+from vla_attention.schemas.stores.store_url import HUB_PROTOCOL, StorePlace, StoreUrl
+
+#: Differing fields that are named of two stores.
+_MOST_NAMED = 5
+#: What a file system says that has no hard links, or none here.
+_NO_LINKS = (errno.EXDEV, errno.EPERM, errno.EACCES, errno.EMLINK, errno.ENOTSUP)
+
+
+@dataclass(frozen=True)
+class Merged:
+    """What a merge did: episodes of the new store, and bytes of its files, by whether they are shared."""
+
+    episodes: int
+    linked_bytes: int
+    copied_bytes: int
+
+
+def merge_stores(
+    stores: Sequence[Store],
+    target: Path,
+    progress: Callable[[int], object] | None = None,
+    *,
+    link: bool = True,
+    packed: bool = False,
+) -> Merged:
+    """Make a store of the episodes of others; `progress` is called with 1 after each.
+
+    link: files of stores of folders that are here are linked, where the file system can; otherwise they are copied.
+    packed: one zip an episode and an index of them, see `analyze/store/packing.py`; nothing is shared then.
+
+    Raises:
+        BadArgument: fewer than two stores, two that hold the same episode, or a place that cannot be written.
+        StoreExists: something is at the target.
+        RunMismatch: the stores are of different configurations; the fields are named.
+        CorruptEpisode: an episode is damaged. Nothing is left of the new store then.
+    """
+    _check(stores, target)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        remove_dead_partials(target)
+        with partial_of(target, "merge") as building:
+            place = building / target.name
+            merged = _merge(stores, place, progress, link)
+            if packed:
+                zips = building / "packed" / target.name
+                zips.parent.mkdir()
+                copied = copy_store(open_store(place), zips, (), packed=True)
+                place, merged = zips, Merged(merged.episodes, 0, copied.copied_bytes)
+            publish(place, target, durable=True)
+            return merged
+    except OSError as error:
+        if isinstance(error, UserError) or error.errno is None:
+            raise
+        raise BadArgument(f"Cannot merge into {target}: {error.strerror or error}; give another place.") from None
+
+
+def _check(stores: Sequence[Store], target: Path) -> None:
+    if len(stores) < 2:
+        raise BadArgument("One store cannot be merged; give two or more, and the new one with -o.")
+    check_place(target, "merge into")
+    if os.path.lexists(target):
+        raise StoreExists(f"Cannot merge into {target}: it exists already; give another name.")
+    for other in stores[1:]:
+        _check_same_run(stores[0], other)
+    holders: dict[str, Store] = {}
+    for store in stores:
+        twice = [episode.name for episode in store.episodes if episode.name in holders]
+        if twice:
+            other = holders[twice[0]]
+            both = [name for name in twice if holders[name] is other]
+            raise BadArgument(
+                f"Cannot merge: {other.path} and {store.path} hold the same episodes: {listing(both, 5)}. "
+                "Remove one of each pair, or leave a store out."
+            )
+        holders |= dict.fromkeys((episode.name for episode in store.episodes), store)
+
+
+def _check_same_run(one: Store, other: Store) -> None:
+    if one.run == other.run and _left_out(one) == _left_out(other):
+        return
+    versions = [store.attributes.version_text for store in (one, other)]
+    if versions[0] != versions[1]:
+        raise RunMismatch(
+            f"Cannot merge {one.path} and {other.path}: the one is of {versions[0]} and the other of {versions[1]} of "
+            "the store format, and no store has episodes of both. Analyses take several stores: give them both."
+        )
+    differences = [
+        f"{where} is {_short(here)} in the one and {_short(second)} in the other"
+        for where, here, second in run_differences(one.attributes, other.attributes)
+    ]
+    if one.run == other.run:
+        differences = [f"the parts that copies left out are '{_left_out(one)}' and '{_left_out(other)}'"]
+    named = "; ".join(differences[:_MOST_NAMED]) or "their zarr.json states the same in other numbers"
+    more = f"; and {len(differences) - _MOST_NAMED} more fields differ" if len(differences) > _MOST_NAMED else ""
+    raise RunMismatch(f"Cannot merge {one.path} and {other.path}, which are not of one run: {named}{more}.")
+
+
+def _left_out(store: Store) -> str:
+    return store.attributes.provenance.get("copied_without", "")
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _merge(stores: Sequence[Store], place: Path, progress: Callable[[int], object] | None, link: bool) -> Merged:
+    """Make the store at `place`, and read it back."""
+    (place / EPISODES_GROUP).mkdir(parents=True)
+    (place / "zarr.json").write_bytes(_root_document(stores))
+    (place / EPISODES_DOCUMENT).write_bytes(group_document({}))
+    linked = copied = 0
+    origin: dict[str, Store] = {}
+    for store in stores:
+        for episode in store.episodes:
+            sizes = _bring(replace(episode), place / EPISODES_GROUP / episode.name, link)
+            linked, copied = linked + sizes[0], copied + sizes[1]
+            origin[episode.name] = store
+            if progress is not None:
+                progress(1)
+    built = open_store(place)
+    for report in reports_of_store(built, False):
+        if report.problems:
+            raise CorruptEpisode(
+                f"Cannot merge: {report.episode} of {origin[report.episode].path} is damaged: "
+                f"{report.problems[0].rstrip('.')}. Repair that store first."
+            )
+    return Merged(len(built.episodes), linked, copied)
+
+
+def _root_document(stores: Sequence[Store]) -> bytes:
+    """The root of the first store, with the names of all of them in its provenance."""
+    attributes = group_attributes(source_of(stores[0].path).whole("zarr.json"))
+    attributes["provenance"]["merged_from"] = ", ".join(
+        f"{_named(store.path)} ({plural(len(store.episodes), 'episode')})" for store in stores
+    )
+    return group_document(with_digest(attributes))
+
+
+def _named(place: StorePlace) -> str:
+    """What a store is called in the provenance: its name, or its address on the hub with the commit."""
+    return str(place) if str(place).startswith(HUB_PROTOCOL) else place.name
+
+
+def _bring(episode: StoredEpisode, folder: Path, link: bool) -> tuple[int, int]:
+    """Link or copy the files of an episode that its seal lists; returns the bytes that were linked and copied."""
+    linked = copied = 0
+    try:
+        refuse_links(episode)
+        files = [*episode.files.records, SEAL_FILE]
+        for file in files:
+            place = folder / file
+            place.parent.mkdir(parents=True, exist_ok=True)
+            if link and _linked(episode, file, place):
+                linked += place.stat().st_size
+                continue
+            if file == SEAL_FILE:
+                copied += place.write_bytes(episode.source.whole(file))
+            else:
+                copied += episode.copy_file(file, place)
+    except CorruptEpisode as error:
+        raise CorruptEpisode(f"Cannot merge: {error} Repair the store first.") from None
+    return linked, copied
+
+
+def _linked(episode: StoredEpisode, file: str, place: Path) -> bool:
+    """Link one file; False where the file system cannot. What the file holds is looked at when all is read back."""
+    if episode.place is not None or isinstance(episode.folder, StoreUrl):
+        return False  # in a zip, or elsewhere
+    path = episode.folder / file
+    try:
+        os.link(path, place, follow_symlinks=False)
+    except OSError as error:
+        if error.errno in _NO_LINKS:
+            return False
+        if isinstance(error, (FileNotFoundError, NotADirectoryError)):
+            raise CorruptEpisode(f"Episode {episode.name} has lost its {file} ({error.strerror}).") from None
+        raise
+    return True

@@ -1,1 +1,0 @@
-"""`vla-attention verify`: reads a store back and checks it."""

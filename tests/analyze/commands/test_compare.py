@@ -1,0 +1,363 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+import pytest
+from scipy import stats
+
+from tests.kit.paths import ROOT
+from tests.kit.stores import StoreSpec, rerun_source, write_store
+from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.commands.compare import compare
+from vla_attention.analyze.core import runs as runs_module
+from vla_attention.analyze.core.runs import (
+    MixedPolicies,
+    RunsDiffer,
+    check_comparable,
+    open_runs,
+    parse_runs,
+)
+from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.render.terminal import screen
+from vla_attention.schemas.layout import Role
+
+TASKS, EPISODES = (0, 1, 2, 5), 4
+
+
+def log_ratio(run, task, episode):
+    """Planted: scenes differ a lot and alike in all runs; run 1 is 0.25 higher, run 2 is 0.4 lower."""
+    scene = np.random.default_rng([task, episode]).normal(0.5 * task, 0.6)
+    own = np.random.default_rng([run, task, episode]).normal(0, 0.04)
+    return scene + own + (0.0, 0.25, -0.4)[run]
+
+
+def planting(run):
+    def plant(task, episode, tokens, rows):
+        visual = tokens.key_role == Role.IMAGE
+        read = np.isin(tokens.key_role, [int(Role.INSTRUCTION), int(Role.BOS)])
+        share = 1 / (1 + np.exp(-log_ratio(run, task, episode)))
+        weight = share * visual / visual.sum(axis=1, keepdims=True) + (1 - share) * read / read.sum(
+            axis=1, keepdims=True
+        )
+        return np.broadcast_to(weight[:, None, None, None, None, :], rows.shape)
+
+    return plant
+
+
+PLAIN = StoreSpec(
+    tasks=TASKS, episodes=EPISODES, replans=2, layers=(0, 1), heads=(0,), denoise_steps=(9,), frames=False,
+    coverage=False, mantissa_bits=23,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    specs = {
+        "base": replace(PLAIN, plant_rows=planting(0)),
+        "higher": replace(PLAIN, plant_rows=planting(1), policy="tuned"),
+        "lower": replace(PLAIN, plant_rows=planting(2), tasks=(1, 2, 5), episodes=5),
+        "reseeded": replace(PLAIN, plant_rows=planting(1), seed=8, tasks=(0, 1), episodes=2),
+        "goal": replace(PLAIN, plant_rows=planting(1), suite="goal"),
+        "goal_base": replace(PLAIN, plant_rows=planting(0), suite="goal"),
+        "one_layer": replace(PLAIN, plant_rows=planting(1), layers=(1,), tasks=(0, 1), episodes=2),
+    }
+    return {name: write_store(folder / f"{name}.zarr", spec=spec) for name, spec in specs.items()}
+
+
+def opened(stores, *names, allowed=(), **settings):
+    return open_runs(parse_runs([str(stores[name]) for name in names]), AnalysisSettings(**settings), allowed)
+
+
+def one(table, **values):
+    rows = table.filter(*(pl.col(name) == value for name, value in values.items()))
+    assert rows.height == 1
+    return rows.row(0, named=True)
+
+
+def test_paired_differences_are_those_of_the_planted_pairs(stores):
+    found = compare(opened(stores, "base", "higher"))
+    expected = {
+        (task, episode): (log_ratio(1, task, episode) - log_ratio(0, task, episode)) / np.log(2)
+        for task in TASKS
+        for episode in range(EPISODES)
+    }
+    row = one(found["differences"], scope="all", layer="layers_avg", quantity="log2_ratio")
+    values = np.array(list(expected.values()))
+    assert row["difference"] == pytest.approx(values.mean(), rel=1e-4)
+    assert (row["paired"], row["num_first"], row["num_tasks"]) == (True, 16, 4)
+    assert row["difference_low"] < 0.25 / np.log(2) < row["difference_high"]
+    assert row["difference_low"] > 0.2
+    for task in TASKS:
+        own = np.array([value for (of, _), value in expected.items() if of == task])
+        row = one(found["differences"], scope="task", task_id=task, layer="1", quantity="log2_ratio")
+        assert row["difference"] == pytest.approx(own.mean(), rel=1e-3)
+        ends = stats.t.interval(0.95, 3, own.mean(), stats.sem(own))
+        assert (row["difference_low"], row["difference_high"]) == pytest.approx(ends, rel=1e-2)
+    pair = one(found["pairs"], task_id=5, episode_first=3, layer="layers_avg", quantity="log2_ratio")
+    assert pair["difference"] == pytest.approx(expected[5, 3], rel=1e-3)
+    assert found["unpaired"].is_empty()
+
+
+def test_with_another_seed_allowed_the_initial_state_alone_makes_a_pair(stores):
+    found = compare(opened(stores, "base", "reseeded", allowed=("seed",)), ("seed",))
+    row = one(found["differences"], scope="all", layer="layers_avg", quantity="log2_ratio")
+    assert (row["paired"], row["num_first"]) == (True, 4)
+    assert found["pairs"].height == 4 * 3 * found["pairs"]["quantity"].n_unique()
+    assert [note for note in found.notes if "seed" in note]
+    text = " ".join(screen(found).split())
+    assert "with the same task and initial state; seeds may differ." in text
+    assert "initial state and seed" not in text
+
+
+def test_episodes_without_a_partner_are_counted_and_named(stores):
+    runs = opened(stores, "base", "lower")
+    found = compare(runs)
+    alone = found["unpaired"].group_by("run").len().sort("run").rows()
+    assert alone == [("base", 4), ("lower", 3)]
+    assert one(found["differences"], scope="all", layer="layers_avg", quantity="log2_ratio")["num_first"] == 12
+    text = screen(found)
+    assert "task 0 episode 0" in text
+    assert "task 1 episode 4" in text
+
+
+def test_nothing_that_pairs_is_compared_unpaired_and_said(stores):
+    runs = opened(stores, "base", "goal", allowed=("suite",))
+    found = compare(runs, ("suite",))
+    row = one(found["differences"], scope="all", layer="layers_avg", quantity="log2_ratio")
+    first, other = ([log_ratio(run, t, e) / np.log(2) for t in TASKS for e in range(EPISODES)] for run in (0, 1))
+    assert row["paired"] is False
+    assert row["difference"] == pytest.approx(np.mean(other) - np.mean(first), rel=1e-4)
+    assert (row["mean_first"], row["mean_other"]) == pytest.approx((np.mean(first), np.mean(other)), rel=1e-4)
+    assert row["difference_low"] < row["difference"] < row["difference_high"]
+    assert row["difference_high"] - row["difference_low"] > 1.0  # scenes are in it
+    assert found["unpaired"].height == 32
+    assert "NOT PAIRED" in screen(found)
+
+
+def test_a_run_of_several_stores_is_compared_suite_by_suite(stores):
+    words = [f"old={stores['base']},{stores['goal_base']}", f"new={stores['higher']},{stores['goal']}"]
+    found = compare(open_runs(parse_runs(words), AnalysisSettings()))
+    of_ratio = found["differences"].filter(layer="layers_avg", quantity="log2_ratio")
+    assert of_ratio["scope"].to_list() == ["task"] * 8 + ["suite"] * 2 + ["all"]
+    assert of_ratio.filter(scope="all")["num_first"].to_list() == [32]
+    assert of_ratio.filter(scope="all")["num_tasks"].to_list() == [8]
+
+
+def test_layers_named_in_two_ways_are_one_block(tmp_path):
+    small = replace(PLAIN, tasks=(0,), episodes=2, num_layers=18)
+    path = write_store(tmp_path / "labelled.zarr", spec=replace(small, plant_rows=planting(1), layer_labels=(18, 19)))
+    plain = write_store(tmp_path / "plain.zarr", spec=replace(small, plant_rows=planting(0)))
+    found = compare(open_runs(parse_runs([str(plain), str(path)]), AnalysisSettings()))
+    assert found["differences"]["layer"].unique().sort().to_list() == ["0", "1", "layers_avg"]
+    assert found["differences"]["paired"].all()
+
+
+CHANGES = {
+    "suite": lambda root: replace(root, protocol=replace(root.protocol, suite="other")),
+    "seed": lambda root: replace(root, protocol=replace(root.protocol, seed=9)),
+    "protocol": lambda root: replace(root, protocol=replace(root.protocol, name="lerobot")),
+    "image_size": lambda root: replace(root, protocol=replace(root.protocol, image_size=360)),
+    "wait_steps": lambda root: replace(root, protocol=replace(root.protocol, wait_steps=11)),
+    "replan_steps": lambda root: replace(root, protocol=replace(root.protocol, replan_steps=4)),
+    "max_steps": lambda root: replace(root, protocol=replace(root.protocol, max_steps=77)),
+    "family": lambda root: replace(root, policy=replace(root.policy, family="another")),
+    "depth": lambda root: replace(root, policy=replace(root.policy, num_heads=5)),
+    "queries": lambda root: replace(root, recording=replace(root.recording, num_action_queries=4)),
+    "processing": lambda root: replace(root, policy=replace(root.policy, config={"normalisation": "other"})),
+    "cameras": lambda root: replace(root, policy=replace(root.policy, cameras=root.policy.cameras[:1])),
+    "simulator": lambda root: replace(root, provenance={"mujoco": "1.2"}),
+}
+
+
+@pytest.fixture
+def changed(stores, monkeypatch):
+    """Two runs, the attributes of the second one changed."""
+
+    def change_second(change, allowed=()):
+        plain = runs_module.open_store
+
+        def changed_store(path):
+            store = plain(path)
+            if path != stores["higher"]:
+                return store
+            root = change(store.attributes)
+            if root.provenance != store.attributes.provenance:  # as episodes of another job have it
+                for episode in store.episodes:
+                    episode.__dict__["attributes"] = replace(episode.attributes, provenance=root.provenance)
+            return replace(store, attributes=root)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(runs_module, "open_store", changed_store)
+            return opened(stores, "base", "higher", allowed=allowed)
+
+    return change_second
+
+
+@pytest.mark.parametrize("field", CHANGES)
+def test_every_field_that_must_agree_is_named_and_can_be_allowed(changed, field):
+    with pytest.raises((RunsDiffer, MixedPolicies), match=rf"--allow-mismatch {field}\b") as caught:
+        check_comparable(changed(CHANGES[field]), ())
+    assert str(caught.value).count("\n") == 0
+    notes = check_comparable(changed(CHANGES[field], (field,)), (field,))
+    assert len(notes) == 1
+    assert field in notes[0]
+
+
+def test_layers_that_only_one_run_recorded_are_refused_until_chosen(stores):
+    with pytest.raises(RunsDiffer, match=r"layers: 0, 1 and 1.*--layers"):
+        compare(opened(stores, "base", "one_layer"))
+    found = compare(opened(stores, "base", "one_layer", layers=(1,)))
+    assert one(found["differences"], scope="all", layer="1", quantity="log2_ratio")["num_first"] == 4
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["{base}"], "needs two runs or more"),
+        (["{base}", "{base}"], "is given twice"),
+        (["a={base},{goal}", "b={goal}"], "is given twice"),
+        (["a={base}", "a={goal}"], "Two runs are named 'a'"),
+        (["{base},{goal}", "{higher}"], "no name; write NAME="),
+        (["={base}", "{goal}"], "Cannot read the run"),
+        (["a=", "{goal}"], "Cannot read the run"),
+        (["{base}", "{goal}"], "suite: made_up and goal"),
+        (["{base}", "{goal}", "--allow-mismatch", "sute"], "Did you mean 'suite'?"),
+        (["{base}", "{reseeded}"], "seed: 0 and 8"),
+        (["{base}", "nowhere.zarr"], "There is no store at nowhere.zarr"),
+    ],
+)
+def test_mistakes_are_one_sentence(stores, words, said, capsys):
+    filled = [word.format(**stores) for word in words]
+    assert main(["compare", *filled]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert len(error.strip().splitlines()) == 1
+
+
+OUTCOMES = {
+    "six lost": ([True] * 8, [False] * 6 + [True] * 2, "does worse", 0.03125),
+    "five lost": ([True] * 8, [False] * 5 + [True] * 3, "Not shown to differ", 0.0625),
+    "as many won": ([True] * 4 + [False] * 4, [False] * 4 + [True] * 4, "Not shown to differ", 1.0),
+}
+
+
+@pytest.mark.parametrize("case", OUTCOMES)
+def test_success_is_that_of_pairs_and_says_what_they_could_have_shown(stores, monkeypatch, case):
+    first, other, verdict, p = OUTCOMES[case]
+    runs = opened(stores, "base", "higher")
+    for run, outcomes in zip(runs, (first, other), strict=True):
+        episodes = run.question.selected[:8]
+        for item, solved in zip(episodes, outcomes, strict=True):
+            monkeypatch.setitem(item.episode.__dict__, "attributes", replace(item.episode.attributes, success=solved))
+        for item in run.question.selected[8:]:
+            monkeypatch.setitem(item.episode.__dict__, "attributes", replace(item.episode.attributes, success=None))
+    found = compare(runs)
+    (finding,) = (finding for finding in found.findings if "better" in finding.asks)
+    assert verdict in finding.sentence
+    assert finding.numbers["p"] == pytest.approx(p)
+    assert (finding.numbers["n"], finding.numbers["lost"]) == (8, sum(a > b for a, b in zip(first, other, strict=True)))
+    assert ("once 6 change" in finding.limit) == (p > 0.05)
+
+
+def test_a_deaf_policy_is_said_first(example_pair):
+    found = compare(open_runs(parse_runs(example_pair), AnalysisSettings()))
+    finding = found.findings[0]
+    assert "cubes_one_colour is not shown to listen" in finding.sentence
+    assert "touched the blue cube first" in finding.sentence
+    assert (finding.numbers["right_first"], finding.numbers["right_other"]) == (6, 2)
+
+
+@pytest.fixture
+def example_pair():
+    return [str(ROOT / "vla_attention" / "example_stores" / f"{name}.zarr") for name in ("cubes", "cubes_one_colour")]
+
+
+@pytest.mark.drawn
+def test_the_command_writes_tables_and_pictures(stores, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert (
+        main(
+            [
+                "compare",
+                str(stores["base"]),
+                f"new={stores['higher']}",
+                str(stores["lower"]),
+                "--pdf",
+                "--output",
+                str(out),
+            ]
+        )
+        == 0
+    )
+    assert "new" in capsys.readouterr().out
+    assert pl.read_parquet(out / "differences.parquet")["run"].unique().sort().to_list() == ["lower", "new"]
+    pairs = pl.read_parquet(out / "pairs.parquet")
+    assert pairs.filter(quantity="log2_ratio").height == (16 + 12) * 3
+    for stem in ("layers_new", "words_lower"):
+        for kind in ("png", "pdf"):
+            assert (out / f"{stem}.{kind}").stat().st_size > 0
+
+
+def test_a_rerun_pairs_at_every_replan(stores, tmp_path):
+    """The rerun has no ratio in the first replan of episodes of odd number, and lacks an episode."""
+
+    def plant(task, episode, tokens, rows):
+        rows = planting(1)(task, episode, tokens, rows).copy()
+        if episode % 2:
+            visual = tokens.key_role[0] == Role.IMAGE
+            rows[0] = np.where(visual, 0.0, rows[0])
+            rows[0] /= rows[0].sum(axis=-1, keepdims=True)
+        return rows
+
+    spec = replace(PLAIN, plant_rows=plant, rerun_of=rerun_source(stores["base"]), tasks=(1, 2, 5))
+    known = {**stores, "rerun": write_store(tmp_path / "rerun.zarr", spec=spec)}
+    found = compare(opened(known, "base", "rerun"))
+    pairs = found["pairs"].filter(quantity="log2_ratio", layer="0")
+    assert pairs.height == 12
+    for row in pairs.iter_rows(named=True):
+        task, episode = row["task_id"], row["episode_first"]
+        assert row["episode_other"] == episode
+        wanted = (log_ratio(1, task, episode) - log_ratio(0, task, episode)) / np.log(2)
+        assert row["difference"] == pytest.approx(wanted, rel=1e-3)
+    text = " ".join(screen(found).split())
+    assert "12 pairs of episodes of rerun and base with the same policy calls. 4 episodes of base without" in text
+    assert "outcome not run" in text
+    assert "success" not in found["differences"]["quantity"].to_list()
+    assert found["runs"].filter(run="rerun")["success_rate"].null_count() == found["runs"].filter(run="rerun").height
+
+
+def test_a_rerun_with_other_replans_is_refused(stores, tmp_path):
+    spec = replace(PLAIN, plant_rows=planting(1), rerun_of=rerun_source(stores["base"]), replans=1, tasks=(0,))
+    known = {**stores, "rerun": write_store(tmp_path / "rerun.zarr", spec=spec)}
+    with pytest.raises(
+        RunsDiffer, match=r"task000_episode000, .* of the rerun rerun has other replans than in its base"
+    ):
+        compare(opened(known, "base", "rerun", allowed=("max_steps",)), ("max_steps",))
+
+
+def test_differences_over_tasks_are_by_families(tmp_path):
+    """Seven tasks of four families: the error is theirs, in the difference, in its effect size and in the text."""
+    families = dict(enumerate("aaabbcd"))
+    spec = replace(PLAIN, tasks=tuple(families), task_families=families, episodes=2)
+    for name, run in (("first", 0), ("other", 1)):
+        write_store(tmp_path / f"{name}.zarr", spec=replace(spec, plant_rows=planting(run)))
+    stores = {name: tmp_path / f"{name}.zarr" for name in ("first", "other")}
+    found = compare(opened(stores, "first", "other"))
+    row = one(found["differences"], scope="all", layer="layers_avg", quantity="log2_ratio")
+    assert (row["num_tasks"], row["num_families"], row["intervals"]) == (7, 4, "tasks-like-these")
+    pairs = found["pairs"].filter(layer="layers_avg", quantity="log2_ratio")
+    means = pairs.group_by("task_id").agg(pl.col("difference").mean()).sort("task_id")["difference"].to_numpy()
+    labels = np.array([0, 0, 0, 1, 1, 2, 3])
+    sums, size = np.bincount(labels, means - means.mean()), np.bincount(labels)
+    shares = size**2 / (7 * (7 - size))
+    degrees = 1 / ((size**2).sum() / 49 + shares.sum() ** 2 - (shares**2).sum())
+    reach = stats.t.ppf(0.975, degrees) * np.sqrt((sums**2 / (7 * (7 - size))).sum())
+    assert row["difference"] == pytest.approx(means.mean())
+    assert (row["difference_low"], row["difference_high"]) == pytest.approx(
+        (means.mean() - reach, means.mean() + reach)
+    )
+    said = " ".join(screen(found).split())
+    assert "about tasks like these, by 4 families" in said

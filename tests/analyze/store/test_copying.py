@@ -1,0 +1,242 @@
+"""Copies of stores: `verify` accepts them, every kept number is equal, and a damaged episode is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.kit.stores import StoreSpec, reseal, small_effects, small_steps, write_store
+from vla_attention.analyze.__main__ import main as analyze
+from vla_attention.analyze.store.copying import PARTS, copy_store, part_sizes
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import CorruptEpisode, RunMismatch, StoreError
+from vla_attention.schemas.stores.verify import verify_store
+
+SPEC = StoreSpec(
+    tasks=(0,),
+    episodes=2,
+    replans=2,
+    layers=(0,),
+    heads=(0,),
+    contributions=True,
+    plant_effects=small_effects,
+    plant_steps=small_steps,
+)
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory) -> Path:
+    return write_store(tmp_path_factory.mktemp("copied") / "a.zarr", spec=SPEC)
+
+
+def all_bytes(folder: Path) -> dict[str, bytes]:
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+@pytest.mark.parametrize("without", [(), ("frames",), ("contributions",), ("effects",), ("steps",), tuple(PARTS)])
+def test_a_copy_verifies_and_holds_the_same_numbers(original, tmp_path, without):
+    before = all_bytes(original)
+    store = open_store(original)
+    copied = copy_store(store, tmp_path / "b.zarr", without)
+    copy = open_store(tmp_path / "b.zarr")
+    assert verify_store(copy) == []
+    assert [episode.name for episode in copy.episodes] == [episode.name for episode in store.episodes]
+    for mine, theirs in zip(copy.episodes, store.episodes, strict=True):
+        left = set(theirs.attributes.arrays) - set(mine.attributes.arrays)
+        expected = {
+            name
+            for name in theirs.attributes.arrays
+            if ("frames" in without and name.startswith("frames/"))
+            or ("objects" in without and name.startswith("objects/"))
+            or ("contributions" in without and name == "joint/contribution")
+            or ("effects" in without and name in ("effects/change", "joint/cut"))
+            or ("steps" in without and name.startswith("steps/"))
+        }
+        assert left == expected
+        for name in mine.attributes.arrays:
+            assert np.array_equal(mine.read(name), theirs.read(name), equal_nan=True), name
+        folders = {entry.name for entry in mine.folder.iterdir()}
+        assert folders.isdisjoint(set(without) & {"effects", "frames", "objects", "steps"})
+    assert list(tmp_path.iterdir()) == [tmp_path / "b.zarr"]
+    assert all_bytes(original) == before
+    sizes = part_sizes(store)
+    assert copied.left_bytes == sum(sizes[name] for name in without)
+    assert sum(part_sizes(copy)[name] for name in without) == 0
+    if not without:
+        assert all_bytes(tmp_path / "b.zarr") == before
+
+
+def test_a_copy_is_brought_up_to_date(tmp_path):
+    path = write_store(tmp_path / "a.zarr", spec=SPEC, episodes=1)
+    first = copy_store(open_store(path), tmp_path / "b.zarr", ("frames",))
+    write_store(path, mode="resume", spec=SPEC)
+    second = copy_store(open_store(path), tmp_path / "b.zarr", ("frames",))
+    assert (first.added, first.present, second.added, second.present) == (1, 0, 1, 1)
+    assert verify_store(open_store(tmp_path / "b.zarr")) == []
+    with pytest.raises(RunMismatch, match="leaves other parts behind"):
+        copy_store(open_store(path), tmp_path / "b.zarr", ("objects",))
+    other = write_store(tmp_path / "other.zarr", spec=SPEC, seed=5)
+    with pytest.raises(RunMismatch, match="of another run"):
+        copy_store(open_store(other), tmp_path / "b.zarr", ("frames",))
+
+
+@pytest.mark.parametrize("words", [(), ("--packed",), ("--without", "frames"), ("--packed", "--without", "frames")])
+def test_an_episode_that_was_recorded_again_is_not_taken_for_the_copied_one(tmp_path, capsys, words):
+    path, target = write_store(tmp_path / "a.zarr", spec=SPEC), tmp_path / "b.zarr"
+    assert analyze(["store", "copy", str(path), str(target), *words]) == 0
+    assert analyze(["store", "copy", str(path), str(target), *words]) == 0
+    assert "0 episodes added (2 were there already)" in capsys.readouterr().out
+    shutil.rmtree(path / "episodes/task000_episode001")
+    write_store(path, mode="resume", spec=SPEC, plant_success=lambda *_: False)
+    before = all_bytes(target)
+    assert analyze(["store", "copy", str(path), str(target), *words]) == 2
+    said = capsys.readouterr().err
+    assert "task000_episode001 in it is not what" in said
+    assert said.count("\n") == 1
+    assert all_bytes(target) == before
+
+
+@pytest.mark.parametrize("file", ["zarr.json", "joint/rows/zarr.json", "seal/zarr.json"])
+def test_damaged_metadata_is_refused_and_never_sealed_anew(original, tmp_path, file):
+    path = tmp_path / "a.zarr"
+    shutil.copytree(original, path)
+    damaged = path / "episodes/task000_episode000" / file
+    damaged.write_bytes(damaged.read_bytes().replace(b'"', b" ", 1))
+    with pytest.raises(CorruptEpisode, match="task000_episode000"):
+        copy_store(open_store(path), tmp_path / "b.zarr", ("frames",))
+    assert verify_store(open_store(tmp_path / "b.zarr")) == []
+    assert not list((tmp_path / "b.zarr/episodes").glob("task*"))
+
+
+def test_a_changed_root_and_a_lost_array_are_refused(original, tmp_path):
+    path = tmp_path / "a.zarr"
+    shutil.copytree(original, path)
+    root = json.loads((path / "zarr.json").read_text())
+    root["attributes"]["protocol"]["seed"] += 1
+    (path / "zarr.json").write_text(json.dumps(root))
+    with pytest.raises(CorruptEpisode, match="a run of another configuration"):
+        copy_store(open_store(path), tmp_path / "b.zarr", ("frames",))
+    shutil.rmtree(path)
+    shutil.copytree(original, path)
+    shutil.rmtree(path / "episodes/task000_episode000/joint/rows")
+    with pytest.raises(CorruptEpisode, match="joint/rows"):
+        copy_store(open_store(path), tmp_path / "c.zarr", ("frames",))
+
+
+@pytest.mark.parametrize("without", [(), ("frames",)])
+def test_damaged_values_are_refused(original, tmp_path, without):
+    path = tmp_path / "a.zarr"
+    shutil.copytree(original, path)
+    (chunk,) = path.glob("episodes/task000_episode000/joint/rows/c.*")
+    content = bytearray(chunk.read_bytes())
+    content[len(content) // 2] ^= 1
+    chunk.write_bytes(bytes(content))
+    with pytest.raises(CorruptEpisode, match="task000_episode000 is damaged: its joint/rows"):
+        copy_store(open_store(path), tmp_path / "b.zarr", without)
+    assert not list((tmp_path / "b.zarr/episodes").glob("task*"))
+
+
+def test_the_seal_of_a_changed_copy_names_the_captured_one(original, tmp_path):
+    copy_store(open_store(original), tmp_path / "b.zarr", ("frames",))
+    copy_store(open_store(tmp_path / "b.zarr"), tmp_path / "c.zarr", ("objects",))
+    stores = [open_store(path) for path in (original, tmp_path / "b.zarr", tmp_path / "c.zarr")]
+    for captured, first, second in zip(*(store.episodes for store in stores), strict=True):
+        assert captured.seal.copied_from == ""
+        assert first.seal.copied_from == second.seal.copied_from == captured.seal.digest
+        assert len({captured.seal.run, first.seal.run, second.seal.run}) == 2  # frames are part of the recording
+
+
+def test_command_line(original, tmp_path, capsys):
+    assert analyze(["store", "copy", str(original), "--without", "frames"]) == 0
+    said = capsys.readouterr().out
+    assert "always copied" in said
+    assert "A copy without frames takes" in said
+    assert analyze(["store", "copy", str(original), str(tmp_path / "b.zarr"), "--without", "frames"]) == 0
+    assert "2 episodes added" in capsys.readouterr().out
+    (tmp_path / "file").touch()
+    for words, expected in (
+        ([str(original), str(tmp_path / "x.zarr"), "--without", "frame"], "Did you mean 'frames'?"),
+        ([str(original), str(tmp_path / "x")], "ends with '.zarr'"),
+        ([str(original), str(original)], "to itself"),
+        ([str(original), str(original / "episodes" / "x.zarr"), "--packed"], "it is inside of the store"),
+        ([str(original), str(original / "sub" / "more" / "x.zarr")], "it is inside of the store"),
+        ([str(original), str(tmp_path / "file" / "x.zarr")], "Cannot copy to"),
+        ([str(tmp_path / "none.zarr")], "There is no store at"),
+    ):
+        assert analyze(["store", "copy", *words]) == 2
+        said = capsys.readouterr().err
+        assert expected in said
+        assert said.count("\n") == 1
+    assert not (tmp_path / "x.zarr").exists()
+
+
+def smuggled(episode: Path) -> None:
+    (episode / "payload.sh").write_text("rm -rf ~")
+    reseal(episode)
+
+
+def linked_file(episode: Path) -> None:
+    (episode / "state/zarr.json").rename(episode.parents[2] / "elsewhere")
+    (episode / "state/zarr.json").symlink_to(episode.parents[2] / "elsewhere")
+
+
+def linked_folder(episode: Path) -> None:
+    (episode / "joint").rename(episode.parents[2] / "elsewhere")
+    (episode / "joint").symlink_to(episode.parents[2] / "elsewhere")
+
+
+def linked_episode(episode: Path) -> None:
+    episode.rename(episode.parents[2] / "elsewhere")
+    episode.symlink_to(episode.parents[2] / "elsewhere")
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("without", [(), ("frames",)])
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        (smuggled, r"has files that belong to no array: payload\.sh"),
+        (linked_file, r"its state/zarr\.json is a link"),
+        (linked_folder, "its joint is a link"),
+        (linked_episode, r"its \. is a link|task000_episode000"),
+    ],
+)
+def test_what_is_no_part_of_an_episode_is_refused(original, tmp_path, change, problem, without, packed):
+    path = tmp_path / "a.zarr"
+    shutil.copytree(original, path)
+    change(path / "episodes/task000_episode000")
+    with pytest.raises(StoreError, match=problem):
+        copy_store(open_store(path), tmp_path / "b.zarr", without, packed=packed)
+    assert not list((tmp_path / "b.zarr").rglob("*payload*"))
+    assert [episode.name for episode in open_store(tmp_path / "b.zarr").episodes] == []
+
+
+def edit(file: Path, change) -> None:
+    document = json.loads(file.read_text())
+    change(document)
+    file.write_text(json.dumps(document))
+
+
+@pytest.mark.filterwarnings("ignore:Ignored in")
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_copy_has_nothing_but_what_the_format_names(original, tmp_path, packed):
+    path = tmp_path / "a.zarr"
+    shutil.copytree(original, path)
+    episode = path / "episodes/task000_episode000"
+    (path / "notes.txt").write_text("mine")
+    (path / "episodes/a.png").write_text("mine")
+    (episode / ".DS_Store").write_text("mine")
+    (episode / "joint/rows/c.9").write_text("mine")
+    (episode / "link").symlink_to(path / "notes.txt")
+    for group in (path, path / "episodes", episode / "seal"):
+        edit(group / "zarr.json", lambda document: document.update(payload="rm -rf ~"))
+    copy_store(open_store(path), tmp_path / "b.zarr", (), packed=packed)
+    copy_store(open_store(original), tmp_path / "expected.zarr", (), packed=packed)
+    copied, expected = all_bytes(tmp_path / "b.zarr"), all_bytes(tmp_path / "expected.zarr")
+    assert set(copied) == set(expected)
+    assert not any(b"rm -rf" in content or content == b"mine" for content in copied.values())
+    assert verify_store(open_store(tmp_path / "b.zarr")) == []
