@@ -40,8 +40,9 @@ def report(question: Question, num_episodes: int = 2, num_replans: int = 8) -> l
         # What all of them say stands once.
         kept = [line for line in result.about if line not in said] if shown else result.about
         notes = [note for note in result.notes if note not in told]
-        told |= {*result.notes}
-        shown.append(replace(result, about=kept, notes=notes))
+        findings = [finding for finding in result.findings if finding.sentence not in told]
+        told |= {*result.notes, *(finding.sentence for finding in result.findings)}
+        shown.append(replace(result, about=kept, findings=findings, notes=notes))
     return shown
 
 

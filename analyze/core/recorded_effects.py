@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import polars as pl
@@ -25,7 +25,7 @@ from vla_attention.analyze.core.action_changes import (
     root_mean_square_change,
     units_of_recorded,
 )
-from vla_attention.analyze.core.axes import columns_of, with_families
+from vla_attention.analyze.core.axes import with_families
 from vla_attention.analyze.core.by_axes import weighted
 from vla_attention.analyze.core.contributions import joint_norm, selected_gram, whole_segments
 from vla_attention.analyze.core.estimate import Scale, estimate
@@ -34,13 +34,13 @@ from vla_attention.analyze.core.measure import Items, Measured, means, measure
 from vla_attention.analyze.measures.alignment import GRIPPER
 from vla_attention.analyze.measures.frames import EPISODE_ID, episode_columns
 from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
-from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_episode
+from vla_attention.analyze.measures.question import Question, select_again
+from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, resolve_episode, vocabulary_of
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.effects import CHANGE
-from vla_attention.schemas.errors import BadArgument, UnknownName, UserError
+from vla_attention.schemas.errors import BadArgument, UnknownName, UserError, plural
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import check_names
 from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
@@ -67,6 +67,9 @@ _VALUES: dict[str, Scale] = {
 }
 
 
+_Episode: TypeAlias = tuple[SelectedEpisode, Mapping[str, Any], Sequence[Measured]]
+
+
 @dataclass(frozen=True)
 class RecordedEffects:
     """The recorded effects of the selected episodes; frames are made of them when they are asked for.
@@ -74,13 +77,13 @@ class RecordedEffects:
     Attributes:
         question: stores and selection.
         spread: the units.
-        measured: of each episode itself, its arrays by entry, and its attention to the items.
-        notes: how far unchanged calls are from those that the robot executed.
+        measured: of each episode itself, its arrays by entry, and its attention to the items, site by site.
+        notes: how far unchanged calls are from those that the robot executed; items that are read at another site.
     """
 
     question: Question
     spread: ActionSpread
-    measured: Sequence[tuple[SelectedEpisode, Mapping[str, NDArray[Any]], Measured | None]]
+    measured: Sequence[_Episode]
     notes: tuple[str, ...]
 
     def rows(self) -> pl.LazyFrame:
@@ -111,10 +114,6 @@ class RecordedEffects:
         rows = rows.with_columns(noise=pl.when(pl.col("kind") != "noise").then("noise"))
         rows = rows.with_columns(minus_noise=pl.col("effect") - pl.col("noise"))
         return with_families(rows, self.question.sampling)
-
-    def summary(self, by: Collection[str] = ()) -> pl.DataFrame:
-        """`summary_of` the episodes, kept apart by the axes `by`."""
-        return summary_of(self.episodes(by), self.question.sampling, [column.name for column in columns_of(by)])
 
 
 def summary_of(episodes: pl.DataFrame, sampling: Sampling, looks: Sequence[str] = ()) -> pl.DataFrame:
@@ -161,19 +160,23 @@ def recorded_effects(
         raise BadArgument(_NOT_SHOWN.format(question.stores[0].path, "None was measured in a selected episode."))
     if spread is None:
         spread = units_of_recorded(*question.stores, skip_corrupt=question.settings.skip_corrupt)
-    here = replace(question, selected=tuple(having))
-    selectors = _selectors(here) if attention else ()
-    measured = measure(here, partial(_items, selectors=selectors), "effects") if selectors else None
-    each = partial(_arrays, spread=spread, site=question.site, selectors=selectors, selection=question.selection)
-    kept = OnDisk(each_episode(each, having))
+    places = _places(replace(question, selected=tuple(having))) if attention else []
+    measured = [measure(at, partial(_items, selectors=selectors), "effects") for at, selectors in places]
+    each = partial(_arrays, spread=spread, places=[(at.site, at.selection, selectors) for at, selectors in places])
+    kept = OnDisk(each_episode(each, zip(having, *(at.selected for at, _ in places), strict=True)))
 
-    def made(i: int) -> tuple[SelectedEpisode, Mapping[str, NDArray[Any]], Measured | None]:
-        return having[i], kept[i], None if measured is None else measured[i]
+    def made(i: int) -> _Episode:
+        return having[i], kept[i], [at_site[i] for at_site in measured]
 
+    elsewhere = [
+        f"Attention to {plural(len(selectors), 'item')} is of site '{at.site}', where the keys are."
+        for at, selectors in places
+        if at.site != question.site
+    ]
     episodes = MadeWhenAsked(made, range(len(having)))
-    found = RecordedEffects(question, spread, episodes, _drift(having, kept))
+    found = RecordedEffects(question, spread, episodes, (*_drift(having, kept), *elsewhere))
     if found.rows().head(1).collect().is_empty():
-        said = found.notes or ("None was measured in a selected replan.",)
+        said = _drift(having, kept) or ("None was measured in a selected replan.",)
         raise BadArgument(_NOT_SHOWN.format(question.stores[0].path, " ".join(said)))
     return found
 
@@ -232,8 +235,11 @@ def _reader_of(knockout: KeyKnockout) -> str:
     return "total" if knockout.queries == "all" else "direct"
 
 
-def _selectors(question: Question) -> tuple[str, ...]:
-    """The selectors of all items that have a name at the question's site."""
+def _places(question: Question) -> list[tuple[Question, tuple[str, ...]]]:
+    """The selectors of all items, each where it names keys: at the question's site, else at the next one that has them.
+
+    No other site is looked at where the user chose one.
+    """
     texts = dict.fromkeys(
         knockout.selector
         for item in question.selected
@@ -241,15 +247,35 @@ def _selectors(question: Question) -> tuple[str, ...]:
         for condition in effects.conditions
         for knockout in condition.keys
     )
-    layout = question.selected[0].tokens.layout
-    found = []
-    for text in texts:
+    sites = [site.name for site in question.stores[0].attributes.sites if site.name != question.site]
+    found, left = [], list(texts)
+    for site in [question.site, *(sites if question.settings.site is None else [])]:
         try:
-            check_names(_grouping((text,)), question.vocabulary, layout)
-        except (SelectorError, UnknownName):  # a site of pictures has no words: there is no attention to them there
+            at = question if site == question.site else _at_site(question, site)
+        except BadArgument:  # the chosen layers are none of that site's
             continue
-        found.append(text)
-    return tuple(found)
+        here = tuple(text for text in left if _has_name(at, text))
+        if here and sites:
+            keys = [resolve_episode(_grouping(here), item).num_keys for item in at.selected]
+            having = np.any([of_episode.any(axis=0) for of_episode in keys], axis=0)
+            here = tuple(text for text, has in zip(here, having, strict=True) if has)
+        if here:
+            found.append((at, here))
+            left = [text for text in left if text not in here]
+    return found
+
+
+def _at_site(question: Question, site: str) -> Question:
+    selected, selection = tuple(load_tokens(question.episodes, site)), select_again(question, site)
+    return replace(question, site=site, selected=selected, vocabulary=vocabulary_of(selected), selection=selection)
+
+
+def _has_name(question: Question, selector: str) -> bool:
+    try:
+        check_names(_grouping((selector,)), question.vocabulary, question.selected[0].tokens.layout)
+    except (SelectorError, UnknownName):  # a site of pictures has no words
+        return False
+    return True
 
 
 def _grouping(selectors: Sequence[str]) -> Grouping:
@@ -264,9 +290,13 @@ def _items(item: SelectedEpisode, selectors: Sequence[str]) -> Items:
 
 
 def _arrays(
-    item: SelectedEpisode, spread: ActionSpread, site: str, selectors: Sequence[str], selection: Selection
-) -> dict[str, NDArray[Any]]:
-    """By entry replan, condition, begin, end, changes (entry, change), gripper; norm (replan, selector)."""
+    items: Sequence[SelectedEpisode], spread: ActionSpread, places: Sequence[tuple[str, Selection, Sequence[str]]]
+) -> dict[str, Any]:
+    """By entry replan, condition, begin, end, changes (entry, change), gripper; norms (replan, selector) by place.
+
+    items: the episode, then with the tokens of each place's site.
+    """
+    item, *at_places = items
     effects, base = item.episode.attributes.effects, BaseEpisode.of(item)
     assert effects is not None
     replan = np.array(effects.replan, np.int64)
@@ -279,14 +309,6 @@ def _arrays(
         alone = root_mean_square_change(at.actions, at.actions + change, of_gripper, at.executed)
         gripper = alone / np.sqrt(spread.used.sum())
     edges = np.append(base.starts, base.num_steps) / base.num_steps
-    norm = np.full((len(base.starts), len(selectors)), np.nan)
-    if selectors and item.store.attributes.recording.contributions:
-        blocks = [i for i in range(len(selection.blocks)) if selection.is_first_of_block(i)]
-        gram = selected_gram(item, site, selection)[:, blocks]
-        parts = whole_segments(item, resolve_episode(_grouping(selectors), item), site)
-        for i in range(len(selectors)):
-            if f"item{i}" in parts:
-                norm[:, i] = joint_norm(gram, parts[f"item{i}"]).mean(axis=(1, 2))
     return {
         "replan": replan,
         "condition": np.array(effects.condition, np.int64),
@@ -295,11 +317,24 @@ def _arrays(
         "end": edges[1:][replan],
         "changes": changes_of(at, at.actions + change, spread),
         "gripper": gripper,
-        "norm": norm,
+        "norms": [_norms(one, *place) for one, place in zip(at_places, places, strict=True)],
     }
 
 
-def _rows(one: tuple[SelectedEpisode, Mapping[str, NDArray[Any]], Measured | None]) -> pl.DataFrame:
+def _norms(item: SelectedEpisode, site: str, selection: Selection, selectors: Sequence[str]) -> NDArray[np.float64]:
+    """Norms of the items' contributions, (replan, selector), means over layers and denoise steps; NaN where none is."""
+    norm = np.full((item.episode.attributes.num_replans, len(selectors)), np.nan)
+    if item.store.attributes.recording.contributions:
+        blocks = [i for i in range(len(selection.blocks)) if selection.is_first_of_block(i)]
+        gram = selected_gram(item, site, selection)[:, blocks]
+        parts = whole_segments(item, resolve_episode(_grouping(selectors), item), site)
+        for i in range(len(selectors)):
+            if f"item{i}" in parts:
+                norm[:, i] = joint_norm(gram, parts[f"item{i}"]).mean(axis=(1, 2))
+    return norm
+
+
+def _rows(one: _Episode) -> pl.DataFrame:
     """`RecordedEffects.rows` of one episode."""
     item, arrays, measured = one
     effects = item.episode.attributes.effects
@@ -312,17 +347,15 @@ def _rows(one: tuple[SelectedEpisode, Mapping[str, NDArray[Any]], Measured | Non
     place = {name: arrays[name] for name in ("replan", "env_step", "begin", "end")}
     values = {name: arrays["changes"][:, i] for i, name in enumerate(CHANGES)} | {"gripper_effect": arrays["gripper"]}
     rows = pl.DataFrame({**keys, **place, **conditions.to_dict(), **values}).filter(pl.col("kind") != "nothing")
-    if measured is None:
+    if not measured:
         return rows.with_columns(
             pl.col(values.keys()).fill_nan(None), *(pl.lit(None, pl.Float64).alias(name) for name in _ATTENTION)
         )
-    attention = means(measured, ("replan",)).with_columns(norm=arrays["norm"].ravel())
-    joined = rows.join(
-        attention.select("replan", "selector", *_ATTENTION),
-        on=["replan", "selector"],
-        how="left",
-        maintain_order="left",
+    attention = pl.concat(
+        means(at_site, ("replan",)).with_columns(norm=norm.ravel()).select("replan", "selector", *_ATTENTION)
+        for at_site, norm in zip(measured, arrays["norms"], strict=True)
     )
+    joined = rows.join(attention, on=["replan", "selector"], how="left", maintain_order="left")
     return joined.with_columns(pl.col(*values, *_ATTENTION).fill_nan(None))
 
 
@@ -350,7 +383,7 @@ def _means(rows: pl.DataFrame, cells: Sequence[str]) -> pl.DataFrame:
     )
 
 
-def _drift(having: Sequence[SelectedEpisode], kept: Sequence[Mapping[str, NDArray[Any]]]) -> tuple[str, ...]:
+def _drift(having: Sequence[SelectedEpisode], kept: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
     """How far calls without a change are from those that the robot executed, if rounding does not explain it."""
     most, where = 0.0, ""
     for item, arrays in zip(having, kept, strict=True):

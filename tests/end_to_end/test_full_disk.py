@@ -14,11 +14,10 @@ from typing import Any
 
 import pytest
 
-from tests.kit.site_stores import SiteStoreSpec, write_site_store
-from tests.kit.stores import StoreSpec, rerun_source, write_store
-from vla_attention.schemas.interventions import Interventions, NoiseChange
+from tests.kit.planted_effects import planted_effects
+from tests.kit.stores import StoreSpec, write_store
 
-SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, contributions=True)
+SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, contributions=True, plant_effects=planted_effects())
 OUT = ("--output", "OUT", "--no-cache")
 #: Commands that together write all kinds of files, in this process and in the second one.
 WRITING: dict[str, tuple[str, ...]] = {
@@ -26,7 +25,7 @@ WRITING: dict[str, tuple[str, ...]] = {
     "analyze, csv": ("analyze", "STORE", *OUT, "--no-plots", "--csv"),
     "words": ("words", "STORE", *OUT, "--task", "0"),
     "overlay": ("overlay", "STORE", *OUT, "--video", "gif"),
-    "effects": ("effects", "STORE", "RERUN", *OUT),
+    "effects": ("effects", "STORE", *OUT),
     "copy": ("store", "copy", "STORE", "OUT/copy.zarr"),
 }
 #: Bytes of the largest file.
@@ -65,7 +64,6 @@ def run(limit: int | None, jobs: Sequence[Sequence[str]], folder: Path) -> list[
 
 def words_of(name: str, store: Path, out: Path) -> list[str]:
     known = {"STORE": str(store), "OUT": str(out)}
-    known |= {"RERUN": str(store.with_name("rerun.zarr")), "DATA": str(store.with_name("data.zarr"))}
     known["OUT/copy.zarr"] = str(out / "copy.zarr")
     return [known.get(word, word) for word in WRITING[name]]
 
@@ -76,12 +74,9 @@ def files(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def stores(tmp_path_factory) -> tuple[Path, dict[str, dict[str, bytes]]]:
-    """A store, and the files that every command writes of it; beside it a rerun, and one of a data set."""
+    """A store, and the files that every command writes of it."""
     folder = tmp_path_factory.mktemp("stores")
     store = write_store(folder / "a.zarr", spec=SPEC)
-    noise = Interventions("noise", noise=NoiseChange(1))
-    write_store(folder / "rerun.zarr", spec=SPEC, rerun_of=rerun_source(store), interventions=noise)
-    write_site_store(folder / "data.zarr", SiteStoreSpec(dataset_actions=0.5, protocol="dataset"))
     outs = {name: folder / f"whole{number}" for number, name in enumerate(WRITING)}
     answers = run(None, [words_of(name, store, out) for name, out in outs.items()], folder)
     assert [(name, answer) for name, answer in zip(WRITING, answers, strict=True) if answer[0] != 0] == []

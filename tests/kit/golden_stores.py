@@ -49,7 +49,8 @@ def numbers_of(path: Path) -> dict[str, pl.DataFrame]:
         }
     if run.stores[0].attributes.recording.effects is not None:
         kept = ["task_id", "episode_index", "condition", "num_replans", "effect", "effect_chunk", "keys", "lift"]
-        tables["effects"] = run.effects()["effects_episodes"].select(kept)
+        rows = run.effects()["effects_episodes"].sort("task_id", "episode_index", "condition")
+        tables["effects"] = rows.select(kept)
     return {name: table for name, table in tables.items() if table.width}
 
 

@@ -24,7 +24,7 @@ from vla_attention.analyze.core.about import about, enough, notes
 from vla_attention.analyze.core.action_changes import ActionSpread
 from vla_attention.analyze.core.axes import check_axes, columns_of
 from vla_attention.analyze.core.estimate import Scale, estimate
-from vla_attention.analyze.core.recorded_effects import PICTURES, TEXT, RecordedEffects, recorded_effects
+from vla_attention.analyze.core.recorded_effects import PICTURES, TEXT, RecordedEffects, recorded_effects, summary_of
 from vla_attention.analyze.core.result import Figure, Finding, Result, Table
 from vla_attention.analyze.core.words_of_numbers import with_interval
 from vla_attention.analyze.measures.alignment import GRIPPER
@@ -75,7 +75,7 @@ def word_effects(question: Question) -> tuple[Finding, list[Table]]:
     if found is None:
         rerun = f"vla-attention capture rerun {shlex.quote(str(question.stores[0].path))} --effects text,cameras"
         return Finding("Not recorded: how the action changes without a word.", _DECIDE, next_step=rerun), []
-    items = with_untested(question, by_item(found.summary()))
+    items = with_untested(question, by_item(summary_of(found.episodes(), question.sampling)))
     table = items.filter(item_kind="word")
     columns = [column for column in columns_of_items(table) if column.name != "lift"]
     return deciding(table, found.spread), [Table("word_effects", table, columns, "What the action does without a word")]
@@ -83,12 +83,13 @@ def word_effects(question: Question) -> tuple[Finding, list[Table]]:
 
 def _recorded(found: RecordedEffects, by: Collection[str]) -> tuple[list[Finding], list[Table], list[Figure]]:
     """Findings, tables and figures of recorded effects."""
-    question, looks = found.question, columns_of(by)
-    summary = found.summary(by)
-    items = by_item(summary, [column.name for column in looks])
+    question, looks, episodes = found.question, columns_of(by), found.episodes(by)
+    names = [column.name for column in looks]
+    summary = summary_of(episodes, question.sampling, names)
+    items = by_item(summary, names)
     files = [
         Table("effects_summary", summary),
-        Table("effects_episodes", found.episodes(by).drop("square", "gripper_square")),
+        Table("effects_episodes", episodes.drop("square", "gripper_square")),
         Table("effects", found.rows()),
     ]
     shown = [*looks, *columns_of_items(items)]
@@ -97,7 +98,7 @@ def _recorded(found: RecordedEffects, by: Collection[str]) -> tuple[list[Finding
         return [Finding(said, "What does the action depend on?")], [Table("effects_items", items, shown), *files], []
     items = with_untested(question, items)
     words, others = items.filter(item_kind="word"), items.filter(pl.col("item_kind") != "word")
-    findings = [deciding(words, found.spread), *_sides(found, items), *_others(others), *_ways(words)]
+    findings = [deciding(words, found.spread), *_sides(question, episodes, items), *_others(others), *_ways(words)]
     findings += _unlike_attention(words)
     course = _over_time(found, items)
     tables = [Table("effects_items", items, shown, "Without it, the action changes by", rows=16), *files]
@@ -146,14 +147,14 @@ def _named(rows: pl.DataFrame, value: str = "effect") -> str:
     return listing([f"{item} ({size:.2g})" for item, size in rows.select("item", value).iter_rows()], _MOST_NAMED)
 
 
-def _sides(found: RecordedEffects, items: pl.DataFrame) -> list[Finding]:
+def _sides(question: Question, episodes: pl.DataFrame, items: pl.DataFrame) -> list[Finding]:
     """Without all pictures against without all text, in the episodes that have both."""
-    rows = found.episodes().filter(pl.col("item").is_in([PICTURES, TEXT]), kind="without", reader="total")
+    rows = episodes.filter(pl.col("item").is_in([PICTURES, TEXT]), kind="without", reader="total")
     both = rows.pivot("item", index=EPISODE_ID, values="effect").with_columns(side=pl.lit("pictures / text"))
     if not {PICTURES, TEXT} <= set(both.columns):
         return []
     sizes: dict[str, Scale] = {PICTURES: "positive", TEXT: "positive"}
-    row = estimate(both.drop_nulls(), ["side"], sizes, found.question.sampling, quotients={"ratio": (PICTURES, TEXT)})
+    row = estimate(both.drop_nulls(), ["side"], sizes, question.sampling, quotients={"ratio": (PICTURES, TEXT)})
     one = row.row(0, named=True)
     if one["ratio"] is None:
         return []
@@ -164,7 +165,7 @@ def _sides(found: RecordedEffects, items: pl.DataFrame) -> list[Finding]:
     mostly = items.filter(pl.col("item").is_in([PICTURES, TEXT]), pl.col("grip_part") >= _HALF)["item"].to_list()
     said += f" Without {mostly[0] if len(mostly) == 1 else 'either'} it is mostly the gripper." if mostly else ""
     numbers = {"estimate": one["ratio"], "low": one["ratio_low"], "high": one["ratio_high"], "n": one["num_episodes"]}
-    return [Finding(said, "Pictures or text?", numbers, enough(found.question))]
+    return [Finding(said, "Pictures or text?", numbers, enough(question))]
 
 
 def _others(items: pl.DataFrame) -> list[Finding]:

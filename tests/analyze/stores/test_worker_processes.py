@@ -10,7 +10,8 @@ from polars.testing import assert_frame_equal
 
 import vla_attention as va
 from tests.analyze.stores.episode_work import damaged, defect, killed_at_two, process_of, square
-from tests.kit.stores import write_store
+from tests.kit.planted_effects import planted_effects
+from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.stores.parallel import WorkersLost, each_episode, map_episodes, workers
 from vla_attention.schemas.errors import BadArgument
@@ -22,7 +23,8 @@ OWN, OTHERS = b"/a/", b"/b/"
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
-    return write_store(tmp_path_factory.mktemp("processes") / "a.zarr", episodes=3, contributions=True)
+    spec = StoreSpec(episodes=3, contributions=True, plant_effects=planted_effects())
+    return write_store(tmp_path_factory.mktemp("processes") / "a.zarr", spec=spec)
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +54,7 @@ def tables(path):
     yield run.analyze(without_sinks="")["sinks"]
     yield from (run.objects()[f"{table}_episodes"] for table in ("objects", "pointing", "iou"))
     yield run.analyze(by=("time",))["by"]
+    yield run.effects()["effects"]
 
 
 def test_every_question_has_the_same_answer_to_the_last_bit(store, monkeypatch):
