@@ -9,13 +9,23 @@ from typing import Any
 import polars as pl
 
 from vla_attention.analyze.commands.apart import kept_apart
+from vla_attention.analyze.commands.effects import word_effects
 from vla_attention.analyze.commands.holdings import holdings, overlaps_of
+from vla_attention.analyze.commands.language import listens
 from vla_attention.analyze.core.about import about, enough, notes, only, out_of
 from vla_attention.analyze.core.axes import COLUMNS, check_axes
+from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.contributions import Norms, group_norms, side_norms
 from vla_attention.analyze.core.levels import Levels, levels_of, overall, task_cells, task_groups
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
-from vla_attention.analyze.core.words_of_numbers import GROUP_COLUMNS, RATIO_COLUMNS, inverse, sides, with_interval
+from vla_attention.analyze.core.words_of_numbers import (
+    GROUP_COLUMNS,
+    NORM_COLUMNS,
+    RATIO_COLUMNS,
+    inverse,
+    sides,
+    with_interval,
+)
 from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.sinks import SinkRule, search_sinks
@@ -26,14 +36,6 @@ from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.groupings.builtin_groupings import find_grouping
 
 AVERAGE = pl.col("layer") == LAYERS_AVG
-_OF_NORMS = (
-    Column("layer", "text"),
-    Column("visual_norm", "number", "pictures", "length of the vector that the keys add to the residual stream"),
-    Column("linguistic_norm", "number", "text"),
-    Column("geometric_mean", "factor", "ratio"),
-    Column("uniform_ratio", "number", "if even", "the ratio if attention were shared out evenly between the segments"),
-    Column("ratio_lift", "factor", "over even", "ratio / ratio if even"),
-)
 _NUMBERS = ("geometric_mean", "geometric_mean_low", "geometric_mean_high", "uniform_ratio", "ratio_lift",
             "ratio_lift_low", "ratio_lift_high", "num_episodes", "num_tasks", "episodes_with_ratio",
             "tasks_with_ratio")  # fmt: skip
@@ -77,13 +79,16 @@ def analyze(
     has_ratio = question.grouping.ratio is not None
     part = only(question, episodes.filter(AVERAGE, pl.col("log_ratio_mean").is_finite())) if has_ratio else question
     norms, of_group_norms = side_norms(question), group_norms(question)
-    files = results_files(levels) if has_ratio and not _without_known_end(question) else {}
+    files = results_files(levels) if has_ratio and not question.of_other_loop else {}
     if save_viz:
         files |= evolution_files(levels)
     return Result(
         "Looks or reads?" if question.grouping.compares_modalities else "Where attention goes",
         about(question),
-        _of_ratio(question, part, rows, cell) if has_ratio else [_of_fractions(question, rows)],
+        [
+            *(_of_ratio(question, part, rows, cell) if has_ratio else [_of_fractions(question, rows)]),
+            *_of_words(question),
+        ],
         [
             *_shown_tables(question, tasks, groups, shown),
             *_tables_of_norms(question, norms, of_group_norms),
@@ -101,9 +106,12 @@ def analyze(
     )
 
 
-def _without_known_end(question: Question) -> bool:
-    """Whether episodes are of a loop that is not ours: nothing is known of their waiting steps, nor of their end."""
-    return any(store.attributes.protocol.of_other_loop for store in question.stores)
+def _of_words(question: Question) -> list[Finding]:
+    """Whether it listens, and which words decide, as `language` says it; of the question that is asked by default."""
+    if not question.grouping.compares_modalities or not question.vocabulary.words or question.of_other_loop:
+        return []
+    asked = with_choices(behaviour(question.episodes))
+    return [] if asked.is_empty() else [listens(asked), word_effects(question)[0]]
 
 
 def _shown_tables(question: Question, tasks: pl.DataFrame, groups: pl.DataFrame, shown: Collection[str]) -> list[Table]:
@@ -127,7 +135,7 @@ def _tables_of_norms(question: Question, norms: Norms | None, of_groups: Norms |
     tables = []
     if norms is not None:
         ratios = norms.ratios(question.sampling)
-        tables = [Table("contributions", ratios, _OF_NORMS, "What the tokens add", AVERAGE)]
+        tables = [Table("contributions", ratios, NORM_COLUMNS, "What the tokens add", AVERAGE)]
         tables.append(Table("contributions_steps", norms.cells()))
     if of_groups is not None:
         tables.append(Table("group_contributions", of_groups.norms()))
