@@ -53,6 +53,7 @@ def test_the_interval_over_tasks_is_by_families(store):
     assert row["geometric_mean_low"] == pytest.approx(np.exp(means.mean() - reach))
     assert row["geometric_mean_high"] == pytest.approx(np.exp(means.mean() + reach))
     assert (row["num_tasks"], row["num_families"], row["intervals"]) == (7, 4, "tasks-like-these")
+    assert "about 90%" in va.open(store).words().notes[0]  # of four families
 
 
 def test_of_fewer_than_four_families_the_interval_is_about_these_tasks(store, tmp_path, capsys):
