@@ -8,7 +8,7 @@ from typing import Any
 import polars as pl
 
 from vla_attention.analyze.commands.compare_tables import ALL, figures_of, tables_of
-from vla_attention.analyze.commands.language import listens, whatever
+from vla_attention.analyze.commands.language import SHOWN_AT, listens, whatever
 from vla_attention.analyze.core.about import UNTRAINED, notes, solved
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.compared import (
@@ -140,7 +140,7 @@ def _behaved(part: Compared, told_first: pl.DataFrame, told_other: pl.DataFrame)
     if not all("p" in numbers for numbers in heard):
         return [success]
     first, name = part.first.run.name, part.name
-    does = [float(str(numbers["p"])) <= NAMED_AT for numbers in heard]
+    does = [float(str(numbers["p"])) <= SHOWN_AT for numbers in heard]
     said = []
     for run, asked, numbers, hears in zip((first, name), (told_first, told_other), heard, does, strict=True):
         p = "p < 0.001" if float(str(numbers["p"])) < 0.001 else f"p = {numbers['p']:.2g}"

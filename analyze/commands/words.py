@@ -13,6 +13,7 @@ from vla_attention.analyze.core.measure import measure, table_of
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
 from vla_attention.analyze.core.word_items import LABELS, SCALE, items_of
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.groupings.vocabulary import NO_WORDS
 from vla_attention.schemas.layout import Role
@@ -24,8 +25,10 @@ _MOST_NAMED = 5
 LIFT = "attention to the word, over what it would get if attention were spread evenly over all tokens"
 
 
-def words(question: Question, by: Collection[str] = ()) -> Result:
+def words(question: Question, by: Collection[str] = (), named_at: float = NAMED_AT) -> Result:
     """Lift, mass and share of every word; which are read more, and which less, than evenly spread attention would.
+
+    named_at: words with at most this q are named; a screen that names other things too asks for less.
 
     Raises:
         BadArgument: the keys of the site spell no words.
@@ -53,7 +56,7 @@ def words(question: Question, by: Collection[str] = ()) -> Result:
     return Result(
         "Which words of the instruction are read",
         about(question),
-        [_finding(question, summary.filter(is_shown), by)],
+        [_finding(question, summary.filter(is_shown), by, named_at)],
         [
             Table("words", summary, columns, "Words of the instruction", is_shown),
             Table("words_scale", summary.filter(is_scale), columns, "For scale"),
@@ -102,7 +105,7 @@ def _columns(num_tasks: int) -> list[Column]:
     ]
 
 
-def _finding(question: Question, words: pl.DataFrame, by: Collection[str]) -> Finding:
+def _finding(question: Question, words: pl.DataFrame, by: Collection[str], named_at: float) -> Finding:
     """Which words get more, and which less, than evenly spread attention would give them."""
     effects = f"vla-attention effects {question.stores[0].path}"
     limit = "Being read is not deciding: a word that the pictures have read decides with hardly any attention."
@@ -111,7 +114,7 @@ def _finding(question: Question, words: pl.DataFrame, by: Collection[str]) -> Fi
         return Finding(
             f"Below, a row for each word and {' and '.join(by)}.", "Which words are read?", {}, limit, effects
         )
-    sure = words.filter(pl.col("lift_q") <= 0.05)
+    sure = words.filter(pl.col("lift_q") <= named_at)
     more = sure.filter(pl.col("lift") > 1).sort("lift", descending=True)
     less = sure.filter(pl.col("lift") < 1).sort("lift")
     said = [
