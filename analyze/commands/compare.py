@@ -207,7 +207,8 @@ def _attention(part: Compared) -> Finding:
         most = f"most in layer {top['layer']}, head {top['head']}: {100 * top['difference']:+.1f} points"
         said.append(f"{sure} of {plural(heads.height, 'head')} differ ({most})")
     against = f"{part.name} against {part.first.run.name}"
-    numbers = {kind: rows.filter(ALL, _SURE).height for kind, rows in part.rows.items() if kind != "effects"}
+    counted = {kind: part.rows[kind].filter(ALL) for kind in ("objects", "words", "heads") if kind in part.rows}
+    numbers = {kind: rows.filter(_SURE).height for kind, rows in {"groups": groups, **counted}.items()}
     limit = "Equal attention is not equal use: a word may change the action without more attention."
     return Finding(f"{against}: {'; '.join(said) if said else 'no difference is shown'}.", _ATTENTION, numbers, limit)
 
