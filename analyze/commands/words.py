@@ -14,7 +14,7 @@ from vla_attention.analyze.core.result import Column, Figure, Finding, Result, T
 from vla_attention.analyze.core.word_items import LABELS, SCALE, items_of
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
-from vla_attention.schemas.errors import BadArgument, plural
+from vla_attention.schemas.errors import BadArgument, listing, plural
 from vla_attention.schemas.groupings.vocabulary import NO_WORDS
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.safe_text import visible
@@ -130,6 +130,9 @@ def _finding(question: Question, words: pl.DataFrame, by: Collection[str], named
         )
         few = "" if tested else "One episode of a word has no interval: record more episodes. "
         return Finding(verdict, "Which words are read?", {"tested": tested}, f"{few}{limit}", effects)
+    few = sure.filter(pl.col("intervals") == "these-tasks")["item"].unique(maintain_order=True)
+    if question.units.estimand.of_other_tasks and len(few):
+        limit = f"Too few kinds of tasks have {listing(map(repr, few), 4)}: said of these tasks alone. {limit}"
     top = (more if more.height else less).row(0, named=True)
     numbers = {"word": top["item"], "estimate": top["lift"], "low": top["lift_low"], "high": top["lift_high"]}
     return Finding(f"{'; '.join(said)}.", "Which words are read?", {**numbers, "q": top["lift_q"]}, limit, effects)
