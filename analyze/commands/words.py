@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Collection
 
 import polars as pl
@@ -104,7 +105,11 @@ def _columns(num_tasks: int) -> list[Column]:
 
 def _finding(question: Question, words: pl.DataFrame, by: Collection[str]) -> Finding:
     """Which words get more, and which less, than evenly spread attention would give them."""
-    effects = f"vla-attention effects {question.stores[0].path}"
+    recorded = any(item.episode.attributes.effects is not None for item in question.selected)
+    path = shlex.quote(str(question.stores[0].path))
+    effects = (
+        f"vla-attention effects {path}" if recorded else f"vla-attention capture rerun {path} --effects text,cameras"
+    )
     limit = "Being read is not deciding: a word that the pictures have read decides with hardly any attention."
     limit = f"{enough(question)} {limit}".lstrip()
     if by:
