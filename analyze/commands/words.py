@@ -14,6 +14,7 @@ from vla_attention.analyze.core.measure import measure, table_of
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
 from vla_attention.analyze.core.word_items import LABELS, SCALE, items_of
 from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.groupings.vocabulary import NO_WORDS
 from vla_attention.schemas.layout import Role
@@ -116,7 +117,9 @@ def _finding(question: Question, words: pl.DataFrame, by: Collection[str]) -> Fi
         return Finding(
             f"Below, a row for each word and {' and '.join(by)}.", "Which words are read?", {}, limit, effects
         )
-    sure = words.filter(pl.col("lift_q") <= 0.05)
+    # What is shown of one task's words alone is no answer about a run of many.
+    alike = pl.col("intervals") == question.units.estimand.value
+    sure = words.filter(alike | (question.num_tasks == 1), pl.col("lift_q") <= NAMED_AT)
     more = sure.filter(pl.col("lift") > 1).sort("lift", descending=True)
     less = sure.filter(pl.col("lift") < 1).sort("lift")
     said = [
