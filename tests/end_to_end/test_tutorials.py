@@ -83,4 +83,4 @@ def test_commands_in_the_text_of_notebooks(tmp_path, monkeypatch, capsys, notebo
     monkeypatch.chdir(tmp_path)
     cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
     text = "\n\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown")
-    assert run_blocks(text, notebook.name) == (5 if notebook.stem == "interventions" else 0)
+    assert run_blocks(text, notebook.name) == (4 if notebook.stem == "interventions" else 0)
