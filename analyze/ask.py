@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_attention.analyze.options import (
+    INSTEAD,
     add_output,
     add_question,
     results_folder,
@@ -38,6 +39,7 @@ def question_parser(name: str) -> OneSentenceParser:
         parser.add_argument("runs", nargs="+", metavar="RUN", help=runs)
     else:
         parser.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses")
+    parser.instead = INSTEAD
     add_question(parser, command.options)
     add_output(parser, name, command.page)
     return parser

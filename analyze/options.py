@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,12 +80,23 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "open": {"action": "store_true", "help": "show the page in the browser"},
     "list": {"action": "store_true", "help": "what the stores hold, and what the grouping takes of it"},
 }  # fmt: skip
+#: What people type who know other programs, and the published scripts -> what it is called here.
+INSTEAD = {
+    "--output": "--output FOLDER says where the files go.",
+    "-o": "--output FOLDER says where the files go.",
+    "--plot": "Pictures are drawn unless --no-plots is given.",
+    "--plots": "Pictures are drawn unless --no-plots is given.",
+    "--format": "Tables are Parquet files; with --csv they are CSV files.",
+}
+_PAGES = {".html", ".htm"}
+#: Endings of files, which no folder of results has.
+_FILES = _PAGES | {".csv", ".json", ".parquet", ".png", ".pdf", ".svg", ".txt", ".md", ".tex", ".gif", ".mp4"}
 #: Settings whose option has another name.
 _OPTION_OF = {"groups": "group"}
 
 
 def output_place(text: str) -> Path:
-    """The type of `--output`: a folder that is in no store. It is looked at before hours of reading."""
+    """The type of a path that is in no store. It is looked at before hours of reading."""
     from vla_attention.schemas.stores.store_place import refuse_in_store
 
     try:
@@ -92,6 +104,17 @@ def output_place(text: str) -> Path:
     except BadArgument as error:
         raise argparse.ArgumentTypeError(str(error).removesuffix(".")) from None
     return Path(text)
+
+
+def results_place(text: str, page: bool = False) -> Path:
+    """The type of `--output`: a folder, or for a page a file that ends with .html."""
+    path = output_place(text)
+    if path.suffix.lower() in _FILES - (_PAGES if page else set()) and not path.is_dir():
+        expected = (
+            "a folder, or a file FILE.html" if page else "a folder, in which result.json, tables and pictures are"
+        )
+        raise argparse.ArgumentTypeError(f"{text} is called like a file of another kind; expected {expected}")
+    return path
 
 
 def add_workers(parser: argparse.ArgumentParser) -> None:
@@ -116,10 +139,10 @@ def add_output(parser: argparse.ArgumentParser, command: str, page: bool = False
     """--output; of a question, whose answer is no page, also --csv, --no-plots, --pdf and --style."""
     if page:
         where = f"folder, or a file FILE.html (default: results/PATH OF STORE/{command})"
-        parser.add_argument("--output", type=output_place, metavar="PATH", help=where)
+        parser.add_argument("--output", type=partial(results_place, page=True), metavar="PATH", help=where)
         return
     parser.add_argument(
-        "--output", type=output_place, metavar="FOLDER", help=f"folder (default: results/PATH OF STORE/{command})"
+        "--output", type=results_place, metavar="FOLDER", help=f"folder (default: results/PATH OF STORE/{command})"
     )
     parser.add_argument("--csv", action="store_true", help="tables as CSV instead of Parquet")
     pictures = parser.add_mutually_exclusive_group()

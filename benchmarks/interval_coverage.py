@@ -3,6 +3,7 @@
     python benchmarks/interval_coverage.py                # 2000 simulated stores of every size, some minutes
     python benchmarks/interval_coverage.py --on-disk 20   # and 20 stores that are written to disk and read back
     python benchmarks/interval_coverage.py --only families
+    python benchmarks/interval_coverage.py --only remedies            # what might be done about skewed deviations
     python benchmarks/interval_coverage.py --store runs/cubes.zarr    # how related the tasks of a store are
 
 The mean log ratios of tasks are drawn from a population with standard deviation `between`. Episodes differ from their
@@ -38,6 +39,7 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import vla_attention as va
+from vla_attention.analyze.statistics.family_errors import family_error
 from vla_attention.analyze.statistics.intervals import (
     POSITIVE,
     EpisodeStatistic,
@@ -48,6 +50,7 @@ from vla_attention.analyze.statistics.intervals import (
 from vla_attention.analyze.statistics.student import student_quantile
 from vla_attention.analyze.statistics.units import Estimand, Units
 
+Values = NDArray[np.float64]
 POPULATION = np.log(5.0)
 NUM_REPLANS = 8
 
@@ -109,6 +112,11 @@ FAMILIES = (
 )
 #: Intraclass correlations of tasks in families; the last one is about that of the suite `cubes`.
 CORRELATIONS = (0.0, 0.5, 0.95)
+#: How deviations are distributed (skewness 0, 2 and 6.2), what is tried about it, and draws of the bootstrap.
+SHAPES = ("normal", "exponential", "log-normal")
+REMEDIES = ("today", "one less", "Johnson", "Hall", "bootstrap-t")
+DRAWS = 399
+OF_REMEDIES = ("5 of 4", "cubes: 6+3+3+3+2", "6 of 3", "10 of 3", "12+6+4+2+2 + 5 of 1")
 #: Standard deviation of tasks, and of episodes in a task; episodes per task.
 OF_TASKS, OF_EPISODES, EPISODES = 0.3, 0.1, 2
 #: Tasks x episodes of the paired comparisons; the true difference is `EFFECT` and differs between tasks by `SPREAD`.
@@ -209,6 +217,95 @@ def print_families(num_stores: int, seed: int) -> None:
                     f"{100 * by_task:5.1f}   {wide:8.2f} {narrow:5.2f}",
                     flush=True,
                 )
+
+
+def remedies(
+    sizes: tuple[int, ...], correlation: float, shape: str, num_stores: int, seed: int
+) -> dict[str, tuple[float, float]]:
+    """Coverage in % of what may be done about skewed deviations, and the median width over that of today's interval.
+
+    As `with_families`, with one mean a task instead of episodes. With S_g the sum of a family's tasks and G families:
+
+        today          t with the degrees of freedom of Satterthwaite
+        one less       the same with one degree of freedom less, at least one
+        Johnson, Hall  today's, from a t that is corrected for the third moment of the S_g: Johnson 1978 (Journal of the
+                       American Statistical Association 73), and the cubic transformation of Hall 1992 (Journal of the
+                       Royal Statistical Society B 54), both inverted
+        bootstrap-t    families drawn with replacement, `DRAWS` times (Efron & Tibshirani 1993, chapter 12; Hall 1988)
+    """
+    generator = np.random.default_rng([seed, len(sizes), sum(sizes), int(100 * correlation), SHAPES.index(shape)])
+    size = np.array(sizes, dtype=np.float64)
+    families, num_families = np.repeat(np.arange(len(sizes)), sizes), len(sizes)
+    own = np.sqrt(1 - correlation) * shaped((num_stores, len(families)), shape, generator)
+    shared = np.sqrt(correlation) * shaped((num_stores, num_families), shape, generator)
+    values = own + shared[:, families]  # (store, task); the truth is 0
+    sums = values @ (families[:, None] == np.arange(num_families))
+    mean = values.mean(axis=1)
+    variance, degrees = family_error(values - mean[:, None], np.ones_like(values, bool), families, 2)
+    error = np.sqrt(variance)
+
+    def quantile(less: float) -> NDArray[np.float64]:
+        return np.array([student_quantile(0.95, max(1.0, one - less)) for one in degrees])
+
+    today = quantile(0.0) * error
+    bounds = {"today": (mean - today, mean + today)}
+    wider = quantile(1.0) * error
+    bounds["one less"] = mean - wider, mean + wider
+    apart = sums - size * mean[:, None]
+    skewness = (apart**3).mean(axis=1) / ((apart**2).mean(axis=1)) ** 1.5
+    root = np.sqrt(num_families)
+    moved = skewness * error / root * (1 / 6 + (quantile(0.0) ** 2) / 3)
+    bounds["Johnson"] = mean + moved - today, mean + moved + today
+    ends = []
+    for sign in (1.0, -1.0):
+        x, a = sign * quantile(0.0), skewness / root
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = 3 * (np.cbrt(1 + a * (x - a / 6)) - 1) / a
+        ends.append(mean - np.where(np.abs(a) < 1e-9, x, t) * error)
+    bounds["Hall"] = np.minimum(*ends), np.maximum(*ends)
+    drawn = generator.integers(0, num_families, (DRAWS, num_families))
+    of_draw = np.stack([_student_of_draws(one, size, drawn) for one in sums - size * mean[:, None]])
+    low, high = np.quantile(of_draw, (0.025, 0.975), axis=1)
+    bounds["bootstrap-t"] = mean - high * error, mean - low * error
+    width = 2 * today
+    return {
+        name: (100 * float(((low <= 0) & (high >= 0)).mean()), float(np.median((high - low) / width)))
+        for name, (low, high) in bounds.items()
+    }
+
+
+def _student_of_draws(apart: Values, size: Values, drawn: NDArray[np.int64]) -> Values:
+    """Student's t of every draw of families (draw, family), of the sums of their deviations (family,)."""
+    sums, sizes = apart[drawn], size[drawn]
+    num_tasks = sizes.sum(axis=1, keepdims=True)
+    mean = sums.sum(axis=1, keepdims=True) / num_tasks
+    with np.errstate(divide="ignore", invalid="ignore"):
+        variance = ((sums - sizes * mean) ** 2 / (num_tasks * (num_tasks - sizes))).sum(axis=1)
+        t = mean[:, 0] / np.sqrt(variance)
+    return np.where(np.isnan(t), 0.0, t)
+
+
+def shaped(shape: tuple[int, ...], kind: str, generator: np.random.Generator) -> Values:
+    """Independent values with mean 0 and standard deviation 1."""
+    if kind == "log-normal":
+        made = np.exp(generator.normal(size=shape))
+        return (made - np.exp(0.5)) / np.sqrt((np.e - 1) * np.e)
+    return deviations(shape, kind == "exponential", generator)
+
+
+def print_remedies(num_stores: int, seed: int) -> None:
+    """The table of remedies."""
+    print("\nWhat may be done about few families of skewed deviations: coverage in %, and width / today's width\n")
+    print(f"| families | deviations | intraclass correlation | {' | '.join(REMEDIES)} |")
+    print("|---|---|---|" + "---|" * len(REMEDIES))
+    for name, sizes in FAMILIES:
+        if name not in OF_REMEDIES:
+            continue
+        for shape in SHAPES:
+            for correlation in (0.0, 0.95):
+                found = remedies(sizes, correlation, shape, num_stores, seed)
+                cells = [f"{found[one][0]:.1f} ({found[one][1]:.2f})" for one in REMEDIES]
+                print(f"| {name} | {shape} | {correlation} | {' | '.join(cells)} |", flush=True)
 
 
 def intraclass_correlation(values: NDArray[np.float64], families: NDArray[np.intp]) -> float:
@@ -317,7 +414,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Coverage and power of the intervals of nominal 95 %.")
     parser.add_argument("--stores", type=int, default=2000, help="simulated stores of every size (default: 2000)")
     parser.add_argument("--on-disk", type=int, default=0, metavar="N", help="also N stores of 10 x 5 through files")
-    parser.add_argument("--only", choices=("tasks", "families"), help="one of the two tables (default: everything)")
+    parser.add_argument("--only", choices=("tasks", "families", "remedies"), help="one of the tables (default: all)")
     parser.add_argument("--store", type=Path, help="instead: the intraclass correlation and the intervals of a store")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
@@ -326,6 +423,9 @@ def main() -> None:
         return
     if arguments.only == "families":
         print_families(arguments.stores, arguments.seed)
+        return
+    if arguments.only == "remedies":
+        print_remedies(arguments.stores, arguments.seed)
         return
     error = 100 * np.sqrt(0.95 * 0.05 / max(1, arguments.stores))
     print(f"Coverage in % of intervals of nominal 95 %, {arguments.stores} stores of each size, error {error:.1f}.")

@@ -105,7 +105,7 @@ SPEC = StoreSpec(
 
 
 def names_something(kind: str, number: int, planted: bool, folder: Path) -> bool:
-    """Whether the sentences about one store, or about two, name something; read from their numbers."""
+    """Whether a sentence of the first screen about one store, or about two, names something; read from its numbers."""
     spec = replace(SPEC, frames=False, coverage=kind in ("objects", "compare"), mantissa_bits=23, seed=number)
     paths = []
     for run in range(2 if kind == "compare" else 1):
@@ -118,9 +118,11 @@ def names_something(kind: str, number: int, planted: bool, folder: Path) -> bool
         q = store.objects(iou=False).findings[0].numbers["over_place_q"]
         return q is not None and float(q) <= LEVEL
     if kind == "analyze":
-        row = store.analyze()["tasks"].filter(scope="all", layer="layers_avg").row(0, named=True)
-        return not row["ratio_lift_low"] <= 1 <= row["ratio_lift_high"]
-    return any(store.compare(paths[1]).findings[-1].numbers.values())
+        numbers = store.analyze().findings[0].numbers
+        return not float(numbers["ratio_lift_low"]) <= 1 <= float(numbers["ratio_lift_high"])
+    *behaved, attention = (finding.numbers for finding in store.compare(paths[1]).findings)
+    tests = [float(p) for numbers in behaved for name, p in numbers.items() if name.split("_")[0] == "p"]
+    return min(tests, default=1.0) <= LEVEL or any(attention.values())
 
 
 def says_it_listens(sets: int, planted: bool) -> float:
@@ -144,9 +146,8 @@ def says_it_listens(sets: int, planted: bool) -> float:
             if planted and generator.random() < FACTOR / 2:
                 moments[told] = 1
             rollouts.append((told, moments))
-        said += listens(with_choices(did(rollouts, goals, "touch cube N"))).sentence.startswith(
-            ("It listens", "It did")
-        )
+        p = listens(with_choices(did(rollouts, goals, "touch cube N"))).numbers.get("p")
+        said += p is not None and float(p) <= LEVEL
     return said / sets
 
 

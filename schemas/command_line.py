@@ -7,12 +7,12 @@ import os
 import sys
 import textwrap
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from vla_attention.schemas.errors import Note, UserError
+from vla_attention.schemas.errors import Note, UserError, did_you_mean
 from vla_attention.schemas.safe_text import visible, visible_output
 from vla_attention.schemas.stop_signals import run_until_stopped
 
@@ -28,8 +28,8 @@ _MOST_OPTIONS = 6
 _MOST_EXAMPLES = 3
 _MAIN_OPTIONS = {
     *("--checkpoint", "--task-suite", "--task", "--num-episodes", "--effects", "--knockout", "--series", "--policy"),
-    *("--layers", "--grouping", "--group", "--ratio", "--episode", "--reruns", "--open", "--video", "--accept"),
-    *("--csv", "--parquet", "--netcdf", "--table", "--output", "--resume", "--budget", "--repair", "--packed"),
+    *("--layers", "--grouping", "--group", "--ratio", "--episode", "--open", "--video", "--accept"),
+    *("--csv", "--output", "--resume", "--budget", "--repair", "--packed"),
     *("--without", "--help-all"),
 }
 
@@ -52,6 +52,8 @@ class OneSentenceParser(argparse.ArgumentParser):
     """An argument parser whose mistakes read like all the others, and whose help fits a screen."""
 
     shows_all = False
+    #: The beginning of an option that other programs have -> what to type here.
+    instead: Mapping[str, str] = {}
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -81,6 +83,26 @@ class OneSentenceParser(argparse.ArgumentParser):
             for one, text in zip(rest, kept, strict=True):
                 one.help = text
 
+    def parse_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
+        """Parse; a word that nothing takes ends with what to type instead, where that is known."""
+        given = sys.argv[1:] if args is None else list(args)
+        parsed, unknown = self.parse_known_args(given, namespace)
+        if unknown:
+            self._refuse(unknown[0].split("=")[0], given)
+        return parsed
+
+    def _refuse(self, word: str, given: Sequence[str]) -> NoReturn:
+        """End with a word that nothing takes."""
+        if not word.startswith("-"):
+            self.error(f"'{visible(word)}' is more than is expected")
+        said = [text for typed, text in self.instead.items() if word == typed or word.startswith(f"{typed}-")]
+        known = list(self._option_string_actions)
+        for action in self._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                known += [option for name in given for option in _options_of(action.choices.get(name))]
+        near = f" {said[0]}" if said else did_you_mean(word, known)
+        self.exit(2, f"{self.prog}: There is no option '{visible(word)}'.{near} See {self.prog} --help.\n")
+
     def error(self, message: str) -> NoReturn:
         """Print the problem and where help is; exit code 2."""
         self.exit(2, f"{self.prog}: {message}. See {self.prog} --help.\n")
@@ -93,6 +115,10 @@ class OneSentenceParser(argparse.ArgumentParser):
             sys.stdout.flush()
         else:
             super()._print_message(message, file)
+
+
+def _options_of(parser: argparse.ArgumentParser | None) -> list[str]:
+    return [] if parser is None else list(parser._option_string_actions)
 
 
 def _first_examples(epilog: str | None) -> str | None:

@@ -30,7 +30,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LEFT_OUT = shutil.ignore_patterns(
     ".git", ".venv*", ".*_cache", ".hypothesis", "__pycache__", "runs", "results", "site", "node_modules", "*.egg-info"
 )
-MEASURES, GOLDEN, STORE = "tests/analyze/measures", "tests/test_golden_tables.py", "tests/capture/store"
+CORE, GOLDEN, STORE = "tests/analyze/core", "tests/test_golden_tables.py", "tests/capture/store"
 
 
 @dataclass(frozen=True)
@@ -46,11 +46,11 @@ class Fault:
 
 FAULTS = (
     Fault(
-        "wrong axis: fractions over layers instead of groups",
-        "analyze/measures/masses.py",
-        "fraction = mass / mass.sum(axis=-1, keepdims=True)",
-        "fraction = mass / mass.sum(axis=-2, keepdims=True)",
-        (MEASURES,),
+        "wrong whole: a fraction is of all valid keys instead of the groups",
+        "analyze/core/measure.py",
+        "share = np.where(whole > 0, mass / whole, np.nan)",
+        "share = np.where(whole > 0, mass / valid, np.nan)",
+        (CORE, GOLDEN),
     ),
     Fault(
         "span off by one: a camera without its last patch",
@@ -61,10 +61,10 @@ FAULTS = (
     ),
     Fault(
         "visual and linguistic swapped",
-        "analyze/measures/masses.py",
-        "for side in (grouping.ratio.numerator, grouping.ratio.denominator)",
-        "for side in (grouping.ratio.denominator, grouping.ratio.numerator)",
-        (MEASURES,),
+        "analyze/core/levels.py",
+        "zip(SIDES, (grouping.ratio.numerator, grouping.ratio.denominator), strict=True)",
+        "zip(SIDES, (grouping.ratio.denominator, grouping.ratio.numerator), strict=True)",
+        (CORE, GOLDEN),
     ),
     Fault(
         "wrong layer numbers: call 25 is block 6",
@@ -104,9 +104,9 @@ FAULTS = (
     Fault(
         "wrong weight of denoise steps: the last one alone",
         "analyze/core/measure.py",
-        "        values = values.mean(axis=averaged, keepdims=True)\n",
-        "        values = values[:, :, -1:].mean(axis=averaged, keepdims=True)\n",
-        ("tests/analyze/core", GOLDEN),
+        "values = values.mean(axis=averaged, keepdims=True)",
+        'values = (values if "denoise" in by else values[:, :, -1:]).mean(axis=averaged, keepdims=True)',
+        (CORE, GOLDEN),
     ),
     Fault(
         "wrong degrees of freedom: families less one",
@@ -162,7 +162,7 @@ FAULTS = (
         "analyze/stores/selection.py",
         'if words is None or list(words) == ["all"]:',
         "if words is None or len(words) > 0:",
-        ("tests/analyze/stores", MEASURES),
+        ("tests/analyze/stores", CORE),
     ),
     Fault(
         "wrong seed: the same noise at every replan",
@@ -183,7 +183,7 @@ FAULTS = (
         "schemas/groupings/key_counts.py",
         "number = seen.sum(axis=-1, keepdims=True)",
         "number = np.full((*seen.shape[:-1], 1), seen.shape[-1])",
-        ("tests/schemas", MEASURES),
+        ("tests/schemas", CORE),
     ),
     Fault(
         "prompt of another row of the batch",

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 import shlex
 from collections.abc import Iterator
 from importlib import import_module
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -103,6 +105,20 @@ def test_the_parsers_take_every_command_line(document):
             given = given[given[0] in COMMANDS :]
             parser = build_analyze_parser(name)
         parser.parse_args(given)  # a mistake ends it with a sentence and 2
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_examples_of_every_help_text_parse(name):
+    """Behind an example may stand what it does, after two spaces or more."""
+    parser = build_analyze_parser(name)
+    acts = [action.choices.values() for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    texts = [one.epilog or "" for one in (parser, *chain.from_iterable(acts))]
+    lines = [line.strip() for text in texts for line in text.splitlines() if line.startswith("  vla-attention ")]
+    assert lines
+    for line in lines:
+        program, command, *given = shlex.split(re.split(r"\s{2,}| > ", line)[0])
+        assert (program, command) == ("vla-attention", name)
+        parser.parse_args(given)
 
 
 def test_the_questions_of_the_readme_run(tmp_path, monkeypatch):

@@ -9,33 +9,36 @@ from typing import Any
 import polars as pl
 
 from vla_attention.analyze.commands.apart import kept_apart
-from vla_attention.analyze.commands.holdings import holdings
-from vla_attention.analyze.core.about import about, enough, notes
+from vla_attention.analyze.commands.effects import word_effects
+from vla_attention.analyze.commands.holdings import holdings, overlaps_of
+from vla_attention.analyze.commands.language import listens
+from vla_attention.analyze.core.about import about, enough, notes, only, out_of
 from vla_attention.analyze.core.axes import COLUMNS, check_axes
+from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.contributions import Norms, group_norms, side_norms
 from vla_attention.analyze.core.levels import Levels, levels_of, overall, task_cells, task_groups
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
-from vla_attention.analyze.core.words_of_numbers import GROUP_COLUMNS, RATIO_COLUMNS, inverse, sides, with_interval
+from vla_attention.analyze.core.words_of_numbers import (
+    GROUP_COLUMNS,
+    NORM_COLUMNS,
+    RATIO_COLUMNS,
+    inverse,
+    sides,
+    with_interval,
+)
 from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.sinks import SinkRule, search_sinks
 from vla_attention.analyze.measures.sinks import without_sinks as take_out
 from vla_attention.analyze.published.plot_evolution import evolution_files
 from vla_attention.analyze.published.results_writer import results_files
-from vla_attention.schemas.errors import plural
+from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.groupings.builtin_groupings import find_grouping
 
 AVERAGE = pl.col("layer") == LAYERS_AVG
-_OF_NORMS = (
-    Column("layer", "text"),
-    Column("visual_norm", "number", "pictures", "length of the vector that the keys add to the residual stream"),
-    Column("linguistic_norm", "number", "text"),
-    Column("geometric_mean", "factor", "ratio"),
-    Column("uniform_ratio", "number", "if even", "the ratio if attention were shared out evenly between the segments"),
-    Column("ratio_lift", "factor", "over even", "ratio / ratio if even"),
-)
 _NUMBERS = ("geometric_mean", "geometric_mean_low", "geometric_mean_high", "uniform_ratio", "ratio_lift",
-            "ratio_lift_low", "ratio_lift_high", "num_episodes", "num_tasks")  # fmt: skip
+            "ratio_lift_low", "ratio_lift_high", "num_episodes", "num_tasks", "episodes_with_ratio",
+            "tasks_with_ratio")  # fmt: skip
 
 
 def analyze(
@@ -74,14 +77,18 @@ def analyze(
     shown = [name for name in question.grouping.names if rows[name]["keys"] or rows[name]["mass"]]
     cell = overall(tasks).filter(AVERAGE).row(0, named=True)
     has_ratio = question.grouping.ratio is not None
+    part = only(question, episodes.filter(AVERAGE, pl.col("log_ratio_mean").is_finite())) if has_ratio else question
     norms, of_group_norms = side_norms(question), group_norms(question)
-    files = results_files(levels) if has_ratio and not _without_known_end(question) else {}
+    files = results_files(levels) if has_ratio and not question.of_other_loop else {}
     if save_viz:
         files |= evolution_files(levels)
     return Result(
         "Looks or reads?" if question.grouping.compares_modalities else "Where attention goes",
         about(question),
-        _of_ratio(question, rows, cell) if has_ratio else [_of_fractions(question, rows)],
+        [
+            *(_of_ratio(question, part, rows, cell) if has_ratio else [_of_fractions(question, rows)]),
+            *_of_words(question),
+        ],
         [
             *_shown_tables(question, tasks, groups, shown),
             *_tables_of_norms(question, norms, of_group_norms),
@@ -94,14 +101,17 @@ def analyze(
             *sinks,
         ],
         _figures(levels, tasks, groups, episodes, shown),
-        [*notes(question), *_notes(levels, cell)],
+        [*notes(part), *_notes(levels, cell)],
         files,
     )
 
 
-def _without_known_end(question: Question) -> bool:
-    """Whether episodes are of a loop that is not ours: nothing is known of their waiting steps, nor of their end."""
-    return any(store.attributes.protocol.of_other_loop for store in question.stores)
+def _of_words(question: Question) -> list[Finding]:
+    """Whether it listens, and which words decide, as `language` says it; of the question that is asked by default."""
+    if not question.grouping.compares_modalities or not question.vocabulary.words or question.of_other_loop:
+        return []
+    asked = with_choices(behaviour(question.episodes))
+    return [] if asked.is_empty() else [listens(asked), word_effects(question)[0]]
 
 
 def _shown_tables(question: Question, tasks: pl.DataFrame, groups: pl.DataFrame, shown: Collection[str]) -> list[Table]:
@@ -125,7 +135,7 @@ def _tables_of_norms(question: Question, norms: Norms | None, of_groups: Norms |
     tables = []
     if norms is not None:
         ratios = norms.ratios(question.sampling)
-        tables = [Table("contributions", ratios, _OF_NORMS, "What the tokens add", AVERAGE)]
+        tables = [Table("contributions", ratios, NORM_COLUMNS, "What the tokens add", AVERAGE)]
         tables.append(Table("contributions_steps", norms.cells()))
     if of_groups is not None:
         tables.append(Table("group_contributions", of_groups.norms()))
@@ -143,8 +153,13 @@ def _of_fractions(question: Question, rows: Mapping[str, Mapping[str, Any]]) -> 
     return Finding(f"Of the attention: {said}{more}.", "Where does attention go?", numbers, enough(question))
 
 
-def _of_ratio(question: Question, rows: Mapping[str, Mapping[str, Any]], cell: Mapping[str, Any]) -> list[Finding]:
-    """How attention is divided between both sides, and token by token; then the ratio itself."""
+def _of_ratio(
+    question: Question, part: Question, rows: Mapping[str, Mapping[str, Any]], cell: Mapping[str, Any]
+) -> list[Finding]:
+    """How attention is divided between both sides, and token by token; then the ratio itself.
+
+    part: the episodes in which both sides get attention; of the others there is no ratio.
+    """
     grouping, compares = question.grouping, question.grouping.compares_modalities
     above, below = ("the pictures", "the text") if compares else map(" + ".join, sides(grouping))
     shares = [sum(rows[name]["fraction"] or 0.0 for name in side) for side in sides(grouping)]
@@ -153,14 +168,14 @@ def _of_ratio(question: Question, rows: Mapping[str, Mapping[str, Any]], cell: M
     numbers = {"numerator_fraction": shares[0], "denominator_fraction": shares[1]} | {
         name: cell[name] for name in _NUMBERS
     }
-    limit = enough(question)
+    limit, some = enough(part), out_of(part, question)
     if cell["geometric_mean"] is None:
-        return [Finding(f"{sentence} In no episode do both get some: there is no ratio.", asks, numbers, limit)]
-    if cell["episodes_with_ratio"] < cell["num_episodes"]:
-        some = f"{cell['episodes_with_ratio']} of {plural(cell['num_episodes'], 'episode')}"
-        some += f" ({cell['tasks_with_ratio']} of {plural(cell['num_tasks'], 'task')})"
-        limit = f"The ratio is of {some}: in the others one side got no attention. {limit}".rstrip()
-    ratio = f"The ratio of {above} to {below} is {with_interval(cell, 'geometric_mean')}"
+        none = f"In none of {plural(len(question.selected), 'episode')} do both get some: there is no ratio."
+        return [Finding(f"{sentence} {none}", asks, numbers, enough(question))]
+    if some:
+        sentence += f" Both get some in {some}; what follows is of these."
+    ratio = f"The ratio of {above} to {below}{f' in {some}' if some else ''} is "
+    ratio += with_interval(cell, "geometric_mean")
     if cell["ratio_lift"] is None or cell["uniform_ratio"] is None:
         return [Finding(f"{sentence} {ratio}.", asks, numbers, limit)]
     even = f"attention spread evenly over all tokens would give {cell['uniform_ratio']:.3g}"
@@ -192,8 +207,9 @@ def _notes(levels: Levels, cell: Mapping[str, Any]) -> list[str]:
     grouping = levels.grouping
     named = bool(levels.question.settings.grouping not in (None, "default") and grouping.description)
     said = [f"Grouping '{grouping.name}': {grouping.description}."] if named else []
-    if levels.grouping.overlap:
-        said.append("The groups overlap: a token that two of them share counts in both.")
+    shared = overlaps_of(levels.question).select("group", "other", "keys_max").iter_rows()
+    if pairs := [f"{group} and {other} share {keys:.3g} tokens" for group, other, keys in shared]:
+        said.append(f"{listing(pairs, 4)}: these count in both groups, and twice in a side of the ratio with both.")
     if levels.grouping.ratio is not None and cell["num_nonfinite"]:
         which = f"{cell['num_nonfinite']} of {plural(cell['num_replans'], 'policy call')}"
         said.append(f"The ratio of {which} is infinite or undefined, and in no mean of ratios; the tables count them.")

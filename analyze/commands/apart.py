@@ -7,13 +7,14 @@ from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.core.about import about, enough, notes
+from vla_attention.analyze.core.about import about, enough, notes, only, out_of
 from vla_attention.analyze.core.axes import columns_of, with_families
 from vla_attention.analyze.core.by_axes import groups_by, ratios_by
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.levels import Levels
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
 from vla_attention.analyze.core.words_of_numbers import GROUP_COLUMNS, RATIO_COLUMNS, sides, with_interval
+from vla_attention.analyze.measures.question import Question
 from vla_attention.schemas.errors import plural
 
 _RATIOS: dict[str, Scale] = {"ratio": "geometric", "uniform_ratio": "geometric", "ratio_lift": "geometric",
@@ -41,19 +42,20 @@ def kept_apart(levels: Levels, by: Collection[str], more: Sequence[Table] = ()) 
     axes = [axis for axis in by if axis != "camera"]
     columns = columns_of(axes)
     order = [*(["layer_number", "block"] if "layer" in axes else []), *(column.name for column in columns)]
-    title, tables = f"By {' and '.join(by)}", []
+    title, tables, part = f"By {' and '.join(by)}", [], question
     if levels.grouping.ratio is not None:
         rows = with_families(ratios_by(levels, axes), sampling)
         quotients = {"ratio_of_means": ("numerator_mass", "denominator_mass")}
         ratios = estimate(rows, order, _RATIOS, sampling, {"ratio_lift": 1.0}, quotients=quotients)
-        counts = rows.group_by(order).agg(pl.col("num_nonfinite").sum())
+        counts = rows.group_by(order).agg(pl.col("num_nonfinite").sum(), episodes_with_ratio=pl.col("ratio").count())
+        part = only(question, rows.drop_nulls("ratio"))
         ratios = ratios.join(counts, on=order, how="left", nulls_equal=True, maintain_order="left")
         shown = (
             *columns,
             Column("ratio", "factor", "ratio", RATIO_COLUMNS[0].meaning),
             *RATIO_COLUMNS[1:],
             Column("ratio_lift_q", "p", "q", "p of no difference per token, adjusted for the number of rows"),
-            Column("num_episodes", "count", "episodes"),
+            Column("episodes_with_ratio", "count", "episodes"),
         )
         tables.append(Table("by", ratios.sort(order, nulls_last=True), shown, title, rows=24))
     rows = with_families(groups_by(levels, axes), sampling)
@@ -66,10 +68,10 @@ def kept_apart(levels: Levels, by: Collection[str], more: Sequence[Table] = ()) 
     return Result(
         f"Where attention goes, by {' and '.join(by)}",
         about(question),
-        [_finding(levels, [*tables, of_groups], columns, by)],
+        [_finding(levels, part, [*tables, of_groups], columns, by)],
         [*tables, of_groups, *_steps(levels), *more],
         _figures(levels, [*tables, of_groups], axes),
-        notes(question),
+        notes(part),
     )
 
 
@@ -80,9 +82,14 @@ def _steps(levels: Levels) -> list[Table]:
     return [Table("steps", levels.steps()), Table("steps_groups", levels.steps_groups())]
 
 
-def _finding(levels: Levels, tables: Sequence[Table], columns: Sequence[Column], by: Collection[str]) -> Finding:
-    """From which cell to which the ratio runs, or the group of each cell with the highest lift."""
-    limit, first = enough(levels.question), tables[0].shown
+def _finding(
+    levels: Levels, part: Question, tables: Sequence[Table], columns: Sequence[Column], by: Collection[str]
+) -> Finding:
+    """From which cell to which the ratio runs, or the group of each cell with the highest lift.
+
+    part: the episodes that have a ratio in a cell.
+    """
+    limit, first, some = enough(part), tables[0].shown, out_of(part, levels.question)
     if tables[0].name == "by":
         known = first.filter(pl.col("ratio").is_not_null()).sort("ratio")
         if known.height < 2:
@@ -91,8 +98,9 @@ def _finding(levels: Levels, tables: Sequence[Table], columns: Sequence[Column],
         low, high = (f"{with_interval(row, 'ratio')} ({_cell(row, columns)})" for row in ends)
         side = " / ".join("+".join(part) for part in sides(levels.grouping))
         numbers = {"lowest": ends[0]["ratio"], "highest": ends[1]["ratio"], "rows": known.height}
+        where = f" in {some}, the others have none," if some else ""
         return Finding(
-            f"The ratio {side} runs from {low} to {high}.", "Where does it look, where read?", numbers, limit
+            f"The ratio {side}{where} runs from {low} to {high}.", "Where does it look, where read?", numbers, limit
         )
     top = first.sort("lift", descending=True, nulls_last=True).row(0, named=True)
     where = f" ({_cell(top, columns)})" if columns else ""

@@ -32,11 +32,12 @@ from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.safe_text import visible
 
-_BETTER, _LISTEN, _MOVED, _ATTENTION = (
-    "Which does better?", "Do they listen?", "How far do the actions move?", "And the attention?",
+_BETTER, _LISTEN, _MOVED, _NEEDS, _ATTENTION = (
+    "Which does better?", "Do they listen?", "How far do the actions move?", "What do the actions depend on?",
+    "And the attention?",
 )  # fmt: skip
-#: Differences of four kinds are named: groups, objects, words and heads.
-_SURE = pl.col("difference_q") <= NAMED_AT / 4
+#: Differences of five kinds are named: effects, groups, objects, words and heads.
+_SURE = pl.col("difference_q") <= NAMED_AT / 5
 #: So many differences of a kind are named.
 _MOST_NAMED = 3
 
@@ -62,13 +63,17 @@ def compare(runs: Sequence[Run], allow_mismatch: Collection[str] = ()) -> Result
     for part in parts:
         if not part.other.run.repeats(first):
             findings += _behaved(part, told[first.name], told[part.name])
-        findings.append(_attention(part))
+        findings += [*_needs(part), _attention(part)]
     about = [f"{run.name}: {_outcome(run, first)}." for run in runs]
     about += dict.fromkeys(line for run in runs for line in run_notes(run.question.episodes))
     about += [UNTRAINED] if any(run.question.untrained for run in runs) else []
     beside = dict.fromkeys(line for run in runs for line in notes(run.question) if line not in about)
     of_pairs = [_pairing(part, "seed" in allow_mismatch) for part in parts]
-    of_pairs += [line for run in others if run.repeats(first) for line in _not_compared(first, run)]
+    of_pairs += [
+        f"Only one of {first.name} and {run.name} holds the {listing(missing)}: not compared."
+        for run in others
+        if run.repeats(first) and (missing := held_by_one(first.stores, run.stores))
+    ]
     cells, groups = by_themselves(base, rest, sampling)
     columns = [column for column in _RUNS if column.name in cells.columns]
     whole = (pl.col("layer") == LAYERS_AVG) & (pl.col("scope") != "task")
@@ -102,21 +107,6 @@ def _pairing(part: Compared, any_seed: bool) -> str:
         named = [f"task {task} episode {episode}" for _, task, episode in rows.select(EPISODE_ID).iter_rows()]
         text += f" {plural(rows.height, 'episode')} of {run} without a partner: {listing(named, 4)}."
     return text
-
-
-def _not_compared(first: Run, rerun: Run) -> list[str]:
-    """What only one of a run and its rerun holds of a call, and what was therefore not held against the other."""
-    names = {episode.name: (store, episode) for store in first.stores for episode in store.episodes}
-    missing = {
-        name: None
-        for store in rerun.stores
-        for episode in store.episodes
-        if episode.name in names
-        for name in held_by_one(*names[episode.name], store, episode)
-    }
-    if not missing:
-        return []
-    return [f"Only one of {first.name} and {rerun.name} holds the {listing(missing)}: these were not compared."]
 
 
 def _how_far(first: Run, reruns: Sequence[Run], sampling: Sampling) -> tuple[list[Finding], list[Table]]:
@@ -187,6 +177,21 @@ def _success(part: Compared) -> Finding:
     return Finding(said, _BETTER, {"won": won, "lost": lost, "n": n, "p": p}, limit)
 
 
+def _needs(part: Compared) -> list[Finding]:
+    """The items without which, or with which exchanged, the action changes more or less than in the first run."""
+    if "effects" not in part.rows:
+        return []
+    rows = part.rows["effects"].filter(ALL, reader="total")
+    said = [
+        f"{2.0 ** row['mean_other']:.2g} standard deviations {'with' if row['item_kind'] == 'exchange' else 'without'} "
+        f"{row['item']} (against {2.0 ** row['mean_first']:.2g})"
+        for row in _largest(rows).iter_rows(named=True)
+    ]
+    numbers = {"items": rows.height, "shown": rows.filter(_SURE).height}
+    text = f"the action moves by {', '.join(said)}" if said else "no item's effect is shown to differ"
+    return [Finding(f"{part.name} against {part.first.run.name}: {text}.", _NEEDS, numbers)]
+
+
 def _attention(part: Compared) -> Finding:
     """The groups, words and heads whose attention is shown to differ, the largest differences first."""
     groups = _overall(part).filter(pl.col("quantity") != "success")
@@ -202,7 +207,7 @@ def _attention(part: Compared) -> Finding:
         most = f"most in layer {top['layer']}, head {top['head']}: {100 * top['difference']:+.1f} points"
         said.append(f"{sure} of {plural(heads.height, 'head')} differ ({most})")
     against = f"{part.name} against {part.first.run.name}"
-    numbers = {kind: rows.filter(ALL, _SURE).height for kind, rows in part.rows.items()}
+    numbers = {kind: rows.filter(ALL, _SURE).height for kind, rows in part.rows.items() if kind != "effects"}
     limit = "Equal attention is not equal use: a word may change the action without more attention."
     return Finding(f"{against}: {'; '.join(said) if said else 'no difference is shown'}.", _ATTENTION, numbers, limit)
 

@@ -21,7 +21,7 @@ def tables_of(parts: Sequence[Compared], told: Mapping[str, pl.DataFrame]) -> li
     """What was told and done; differences of groups, words, heads, layers and tasks; then single pairs."""
     several = [Column("run", "text")] if len(parts) > 1 else []
     names = {"first": parts[0].first.run.name, "other": parts[0].name if len(parts) == 1 else "other"}
-    did, both = ([_named_after(column, names) for column in columns] for columns in (_DID, _BOTH))
+    did, both, times = ([_named_after(column, names) for column in columns] for columns in (_DID, _BOTH, _TIMES))
     behaved = [rows for part in parts if (rows := side_by_side(part, told)) is not None]
     found = [Table("behaviour", pl.concat(behaved), [*several, *did], "Told and did", rows=6)] if behaved else []
     rows_of = {kind: [_of_run(part, part.rows[kind]) for part in parts if kind in part.rows] for kind in KINDS}
@@ -31,7 +31,10 @@ def tables_of(parts: Sequence[Compared], told: Mapping[str, pl.DataFrame]) -> li
     for kind, columns, title in _EACH:
         if kind in each:
             rows = each[kind].sort(pl.col("difference").abs(), descending=True, nulls_last=True, maintain_order=True)
-            found.append(Table(kind, rows, [*several, *columns, *both], title, ALL, rows=5))
+            is_log = kind in _LOGARITHMS
+            rows, shown_values = (as_factors(rows), times) if is_log else (rows, both)
+            where = ALL & (pl.col("reader") == "total") if kind == "effects" else ALL
+            found.append(Table(kind, rows, [*several, *columns, *shown_values], title, where, rows=5))
     shown = ALL & average & (pl.col("quantity") != "success")
     # Behind objects and words, before the heads.
     at = len(found) - ("heads" in each)
@@ -68,16 +71,16 @@ def figures_of(part: Compared, told: Mapping[str, pl.DataFrame]) -> list[Figure]
     layer = pl.when(pl.col("layer") == LAYERS_AVG).then(pl.lit("all layers")).otherwise(pl.format("layer {}", "layer"))
     of_layers = groups.filter(quantity=main).with_columns(layer)
     if main == "log2_ratio":
-        title, looks = "The ratio", _TIMES | {"xlabel": "times the ratio (logarithmic)"}
-        of_layers = _as_factors(of_layers)
+        title, looks = "The ratio", _FACTORS | {"xlabel": "times the ratio (logarithmic)"}
+        of_layers = as_factors(of_layers)
     else:
-        title, looks = main.removesuffix("_fraction"), _POINTS
+        title, looks = main.removesuffix("_fraction"), _LOOK
     title = f"{title} by layer, {name} against {first}"
     found.append(Figure(f"layers_{name}", "forest", of_layers, title, _BARS, {**looks, "label": "layer"}))
     if "words" in part.rows:
-        looks = {**_TIMES, "label": "item", "xlabel": "times the attention (logarithmic)"}
+        looks = {**_FACTORS, "label": "item", "xlabel": "times the attention (logarithmic)"}
         title = f"Attention to words, {name} against {first}"
-        words = _as_factors(part.rows["words"].filter(ALL))
+        words = as_factors(part.rows["words"].filter(ALL))
         found.append(Figure(f"words_{name}", "forest", words, title, _BARS, looks))
     if part.pairs.height:
         items, rows = strip_of_pair(part, told[first], told[name])
@@ -87,14 +90,16 @@ def figures_of(part: Compared, told: Mapping[str, pl.DataFrame]) -> list[Figure]
     return found
 
 
-def _as_factors(rows: pl.DataFrame) -> pl.DataFrame:
-    """Differences of logarithms to base 2 as factors."""
-    ends = ("difference", "difference_low", "difference_high")
-    return rows.with_columns((2.0 ** pl.col(end)).alias(end) for end in ends)
+def as_factors(rows: pl.DataFrame) -> pl.DataFrame:
+    """Values and differences of logarithms to base 2 as what they are of, and as factors `times`."""
+    found = rows.with_columns((2.0 ** pl.col(name)).alias(name) for name in ("mean_first", "mean_other"))
+    ends = {f"difference{end}": f"times{end}" for end in ("", "_low", "_high")}
+    found = found.with_columns((2.0 ** pl.col(name)).alias(name) for name in ends)
+    return found.rename({**ends, "difference_q": "times_q"})
 
 
-_POINTS = {"value": "difference", "baseline": 0.0, "baseline_name": "the same", "xlabel": "difference of the shares"}
-_TIMES = {**_POINTS, "baseline": 1.0, "log": True}
+_LOOK = {"value": "difference", "baseline": 0.0, "baseline_name": "the same", "xlabel": "difference of the shares"}
+_FACTORS = {**_LOOK, "value": "times", "baseline": 1.0, "log": True}
 _BARS = "Points: means over episodes, every task weighing the same; bars: 95% intervals."
 _DID = [
     Column("told", "text"),
@@ -111,9 +116,22 @@ _BOTH = [
     Column("difference_q", "p", "q", "p of no difference, adjusted for the number of rows (Benjamini-Hochberg)"),
     Column("num_first", "count", "n", "pairs of episodes, or episodes of the first run"),
 ]
+_TIMES = [
+    *_BOTH[:2],
+    Column("times", "factor", "times as much"),
+    Column("times_q", "p", "q", "p of as much, adjusted for the number of rows (Benjamini-Hochberg)"),
+    _BOTH[-1],
+]
+#: Kinds whose values are logarithms.
+_LOGARITHMS = ("effects", "objects", "words")
 _WORD, _LAYER, _HEAD = Column("item", "text", "word"), Column("layer", "count"), Column("head", "count")
 _EACH = (
-    ("objects", [Column("item", "text", "object")], "Objects: log2 of their attention over that of their area"),
-    ("words", [_WORD], "Words: log2 of their attention over evenly spread"),
+    (
+        "effects",
+        [Column("item", "text", "without, or changed")],
+        "How far the action moves, in standard deviations",
+    ),
+    ("objects", [Column("item", "text", "object")], "Attention to objects, over that of their area"),
+    ("words", [_WORD], "Attention to words, evenly spread = 1"),
     ("heads", [_LAYER, _HEAD], "Heads: their attention on the first side of the ratio"),
 )

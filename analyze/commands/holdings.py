@@ -61,7 +61,8 @@ def holdings(question: Question) -> Result:
     whole = _with_untaken(grouping)
     resolved = [resolve(whole, item.tokens) for item in question.selected]
     names = [UNTAKEN if name == _UNTAKEN_GROUP else name for name in whole.names]
-    groups, words, overlaps = _groups(question, names, resolved), _words(question, names, resolved), _overlaps(question)
+    groups, words = _groups(question, names, resolved), _words(question, names, resolved)
+    overlaps = overlaps_of(question)
     selectors = pl.DataFrame(
         [(name, " | ".join(parts)) for name, parts in grouping.groups.items()],
         schema={"group": pl.String, "selector": pl.String}, orient="row",
@@ -162,7 +163,8 @@ def _words(question: Question, names: Sequence[str], resolved: Sequence[Resolved
     return pl.DataFrame(rows, schema=_WORDS, orient="row")
 
 
-def _overlaps(question: Question) -> pl.DataFrame:
+def overlaps_of(question: Question) -> pl.DataFrame:
+    """Pairs of groups that share keys, and how many at a policy call."""
     if not question.grouping.overlap:
         return pl.DataFrame(schema=_OVERLAPS)
     counts = []

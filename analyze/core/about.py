@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
+import polars as pl
+
+from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.task_families import units_of, unknown_families
 from vla_attention.analyze.statistics.units import FEWEST_FAMILIES
@@ -52,6 +56,21 @@ def notes(question: Question) -> list[str]:
         *([f"Of site '{question.site}' only; {listing(others)} are softmaxes of their own: choose by --site, and never "
            "divide a mass of one by a mass of another."] if others else []),
     ]  # fmt: skip
+
+
+def only(question: Question, episodes: pl.DataFrame) -> Question:
+    """The question about the episodes in a table, by `EPISODE_ID`; about all where the table is empty."""
+    wanted = set(episodes.select(EPISODE_ID).iter_rows())
+    left = [item for item in question.selected if (*item.task, item.episode.attributes.episode_index) in wanted]
+    return replace(question, selected=tuple(left) or question.selected)
+
+
+def out_of(part: Question, question: Question) -> str:
+    """`2 of 6 episodes (1 of 3 tasks)`; empty where the part is all."""
+    if len(part.selected) == len(question.selected):
+        return ""
+    episodes, tasks = plural(len(question.selected), "episode"), plural(question.num_tasks, "task")
+    return f"{len(part.selected)} of {episodes} ({part.num_tasks} of {tasks})"
 
 
 def without_a_side(root: RootAttributes, site: str) -> str:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import polars as pl
 
+from vla_attention.analyze.core.action_changes import units_of_recorded
 from vla_attention.analyze.core.courses import PICTURES
 from vla_attention.analyze.core.differences import (
     alone,
@@ -28,11 +29,13 @@ from vla_attention.analyze.core.object_shares import (
     object_episodes,
     with_coverage,
 )
+from vla_attention.analyze.core.recorded_effects import recorded_effects
 from vla_attention.analyze.core.runs import Run
 from vla_attention.analyze.core.word_items import items_of
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.statistics.episode_intervals import Sampling
+from vla_attention.schemas.errors import BadArgument
 
 #: What is compared -> the columns that name an item of it, and inside of which looks are counted.
 KINDS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -40,6 +43,7 @@ KINDS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "heads": (("layer", "head"), ()),
     "words": (("item",), ()),
     "objects": (("kind", "item"), ("kind",)),
+    "effects": (("item_kind", "item", "reader"), ("reader",)),
 }
 
 
@@ -141,6 +145,9 @@ def compared(first: RunValues, other: RunValues, sampling: Sampling) -> Compared
             {**side, "groups": groups.filter(pl.col("quantity") != "success")}
             for side, groups in zip(sides, of_groups, strict=True)
         ]
+    if (effects := _effects(first.run, other.run)) is not None:
+        for side, of_side in zip(sides, effects, strict=True):
+            side["effects"] = of_side
     rows, values = {}, {}
     for kind, (item, looks) in KINDS.items():
         if not all(kind in side for side in sides):
@@ -152,6 +159,38 @@ def compared(first: RunValues, other: RunValues, sampling: Sampling) -> Compared
             episodes = first.episodes, other.episodes
             rows[kind] = differences_unpaired(sides[0][kind], sides[1][kind], episodes, item, sampling, looks)
     return Compared(first, other, pairs, rows, values)
+
+
+def _effects(first: Run, other: Run) -> tuple[pl.DataFrame, pl.DataFrame] | None:
+    """log2 of the recorded effects of both runs on their actions; None where one recorded none.
+
+    Each is in units of its own run's actions, over the dimensions that both compare.
+    """
+    if not all(store.attributes.recording.effects is not None for run in (first, other) for store in run.stores):
+        return None
+    questions = [run.question for run in (first, other)]
+    try:
+        units = [units_of_recorded(*one.stores, skip_corrupt=one.settings.skip_corrupt) for one in questions]
+        used = units[0].used & units[1].used
+        found = [
+            recorded_effects(one, attention=False, spread=replace(unit, used=used))
+            for one, unit in zip(questions, units, strict=True)
+        ]
+    except BadArgument:  # the question `effects` says why none is shown
+        return None
+    tables = []
+    for one in found:
+        assert one is not None
+        rows = one.episodes().filter(pl.col("kind").is_in(["without", "prompt", "image"]))
+        rows = rows.with_columns(pl.col("reader").fill_null("total"))
+        # An episode has few words to exchange: all together they say what none of them shows.
+        exchanged = rows.filter(kind="prompt", reader="total").group_by(EPISODE_ID).agg(pl.mean("effect"))
+        exchanged = exchanged.with_columns(
+            item_kind=pl.lit("exchange"), item=pl.lit("any word exchanged"), reader=pl.lit("total")
+        )
+        rows = pl.concat([exchanged, rows.filter(pl.col("reader").is_in(["total", "direct"]))], how="diagonal")
+        tables.append(rows.select(*EPISODE_ID, "item_kind", "item", "reader", value=pl.col("effect").log(2.0)))
+    return tables[0], tables[1]
 
 
 def strip_of_pair(

@@ -91,8 +91,15 @@ def check_same_calls(base: Store, episode: StoredEpisode, rerun: Store, own: Sto
         )
 
 
-def held_by_one(base: Store, episode: StoredEpisode, rerun: Store, own: StoredEpisode) -> list[str]:
-    """The inputs that only one of the two episodes holds, and which are therefore not compared."""
+def held_by_one(bases: Sequence[Store], reruns: Sequence[Store]) -> list[str]:
+    """The inputs that only one of a run and its rerun holds, and which are therefore not compared."""
+    known = {(store.suite, episode.name): (store, episode) for store in bases for episode in store.episodes}
+    pairs = [(known.get((store.suite, one.name)), (store, one)) for store in reruns for one in store.episodes]
+    found = [name for base, own in pairs if base is not None for name in _held_by_one(*base, *own)]
+    return list(dict.fromkeys(found))
+
+
+def _held_by_one(base: Store, episode: StoredEpisode, rerun: Store, own: StoredEpisode) -> list[str]:
     free, names = Changed.between(base, rerun), {*_inputs(episode), *_inputs(own)}
     return [
         _called(name, "s") for name in sorted(names) if episode.has(name) != own.has(name) and not free.is_free(name)

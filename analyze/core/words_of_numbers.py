@@ -21,6 +21,14 @@ RATIO_COLUMNS = (
     Column("uniform_ratio", "number", "if even", "the ratio if attention were spread evenly over all tokens"),
     Column("ratio_lift", "factor", "per token", "ratio / ratio if even"),
 )
+NORM_COLUMNS = (
+    Column("layer", "text"),
+    Column("visual_norm", "number", "pictures", "length of the vector that the keys add to the residual stream"),
+    Column("linguistic_norm", "number", "text"),
+    Column("geometric_mean", "factor", "ratio"),
+    Column("uniform_ratio", "number", "if even", "the ratio if attention were shared out evenly between the segments"),
+    Column("ratio_lift", "factor", "over even", "ratio / ratio if even"),
+)
 
 
 def sides(grouping: Grouping) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -95,6 +95,11 @@ class Question:
         return len({item.task for item in self.selected})
 
     @property
+    def of_other_loop(self) -> bool:
+        """Whether episodes are of a loop that is not ours: of their waiting steps and their end nothing is known."""
+        return any(store.attributes.protocol.of_other_loop for store in self.stores)
+
+    @property
     def untrained(self) -> bool:
         """Whether a store's policy has random weights."""
         return any(store.attributes.policy.untrained for store in self.stores)

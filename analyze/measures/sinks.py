@@ -398,8 +398,8 @@ def describe_sinks(sinks: pl.DataFrame, num_tasks: int, rule: SinkRule, num_vali
     also = ""
     if left:
         also = (
-            f" Sinks of fewer heads stay in: {plural(left, 'key')}, counted in every task by itself (a smaller "
-            "--sink-heads takes them out too)."
+            f" Sinks of fewer heads stay in: {plural(left, 'key')}, counted in every task by itself (a rule "
+            "with a smaller `heads` takes them out too)."
         )
     of_rule = f"{rule}, in at least {rule.heads:.0%} of the layers' heads"
     also += f" {cannot_fire(num_valid, rule)}".rstrip()

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Answer(Result):
     """A `Result` that shows itself: `print(answer)`, the last line of a notebook's cell, `.plot()`, `.save(folder)`."""
 
@@ -28,6 +28,9 @@ class Answer(Result):
 
     def __str__(self) -> str:
         return screen(self)
+
+    #: At Python's prompt too: what it holds would fill many screens.
+    __repr__ = __str__
 
     def _repr_html_(self) -> str:
         from vla_attention.analyze.render.page import fragment

@@ -134,12 +134,12 @@ def site_that(root: RootAttributes, wanted: str | None, fits: Callable[[SiteLayo
 
 
 def parse_denoise_steps(words: Sequence[str] | None, recorded: Sequence[int]) -> tuple[int, ...]:
-    """Read `--denoise`: numbers of recorded denoise steps, `first`, `last` or `all`."""
+    """Read `--denoise`: numbers of recorded denoise steps, `first`, `last` or `all`; also with commas."""
     if words is None or list(words) == ["all"]:
         return tuple(recorded)
     named = {"first": min(recorded), "last": max(recorded)}
     steps = []
-    for word in words:
+    for word in (part.strip() for given in words for part in given.split(",") if part.strip()):
         if word in named:
             steps.append(named[word])
         elif word.isdigit() and int(word) in recorded:
@@ -163,7 +163,10 @@ def task_numbers(store: Store, tasks: Sequence[int | str]) -> tuple[int, ...]:
 def select_episodes(store: Store, tasks: Sequence[int | str] | None) -> tuple[StoredEpisode, ...]:
     """The store's episodes of the wanted tasks, in order; an empty selection is an error."""
     if not store.episodes:
-        raise StoreError(f"The store {store.path} holds no complete episode yet; let vla-capture finish one.")
+        raise StoreError(
+            f"The store {store.path} holds no complete episode yet: vla-attention capture status {store.path} "
+            "says what is being written, and the command that makes it goes on with --resume."
+        )
     if tasks is None:
         return store.episodes
     numbers = task_numbers(store, tasks)

@@ -33,6 +33,10 @@ from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
 _GROUP_FIELDS = {"attributes", "zarr_format", "node_type", "consolidated_metadata"}
 
 
+#: What to do without a store.
+_MAKE_ONE = "Make one: vla-attention capture pi --output NAME.zarr; vla-attention example copies small ones."
+
+
 def read_root(path: StorePlace) -> RootAttributes:
     """The attributes of the store at `path`; raises as `read_run` does."""
     return read_run(path)[0]
@@ -47,11 +51,9 @@ def read_run(path: StorePlace) -> tuple[RootAttributes, str]:
         FormatTooNew: a later version wrote it.
     """
     if isinstance(path, Path) and not path.exists():
-        nearby = sorted(str(store) for store in path.parent.glob("*.zarr")) if path.parent.is_dir() else []
-        raise StoreNotFound(
-            f"There is no store at {path}.{did_you_mean(str(path), nearby)} "
-            f"Stores in {path.parent}: {listing(nearby, 5)}. Make one with vla-capture."
-        )
+        nearby = [str(store) for store in _stores_in(path.parent)]
+        there = f"Stores in {path.parent}: {listing(nearby, 5)}. " if nearby else ""
+        raise StoreNotFound(f"There is no store at {path}.{did_you_mean(str(path), nearby)} {there}{_MAKE_ONE}")
     try:
         attributes = group_attributes(source_of(path).whole("zarr.json", most=ROOT_BYTES))
     except (RemoteFailure, BadArgument):
@@ -62,9 +64,9 @@ def read_run(path: StorePlace) -> tuple[RootAttributes, str]:
                 f"There is no store at {path}: no zarr.json was found there. Give the address of the NAME.zarr itself; "
                 "private places need the credentials of their service in the environment."
             ) from None
-        inside = sorted(entry.name for entry in path.iterdir() if entry.suffix == ".zarr") if path.is_dir() else []
-        held = f" The folder holds the stores {listing(inside, 10)}: name one, or several." if inside else ""
-        raise StoreError(f"{path} is not a store: it has no zarr.json.{held}") from None
+        inside = [store.name for store in _stores_in(path)]
+        held = f"The folder holds the stores {listing(inside, 10)}: name one, or several." if inside else _MAKE_ONE
+        raise StoreError(f"{path} is not a store: it has no zarr.json. {held}") from None
     except (OSError, ValueError) as error:
         reason = f"its zarr.json: {error.strerror or error}" if isinstance(error, OSError) else error
         raise StoreError(f"The store {path} cannot be read: {reason}.") from None
@@ -76,6 +78,11 @@ def read_run(path: StorePlace) -> tuple[RootAttributes, str]:
         raise
     except (MalformedDocument, ValueError) as error:
         raise StoreError(f"The store {path} cannot be read: {error}") from None
+
+
+def _stores_in(folder: Path) -> list[Path]:
+    """What a sentence offers: what is called a store in a folder and has what a store begins with."""
+    return sorted(store for store in folder.glob("*.zarr") if (store / "zarr.json").is_file())
 
 
 def _refuse_inside(path: Path, attributes: dict[str, Any]) -> None:

@@ -57,12 +57,12 @@ def test_your_checkpoint_and_then_your_question(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert walk("your-checkpoint.md") == 8
     assert "touch the red cube" in capsys.readouterr().out
-    assert Path("results/mine/report.html").stat().st_size > 10_000
+    assert Path("results/runs/mine/report/report.html").stat().st_size > 10_000
     # The walk begins with what `make capture` makes, of which the first episode is the one of the walk before.
     Path("runs/mine.zarr").rename("runs/cubes.zarr")
     assert walk("your-question.md") > 10
     printed = capsys.readouterr().out
-    assert "The ratio named / others is" in printed
+    assert "The ratio of named to others is" in printed
     assert "bit-equal" in printed
 
 

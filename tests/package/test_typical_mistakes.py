@@ -14,7 +14,11 @@ def store(tmp_path_factory):
 
 
 def said(capsys, *words: object, code: int = 2) -> str:
-    assert main([str(word) for word in words]) == code
+    try:
+        ended: object = main([str(word) for word in words])
+    except SystemExit as end:  # of a mistake in the arguments
+        ended = end.code
+    assert ended == code
     printed = capsys.readouterr()
     assert "Traceback" not in printed.err
     return printed.err if code else printed.out
@@ -28,10 +32,39 @@ def said(capsys, *words: object, code: int = 2) -> str:
         (["capture", "smolvla"], "with va.record, or over a data set"),
         (["capture", "pi", "--episodes", "3"], "--num-episodes N is how many of each task, --task which tasks"),
         (["wrods"], "Did you mean 'words'?"),
+        (["analyze", "STORE", "--output-dir", "out"], "--output FOLDER"),
+        (["words", "STORE", "-o", "out"], "--output FOLDER"),
+        (["analyze", "STORE", "--plot-all"], "--no-plots"),
+        (["objects", "STORE", "--plots"], "--no-plots"),
+        (["analyze", "STORE", "--format=csv"], "--csv"),
+        (["analyze", "STORE", "--gruoping", "cameras"], "Did you mean '--grouping'?"),
+        (["store", "verify", "STORE", "--quik"], "Did you mean '--quick'?"),
+        (["analyze", "STORE", "--output", "OUT/a.csv"], "expected a folder"),
+        (["compare", "STORE", "STORE", "--output", "OUT/a.JSON"], "expected a folder"),
+        (["report", "STORE", "--output", "OUT/a.json"], "a file FILE.html"),
+        (["analyze", "OUT/nowhere.zarr"], "vla-attention capture pi --output NAME.zarr"),
+        (["analyze", "OUT/empty.zarr"], "vla-attention capture pi --output NAME.zarr"),
     ],
 )
-def test_the_sentence_says_what_to_type(capsys, words, sentence):
-    assert sentence in said(capsys, *words)
+def test_the_sentence_says_what_to_type(store, tmp_path, capsys, words, sentence):
+    (tmp_path / "empty.zarr").mkdir()
+    words = [word.replace("STORE", str(store)).replace("OUT", str(tmp_path)) for word in words]
+    answer = said(capsys, *words)
+    assert sentence in answer
+    assert f"{tmp_path}: " not in answer  # what is no store is not offered
+    assert [entry.name for entry in tmp_path.iterdir()] == ["empty.zarr"]
+
+
+@pytest.mark.parametrize(
+    "words", [["--layers", "0,2"], ["--heads", "0,1"], ["--denoise", "0,9"], ["--denoise", "first,last"]]
+)
+def test_several_numbers_may_have_commas_between(store, tmp_path, capsys, words):
+    option, text = words
+    spaced = [option, *text.split(",")]
+    more = ["--no-plots", "--output", tmp_path]
+    assert said(capsys, "analyze", store, *words, *more, code=0) == said(
+        capsys, "analyze", store, *spaced, *more, code=0
+    )
 
 
 def test_the_store_may_stand_first(store, tmp_path, capsys):
@@ -52,7 +85,7 @@ def test_a_store_alone_is_analysed(store, tmp_path, capsys):
 
 def test_a_ratio_may_name_a_default_group_beside_ones_own(store, tmp_path, capsys):
     words = ["--group", "bowl=word:bowl", "--no-plots", "--output", tmp_path]
-    assert "The ratio of visual to bowl is" in " ".join(
+    assert "The ratio of visual to bowl" in " ".join(
         said(capsys, "analyze", store, "--ratio", "visual/bowl", *words, code=0).split()
     )
     assert "nouns" in said(capsys, "analyze", store, "--ratio", "visual/nouns", *words)

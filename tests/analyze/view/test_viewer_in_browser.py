@@ -89,6 +89,11 @@ def test_a_walk_through_a_run_shows_pythons_numbers(view, server, store):
     for i, row in enumerate(episodes.iter_rows(named=True)):
         shown = float(view.page.locator(".episodes li .ratio").nth(i).inner_text())
         assert shown == pytest.approx(row["geometric_mean"], rel=2e-3)
+    for text, solved in (("failed", False), ("not solved", False), ("solved", True), ("success", True)):
+        view.page.fill(".episodes input", text)
+        listed = view.page.locator(".episodes li button").evaluate_all("all => all.map((one) => one.dataset.episode)")
+        wanted = episodes.filter(success=solved).select("task_id", "episode_index").rows()
+        assert listed == [f"task{task:03d}_episode{episode:03d}" for task, episode in wanted], text
     view.page.fill(".episodes input", "task001_episode001")
     view.page.locator(".episodes li").nth(1).wait_for(state="hidden")
     view.page.click(".episodes li button")

@@ -29,12 +29,17 @@ const order: Readonly<Record<Sort, (a: Row, b: Row) => number>> = {
   instruction: (a, b) => (a.instruction ?? "").localeCompare(b.instruction ?? ""),
 };
 
-/** The rows that hold all words of a search in their name, task, instruction or outcome, sorted. */
+/** What people call outcomes; "not solved" is looked for as "unsolved", for "solved" must not find it. */
+const SOLVED = ["solved", "success", "successful", "succeeded"];
+const FAILED = ["unsolved", "unsuccessful", "failed", "failure", "fails", "not"];
+
+/** The rows that hold all words of a search in their name, task or instruction, or begin their outcome, sorted. */
 export function found<T extends Row>(rows: readonly T[], search: string, sort: Sort): T[] {
-  const words = search.toLowerCase().split(/\s+/).filter(Boolean);
+  const words = search.toLowerCase().replace(/\bnot\s+(?=s)/g, "un").split(/\s+/).filter(Boolean);
   const fits = (row: T): boolean => {
-    const text = [row.name, row.task, row.instruction, outcomeWord(row.success ?? null)].join(" ").toLowerCase();
-    return words.every((word) => text.includes(word));
+    const text = [row.name, row.task, row.instruction].join(" ").toLowerCase();
+    const outcome = row.success === true ? SOLVED : row.success === false ? FAILED : outcomeWord(null).split(" ");
+    return words.every((word) => text.includes(word) || outcome.some((one) => one.startsWith(word)));
   };
   return rows.filter(fits).sort(order[sort]);
 }

@@ -1,0 +1,33 @@
+"""analyze: of which episodes the ratio is, and what it counts twice."""
+
+from __future__ import annotations
+
+import pytest
+
+import vla_attention as va
+from tests.kit.paths import ROOT
+
+CUBES = ROOT / "vla_attention/example_stores/cubes.zarr"
+
+
+@pytest.mark.parametrize("by", [(), ("layer",)])
+def test_a_ratio_that_some_episodes_lack_says_first_of_how_many_it_is(by):
+    """Only the task of the red cube has the word: the interval is over its episodes, and says nothing of tasks."""
+    answer = va.open(CUBES).analyze(groups={"red": "word:red"}, ratio="red/visual", by=by)
+    (first, *_) = answer.findings
+    assert "2 of 6 episodes (1 of 3 tasks)" in first.sentence
+    assert first.limit.startswith("One task of 2 episodes")
+    if by:
+        assert answer["by"]["episodes_with_ratio"].unique().to_list() == [2]
+    else:
+        assert (first.numbers["episodes_with_ratio"], first.numbers["tasks_with_ratio"]) == (2, 1)
+
+
+def test_groups_that_share_keys_are_named_with_their_number(tmp_path):
+    file = tmp_path / "shared.toml"
+    file.write_text(
+        'name = "shared"\noverlap = true\n[groups]\na = "role:image"\nb = "camera:base_0_rgb"\nt = "word:touch"\n'
+        '[ratio]\nnumerator = ["a", "b"]\ndenominator = ["t"]\n'
+    )
+    (note,) = [note for note in va.open(CUBES).analyze(grouping=str(file)).notes if "twice" in note]
+    assert note.startswith("a and b share 64 tokens")
