@@ -177,11 +177,14 @@ def results_folder(stores: Sequence[StorePlace], command: str, given: argparse.N
     """
     path, *others = (_path_of(store) for store in stores)
     command = "-".join([command, *(one.with_suffix("").name for one in others)])
-    said = [
-        f"{name}-{'-'.join(map(str, value)) if isinstance(value, list | tuple) else value}"
-        for name in ("tasks", *OPTIONS)
-        if (value := getattr(given, name, None)) and value != OPTIONS.get(name, {}).get("default")
-    ]
+    said = []
+    for name in ("tasks", *OPTIONS):
+        value = getattr(given, name, None)
+        # An option without its value ("") and episode 0 were given too.
+        if value is None or value is False or value in ([], ()) or value == OPTIONS.get(name, {}).get("default"):
+            continue
+        values = value if isinstance(value, list | tuple) else [] if value is True or value == "" else [value]
+        said.append("-".join([name, *map(str, values)]))
     name = file_part("_".join([command, *said]))
     if len(name) > _LONGEST_NAME:
         name = f"{name[:_LONGEST_NAME]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"

@@ -6,7 +6,7 @@
 In a null store every key's attention is the same in expectation; tasks, episodes and keys scatter around it. The nulls:
 
     analyze   neither pictures nor text get more attention per token
-    words     every word has the same lift in every layer and head, and in every task
+    words     every word has the same lift in every layer and head
     objects   attention does not depend on where the objects are
     compare   two runs of the same distribution, paired by initial state
     language  what is done has nothing to do with what is told (rollouts without attention: seconds)
@@ -69,10 +69,8 @@ def plant_of(kind: str, seed: int, planted: bool) -> Callable[[int, int, Episode
     """The rows of one store."""
 
     def plant(task: int, episode: int, tokens: EpisodeTokens, rows: Rows) -> Rows:
-        # Tasks differ too, which is noise about tasks like these; both runs of a comparison share it. Not so for words:
-        # one of fewer than four kinds of tasks is named about these tasks, of which it would be true.
-        spread = 0.0 if kind == "words" else 0.15
-        of_task = np.random.default_rng([seed // 2, task, 10**6]).normal(0, spread, rows.shape[-1])
+        # Tasks differ too, which is noise about tasks like these; both runs of a comparison share it.
+        of_task = np.random.default_rng([seed // 2, task, 10**6]).normal(0, 0.15, rows.shape[-1])
         made = scattered(np.random.default_rng([seed, task, episode]), rows) * np.exp(of_task)
         factor = np.ones((len(made), made.shape[-1]))
         image = tokens.key_role == Role.IMAGE

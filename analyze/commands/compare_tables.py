@@ -69,7 +69,7 @@ def figures_of(part: Compared, told: Mapping[str, pl.DataFrame]) -> list[Figure]
     groups, found = part.rows["groups"].filter(ALL), []
     main = groups["quantity"][0]
     layer = pl.when(pl.col("layer") == LAYERS_AVG).then(pl.lit("all layers")).otherwise(pl.format("layer {}", "layer"))
-    of_layers = groups.filter(quantity=main).with_columns(layer)
+    of_layers = groups.filter(quantity=main).with_columns(layer=layer, num_episodes="num_first")
     if main == "log2_ratio":
         title, looks = "The ratio", _FACTORS | {"xlabel": "times the ratio (logarithmic)"}
         of_layers = as_factors(of_layers)
@@ -80,7 +80,7 @@ def figures_of(part: Compared, told: Mapping[str, pl.DataFrame]) -> list[Figure]
     if "words" in part.rows:
         looks = {**_FACTORS, "label": "item", "xlabel": "times the attention (logarithmic)"}
         title = f"Attention to words, {name} against {first}"
-        words = as_factors(part.rows["words"].filter(ALL))
+        words = as_factors(part.rows["words"].filter(ALL)).with_columns(num_episodes="num_first")
         found.append(Figure(f"words_{name}", "forest", words, title, _BARS, looks))
     if part.pairs.height:
         items, rows = strip_of_pair(part, told[first], told[name])

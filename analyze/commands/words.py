@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Collection
 
 import polars as pl
@@ -14,7 +15,7 @@ from vla_attention.analyze.core.result import Column, Figure, Finding, Result, T
 from vla_attention.analyze.core.word_items import LABELS, SCALE, items_of
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
-from vla_attention.schemas.errors import BadArgument, listing, plural
+from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.groupings.vocabulary import NO_WORDS
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.safe_text import visible
@@ -107,14 +108,20 @@ def _columns(num_tasks: int) -> list[Column]:
 
 def _finding(question: Question, words: pl.DataFrame, by: Collection[str], named_at: float) -> Finding:
     """Which words get more, and which less, than evenly spread attention would give them."""
-    effects = f"vla-attention effects {question.stores[0].path}"
+    recorded = any(item.episode.attributes.effects is not None for item in question.selected)
+    path = shlex.quote(str(question.stores[0].path))
+    effects = (
+        f"vla-attention effects {path}" if recorded else f"vla-attention capture rerun {path} --effects text,cameras"
+    )
     limit = "Being read is not deciding: a word that the pictures have read decides with hardly any attention."
     limit = f"{enough(question)} {limit}".lstrip()
     if by:
         return Finding(
             f"Below, a row for each word and {' and '.join(by)}.", "Which words are read?", {}, limit, effects
         )
-    sure = words.filter(pl.col("lift_q") <= named_at)
+    # What is shown of one task's words alone is no answer about a run of many.
+    alike = pl.col("intervals") == question.units.estimand.value
+    sure = words.filter(alike | (question.num_tasks == 1), pl.col("lift_q") <= named_at)
     more = sure.filter(pl.col("lift") > 1).sort("lift", descending=True)
     less = sure.filter(pl.col("lift") < 1).sort("lift")
     said = [
@@ -130,9 +137,6 @@ def _finding(question: Question, words: pl.DataFrame, by: Collection[str], named
         )
         few = "" if tested else "One episode of a word has no interval: record more episodes. "
         return Finding(verdict, "Which words are read?", {"tested": tested}, f"{few}{limit}", effects)
-    few = sure.filter(pl.col("intervals") == "these-tasks")["item"].unique(maintain_order=True)
-    if question.units.estimand.of_other_tasks and len(few):
-        limit = f"Too few kinds of tasks have {listing(map(repr, few), 4)}: said of these tasks alone. {limit}"
     top = (more if more.height else less).row(0, named=True)
     numbers = {"word": top["item"], "estimate": top["lift"], "low": top["lift_low"], "high": top["lift_high"]}
     return Finding(f"{'; '.join(said)}.", "Which words are read?", {**numbers, "q": top["lift_q"]}, limit, effects)

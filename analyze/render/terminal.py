@@ -12,6 +12,8 @@ from vla_attention.analyze.render.numbers import cell
 WIDTH, LINES = 100, 40
 #: A table of which fewer rows would fit is left out.
 _FEWEST_ROWS = 3
+#: Lines that name the tables that did not fit.
+_NAMES_LEFT = 2
 _NO_END = 1_000_000
 
 
@@ -28,7 +30,7 @@ def screen(result: Result, lines: int = LINES, last: Sequence[str] = ()) -> str:
         top += [f"  {finding.next_step}"] if finding.next_step else []  # to be copied: it is not wrapped
     below = wrapped(f"note: {note}" for note in result.notes)
     end = wrapped(last)
-    room = lines - sum(len(part) + 1 for part in (top, below, end) if part)
+    room = lines - _NAMES_LEFT - sum(len(part) + 1 for part in (top, below, end) if part)
     room = _NO_END if result.whole else room
     tables: list[list[str]] = []
     left, said = [], set[str]()

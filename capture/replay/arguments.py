@@ -152,7 +152,7 @@ def _add_change_arguments(parser: argparse.ArgumentParser) -> None:
         "--rerun-of",
         type=Path,
         metavar="BASE.zarr",
-        help="the replay of the same frames without interventions, with which `vla-attention effects` then pairs the "
+        help="the replay of the same frames without interventions, with which `vla-attention compare` then pairs the "
         "calls of this one, replan by replan",
     )
 

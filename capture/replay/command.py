@@ -34,6 +34,6 @@ def run_replay(arguments: argparse.Namespace, threads: Threads, termination: Ter
     say(
         f"Next: vla-attention analyze {plan.store}"
         if base is None
-        else f"Next: vla-attention effects {base} {plan.store}"
+        else f"Next: vla-attention compare {base} {plan.store}"
     )
     return 0

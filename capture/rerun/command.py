@@ -81,7 +81,7 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
     say(
         f"Next: vla-attention analyze {target}"
         if interventions.is_none
-        else f"Next: vla-attention effects {base.path} {target}"
+        else f"Next: vla-attention compare {base.path} {target}"
     )
     return 0
 

@@ -253,7 +253,7 @@ class SeriesRun:
                 impossible.append(condition.name)
         if impossible:
             say(f"Not possible: {listing(impossible, 40)}; the reasons are above.")
-        say(f"Next: vla-attention effects {self.base.path} {self.folder}")
+        say(f"Next: vla-attention compare {self.base.path} {self.folder}/*{STORE_SUFFIX}")
 
     def _write(self, rerun: Rerun, condition: SeriesCondition, changed: Interventions) -> None:
         target = self.folder / f"{file_part(condition.name)}{STORE_SUFFIX}"

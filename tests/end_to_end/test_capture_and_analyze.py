@@ -11,6 +11,7 @@ import polars as pl
 import pytest
 import zarr
 
+import vla_attention as va
 from tests.end_to_end.written_tables import written_steps
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
@@ -125,8 +126,8 @@ def test_three_groupings_of_one_store_need_no_model(captured_store, tmp_path, mo
 
 
 def test_masses_equal_a_computation_by_hand_from_the_raw_arrays(captured_store, tmp_path):
-    groups = ["--group", "left=patch:base_0_rgb[0:2,0:1]", "--group", "cube=word:cube"]
-    assert analyze([str(captured_store), *groups, "--per-head", "--output", str(tmp_path), "--no-plots"]) == 0
+    groups = {"left": "patch:base_0_rgb[0:2,0:1]", "cube": "word:cube"}
+    va.open(captured_store).analyze(groups=groups, per_head=True).save(tmp_path, pictures=False)
     steps = written_steps(tmp_path).filter(task_id=1, episode_index=1)
     raw = zarr.open_group(captured_store / "episodes/task001_episode001", mode="r")
     rows = raw["joint/rows"][:].astype(np.float64)[..., 0, :]

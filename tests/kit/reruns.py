@@ -1,4 +1,4 @@
-"""A base whose actions are known, and reruns whose changes are planted: what `vla-attention effects` must find."""
+"""A base whose actions are known, and reruns whose changes are planted: what a comparison with the base must find."""
 
 from __future__ import annotations
 

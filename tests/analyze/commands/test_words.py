@@ -125,7 +125,7 @@ def test_the_command_prints_writes_and_draws(reader_store, tmp_path, capsys):
     assert main(["words", str(reader_store), "--output", str(tmp_path), "--pdf", "--intervals", "these-tasks"]) == 0
     printed = capsys.readouterr().out
     assert "'bowl'" in printed
-    assert all(len(line) <= 100 for line in printed.splitlines() if str(tmp_path) not in line)
+    assert all(len(line) <= 100 for line in printed.splitlines() if "/" not in line)  # paths are not broken
     tables = ("words", "words_scale", "words_episodes")
     files = {"result.json", "word_bars.png", "word_bars.pdf", *(f"{name}.parquet" for name in tables)}
     assert {path.name for path in tmp_path.iterdir()} == files

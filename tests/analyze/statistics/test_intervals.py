@@ -133,7 +133,7 @@ def test_the_order_of_episodes_and_the_names_of_tasks_do_not_matter():
 def test_no_interval_where_none_can_be_had():
     assert one(mean_over_episodes([3.0]), [0]).interval() is None
     left_out = mean_over_episodes([3.0, np.inf, np.nan])
-    assert left_out.num_left_out == 2
+    assert (~left_out.used).sum() == 2
     assert one(left_out, [0, 0, 0]).value == 3.0
     assert one(left_out, [0, 0, 0]).interval() is None
     assert one(mean_over_episodes([np.inf]), [0]).value is None

@@ -68,7 +68,7 @@ def test_a_third_family_captures_and_is_analysed(tmp_path, capfd):
     steps = pl.read_parquet(tmp_path / "steps.parquet")
     assert steps.height == 6
     assert (tmp_path / "attention_ratio_results_robosuite.json").is_file()
-    assert "seen / read" in capfd.readouterr().out
+    assert "The ratio of seen to read" in capfd.readouterr().out
     # Its store is run again with the family's own options.
     assert main(["rerun", str(store), "--toy-size", "3", "--check", "2"]) == 0
     assert "made again without any change: bit-equal" in capfd.readouterr().out

@@ -85,7 +85,7 @@ def test_keys_that_do_not_exist_are_absent_and_not_padding(tmp_path):
         assert labels[PATCHES + LONGEST :] == ["action"] * (TOKENS - 1)
         expected = computed(policy, number, TEXTS[number]).mean(1)
         np.testing.assert_allclose(store.episodes[number].read("joint/rows")[0, :, 0, :, 0], expected, atol=2e-6)
-    assert set(va.open(tmp_path / "a.zarr").words()["item"]) >= {"pick", "red", "bowl"}
+    assert set(va.open(tmp_path / "a.zarr").words()["words"]["item"]) >= {"pick", "red", "bowl"}
 
 
 def test_fewer_tokens_than_planned(tmp_path):
@@ -159,7 +159,7 @@ def test_blocks_that_read_the_text_or_the_pictures_only(tmp_path):
     assert text == ["masked_image"] * PATCHES + ["bos", *["instruction"] * 3, "template"]
     assert image == ["image"] * PATCHES + ["padding"] * 5
     assert len(episode.attributes.prompts[0].pieces) == 4
-    assert set(va.open(tmp_path / "a.zarr").words(site="cross_text")["item"]) >= {"pick", "the", "bowl"}
+    assert set(va.open(tmp_path / "a.zarr").words(site="cross_text")["words"]["item"]) >= {"pick", "the", "bowl"}
 
 
 class DecoderBlock(nn.Module):
