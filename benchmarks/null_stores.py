@@ -36,7 +36,7 @@ from tests.kit.made_up_behaviour import STEPS, did, goals_of
 from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.commands.effects.answer import deciding
 from vla_attention.analyze.commands.effects.items import by_item
-from vla_attention.analyze.commands.language import listens
+from vla_attention.analyze.commands.language import SHOWN_AT, listens
 from vla_attention.analyze.core.action_changes import ActionSpread
 from vla_attention.analyze.core.behaviour import with_choices
 from vla_attention.analyze.core.recorded_effects import summary_of
@@ -147,7 +147,7 @@ def says_it_listens(sets: int, planted: bool) -> float:
                 moments[told] = 1
             rollouts.append((told, moments))
         p = listens(with_choices(did(rollouts, goals, "touch cube N"))).numbers.get("p")
-        said += p is not None and float(p) <= LEVEL
+        said += p is not None and float(p) <= SHOWN_AT
     return said / sets
 
 

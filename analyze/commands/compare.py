@@ -8,7 +8,7 @@ from typing import Any
 import polars as pl
 
 from vla_attention.analyze.commands.compare_tables import ALL, figures_of, tables_of
-from vla_attention.analyze.commands.language import listens, whatever
+from vla_attention.analyze.commands.language import SHOWN_AT, listens, whatever
 from vla_attention.analyze.core.about import UNTRAINED, notes, solved
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.compared import (
@@ -140,7 +140,7 @@ def _behaved(part: Compared, told_first: pl.DataFrame, told_other: pl.DataFrame)
     if not all("p" in numbers for numbers in heard):
         return [success]
     first, name = part.first.run.name, part.name
-    does = [float(str(numbers["p"])) <= NAMED_AT for numbers in heard]
+    does = [float(str(numbers["p"])) <= SHOWN_AT for numbers in heard]
     said = []
     for run, asked, numbers, hears in zip((first, name), (told_first, told_other), heard, does, strict=True):
         p = "p < 0.001" if float(str(numbers["p"])) < 0.001 else f"p = {numbers['p']:.2g}"
@@ -207,7 +207,8 @@ def _attention(part: Compared) -> Finding:
         most = f"most in layer {top['layer']}, head {top['head']}: {100 * top['difference']:+.1f} points"
         said.append(f"{sure} of {plural(heads.height, 'head')} differ ({most})")
     against = f"{part.name} against {part.first.run.name}"
-    numbers = {kind: rows.filter(ALL, _SURE).height for kind, rows in part.rows.items() if kind != "effects"}
+    counted = {kind: part.rows[kind].filter(ALL) for kind in ("objects", "words", "heads") if kind in part.rows}
+    numbers = {kind: rows.filter(_SURE).height for kind, rows in {"groups": groups, **counted}.items()}
     limit = "Equal attention is not equal use: a word may change the action without more attention."
     return Finding(f"{against}: {'; '.join(said) if said else 'no difference is shown'}.", _ATTENTION, numbers, limit)
 

@@ -22,6 +22,8 @@ from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.schemas.errors import plural
 
 _LISTENS = "Does it listen?"
+#: p of what is done, and q of a word that is read: three kinds of things are named (docs/benchmarks.md has the rates).
+SHOWN_AT = NAMED_AT / 3
 #: From this share of episodes on, what was done most is said.
 _MOSTLY = 0.8
 #: Of episodes or steps.
@@ -42,7 +44,7 @@ def language(question: Question) -> Result:
     done = _behaviour_tables(asked)
     decide, effects = word_effects(question)
     # Attention to the words: one call.
-    read = words(question)
+    read = words(question, named_at=SHOWN_AT)
     missing = len(question.selected) - asked.height
     left = [f"What {plural(missing, 'episode')} did is not known: no simulator of ours ran them."] if missing else []
     return Result(
@@ -83,7 +85,7 @@ def listens(asked: pl.DataFrame) -> Finding:
     where = "in which the scene allowed something else"
     # Where each task has its own initial states, the pictures say what to do as well as the words.
     shared = shown.select((pl.col("told_goal").n_unique().over("stratum", "state") > 1).mean()).item() >= _HALF
-    if found.p_value > NAMED_AT:
+    if found.p_value > SHOWN_AT:
         sentence = f"Not shown to listen: {whatever(shown)}it did what it was told in {right} of {n} episodes {where}"
     elif not shared:
         sentence = f"It did what it was told in {right} of {n} episodes {where}"
@@ -91,7 +93,7 @@ def listens(asked: pl.DataFrame) -> Finding:
         verdict = "It listens" if 2 * right > n else "It listens in part"
         sentence = f"{verdict}: it did what it was told in {right} of {n} episodes {where}"
     limits = []
-    if found.least_p > NAMED_AT:
+    if found.least_p > SHOWN_AT:
         limits.append(f"Too few episodes: even without a mistake p would be {found.least_p:.2g}.")
     if not shared:
         limits.append("Each task has its own initial states here, so the pictures could say what to do.")

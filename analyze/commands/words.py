@@ -26,8 +26,10 @@ _MOST_NAMED = 5
 LIFT = "attention to the word, over what it would get if attention were spread evenly over all tokens"
 
 
-def words(question: Question, by: Collection[str] = ()) -> Result:
+def words(question: Question, by: Collection[str] = (), named_at: float = NAMED_AT) -> Result:
     """Lift, mass and share of every word; which are read more, and which less, than evenly spread attention would.
+
+    named_at: words with at most this q are named; a screen that names other things too asks for less.
 
     Raises:
         BadArgument: the keys of the site spell no words.
@@ -55,7 +57,7 @@ def words(question: Question, by: Collection[str] = ()) -> Result:
     return Result(
         "Which words of the instruction are read",
         about(question),
-        [_finding(question, summary.filter(is_shown), by)],
+        [_finding(question, summary.filter(is_shown), by, named_at)],
         [
             Table("words", summary, columns, "Words of the instruction", is_shown),
             Table("words_scale", summary.filter(is_scale), columns, "For scale"),
@@ -104,7 +106,7 @@ def _columns(num_tasks: int) -> list[Column]:
     ]
 
 
-def _finding(question: Question, words: pl.DataFrame, by: Collection[str]) -> Finding:
+def _finding(question: Question, words: pl.DataFrame, by: Collection[str], named_at: float) -> Finding:
     """Which words get more, and which less, than evenly spread attention would give them."""
     recorded = any(item.episode.attributes.effects is not None for item in question.selected)
     path = shlex.quote(str(question.stores[0].path))
@@ -119,7 +121,7 @@ def _finding(question: Question, words: pl.DataFrame, by: Collection[str]) -> Fi
         )
     # What is shown of one task's words alone is no answer about a run of many.
     alike = pl.col("intervals") == question.units.estimand.value
-    sure = words.filter(alike | (question.num_tasks == 1), pl.col("lift_q") <= NAMED_AT)
+    sure = words.filter(alike | (question.num_tasks == 1), pl.col("lift_q") <= named_at)
     more = sure.filter(pl.col("lift") > 1).sort("lift", descending=True)
     less = sure.filter(pl.col("lift") < 1).sort("lift")
     said = [
