@@ -71,7 +71,7 @@ def failures(question: Question, twins: Question | None = None) -> Result:
         "Why did it fail? What was done instead",
         about(question),
         [*_why(question, failed, outcomes.height, lost), *where, *_foretold(outcomes)],
-        [*tables, _by_task(outcomes)],
+        [*tables, _by_task(outcomes, bool(failed))],
         _strip(left),
         [*question.skipped, *(run_notes(twins.episodes) if twins else ())],
     )
@@ -204,7 +204,7 @@ def _foretold(outcomes: pl.DataFrame) -> list[Finding]:
     return [Finding(said, _BEFORE, {"right": right, "n": n, "solved": solved_ones})]
 
 
-def _by_task(outcomes: pl.DataFrame) -> Table:
+def _by_task(outcomes: pl.DataFrame, shown: bool) -> Table:
     tasks = outcomes.group_by("suite", "task_id", "instruction").agg(
         pl.len().alias("episodes"),
         failed=(~pl.col("solved")).sum(),
@@ -218,7 +218,7 @@ def _by_task(outcomes: pl.DataFrame) -> Table:
         Column("steps", "number", "steps if solved", "median"),
     ]
     order = tasks.sort("failed", "suite", "task_id", descending=[True, False, False])
-    return Table("failures_by_task", order, columns, "Task by task")
+    return Table("failures_by_task", order, columns if shown else (), "Task by task")
 
 
 def _strip(left: Sequence[Leaving]) -> list[Figure]:

@@ -36,13 +36,19 @@ def report(question: Question, num_episodes: int = 2, num_replans: int = 8) -> l
     said = {line for result in results[:1] for line in result.about}
     told: set[str] = set()
     shown: list[Result] = []
-    for result in results:
-        # What all of them say stands once.
+    for number, result in enumerate(results):
+        # What several of them show stands once: pictures and tables in the section that is about them.
+        rest = results[number + 1 :]
+        later = {one.name for other in rest for one in other.figures} | {
+            one.name for other in rest for one in other.tables
+        }
+        figures = [figure for figure in result.figures if figure.name not in later]
+        tables = [table for table in result.tables if table.name not in later]
         kept = [line for line in result.about if line not in said] if shown else result.about
         notes = [note for note in result.notes if note not in told]
         findings = [finding for finding in result.findings if finding.sentence not in told]
         told |= {*result.notes, *(finding.sentence for finding in result.findings)}
-        shown.append(replace(result, about=kept, findings=findings, notes=notes))
+        shown.append(replace(result, about=kept, findings=findings, tables=tables, figures=figures, notes=notes))
     return shown
 
 
@@ -57,4 +63,4 @@ def _answers(question: Question, own: Mapping[str, Mapping[str, Any]]) -> Iterat
             title = COMMANDS[name].answers
             yield Result(f"{title[0].upper()}{title[1:]}", about(question), [], [], notes=[str(error)])
     held = answer_to("analyze", question.stores, question.settings, {"list": True})
-    yield replace(held, title="What was run", findings=(), tables=held.tables[:1])
+    yield replace(held, title="What was run", findings=(), tables=held.tables[:1], whole=False)

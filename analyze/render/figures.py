@@ -174,7 +174,8 @@ def _legend(axes: Axes, rows: pl.DataFrame, o: Any) -> None:
 
 def _legend_above(axes: Axes, handles: Sequence[Any], labels: Sequence[str]) -> None:
     figure = axes.get_figure(root=True)
-    columns = 4 if figure is None or figure.get_figwidth() > 4 else 2
+    width = 8.4 if figure is None else figure.get_figwidth()
+    columns = 4 if width > 6 else 3 if width > 4 else 2
     axes.legend(handles, labels, loc="lower left", bbox_to_anchor=(0, 1), ncols=columns, borderaxespad=0.1,
                 handlelength=1.4, columnspacing=1.0)  # fmt: skip
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from io import BytesIO
 
 import jinja2
 
-from vla_attention.analyze.core.result import Column, Figure, Result
+from vla_attention.analyze.core.result import Column, Figure, Result, Table
 from vla_attention.analyze.render import style as style_module
 from vla_attention.analyze.render.figures import draw
 from vla_attention.analyze.render.numbers import cell
@@ -18,6 +19,10 @@ from vla_attention.schemas.safe_text import visible
 
 #: Rows of a table on the page; the files have all.
 _MOST_ROWS = 100
+#: Width of a picture, two of which stand side by side: text is as large as the page's small print.
+_INCHES = 5.4
+#: Rows of a table that stands open.
+_SHORT = 12
 
 
 def fragment(result: Result) -> str:
@@ -43,13 +48,27 @@ def _environment() -> Iterator[jinja2.Environment]:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals.update(cell=cell, picture=_picture, most=_MOST_ROWS, sort_key=_sort_key)
+    environment.globals.update(
+        cell=cell, picture=_picture, most=_MOST_ROWS, sort_key=_sort_key, open_tables=partial(_tables, folded=False),
+        folded_tables=partial(_tables, folded=True),
+    )  # fmt: skip
     yield environment
+
+
+def _tables(result: Result, folded: bool) -> list[Table]:
+    """The tables with rows: the first is open where it is short and no picture shows it, all where they were asked for.
+
+    All others are folded: who wants numbers opens them.
+    """
+    tables = [table for table in result.tables if table.columns and table.shown.height]
+    first = bool(tables) and not result.figures and tables[0].shown.height <= _SHORT
+    number = len(tables) if result.whole else int(first)
+    return tables[number:] if folded else tables[:number]
 
 
 def _picture(figure: Figure) -> str:
     """The address of a picture that stands in the page itself; photographs as WebP, half the bytes of PNG."""
-    style = Style()
+    style = Style(inches=_INCHES)
     canvas = draw(figure, style)
     style_module.find_places(canvas, style.dpi)
     content = BytesIO()

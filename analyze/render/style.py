@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 StyleName: TypeAlias = Literal["screen", "paper"]
 #: Columns of a page in a two-column paper, in inches: one, and both.
 _ONE_COLUMN, _BOTH_COLUMNS = 3.35, 6.9
+#: Of rows of pictures on a screen, in inches.
+_WIDE = 8.4
 _SETTINGS: dict[str, Any] = {
     "font.family": "DejaVu Sans",  # comes with matplotlib: the same picture on every machine
     "axes.spines.top": False,
@@ -34,9 +36,13 @@ _SETTINGS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Style:
-    """Sizes of a style. A paper's pictures have no title inside, text of 7 to 9 points, and a caption file."""
+    """Sizes of a style. A paper's pictures have no title inside, text of 7 to 9 points, and a caption file.
+
+    inches: of a picture on a screen that need not be wide.
+    """
 
     name: StyleName = "screen"
+    inches: float = 8.4
 
     @property
     def paper(self) -> bool:
@@ -57,7 +63,7 @@ class Style:
         """Inches of a picture of one column, or with `wide` of both."""
         if self.paper:
             return _BOTH_COLUMNS if wide else _ONE_COLUMN
-        return 8.4
+        return max(self.inches, _WIDE) if wide else self.inches
 
     def scaled(self, inches: float) -> float:
         """A height that is right on a screen, in this style."""

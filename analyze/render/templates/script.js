@@ -3,6 +3,11 @@
   document.documentElement.classList.add("js");
   const announcer = document.getElementById("announcer");
 
+  // On paper nothing can be opened.
+  window.addEventListener("beforeprint", function () {
+    for (const folded of document.querySelectorAll("details")) folded.open = true;
+  });
+
   // Tables: a button in every header; numbers sort as numbers, what has no value stays last in both directions.
   function compare(a, b) {
     const x = Number(a), y = Number(b);
