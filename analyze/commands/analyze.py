@@ -111,7 +111,7 @@ def _of_words(question: Question) -> list[Finding]:
     if not question.grouping.compares_modalities or not question.vocabulary.words or question.of_other_loop:
         return []
     asked = with_choices(behaviour(question.episodes))
-    return [] if asked.is_empty() else [listens(asked), word_effects(question)[0]]
+    return [] if asked.is_empty() else [listens(asked), *word_effects(question)[0]]
 
 
 def _shown_tables(question: Question, tasks: pl.DataFrame, groups: pl.DataFrame, shown: Collection[str]) -> list[Table]:

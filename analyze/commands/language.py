@@ -50,7 +50,7 @@ def language(question: Question) -> Result:
     return Result(
         "Does it listen? What was told, and what was done",
         about(question),
-        [behaved, decide, *read.findings[:1]],
+        [behaved, *decide, *read.findings[:1]],
         [*done[:1], *effects, *done[1:], *read.tables[:1]],
         read.figures[:1],
         [*left, *notes(question)],

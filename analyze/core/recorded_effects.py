@@ -64,6 +64,7 @@ _VALUES: dict[str, Scale] = {
     **dict.fromkeys(("effect", "effect_chunk", "angle", *_ATTENTION, "noise"), "positive"),
     "gripper_flips": "share",
     "minus_noise": "plain",
+    "times_noise": "plain",
 }
 
 
@@ -103,7 +104,8 @@ class RecordedEffects:
 
         Returns:
             suite, task_id, instruction, episode_index, family, the axes' columns, `NAMES`, num_replans; `CHANGES`,
-            keys, mass, lift, norm; noise: the effect of another noise seed there, and minus_noise: the effect minus it.
+            keys, mass, lift, norm; noise: the effect of another noise seed there, minus_noise: the effect minus it, and
+            times_noise: the logarithm of their quotient.
         """
         cells = [name for axis, name in (("replan", "replan"), ("replan", "env_step"), ("time", "phase")) if axis in by]
         then = partial(_means, cells=cells)
@@ -112,7 +114,8 @@ class RecordedEffects:
         noise = rows.filter(kind="noise").group_by(place).agg(noise=pl.col("effect").mean())
         rows = rows.join(noise, on=place, how="left", maintain_order="left")
         rows = rows.with_columns(noise=pl.when(pl.col("kind") != "noise").then("noise"))
-        rows = rows.with_columns(minus_noise=pl.col("effect") - pl.col("noise"))
+        quotient = (pl.col("effect") / pl.col("noise")).log()
+        rows = rows.with_columns(minus_noise=pl.col("effect") - pl.col("noise"), times_noise=quotient)
         return with_families(rows, self.question.sampling)
 
 
@@ -126,19 +129,22 @@ def summary_of(episodes: pl.DataFrame, sampling: Sampling, looks: Sequence[str] 
 
     Returns:
         looks, `NAMES`, num_episodes, num_tasks; the values of `episodes`; over_noise, the mean effect / that of another
-        noise seed; gripper_part, the part of the squared effect that is the gripper's. minus_noise_q is adjusted for
-        the conditions of a cell, without those of random keys.
+        noise seed; gripper_part, the part of the squared effect that is the gripper's. minus_noise_q and times_noise_q
+        are adjusted for the conditions of a cell, without those of random keys.
     """
     is_random = pl.col("kind") == "random"
     found = estimate(
-        episodes.with_columns(_random=is_random), [*looks, *NAMES, "_random"], _VALUES, sampling, {"minus_noise": 0.0},
+        episodes.with_columns(_random=is_random), [*looks, *NAMES, "_random"], _VALUES, sampling,
+        {"minus_noise": 0.0, "times_noise": 0.0},
         [*looks, "_random"], {"over_noise": ("effect", "noise")},
     )  # fmt: skip
     squares = episodes.group_by(*looks, *NAMES).agg(
         gripper_part=pl.col("gripper_square").mean() / pl.col("square").mean()
     )
     found = found.join(squares, on=[*looks, *NAMES], how="left", nulls_equal=True, maintain_order="left")
-    found = found.with_columns(minus_noise_q=pl.when(~is_random).then("minus_noise_q")).drop("_random")
+    found = found.with_columns(
+        pl.when(~is_random).then(name).alias(name) for name in ("minus_noise_q", "times_noise_q")
+    ).drop("_random")
     order = [*looks, "effect", "condition"]
     return found.sort(order, descending=[name == "effect" for name in order], nulls_last=True)
 

@@ -17,6 +17,7 @@ from vla_attention.analyze.commands.effects.items import (
     UNIT,
     by_item,
     columns_of_items,
+    exchanged,
     figures_of_items,
     with_untested,
 )
@@ -66,19 +67,21 @@ def effects(question: Question, by: Collection[str] = ()) -> Result:
     )
 
 
-def word_effects(question: Question) -> tuple[Finding, list[Table]]:
-    """How the action changes without each word: the finding that `effects` begins with, and table "word_effects"."""
+def word_effects(question: Question) -> tuple[list[Finding], list[Table]]:
+    """How the action changes with words exchanged, and without each: the first findings of `effects`, and a table."""
     try:
         found = recorded_effects(question, attention=False)
     except BadArgument as error:
-        return Finding(f"Not shown: {error}", _DECIDE), []
+        return [Finding(f"Not shown: {error}", _DECIDE)], []
     if found is None:
         rerun = f"vla-attention capture rerun {shlex.quote(str(question.stores[0].path))} --effects text,cameras"
-        return Finding("Not recorded: how the action changes without a word.", _DECIDE, next_step=rerun), []
-    items = with_untested(question, by_item(summary_of(found.episodes(), question.sampling)))
+        return [Finding("Not recorded: how the action changes without a word.", _DECIDE, next_step=rerun)], []
+    episodes = found.episodes()
+    items = with_untested(question, by_item(summary_of(episodes, question.sampling)))
     table = items.filter(item_kind="word")
     columns = [column for column in columns_of_items(table) if column.name != "lift"]
-    return deciding(table, found.spread), [Table("word_effects", table, columns, "What the action does without a word")]
+    findings = [*exchanged(question, episodes), deciding(table, found.spread)]
+    return findings, [Table("word_effects", table, columns, "What the action does without a word")]
 
 
 def _recorded(found: RecordedEffects, by: Collection[str]) -> tuple[list[Finding], list[Table], list[Figure]]:
@@ -97,8 +100,10 @@ def _recorded(found: RecordedEffects, by: Collection[str]) -> tuple[list[Finding
         said = f"Below, a row for each item and {' and '.join(by)}."
         return [Finding(said, "What does the action depend on?")], [Table("effects_items", items, shown), *files], []
     items = with_untested(question, items)
-    words, others = items.filter(item_kind="word"), items.filter(pl.col("item_kind") != "word")
-    findings = [deciding(words, found.spread), *_sides(question, episodes, items), *_others(others), *_ways(words)]
+    is_word, of_prompt = pl.col("item_kind") == "word", pl.col("item").str.starts_with("'")
+    words, others = items.filter(is_word), items.filter(~of_prompt)
+    findings = [*exchanged(question, episodes), deciding(words, found.spread)]
+    findings += [*_sides(question, episodes, items), *_others(others), *_ways(words)]
     findings += _unlike_attention(words)
     course = _over_time(found, items)
     tables = [Table("effects_items", items, shown, "Without it, the action changes by", rows=16), *files]
@@ -134,9 +139,12 @@ def deciding(words: pl.DataFrame, spread: ActionSpread) -> Finding:
     numbers = {"word": top["item"], "estimate": top["effect"], "low": top["effect_low"], "high": top["effect_high"],
                "noise": top["noise"], "shown": sure.height, "tested": tested.height}  # fmt: skip
     if (top["grip_part"] or 0.0) >= _HALF:
-        said += f" Of this, {top['grip_part']:.0%} is the gripper, told the opposite in {top['grip']:.0%} of the steps "
-        said += f"(standard deviation of its commands: {spread.spread[GRIPPER]:.2g}); the hand's direction turns by "
-        said += f"{top['turn'] or 0.0:.0f} degrees."
+        said += f" The change without {top['item']} is {top['grip_part']:.0%} gripper: it is told the opposite in "
+        said += f"{top['grip']:.0%} of the steps, and as its commands hardly vary here (standard deviation "
+        said += (
+            f"{spread.spread[GRIPPER]:.2g}), that counts much; the hand's direction turns by {top['turn'] or 0.0:.0f} "
+        )
+        said += "degrees."
         turn = tested.sort("turn", descending=True, nulls_last=True).row(0, named=True)
         if turn["item"] != top["item"] and turn["turn"] is not None:
             said += f" The hand's direction turns most without {turn['item']}: by {turn['turn']:.0f} degrees."
@@ -175,12 +183,11 @@ def _others(items: pl.DataFrame) -> list[Finding]:
         return []
     sure, less = items.filter(than_noise=MORE), items.filter(than_noise=LESS)
     rest = items.height - sure.height - less.height
-    parts = [f"shown for {_named(sure)}"] if sure.height else []
-    parts += [f"smaller than what another noise seed does: {_named(less)}"] if less.height else []
-    parts += [f"not shown for {plural(rest, 'other item') if parts else 'any item'}"] if rest else []
-    said = "; ".join(parts)
+    parts = [f"Changed by more than by another noise seed: without {_named(sure)}"] if sure.height else []
+    parts += [f"Changed less: without {_named(less)}"] if less.height else []
+    parts += [f"Not shown to be changed by more: {plural(rest, 'other item') if parts else 'any item'}"] if rest else []
     numbers = {"shown": sure.height, "smaller": less.height, "open": rest}
-    return [Finding(f"{said[0].upper()}{said[1:]}.", "What else changes it by more than another noise seed?", numbers)]
+    return [Finding(f"{'. '.join(parts)}.", "And without something else?", numbers)] if parts else []
 
 
 def _ways(words: pl.DataFrame) -> list[Finding]:

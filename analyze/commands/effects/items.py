@@ -6,9 +6,13 @@ from collections.abc import Sequence
 
 import polars as pl
 
-from vla_attention.analyze.core.result import Column, Figure
+from vla_attention.analyze.core.estimate import Scale, estimate
+from vla_attention.analyze.core.result import Column, Figure, Finding
+from vla_attention.analyze.core.words_of_numbers import with_interval
+from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
+from vla_attention.schemas.errors import listing
 
 #: Whether an item is shown to change the action by more than another noise seed does.
 MORE, OPEN, LESS, FEW, UNTESTED, NO_NOISE = (
@@ -34,7 +38,8 @@ def by_item(summary: pl.DataFrame, looks: Sequence[str] = ()) -> pl.DataFrame:
     rows = summary.filter(pl.col("kind").is_in(_SHOWN_KINDS)).with_columns(pl.col("reader").fill_null("total"))
     of_total = rows.filter(reader="total")
     direct = rows.filter(reader="direct").join(of_total, on=names, how="anti", nulls_equal=True)
-    q, above = pl.col("minus_noise_q"), pl.col("minus_noise")
+    # On the scale of the effects themselves, which differ by factors: a difference would be of the largest episodes.
+    q, above = pl.col("times_noise_q"), pl.col("times_noise")
     shown = (
         pl.when(above.is_null()).then(pl.lit(NO_NOISE))
         .when(above <= 0).then(pl.lit(LESS))
@@ -68,6 +73,32 @@ def with_untested(question: Question, items: pl.DataFrame) -> pl.DataFrame:
 
 
 _TEXTS = dict.fromkeys(("item", "item_kind", "than_noise"), pl.String)
+
+
+def exchanged(question: Question, episodes: pl.DataFrame) -> list[Finding]:
+    """Whether it tells words apart: how far the action moves with one exchanged for another, which tasks also have."""
+    rows = episodes.filter(kind="prompt", item_kind="exchange").group_by(*EPISODE_ID, maintain_order=True)
+    of_episodes = rows.agg(pl.mean("effect", "noise"), words=pl.col("item"))
+    if of_episodes.is_empty():
+        return []
+    of_episodes = of_episodes.with_columns(
+        what=pl.lit("any word"), times_noise=(pl.col("effect") / pl.col("noise")).log()
+    )
+    sizes: dict[str, Scale] = {"effect": "positive", "noise": "positive", "times_noise": "plain"}
+    row = estimate(of_episodes, ["what"], sizes, question.sampling, {"times_noise": 0.0}).row(0, named=True)
+    words = of_episodes["words"].explode().unique().sort().to_list()
+    said = (
+        f"with a word exchanged for another ({listing(words, 2)}) the action moves by {with_interval(row, 'effect')} "
+    )
+    said += f"{UNIT}" + ("" if row["noise"] is None else f"; another noise seed moves it by {row['noise']:.2g}")
+    verdict = ""
+    if row["times_noise"] is not None and row["times_noise_q"] is not None and row["times_noise_q"] <= NAMED_AT:
+        verdict = "It does: " if row["times_noise"] > 0 else "Not shown, and less than noise: "
+    numbers = {"estimate": row["effect"], "low": row["effect_low"], "high": row["effect_high"], "noise": row["noise"],
+               "q": row["times_noise_q"], "n": row["num_episodes"]}  # fmt: skip
+    limit = "" if verdict else "Not shown to be more than noise."
+    said = f"{verdict}{said}." if verdict else f"{said[0].upper()}{said[1:]}."
+    return [Finding(said, "Does it tell words apart?", numbers, limit)]
 
 
 def figures_of_items(items: pl.DataFrame, course: pl.DataFrame, summary: pl.DataFrame) -> list[Figure]:
