@@ -113,7 +113,7 @@ def _why(question: Question, failed: Sequence[SelectedEpisode], num_known: int, 
 
 def _group(row: dict[str, Any]) -> str:
     """How many episodes did the same, and what; of a single one, when."""
-    at = f" at step {row['touched_at']:.0f}" if row["episodes"] == 1 else ""
+    at = f" at step {row['touched_at']:.0f}" if row["episodes"] == 1 and row["touched"] is not None else ""
     first = "touched nothing" if row["touched"] is None else f"touched the {row['touched']} first{at}"
     told, reached = f" (told {row['told']})", f" and reached the goal of '{row['did']}'"
     so, unfinished = f"{reached}, as it was told, which is not its task", f", as told, and did not finish{told}"

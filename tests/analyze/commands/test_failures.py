@@ -111,6 +111,18 @@ def test_what_it_did_instead():
     assert (touched["how"][0], touched["touched"][0], touched["touched_at"][0]) == (OTHER_TOUCH, "thing 1", 7)
 
 
+def touching_nothing(spec, task, episode, steps):
+    made = small_steps(spec, task, episode, steps)
+    untouched = replace(made.attributes, first_touch=(None,) * len(made.attributes.bodies))
+    return replace(made, attributes=untouched)
+
+
+def test_a_single_failure_that_touched_nothing(tmp_path):
+    spec = replace(SPEC, tasks=(0,), episodes=1, plant_steps=touching_nothing, plant_success=lambda *_: False)
+    found = failures(question_about(write_store(tmp_path / "a.zarr", spec=spec)))
+    assert "1 touched nothing" in found.findings[0].sentence
+
+
 def test_what_the_task_alone_tells():
     found = failures(question_about(PAIR[0])).findings[-1]
     assert (found.numbers["right"], found.numbers["n"]) == (6, 6)
