@@ -119,7 +119,7 @@ def _how_far(first: Run, reruns: Sequence[Run], sampling: Sampling) -> tuple[lis
         said = f"{run.name}: by {with_interval(row, 'effect')} standard deviations of the actions of {first.name}"
         limit, times = "", row["over_noise"]
         if is_noise(run):
-            said += ", which is what another noise seed does"
+            said += ", which is how far another noise seed alone moves them"
         elif times is None:
             limit = "How much of it is chance, a rerun with another noise seed says (--noise-seed)."
         elif times < 1:
@@ -173,7 +173,8 @@ def _success(part: Compared) -> Finding:
     verdict = "Not shown to differ" if p > NAMED_AT else f"{name} does {'better' if won > lost else 'worse'}"
     said = f"{verdict}: {name} solves {pairs['other'].sum():.0f} of {n} episodes, {first} {pairs['first'].sum():.0f}"
     said += f"; {lost} lost, {won} won (exact p = {p:.2g})."
-    limit = "" if p <= NAMED_AT else f"Pairs show a difference once {fewest} change, all one way; there are {n}."
+    limit = "" if p <= NAMED_AT else f"To show a difference, {fewest} pairs or more must change, all in one direction; "
+    limit += f"here {won + lost} of {n} changed." if limit else ""
     return Finding(said, _BETTER, {"won": won, "lost": lost, "n": n, "p": p}, limit)
 
 
@@ -189,7 +190,8 @@ def _needs(part: Compared) -> list[Finding]:
     ]
     numbers = {"items": rows.height, "shown": rows.filter(_SURE).height}
     text = f"the action moves by {', '.join(said)}" if said else "no item's effect is shown to differ"
-    return [Finding(f"{part.name} against {part.first.run.name}: {text}.", _NEEDS, numbers)]
+    limit = "Without a word it reads a sentence that no task has; with one exchanged, one that it was trained on."
+    return [Finding(f"{part.name} against {part.first.run.name}: {text}.", _NEEDS, numbers, limit)]
 
 
 def _attention(part: Compared) -> Finding:

@@ -118,8 +118,8 @@ _BOTH = [
 ]
 _TIMES = [
     *_BOTH[:2],
-    Column("times", "factor", "times as much"),
-    Column("times_q", "p", "q", "p of as much, adjusted for the number of rows (Benjamini-Hochberg)"),
+    Column("times", "factor", "other / first"),
+    Column("times_q", "p", "q", "p of no difference, adjusted for the number of rows (Benjamini-Hochberg)"),
     _BOTH[-1],
 ]
 #: Kinds whose values are logarithms.

@@ -127,9 +127,9 @@ _CAMERA = Column("camera", "text")
 def _columns(known: bool, num_tasks: int) -> list[Column]:
     place = (
         Column("over_place", "factor", "over its place",
-               "attention over what the same maps give the places where the object stands in other episodes of the "
-               "task; near 1 for an object that hardly moves, whatever attention does"),
-        Column("over_place_q", "p", "q", "p of 1 over its place, adjusted for the number of rows (Benjamini-Hochberg)"),
+               "attention to the object over the attention, in the same pictures, to where it stands in the task's "
+               "other episodes; 1: the place alone explains it, as for an object that hardly moves"),
+        Column("over_place_q", "p", "q", "p of 1, adjusted for the number of rows (Benjamini-Hochberg)"),
     )  # fmt: skip
     return [
         Column("item", "text", "object"),

@@ -17,7 +17,12 @@ GROUP_COLUMNS = (
     Column("keys", "number", "tokens"),
 )
 RATIO_COLUMNS = (
-    Column("geometric_mean", "factor", "ratio", "attention to one side over the other, geometric mean"),
+    Column(
+        "geometric_mean",
+        "factor",
+        "ratio",
+        "attention to one side over the other, geometric mean over layers, calls and tasks",
+    ),
     Column("uniform_ratio", "number", "if even", "the ratio if attention were spread evenly over all tokens"),
     Column("ratio_lift", "factor", "per token", "ratio / ratio if even"),
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Collection, Iterable, Sequence
 
-from vla_attention.analyze.core.result import Result, Table
+from vla_attention.analyze.core.result import Column, Result, Table
 from vla_attention.analyze.render.numbers import cell
 
 #: Columns and lines of a screen.
@@ -48,7 +48,7 @@ def screen(result: Result, lines: int = LINES, last: Sequence[str] = ()) -> str:
         if rows.height > fit:
             block.append(f"... {rows.height - fit} more rows in {table.of or table.name}")
         block += legend
-        said |= {column.meaning for column in table.columns}
+        said |= {column.meaning for column in _fitting(table, fit)[0]}
         tables.append(block)
         room -= len(block) + 1
     more = wrapped([f"Also in the files: {'; '.join(left)}."] if left else [])
@@ -75,12 +75,13 @@ def wrapped(texts: Iterable[str], first: str = "") -> list[str]:
 
 def _legend(table: Table, said: Collection[str]) -> list[str]:
     """What the columns mean that a terminal shows, but for what was said below an earlier table."""
-    parts = [f"{one.title}: {one.meaning}" for one in table.columns if one.screen and one.meaning not in ("", *said)]
+    columns, _, _ = _fitting(table, table.rows)
+    parts = [f"{one.title}: {one.meaning}" for one in columns if one.meaning not in ("", *said)]
     return [f"{'. '.join(parts)}."] if parts else []
 
 
-def _laid_out(table: Table, rows: int) -> list[str]:
-    """The header and the first rows, aligned; numbers to the right. The last columns give way to the width."""
+def _fitting(table: Table, rows: int) -> tuple[list[Column], list[list[str]], list[int]]:
+    """The columns that fit; the cells of all columns in the first rows, under their titles; the widths of those."""
     columns = [column for column in table.columns if column.screen]
     cells = [[column.title for column in columns]]
     cells += [[cell(row, column) for column in columns] for row in table.shown.head(rows).iter_rows(named=True)]
@@ -89,6 +90,12 @@ def _laid_out(table: Table, rows: int) -> list[str]:
         widths[-1] = max(20, WIDTH - sum(widths[:-1]) - 2 * (len(widths) - 1))
     while len(widths) > 2 and sum(widths) + 2 * (len(widths) - 1) > WIDTH and columns[-1].kind not in ("text", "prose"):
         columns, widths = columns[:-1], widths[:-1]
+    return columns, cells, widths
+
+
+def _laid_out(table: Table, rows: int) -> list[str]:
+    """The header and the first rows, aligned; numbers to the right. The last columns give way to the width."""
+    columns, cells, widths = _fitting(table, rows)
     rest = max(20, WIDTH - sum(widths[:-1]) - 2 * (len(widths) - 1))
     if columns[-1].kind == "text":  # what runs over is cut: the files have it whole
         widths[-1] = min(widths[-1], rest)
