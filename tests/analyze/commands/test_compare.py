@@ -259,7 +259,7 @@ def test_success_is_that_of_pairs_and_says_what_they_could_have_shown(stores, mo
     assert verdict in finding.sentence
     assert finding.numbers["p"] == pytest.approx(p)
     assert (finding.numbers["n"], finding.numbers["lost"]) == (8, sum(a > b for a, b in zip(first, other, strict=True)))
-    assert ("once 6 change" in finding.limit) == (p > 0.05)
+    assert ("6 pairs or more must change" in finding.limit) == (p > 0.05)
 
 
 def test_a_deaf_policy_is_said_first(example_pair):
