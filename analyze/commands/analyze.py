@@ -96,8 +96,8 @@ def analyze(
             Table("episodes_groups", of_groups),
             Table("steps", levels.steps()),
             Table("steps_groups", levels.steps_groups()),
-            Table("replans", levels.replans()),
-            Table("replans_groups", levels.groups("replan", "layer")),
+            Table("replans", levels.replans(), file=False),
+            Table("replans_groups", levels.groups("replan", "layer"), file=False),
             *sinks,
         ],
         _figures(levels, tasks, groups, episodes, shown),
@@ -110,6 +110,8 @@ def _of_words(question: Question) -> list[Finding]:
     """Whether it listens, and which words decide, as `language` says it; of the question that is asked by default."""
     if not question.grouping.compares_modalities or not question.vocabulary.words or question.of_other_loop:
         return []
+    if all(item.episode.attributes.steps is None for item in question.selected[:1]):
+        return []  # nor have the others: they are recorded in the same way
     asked = with_choices(behaviour(question.episodes))
     return [] if asked.is_empty() else [listens(asked), *word_effects(question)[0]]
 

@@ -69,7 +69,7 @@ def kept_apart(levels: Levels, by: Collection[str], more: Sequence[Table] = ()) 
         f"Where attention goes, by {' and '.join(by)}",
         about(question),
         [_finding(levels, part, [*tables, of_groups], columns, by)],
-        [*tables, of_groups, *_steps(levels), *more],
+        [*tables, of_groups, *_steps(levels), *_replans(levels, by), *more],
         _figures(levels, [*tables, of_groups], axes),
         notes(part),
     )
@@ -80,6 +80,13 @@ def _steps(levels: Levels) -> list[Table]:
     if not levels.heads:
         return []
     return [Table("steps", levels.steps()), Table("steps_groups", levels.steps_groups())]
+
+
+def _replans(levels: Levels, by: Collection[str]) -> list[Table]:
+    """Every replan and layer, with means over the layers as the published scripts take them."""
+    if "replan" not in by:
+        return []
+    return [Table("replans", levels.replans()), Table("replans_groups", levels.groups("replan", "layer"))]
 
 
 def _finding(

@@ -55,6 +55,7 @@ class Table:
         where: the rows that texts show; all unless it is given.
         rows: how many of them a terminal shows at most.
         of: name of the table whose file has these rows; without one the table has a file of its own.
+        file: whether it has a file at all; a large one that few ask for is for Python and for `--by`.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Table:
     where: pl.Expr | None = None
     rows: int = 12
     of: str = ""
+    file: bool = True
 
     @property
     def shown(self) -> pl.DataFrame:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
 from vla_attention.analyze.core.measure import Items
 from vla_attention.analyze.measures.selected import SelectedEpisode
@@ -32,7 +31,8 @@ def items_of(item: SelectedEpisode) -> Items:
     """
     tokens = item.tokens
     prompts, num_keys = max(1, len(tokens.prompts)), tokens.layout.num_keys
-    members: dict[tuple[str, str, int | None, str | None], NDArray[np.float32]] = {}
+    members: dict[tuple[str, str, int | None, str | None], int] = {}
+    cells: list[tuple[int, int, int]] = []
     for number, words in enumerate(tokens.words):
         for place, word in enumerate(words):
             text, of_class = word.text.casefold(), word_class(word.text)
@@ -41,14 +41,18 @@ def items_of(item: SelectedEpisode) -> Items:
                 ("place", text, place, of_class),
                 ("scale", f"{of_class} words", None, of_class),
             ):
-                members.setdefault(name, np.zeros((prompts, num_keys), np.float32))[number, list(word.keys)] = 1.0
-    of_words = np.stack([*members.values()], axis=-1) if members else np.zeros((prompts, num_keys, 0), np.float32)
-    of_words = of_words if prompts == 1 else of_words[tokens.prompt_index]
+                item_number = members.setdefault(name, len(members))
+                cells += [(number, key, item_number) for key in word.keys]
     roles = tokens.static_roles
     named = [role for role in SCALE if (roles == role).any()]
-    of_roles = np.stack([roles == role for role in named], axis=-1).astype(np.float32)
-    replans = max(len(of_words), len(of_roles))
-    weights = np.concatenate([np.broadcast_to(part, (replans, *part.shape[1:])) for part in (of_words, of_roles)], 2)
+    of_prompt = np.zeros(1, np.intp) if prompts == 1 else np.asarray(tokens.prompt_index)
+    weights = np.zeros((max(len(of_prompt), len(roles)), num_keys, len(members) + len(named)), np.float32)
+    if cells:
+        of_words = np.zeros((prompts, num_keys, len(members)), np.float32)
+        of_words[tuple(np.array(cells).T)] = 1.0
+        weights[..., : len(members)] = of_words[of_prompt]
+    for i, role in enumerate(named, len(members)):
+        weights[..., i] = roles == role
     names = [*members, *(("scale", SCALE[role], None, None) for role in named)]
     labels = {
         column: pl.Series(column, [name[i] for name in names], dtype=dtype)

@@ -25,7 +25,7 @@ def write_result(result: Result, folder: Path, csv: bool = False) -> list[Path]:
         BadArgument: the folder cannot be made or written to.
     """
     ending = "csv" if csv else "parquet"
-    tables = [table for table in result.tables if not table.of]
+    tables = [table for table in result.tables if table.file and not table.of]
     about = {"title": result.title, "about": " ".join(result.about)}
     with writing("results", folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -57,6 +57,7 @@ def document(result: Result, ending: str = "parquet") -> dict[str, object]:
                 "columns": {column.name: {"kind": column.kind, "meaning": column.meaning} for column in table.columns},
             }
             for table in result.tables
+            if table.file
         },
         "figures": {figure.name: {"title": figure.title, "caption": figure.caption} for figure in result.figures},
     }

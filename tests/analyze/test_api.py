@@ -76,7 +76,7 @@ def test_tables_are_those_of_the_command(run, store, tmp_path):
     assert main(words) == 0
     answer = run.analyze(layers=[2], intervals="these-tasks")
     written = {file.stem: pl.read_parquet(file) for file in tmp_path.glob("*.parquet")}
-    assert set(written) == {table.name for table in answer.tables if not table.of}
+    assert set(written) == {table.name for table in answer.tables if table.file and not table.of}
     for name, table in written.items():
         assert_frame_equal(answer[name], table)
 

@@ -61,7 +61,7 @@ CASES: dict[str, tuple[tuple[str, ...], ...]] = {
     "cubes_heads": tuple(("analyze", "cubes.zarr", *more) for more in _HEADS),
     "cubes_time": (("analyze", "cubes.zarr", "--by", "time"),),
     "cubes_groups": (("analyze", "cubes.zarr", "--list"),),
-    "cubes_export": (("analyze", "cubes.zarr"),),
+    "cubes_export": (("analyze", "cubes.zarr"), ("analyze", "cubes.zarr", "--by", "replan")),
     "cubes_per_head": (("analyze", "cubes.zarr", "--by", "head", "--task", "0"),),
     "pair_compare": (("compare", "cubes.zarr", "one_colour.zarr"),),
     "reruns_compare": (("compare", "cubes.zarr", "RERUNS"),),
@@ -455,6 +455,10 @@ FORMS: dict[tuple[str, str], Form] = {
     ),
     ("heads", "sinks"): Form((*_EPISODE[:2], "key"), lambda tables: tables["2/sinks"]),
     ("heads", "sink_heads"): Form((*_EPISODE[:2], "key", "layer", "head"), lambda tables: tables["2/sink_heads"]),
+    ("export", "replans"): Form((*_EPISODE, "replan", "layer"), lambda tables: tables["1/replans"]),
+    ("export", "replans_groups"): Form(
+        (*_EPISODE, "replan", "layer", "group"), lambda tables: tables["1/replans_groups"]
+    ),
     ("compare", "comparison"): Form(
         ("run", "scope", "suite", "task_id", "layer", "quantity"),
         _compared,
