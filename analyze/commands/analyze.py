@@ -51,7 +51,6 @@ def analyze(
     """Fractions and lifts of the groups and the ratio of the grouping, over all tasks, by task and by layer.
 
     Args:
-        question: stores, selection and grouping.
         by: axes that are kept apart, of `axes.COLUMNS` and "camera"; see `apart.kept_apart`.
         without_sinks: take the keys that are sinks by this rule out of every group; reads all rows.
         list: what the stores hold, and what the grouping takes of it, instead.

@@ -38,8 +38,7 @@ _BETTER, _LISTEN, _MOVED, _NEEDS, _ATTENTION = (
 )  # fmt: skip
 #: Differences of five kinds are named: effects, groups, objects, words and heads.
 _SURE = pl.col("difference_q") <= NAMED_AT / 5
-#: So many differences of a kind are named.
-_MOST_NAMED = 3
+_MOST_NAMED = 3  # differences of a kind
 
 
 def compare(runs: Sequence[Run], allow_mismatch: Collection[str] = ()) -> Result:
