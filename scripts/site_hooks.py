@@ -134,11 +134,13 @@ PUBLISHED = {
 
 
 def commands_of(program: str) -> list[str]:
-    """The commands that the program's own help lists."""
-    text = printed_help(program, "")
-    part = text.partition("commands (" if program == "vla-analyze" else "positional arguments:")[2]
-    width = 2 if program == "vla-analyze" else 4
-    lines = part.partition("\nexamples:" if program == "vla-analyze" else "\noptions:")[0].splitlines()
+    """The commands that the program's own help lists; those of `vla-analyze` are in the help of all."""
+    questions = program == "vla-analyze"
+    text = printed_help("vla-attention" if questions else program, "")
+    begin, end, width = (
+        ("\nquestions to a store", "\n  help,", 2) if questions else ("positional arguments:", "\noptions:", 4)
+    )
+    lines = text.partition(begin)[2].partition(end)[0].splitlines()
     return [line.split()[0] for line in lines if re.match(rf" {{{width}}}[a-z]", line)]
 
 

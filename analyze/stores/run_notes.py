@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from dataclasses import replace
 
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.layout import Prompt
@@ -17,8 +18,14 @@ Episodes = Iterable[tuple[Store, StoredEpisode]]
 def run_notes(episodes: Episodes) -> tuple[str, ...]:
     """A line on each store whose run was changed, and what `prompt_notes` says of it; empty without any."""
     episodes = list(episodes)
-    stores = {str(store.path): store for store, _ in episodes}
-    return (*change_notes(stores.values()), *prompt_notes(episodes))
+    told = prompt_notes(episodes)
+    # Of a run that differs in its prompt alone, these lines say more.
+    stores = {
+        str(store.path): store
+        for store, _ in episodes
+        if not told or not replace(store.attributes.interventions, prompt=None).is_none
+    }
+    return (*change_notes(stores.values()), *told)
 
 
 def change_notes(stores: Iterable[Store]) -> tuple[str, ...]:

@@ -45,7 +45,7 @@ QUESTIONS: dict[str, Callable[[OpenStores, Path], pl.DataFrame | list[pl.DataFra
     "words": lambda run, other: [run.words()["words"], run.words()["words_episodes"]],
     "objects": lambda run, other: [run.objects()["objects_episodes"], run.objects()["iou_episodes"]],
     "time": lambda run, other: run.analyze(by=("time",))["by"],
-    "compare": lambda run, other: run.compare(other, allow_mismatch=["seed"]),
+    "compare": lambda run, other: run.compare(other, allow_mismatch=["seed"])["differences"],
     "export": lambda run, other: [
         pl.DataFrame(one["rows"].to_series().reset_index()) for one in run.to_xarray(rows=True)
     ],
