@@ -15,7 +15,6 @@ import ctypes
 import gc
 import time
 
-import measurement
 from measurement import Table, fix_threads, measured, peak_memory, ratios, write_rows
 
 #: Name of a row -> items, readers, denoise steps (None: all), and the conditions that are kept (None: all).
@@ -64,7 +63,7 @@ def cost_table(rounds: int, number: int, threads: int) -> Table:
     family, options = default_family(), argparse.ArgumentParser()
     family.add_arguments(options)
     policy = family.build(options.parse_args([]), "cpu")
-    store = open_store(measurement.ROOT / "vla_attention" / "example_stores" / "cubes.zarr")
+    store = open_store(va.example("cubes"))
     tasks = {episode.attributes.task_id: episode.attributes for episode in store.episodes}
     instructions = {number: task.instruction for number, task in tasks.items()}
     families = siblings_of((number, task.instruction, task.task_family) for number, task in tasks.items())

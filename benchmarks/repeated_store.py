@@ -37,6 +37,6 @@ def repeat_store(source: Path, path: Path, times: int) -> Path:
             for changed in ("zarr.json", "seal/zarr.json"):  # not through the link: the source stays as it is
                 (folder / changed).unlink()
             (folder / "zarr.json").write_text(json.dumps(document))
-            seal_episode(folder, name, episode.run, episode.version)
+            seal_episode(folder, name, episode.run)
     partial.rename(path)
     return path

@@ -12,7 +12,6 @@ from typing import Any
 from vla_attention.schemas.groupings.grouping import GroupingFile
 from vla_attention.schemas.jsonable import json_schema
 from vla_attention.schemas.results import EpisodeResult
-from vla_attention.schemas.stores.packed_index import PackedIndex
 from vla_attention.schemas.stores.seal_content import EpisodeSeal
 from vla_attention.schemas.stores.store_format import EpisodeAttributes, RootAttributes
 
@@ -32,9 +31,6 @@ def schema_documents() -> dict[str, dict[str, Any]]:
         ),
         "episode_seal.schema.json": json_schema(
             EpisodeSeal, "Episode seal", "Attributes of the group seal of an episode in a NAME.zarr store."
-        ),
-        "packed_index.schema.json": json_schema(
-            PackedIndex, "Packed index", "The file index.json of a packed store: its episodes and their zips."
         ),
         "grouping.schema.json": json_schema(
             GroupingFile, "Grouping file", "A TOML grouping file, after reading: group name to selector or selectors."

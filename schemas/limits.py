@@ -72,8 +72,6 @@ EFFECT_ENTRIES = 1_000_000
 #: Bodies of a scene whose poses are stored, and tasks that share a scene. LIBERO's scenes have up to 20 and 10.
 BODIES = 10_000
 GOALS = 10_000
-#: Queries x keys of a growing span, for which version 1 counts each key in float64.
-GROWING_CELLS = 1_000_000
 #: Replans of an episode: fourteen hours at 20 calls a second.
 REPLANS = 1_000_000
 #: Rows or columns of a picture, and its pixels: a little more than 4K.
@@ -106,8 +104,6 @@ CLAIMED_BYTES = 64_000_000
 EXPANSION = 100
 #: Bytes of a file that is read whole: an array of one chunk. Arrays that are longer are shards, read chunk by chunk.
 WHOLE_FILE_BYTES = 256_000_000
-#: Bytes at the end of a packed episode's zip: metadata, small files and the directory.
-ZIP_TAIL_BYTES = 64_000_000
 #: Files of an episode; see "Few files" in docs/store.md: 52.
 EPISODE_FILES = 10_000
 #: Bytes of an array; numpy counts them in 64 bits.

@@ -2,12 +2,12 @@
 
 Usage: python scripts/make_example_stores.py [--folder vla_attention/example_stores] [--keep FOLDER]
 
-`cubes.zarr`             the shipped policy pi05_cubes, "touch the red (green, blue) cube", two episodes each, with
-                         effects of words and cameras for all four readers
-`cubes_one_colour.zarr`  the same tasks, initial states, noise and effects, of a copy of that policy to which the three
-                         colour words are the same: their embeddings are replaced by their mean
-`cubes_noise.zarr`       the first episode of each task of cubes.zarr again, with other noise. Actions and attention of
-                         the same layers, without pictures and steps
+`cubes`             the shipped policy pi05_cubes, "touch the red (green, blue) cube", two episodes each, with
+                    effects of words and cameras for all four readers
+`cubes_one_colour`  the same tasks, initial states, noise and effects, of a copy of that policy to which the three
+                    colour words are the same: their embeddings are replaced by their mean
+`cubes_noise`       the first episode of each task of cubes again, with other noise. Actions and attention of the
+                    same layers, without pictures and steps
 
 Takes about a minute on two cores. The same machine, libraries and number of threads give the same stores, but for
 the times and versions in their provenance. `tests/package/test_example_stores.py` reads what is there.
@@ -24,6 +24,7 @@ from pathlib import Path
 
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
+from vla_attention.schemas.stores.tar_files import write_tar
 
 ROOT = Path(__file__).resolve().parents[1]
 POLICY = ROOT / "capture/policies/pi/pi05_cubes"
@@ -55,7 +56,7 @@ def main() -> int:
 
 
 def make(folder: Path) -> None:
-    """Record here, and put packed copies into `folder`."""
+    """Record here, and put archives of copies into `folder`."""
     store, other, noise = Path("cubes.zarr"), Path("cubes_one_colour.zarr"), Path("cubes_noise.zarr")
     rollouts = ("--task-suite", "cubes", "--task-id", *TASKS, "--num-episodes", "2", "--max-steps", MOST_STEPS)
     must(capture, "pi", *rollouts, *EFFECTS, "--output", store)
@@ -63,9 +64,9 @@ def make(folder: Path) -> None:
     # The layers, heads and denoise steps of the base: the viewer compares what both recorded.
     recorded = ("--num-episodes", "1", "--no-frames", "--no-contributions", "--precision", "7")
     must(capture, "rerun", store, "--noise-seed", NOISE_SEED, *recorded, "--output", noise)
-    pack(store, folder / store.name)
-    pack(other, folder / other.name, "--without", "contributions")
-    pack(noise, folder / noise.name, "--without", "objects", "steps")
+    archive(store, folder)
+    archive(other, folder, "--without", "contributions")
+    archive(noise, folder, "--without", "objects", "steps")
 
 
 def one_colour(folder: Path) -> Path:
@@ -84,11 +85,13 @@ def one_colour(folder: Path) -> Path:
     return folder
 
 
-def pack(store: Path, copy: Path, *options: str) -> None:
-    """Put a packed copy of a store into its place."""
-    shutil.rmtree(copy, ignore_errors=True)
-    copy.parent.mkdir(parents=True, exist_ok=True)
-    must(analyze, "store", "copy", store, copy, "--packed", *options)
+def archive(store: Path, folder: Path, *options: str) -> None:
+    """Put an archive of a copy of a store into a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as temporary:
+        copy = Path(temporary) / store.name
+        must(analyze, "store", "copy", store, copy, *options)
+        write_tar(copy, folder / f"{store.stem}.tar.xz")
 
 
 def must(program: object, *arguments: object) -> None:

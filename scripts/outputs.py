@@ -3,7 +3,7 @@
     python scripts/outputs.py make FOLDER [--only TEXT]      with the checkout and the installation that run it
     python scripts/outputs.py compare BEFORE AFTER           exit code 1 and a list where they differ
 
-Inputs: the golden stores of both versions, the example stores, a capture of the suite `cubes` by the policy that comes
+Inputs: the golden stores, the example stores, a capture of the suite `cubes` by the policy that comes
 along, one of Cosmos, one of LIBERO (where VLA_LIBERO_ASSETS names its assets), a policy recorded from its user's own
 code, a data set made here, and the published results files of the tests. A change that is to alter no number and no
 sentence is made between two calls of `make`.
@@ -18,7 +18,6 @@ import argparse
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -28,6 +27,8 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
+
+from vla_attention.schemas.stores.tar_files import unpack  # noqa: E402 - a script, and not part of the package
 
 #: Names of JSON members that say when, where and with what a file was made, or digest what does.
 VARIES = {
@@ -113,10 +114,11 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
         "seen/colour", "--output", "results/own_groups",
     ]  # fmt: skip
     yield "copy", ["vla-attention", "store", "copy", base, "stores/copied.zarr", "--without", "frames"]
-    yield "pack", ["vla-attention", "store", "copy", cubes, "stores/packed.zarr", "--packed"]
+    yield "tar", ["vla-attention", "store", "copy", cubes, "stores/tars.zarr", "--tar"]
+    yield "unpack", ["vla-attention", "store", "copy", "stores/tars.zarr", "stores/unpacked.zarr"]
     yield (
         "merge",
-        ["vla-attention", "store", "copy", "stores/packed.zarr", "stores/task.zarr", "-o", "stores/merged.zarr"],
+        ["vla-attention", "store", "copy", "stores/unpacked.zarr", "stores/task.zarr", "-o", "stores/merged.zarr"],
     )
     yield "merge_refused", ["vla-attention", "store", "copy", cubes, "stores/two.zarr", "-o", "stores/refused.zarr"]
     for name, words in {
@@ -143,7 +145,7 @@ def _commands_of(stage: str) -> list[str]:
 
 def _stores(folder: Path) -> list[str]:
     """Golden and example stores, the run of cubes, and one recorded by a policy's user."""
-    golden = sorted(str(path.relative_to(folder)) for path in (folder / "stores/golden").glob("*/*.zarr"))
+    golden = sorted(str(path.relative_to(folder)) for path in (folder / "stores/golden").glob("*.zarr"))
     own = ["stores/cubes.zarr", "stores/cosmos.zarr", "stores/recorded.zarr", "stores/replay.zarr"]
     libero = ["stores/libero.zarr"] if os.environ.get("VLA_LIBERO_ASSETS") else []
     return [*golden, "stores/example/cubes.zarr", *own, *libero]
@@ -153,10 +155,9 @@ def make(folder: Path, only: str) -> int:
     """Run all commands below a new folder."""
     folder.mkdir(parents=True)
     stores = folder / "stores"
-    for version in ("version1", "version2"):
-        for store in sorted((ROOT / "tests/golden/stores" / version).glob("*.zarr")):
-            shutil.copytree(store, stores / "golden" / version / store.name)
-    shutil.copytree(ROOT / "vla_attention/example_stores", stores / "example", ignore=shutil.ignore_patterns("*.py*"))
+    for place, inside in (("tests/golden/stores", "golden"), ("vla_attention/example_stores", "example")):
+        for archive in sorted((ROOT / place).glob("*.tar.xz")):
+            unpack(archive, stores / inside)
     subprocess.run([sys.executable, __file__, "--inputs", str(folder)], check=True)
     environment = os.environ | {
         "OMP_NUM_THREADS": "1", "VLA_CACHE": "off", "SOURCE_DATE_EPOCH": "0", "COLUMNS": "120", "NO_COLOR": "1",

@@ -15,6 +15,7 @@ import pytest
 import yaml
 
 from scripts.site_hooks import OUTSIDE
+from tests.kit.archives import unpacked
 from tests.kit.golden_tables import STORES
 from vla_attention.__main__ import COMMANDS as PROGRAM_COMMANDS
 from vla_attention.__main__ import main as vla_attention
@@ -129,7 +130,7 @@ def test_the_questions_of_the_readme_run(tmp_path, monkeypatch):
     questions = [shlex.split(line)[1:] for line in lines if " view " not in line]
     assert {words[0] for words in questions} == {"analyze", "language", "objects", "words", "effects"}
     for words in questions:
-        store = STORES["effects" if words[0] == "effects" else "cubes"]
+        store = unpacked(STORES["effects" if words[0] == "effects" else "cubes"])
         Path("runs/cubes.zarr").unlink(missing_ok=True)
         Path("runs/cubes.zarr").symlink_to(store, target_is_directory=True)
         assert vla_attention([word for word in words if word != "-->"]) == 0

@@ -14,8 +14,6 @@ TOP = {
     "docs", "examples", "mkdocs.yml", "paper.bib", "paper.md", "pyproject.toml", "requirements-libero.txt",
     "schemas", "scripts", "tests", "vla_attention",
 }  # fmt: skip
-#: Below these, folders NAME.zarr are tracked.
-STORES = ("tests/golden/stores/", "tests/golden/tables/stores/", "vla_attention/example_stores/")
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +28,8 @@ def test_the_top_has_these_entries_and_no_others(tracked):
     assert sorted({name.split("/")[0] for name in tracked}) == sorted(TOP)
 
 
-def test_stores_are_tracked_where_stores_may_be(tracked):
-    assert [name for name in tracked if ".zarr/" in name and not name.startswith(STORES)] == []
+def test_no_store_is_tracked(tracked):
+    assert [name for name in tracked if ".zarr/" in name] == []
 
 
 def test_no_results_of_a_run_are_tracked(tracked):

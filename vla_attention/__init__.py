@@ -2,15 +2,15 @@
 
     import vla_attention as va
 
-    run = va.open("runs/libero_10.zarr")    # a store, or several that are analysed as one
-    run.analyze()["tasks"]                            # a polars frame; docs/python.md lists the other methods
+    run = va.open("runs/libero_10.zarr")    # a store, or several that are analysed as one; or va.example("cubes")
+    run.analyze()["tasks"]                  # a polars frame; docs/python.md lists the other methods
 
     with va.record("run.zarr", policy, layout=va.layouts.smolvla(policy)) as run:    # docs/your-policy.md
         ...
 
-Public names: `open`, `workers` and `OpenStores` (stage two); `record`, `inspect`, `check_layout`, `layouts`, the parts
-of a `PolicyLayout` and `EffectSettings` (stage one, from your own code; they need torch); `UserError` (the base of
-every error that a user can cause) and `__version__`. `vla_attention.datasets` reads data sets of robots.
+Public names: `open`, `example`, `workers` and `OpenStores` (stage two); `record`, `inspect`, `check_layout`, `layouts`,
+the parts of a `PolicyLayout` and `EffectSettings` (stage one, from your own code; they need torch); `UserError` (the
+base of every error that a user can cause) and `__version__`. `vla_attention.datasets` reads data sets of robots.
 This import loads neither torch nor zarr, polars or numpy.
 """
 
@@ -58,7 +58,7 @@ _RECORDER = {
     "schemas.layout": ("PatchGrid", "SiteLayout", "Span"),
 }
 
-__all__ = ["OpenStores", "UserError", "__version__", "inspect", "open", "workers"]
+__all__ = ["OpenStores", "UserError", "__version__", "example", "inspect", "open", "workers"]
 
 
 def __dir__() -> list[str]:
@@ -80,6 +80,20 @@ def open(stores: str | Path | Sequence[str | Path]) -> OpenStores:
     from vla_attention.analyze.api import open_stores
 
     return open_stores(stores)
+
+
+def example(name: str) -> Path:
+    """Return the path of a small store that comes along: `cubes`, `cubes_one_colour` or `cubes_noise`.
+
+    >>> run = va.open(va.example("cubes"))
+
+    Raises:
+        UserError: there is no such store.
+    """
+    # Imported here: `import vla_attention` loads little.
+    from vla_attention.example_stores import example as example_there
+
+    return example_there(name)
 
 
 def workers(where: int | str) -> AbstractContextManager[None]:

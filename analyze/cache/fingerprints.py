@@ -34,11 +34,8 @@ def file_state(episode: StoredEpisode) -> bytes | None:
     place = episode.folder
     if not isinstance(place, Path):
         return _ELSEWHERE
-    if place.is_file():
-        paths = {"": str(place)}  # the episode is one zip
-    else:
-        names = [name for name in episode.files.records if not name.startswith(_NOT_MEASURED)]
-        paths = {name: f"{place}/{name}" for name in (*names, f"{SEAL_GROUP}/zarr.json")}
+    names = [name for name in episode.files.records if not name.startswith(_NOT_MEASURED)]
+    paths = {name: f"{place}/{name}" for name in (*names, f"{SEAL_GROUP}/zarr.json")}
     newest, stats = 0, []
     for name, path in paths.items():
         try:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.core.about import about
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
-from vla_attention.analyze.measures.baselines import baseline_notes, uniform_keys, uniform_masses
+from vla_attention.analyze.measures.baselines import uniform_keys, uniform_masses
 from vla_attention.analyze.measures.masses import uniform_ratio
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import resolve_all
@@ -198,7 +198,4 @@ def _uniform(question: Question, resolved: Sequence[ResolvedGrouping]) -> list[s
     low, high = (f"{end:.4g}" for end in (defined.min(), defined.max()))
     bounds = low if low == high else f"{low} to {high}"
     side = " / ".join(" + ".join(part) for part in (grouping.ratio.numerator, grouping.ratio.denominator))
-    return [
-        f"Attention spread evenly over all tokens gives the ratio {side} {bounds}.",
-        *baseline_notes(question.stores),
-    ]
+    return [f"Attention spread evenly over all tokens gives the ratio {side} {bounds}."]

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from vla_attention.analyze.measures.baselines import baseline_notes, contribution_notes
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
 from vla_attention.analyze.measures.task_families import sampling_of, units_of
@@ -77,12 +76,7 @@ class Question:
 
     @property
     def _remarks_on_numbers(self) -> tuple[str, ...]:
-        return (
-            *self.skipped,
-            *run_notes(self.episodes),
-            *baseline_notes(self.stores),
-            *contribution_notes(self.stores),
-        )
+        return (*self.skipped, *run_notes(self.episodes))
 
     @property
     def units(self) -> Units:

@@ -23,7 +23,8 @@ _EXAMPLES = """examples:
   vla-attention store copy libero_10.zarr slim.zarr --without frames
   vla-attention store copy libero_10.zarr slim.zarr --without frames objects contributions effects
   vla-attention store copy libero_10.zarr slim.zarr --without frames    again: adds what was captured meanwhile
-  vla-attention store copy libero_10.zarr packed.zarr --packed          one file an episode
+  vla-attention store copy libero_10.zarr tars.zarr --tar               one file an episode, to be carried
+  vla-attention store copy tars.zarr libero_10.zarr                     and back
   vla-attention store copy hf://datasets/ORG/NAME/libero_10.zarr here.zarr
   vla-attention store copy node1/libero_10.zarr node2/libero_10.zarr --output libero_10.zarr     one store of several
 
@@ -34,7 +35,7 @@ verify, and its provenance names the omitted parts.
 
 Several stores have to be of one run configuration: what differs is named. No two of them may hold the same episode. The
 one store shares the files of the given ones (hard links), so that it takes no space; a damage of one is then a damage
-of both, and --copy makes files of its own. What comes from a zip or from elsewhere is always copied.
+of both, and --copy makes files of its own. What comes from elsewhere is always copied.
 """
 
 
@@ -44,9 +45,9 @@ def build_parser() -> argparse.ArgumentParser:
     acts = parser.add_subparsers(required=True, metavar="copy|verify", parser_class=OneSentenceParser)
     copy = acts.add_parser(
         "copy",
-        help="a copy: smaller, packed, from elsewhere; or one store of several",
-        description="Copy a store, for instance without its pictures or packed into few files, or make one store of "
-        "several of\none run. Without a place to copy to, print how large each part is.",
+        help="a copy: smaller, in tar files, from elsewhere; or one store of several",
+        description="Copy a store, for instance without its pictures or as a tar file an episode, or make one store "
+        "of several of\none run. Without a place to copy to, print how large each part is.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -68,9 +69,9 @@ def build_parser() -> argparse.ArgumentParser:
         help="frames, objects, contributions, effects, steps (default: copy all)",
     )
     copy.add_argument(
-        "--packed",
+        "--tar",
         action="store_true",
-        help="one zip file an episode and an index of them; every command reads it in place, here and elsewhere",
+        help="one tar file an episode, where many files are a burden; store copy makes a store of them again",
     )
     copy.add_argument(
         "--copy", action="store_true", help="of several stores: copy every file, instead of sharing it (hard links)"
@@ -114,29 +115,29 @@ def _run_copy(arguments: argparse.Namespace) -> int:
         raise BadArgument(f"{len(stores)} stores and no place for the one that they become; add --output DEST.zarr.")
     without = check_parts(arguments.without)
     if target is None:
-        if arguments.packed:
-            raise BadArgument("--packed needs a place for the packed copy; give DEST.zarr.")
+        if arguments.tar:
+            raise BadArgument("--tar needs a place for the copy; give DEST.zarr.")
         from vla_attention.schemas.stores.reader import open_store
 
         print(_sizes_text(open_store(stores[0]), without))
         return 0
     if len(stores) > 1:
-        if without:
-            raise BadArgument("--without is for one store; make one of the several first, then copy that.")
-        return _merge(stores, target, copy=arguments.copy, packed=arguments.packed)
+        if without or arguments.tar:
+            option = "--without" if without else "--tar"
+            raise BadArgument(f"{option} is for one store; make one of the several first, then copy that.")
+        return _merge(stores, target, copy=arguments.copy)
     if arguments.copy:
         raise BadArgument("--copy is for several stores: the copy of one has files of its own anyway.")
-    return _copy(stores[0], target, without, packed=arguments.packed)
+    return _copy(stores[0], target, without, tar=arguments.tar)
 
 
-def _copy(place: StorePlace, target: Path, without: Sequence[str], *, packed: bool) -> int:
-    from vla_attention.analyze.store.copying import copy_store
+def _copy(place: StorePlace, target: Path, without: Sequence[str], *, tar: bool) -> int:
+    from vla_attention.analyze.store.copying import copy_store, open_source
     from vla_attention.schemas.progress_bar import progress_bar
-    from vla_attention.schemas.stores.reader import open_store
 
-    store = open_store(place)
+    store = open_source(place)
     with progress_bar(len(store.episodes), "episodes") as advance:
-        copied = copy_store(store, target, without, advance, packed=packed)
+        copied = copy_store(store, target, without, advance, tar=tar)
     already = f" ({copied.present} were there already)" if copied.present else ""
     left = f", {format_bytes(copied.left_bytes)} left behind: {', '.join(without)}" if without else ""
     added = plural(copied.added, "episode")
@@ -144,14 +145,14 @@ def _copy(place: StorePlace, target: Path, without: Sequence[str], *, packed: bo
     return 0
 
 
-def _merge(places: Sequence[StorePlace], target: Path, *, copy: bool, packed: bool) -> int:
+def _merge(places: Sequence[StorePlace], target: Path, *, copy: bool) -> int:
     from vla_attention.analyze.store.merging import merge_stores
     from vla_attention.schemas.progress_bar import progress_bar
     from vla_attention.schemas.stores.reader import open_store
 
     stores = [open_store(path) for path in places]
     with progress_bar(sum(len(store.episodes) for store in stores), "episodes") as advance:
-        merged = merge_stores(stores, target, advance, link=not copy, packed=packed)
+        merged = merge_stores(stores, target, advance, link=not copy)
     parts = ", ".join(f"{len(store.episodes)} of {store.path}" for store in stores)
     shared = f"; {format_bytes(merged.linked_bytes)} are shared with the given stores" if merged.linked_bytes else ""
     print(f"{target}: {plural(merged.episodes, 'episode')} ({parts}), all whole{shared}.")

@@ -11,32 +11,43 @@ from __future__ import annotations
 
 import errno
 import json
-import os
 import re
 import shutil
+import tarfile
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from vla_attention.analyze.store.packing import Packing
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 from vla_attention.schemas.stores.digest import run_digest, with_digest
-from vla_attention.schemas.stores.durable_files import lock_for_writing, publish
+from vla_attention.schemas.stores.durable_files import publish, publish_file
 from vla_attention.schemas.stores.episode_files import files_of_no_array, refuse_links
 from vla_attention.schemas.stores.partial_folders import partial_of, remove_dead_partials
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
-from vla_attention.schemas.stores.root import episode_folders, group_attributes, group_document, without_other_fields
+from vla_attention.schemas.stores.root import (
+    NAMES_FILE,
+    TAR_SUFFIX,
+    episode_folders,
+    group_attributes,
+    group_document,
+    names_document,
+    read_run,
+    without_other_fields,
+)
 from vla_attention.schemas.stores.seal import SEAL_FILE, seal_episode
 from vla_attention.schemas.stores.store_format import (
     EPISODES_DOCUMENT,
     EPISODES_GROUP,
     CorruptEpisode,
     RunMismatch,
+    is_episode_name,
+    parse_episode_name,
 )
 from vla_attention.schemas.stores.store_place import check_place
-from vla_attention.schemas.stores.store_url import HUB_PROTOCOL, MAIN, HubAddress, StoreUrl
+from vla_attention.schemas.stores.store_url import HUB_PROTOCOL, MAIN, HubAddress, StorePlace, StoreUrl
+from vla_attention.schemas.stores.tar_files import unpack, write_tar
 
 
 @dataclass(frozen=True)
@@ -71,6 +82,36 @@ class Copied:
     left_bytes: int
 
 
+def open_source(place: StorePlace) -> Store:
+    """What is copied: a store, or a copy whose episodes are tar files; those are unpacked one by one."""
+    tars = _tars(place) if isinstance(place, Path) else {}
+    if not tars:
+        return open_store(place)
+    root, run = read_run(place)
+    names = sorted(tars, key=parse_episode_name)
+    return Store(place, root, run, tuple(StoredEpisode(tars[name], name, run) for name in names))
+
+
+def _tars(store: Path) -> dict[str, Path]:
+    """The tar files of a copy by the name of their episode; a link is none."""
+    tars = {path.name.removesuffix(TAR_SUFFIX): path for path in (store / EPISODES_GROUP).glob(f"*{TAR_SUFFIX}")}
+    return {name: path for name, path in tars.items() if is_episode_name(name) and not path.is_symlink()}
+
+
+def _unpacked(episode: StoredEpisode, building: Path, only: str = "") -> StoredEpisode:
+    """An episode in a folder: unpacked where it is a tar file. only: the one file that is needed."""
+    tar = episode.folder
+    if not isinstance(tar, Path) or tar.suffix != TAR_SUFFIX:
+        return episode
+    into = building / "tar"
+    shutil.rmtree(into, ignore_errors=True)
+    try:
+        unpack(tar, into, [f"{episode.name}/{only}"] if only else ())
+    except (tarfile.TarError, KeyError, EOFError) as error:
+        raise CorruptEpisode(f"Episode {episode.name} cannot be read: its tar file is damaged ({error}).") from None
+    return replace(episode, folder=into / episode.name)
+
+
 def part_sizes(store: Store) -> dict[str, int]:
     """Bytes of each part of a store, as the seals list them; `rest` is everything else."""
     sizes = dict.fromkeys((*PARTS, REST), 0)
@@ -95,11 +136,11 @@ def copy_store(
     without: Sequence[str],
     progress: Callable[[int], object] | None = None,
     *,
-    packed: bool = False,
+    tar: bool = False,
 ) -> Copied:
     """Copy every episode of a store; `progress` is called with 1 after each. A copy that exists is brought up to date.
 
-    packed: one zip an episode and an index of them, see `packing.py`; otherwise a folder each, whatever the store has.
+    tar: one tar file an episode; what reads stores reads the copy of such a copy.
 
     Raises:
         BadArgument: the target cannot be written, or is the store itself.
@@ -111,7 +152,7 @@ def copy_store(
     if isinstance(store.path, Path) and target.resolve() == store.path.resolve():
         raise BadArgument(f"Cannot copy {store.path} to itself; give another name.")
     try:
-        return _copy(store, target, without, progress, packed)
+        return _copy(store, target, without, progress, tar)
     except OSError as error:
         if isinstance(error, UserError) or error.errno is None:
             raise
@@ -119,42 +160,43 @@ def copy_store(
 
 
 def _copy(
-    store: Store, target: Path, without: tuple[str, ...], progress: Callable[[int], object] | None, packed: bool
+    store: Store, target: Path, without: tuple[str, ...], progress: Callable[[int], object] | None, tar: bool
 ) -> Copied:
     root = _root_document(store, without)
     run = run_digest(group_attributes(root))
     target.parent.mkdir(parents=True, exist_ok=True)
     remove_dead_partials(target)
-    pack: Packing | None = None
-    lock: int | None = None
     with partial_of(target, "copy") as building:
-        try:
-            _ensure_root(store, target, root, building)
-            lock = lock_for_writing(target, packing=packed)
-            pack = Packing(target, run, building) if packed else None
-            present = {folder.name for folder in episode_folders(target)} if pack is None else pack.present()
-            _refuse_others(store, target, present)
-            added = copied = left = 0
-            for episode in store.episodes:
-                if episode.name not in present:
-                    folder = building / episode.name
-                    sizes = _copy_episode(store, episode, folder, without, run)
-                    copied, left, added = copied + sizes[0], left + sizes[1], added + 1
-                    if pack is None:
-                        _rename_new(folder, target / EPISODES_GROUP / episode.name)
-                    else:
-                        pack.add(episode.name, folder)
-                        shutil.rmtree(folder)
-                if progress is not None:
-                    progress(1)
-        finally:
-            try:
-                if pack is not None:
-                    pack.write_index()
-            finally:
-                if lock is not None:
-                    os.close(lock)
+        _ensure_root(store, target, root, building)
+        present = set(_tars(target)) if tar else {folder.name for folder in episode_folders(target)}
+        if tar and not present and episode_folders(target):
+            raise BadArgument(f"Cannot copy tar files to {target}: its episodes are folders; give another name.")
+        _refuse_others(store, target, present, building)
+        added = copied = left = 0
+        for episode in store.episodes:
+            if episode.name not in present:
+                folder = building / episode.name
+                sizes = _copy_episode(store, _unpacked(episode, building), folder, without, run)
+                copied, left, added = copied + sizes[0], left + sizes[1], added + 1
+                if tar:
+                    file = building / f"{episode.name}{TAR_SUFFIX}"
+                    write_tar(folder, file)
+                    shutil.rmtree(folder)
+                    publish_file(file, target / EPISODES_GROUP / file.name)
+                else:
+                    _rename_new(folder, target / EPISODES_GROUP / episode.name)
+            if progress is not None:
+                progress(1)
+        if not tar:
+            write_names(target, building)
     return Copied(added, len(store.episodes) - added, copied, left)
+
+
+def write_names(store: Path, building: Path) -> None:
+    """Write the list of a store's episodes, for web servers; `building` is a folder beside the store."""
+    names = sorted((folder.name for folder in episode_folders(store)), key=parse_episode_name)
+    (building / NAMES_FILE).write_bytes(names_document(names))
+    publish_file(building / NAMES_FILE, store / NAMES_FILE)
 
 
 def _ensure_root(store: Store, target: Path, root: bytes, building: Path) -> None:
@@ -179,23 +221,23 @@ def _ensure_root(store: Store, target: Path, root: bytes, building: Path) -> Non
         )
 
 
-def _refuse_others(store: Store, target: Path, present: Collection[str]) -> None:
+def _refuse_others(store: Store, target: Path, present: Collection[str], building: Path) -> None:
     """Raise `RunMismatch` where the copy has an episode by its name that is another recording than the store's.
 
     One that was recorded again (`--overwrite`, after `repair`) has the name and the configuration of the first.
     """
     if not present:
         return
-    copied = {episode.name: episode for episode in open_store(target).episodes}
+    copied = {episode.name: episode for episode in open_source(target).episodes}
     others = []
     for episode in store.episodes:
         if episode.name not in present:
             continue
         try:
-            captured = _captured(copied[episode.name])
+            captured = _captured(_unpacked(copied[episode.name], building, SEAL_FILE))
         except CorruptEpisode as error:
             raise CorruptEpisode(f"Cannot continue the copy {target}: {error}") from None
-        if captured != _captured(episode):
+        if captured != _captured(_unpacked(episode, building, SEAL_FILE)):
             others.append(episode.name)
     if others:
         raise RunMismatch(
@@ -235,7 +277,7 @@ def _copy_episode(
             copied += episode.copy_file(file, place)
     seal = folder / SEAL_FILE
     if without:
-        seal_episode(folder, episode.name, run, episode.version, copied_from=_captured(episode))
+        seal_episode(folder, episode.name, run, copied_from=_captured(episode))
     else:
         seal.parent.mkdir()
         seal.write_bytes(without_other_fields(episode.source.whole(SEAL_FILE)))

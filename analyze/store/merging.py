@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from vla_attention.analyze.store.copying import copy_store
+from vla_attention.analyze.store.copying import write_names
 from vla_attention.analyze.stores.checking import reports_of_store
 from vla_attention.schemas.errors import BadArgument, UserError, listing, plural
 from vla_attention.schemas.stores.digest import run_differences, with_digest
@@ -55,12 +55,10 @@ def merge_stores(
     progress: Callable[[int], object] | None = None,
     *,
     link: bool = True,
-    packed: bool = False,
 ) -> Merged:
     """Make a store of the episodes of others; `progress` is called with 1 after each.
 
     link: files of stores of folders that are here are linked, where the file system can; otherwise they are copied.
-    packed: one zip an episode and an index of them, see `analyze/store/packing.py`; nothing is shared then.
 
     Raises:
         BadArgument: fewer than two stores, two that hold the same episode, or a place that cannot be written.
@@ -75,11 +73,7 @@ def merge_stores(
         with partial_of(target, "merge") as building:
             place = building / target.name
             merged = _merge(stores, place, progress, link)
-            if packed:
-                zips = building / "packed" / target.name
-                zips.parent.mkdir()
-                copied = copy_store(open_store(place), zips, (), packed=True)
-                place, merged = zips, Merged(merged.episodes, 0, copied.copied_bytes)
+            write_names(place, building)
             publish(place, target, durable=True)
             return merged
     except OSError as error:
@@ -112,12 +106,6 @@ def _check(stores: Sequence[Store], target: Path) -> None:
 def _check_same_run(one: Store, other: Store) -> None:
     if one.run == other.run and _left_out(one) == _left_out(other):
         return
-    versions = [store.attributes.version_text for store in (one, other)]
-    if versions[0] != versions[1]:
-        raise RunMismatch(
-            f"Cannot merge {one.path} and {other.path}: the one is of {versions[0]} and the other of {versions[1]} of "
-            "the store format, and no store has episodes of both. Analyses take several stores: give them both."
-        )
     differences = [
         f"{where} is {_short(here)} in the one and {_short(second)} in the other"
         for where, here, second in run_differences(one.attributes, other.attributes)
@@ -199,8 +187,8 @@ def _bring(episode: StoredEpisode, folder: Path, link: bool) -> tuple[int, int]:
 
 def _linked(episode: StoredEpisode, file: str, place: Path) -> bool:
     """Link one file; False where the file system cannot. What the file holds is looked at when all is read back."""
-    if episode.place is not None or isinstance(episode.folder, StoreUrl):
-        return False  # in a zip, or elsewhere
+    if isinstance(episode.folder, StoreUrl):
+        return False
     path = episode.folder / file
     try:
         os.link(path, place, follow_symlinks=False)

@@ -1,7 +1,6 @@
 """Rows of one episode, one layer and denoise step at a time: no analysis holds all rows of an episode.
 
-Every row that is read is held against its stored sum. Of a store of version 1 this finds what a crc32c alone cannot:
-bits that were chosen so that it stays.
+Every row that is read is held against its stored sum: a chunk of another episode has a checksum that fits, too.
 """
 
 from __future__ import annotations

@@ -10,7 +10,6 @@ from urllib.parse import unquote_to_bytes
 
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.safe_text import check_inner_path
-from vla_attention.schemas.stores.packed_index import INDEX_FILE
 from vla_attention.schemas.stores.store_format import EPISODES_GROUP
 
 #: The files of the page; the others in its folder say how it was built.
@@ -22,7 +21,7 @@ PAGE_FILES = {
 }
 STORES_DOCUMENT = "stores.json"
 #: What of a store is served. Whatever else lies in its folder stays there.
-_STORE_FILES = ("zarr.json", INDEX_FILE, EPISODES_GROUP)
+_STORE_FILES = ("zarr.json", EPISODES_GROUP)
 _LOOPBACK = frozenset({"127.0.0.1", "localhost", "[::1]"})
 _HOST = re.compile(r"([0-9a-z_](?:[0-9a-z_.-]{0,252})|\[[0-9a-f:.]{2,45}\])(?::[0-9]{1,5})?")
 _SUMMARY = re.compile(r"([0-9]{1,4})\.summary\.json")

@@ -16,7 +16,6 @@ from vla_attention.schemas.stores.remote_source import source_of
 from vla_attention.schemas.stores.root import episode_folders
 from vla_attention.schemas.stores.store_format import StoreError
 from vla_attention.schemas.stores.store_url import StorePlace
-from vla_attention.schemas.stores.zip_members import ZipMembers
 
 #: Bytes of a file that are read at once.
 _PIECE = 4_000_000
@@ -41,14 +40,9 @@ class ServedStore:
         """Where it is."""
         return self.store.path
 
-    @property
-    def is_packed(self) -> bool:
-        """Whether its episodes are zip files."""
-        return any(isinstance(episode.place, ZipMembers) for episode in self.store.episodes)
-
     def refresh(self) -> None:
         """List the episodes of a store of this machine anew: a capture may add some while the page is open."""
-        if not isinstance(self.place, Path) or self.is_packed:
+        if not isinstance(self.place, Path):
             return
         with self._lock:
             try:
@@ -96,7 +90,6 @@ def stores_document(stores: Sequence[ServedStore], with_paths: bool = False) -> 
                 "name": store.place.name if counts[store.place.name] == 1 else str(store.place),
                 "root": f"stores/{number}/",
                 "episodes": [{"name": episode.name} for episode in store.store.episodes],
-                "packed": store.is_packed,
                 "summary": f"stores/{number}.summary.json",
                 **({"path": str(store.place)} if with_paths else {}),
             }

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.threads import add_threads
 
 #: The two untrained policies that come with the program: a small one, and a smaller one for tests.
@@ -14,14 +12,6 @@ UNTRAINED_TINY = "untrained-tiny"
 UNTRAINED_POLICIES = (UNTRAINED, UNTRAINED_TINY)
 #: What `--threads` says of the policy.
 POLICY_THREADS = "processor threads of the policy (default: OMP_NUM_THREADS, else the cores that this process may use)"
-#: Their names in stores that were made before they said what the policies are.
-FORMER_NAMES = {"embedded": UNTRAINED, "dummy": UNTRAINED_TINY}
-
-
-def check_not_renamed(checkpoint: str) -> None:
-    """Raise `BadArgument` with the new name for a former name of an untrained policy, unless a folder is called so."""
-    if checkpoint in FORMER_NAMES and not Path(checkpoint).exists():
-        raise BadArgument(f"The policy '{checkpoint}' is now called '{FORMER_NAMES[checkpoint]}'; give this name.")
 
 
 def add_model_arguments(

@@ -62,7 +62,7 @@ def open_base(path: Path, chosen: Sequence[int | str] | None = None, num_episode
             of_task[task_id] += 1
             kept.append(episode)
     for episode in kept:
-        damaged = look_at(store, episode, read_only=True)
+        damaged = look_at(store, episode)
         if damaged is not None:
             raise CorruptEpisode(
                 f"Cannot rerun {path}: {damaged.describe().rstrip('.')}; vla-attention capture verify --repair moves "

@@ -215,7 +215,7 @@ class EpisodeWriter:
                 self.write(name, values, axes)
             self.group.update_attributes(to_json(self._attributes(success, num_steps, steps)))
             run = read_run(self.store)[1]
-            seal_episode(self.folder, self.name, run, self.run.store_version)
+            seal_episode(self.folder, self.name, run)
             self._read_back(run)
             return self._publish()
 
@@ -318,5 +318,5 @@ class EpisodeWriter:
 
     def _read_back(self, run: str) -> None:
         """Read everything back from disk, with the checks of `vla-attention store verify`."""
-        for problem in content_problems(self.run, StoredEpisode(self.folder, self.name, run, self.run.store_version)):
+        for problem in content_problems(self.run, StoredEpisode(self.folder, self.name, run)):
             raise CorruptEpisode(f"Episode {self.name}, read back from {self.folder}, is damaged: {problem.text}.")

@@ -29,11 +29,6 @@ from vla_attention.schemas.stores.store_format import (
 
 def check_same_run(path: Path, existing: RootAttributes, wanted: RootAttributes) -> None:
     """Raise `RunMismatch` for the first field of the run's configuration that differs."""
-    if existing.store_version != wanted.store_version:
-        raise RunMismatch(
-            f"Cannot resume {path}: it is of {existing.version_text}, and captures write {wanted.version_text}; give "
-            "another --output."
-        )
     for where, old, new in run_differences(existing, wanted):
         raise RunMismatch(
             f"Cannot resume {path}: its {where} is {old!r}, this run's is {new!r}; "

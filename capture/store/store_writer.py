@@ -29,7 +29,7 @@ from vla_attention.schemas.stores.partial_folders import (
     remove_dead_partials,
     remove_if_empty,
 )
-from vla_attention.schemas.stores.root import episode_folders
+from vla_attention.schemas.stores.root import NAMES_FILE, episode_folders
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
     RootAttributes,
@@ -95,6 +95,7 @@ def open_run(path: Path, attributes: RootAttributes, mode: WriteMode, *, durable
             _take_empty(path, attributes)
         existing = read_existing_root(path) if path.exists() else create_root(path, attributes, durable)
         check_same_run(path, existing, attributes)
+        (path / NAMES_FILE).unlink(missing_ok=True)  # of a copy: it would lack what is recorded now
         remove_dead_partials(path)
     return RunStore(path, existing, durable)
 

@@ -56,7 +56,6 @@ class EpisodeTokens:
         prompt_index: which prompt each replan had, shape (replan,).
         objects: the scene's objects, in the order of the coverage's last axis.
         coverage: per camera the area of each patch that each object covers, shape (replan, patch, object), 0..1.
-        num_queries: action queries of a replan; needed for version 1, where the layout has a growing span.
     """
 
     layout: SiteLayout
@@ -65,7 +64,6 @@ class EpisodeTokens:
     prompt_index: NDArray[np.integer] | None = None
     objects: tuple[SceneObject, ...] = ()
     coverage: Mapping[str, NDArray[np.float32]] | None = None
-    num_queries: int = 0
 
     @property
     def num_replans(self) -> int:

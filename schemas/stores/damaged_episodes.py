@@ -33,19 +33,11 @@ class DamagedEpisode:
         return f"{first}{more}."
 
 
-def look_at(
-    store: Store, episode: StoredEpisode, verify: bool = False, *, read_only: bool = False
-) -> DamagedEpisode | None:
+def look_at(store: Store, episode: StoredEpisode, verify: bool = False) -> DamagedEpisode | None:
     """Return what is wrong with an episode, or None.
 
-    verify: read all of it, as `vla-attention store verify` does. read_only: nothing is added to the store, which may be
-    packed.
+    verify: read all of it, as `vla-attention store verify` does.
     """
-    if episode.place is not None and not read_only:
-        raise StoreError(
-            f"{store.path} is packed, and captures add nothing to packed stores; vla-attention store verify "
-            f"{store.path} checks it, and vla-attention store copy {store.path} NAME.zarr makes a store of folders."
-        )
     problems = [problem.text for problem in check_presence(replace(episode))]
     if verify and not problems:
         problems = [fault.problem for fault in episode_faults(store, episode)]

@@ -90,7 +90,7 @@ def _array_problems(root: RootAttributes, episode: StoredEpisode, name: str, sha
     site = next((site for site in root.sites if site.name == site_name), None)
     recording = root.recording if site is None else root.recording.of_site(site)
     sums = _row_sums(episode, name, array.shape[:-1]) if kind in ("rows", "atoms") else None
-    uniform = _uniform(episode, site_name) if kind == "rows" and root.store_version > 1 else None
+    uniform = _uniform(episode, site_name) if kind == "rows" else None
     digest, problems = ArrayDigest(), list[str]()
     step = episode.reading_step(name)
     for first in range(0, array.shape[0], step):

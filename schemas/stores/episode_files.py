@@ -18,9 +18,8 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path, PurePosixPath
 
-from vla_attention.schemas.stores.packed_index import INDEX_FILE, read_index, unlisted_episodes
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
-from vla_attention.schemas.stores.remote_source import source_of
+from vla_attention.schemas.stores.root import NAMES_FILE
 from vla_attention.schemas.stores.seal import SEAL_FILE
 from vla_attention.schemas.stores.store_format import (
     EPISODES_DOCUMENT,
@@ -32,7 +31,6 @@ from vla_attention.schemas.stores.store_format import (
     is_episode_name,
 )
 from vla_attention.schemas.stores.store_url import StoreUrl
-from vla_attention.schemas.stores.zip_members import ZipMembers
 
 #: Names of chunks below their array, in the encodings that Zarr v3 has: `c.0.1`, `c/0/1`, `0.1`, `0/1`, `c`.
 _CHUNK = re.compile(r"c|(?:c[./])?[0-9]{1,20}(?:[./][0-9]{1,20}){0,30}")
@@ -56,11 +54,11 @@ def _belongs(file: str, arrays: Iterable[str], groups: set[str]) -> bool:
 
 
 def links_in_episode(episode: StoredEpisode) -> list[str]:
-    """Files and folders of an episode that are links; none of one in a zip or at an address.
+    """Files and folders of an episode that are links; none of one at an address.
 
     What a link leads to is not in the store: copies follow none. The episode's own folder is `.`.
     """
-    if episode.place is not None or isinstance(episode.folder, StoreUrl):
+    if isinstance(episode.folder, StoreUrl):
         return []
     files = [*episode.files.records, SEAL_FILE]
     folders = {str(parent) for file in files for parent in PurePosixPath(file).parents}
@@ -79,29 +77,25 @@ MOST_NAMED = 100
 
 
 def foreign_in_episode(episode: StoredEpisode) -> tuple[str, ...]:
-    """Paths in an episode's folder or zip that its seal does not list; a folder without any sealed file ends with /.
+    """Paths in an episode's folder that its seal does not list; a folder without any sealed file ends with /.
 
-    Links are not among them (`links_beyond_seal`). Of an episode at an address that is not packed, nothing is known.
+    Links are not among them (`links_beyond_seal`). Of an episode at an address nothing is known.
     `CorruptEpisode` when it has no readable seal.
     """
-    source = episode.source
-    if isinstance(source, ZipMembers):
-        known = {SEAL_FILE, *episode.files.records}
-        return tuple(islice((name for name in source.names() if name not in known), MOST_NAMED))
     return _named(file for file in _beyond_seal(episode) if not file.is_link)
 
 
 def links_beyond_seal(episode: StoredEpisode) -> tuple[str, ...]:
     """Links in an episode's folder that its seal does not list; raises as `foreign_in_episode` does.
 
-    Those in place of what it lists are `links_in_episode`; a zip with links cannot be read, see `ZipMembers`.
+    Those in place of what it lists are `links_in_episode`.
     """
     return _named(file for file in _beyond_seal(episode) if file.is_link)
 
 
 def _beyond_seal(episode: StoredEpisode) -> Iterator[_Found]:
     known = {SEAL_FILE, *episode.files.records}
-    if episode.place is None and isinstance(episode.folder, Path):
+    if isinstance(episode.folder, Path):
         folders = {"."}
         for file in known:
             while file := file.rpartition("/")[0]:
@@ -110,43 +104,28 @@ def _beyond_seal(episode: StoredEpisode) -> Iterator[_Found]:
 
 
 def foreign_in_store(store: Store) -> tuple[str, ...]:
-    """Paths beside the episodes of a store that are no part of it; nothing is known of a store at an address.
-
-    Episodes that the index of a packed store does not list are not among them: they are faults.
-    """
+    """Paths beside the episodes of a store that are no part of it; nothing is known of a store at an address."""
     if isinstance(store.path, StoreUrl):
         return ()
-    known = {"zarr.json", EPISODES_DOCUMENT}
-    folders = {".", EPISODES_GROUP}
-    index = read_index(source_of(store.path), store.path, store.run)
-    if index is not None:
-        packed = {entry.file for entry in index.episodes.values()} | {*unlisted_episodes(store.path, index)}
-        known |= {INDEX_FILE, *packed}
-        folders |= {str(PurePosixPath(file).parent) for file in packed}
-    else:
-        known |= {f"{EPISODES_GROUP}/{name}" for name in _episode_names(store.path / EPISODES_GROUP)}
-    beyond = _beyond(store.path, known, folders)
+    known = {"zarr.json", EPISODES_DOCUMENT, NAMES_FILE}
+    known |= {f"{EPISODES_GROUP}/{name}" for name in _episode_names(store.path / EPISODES_GROUP)}
+    beyond = _beyond(store.path, known, {".", EPISODES_GROUP})
     return _named(replace(one, path=f"{one.path} (a link)") if one.is_link else one for one in beyond)
 
 
 def beyond_the_format(store: Store) -> tuple[str, ...]:
     """Everything that a copy of a store's folder which follows links would take along beside the store: paths in it.
 
-    Named are links, also those in place of the store's own files, what is no part of it, and episodes that no index
-    lists; of one that is in a zip with its path there. Nothing is known of a store at an address.
+    Named are links, also those in place of the store's own files, and what is no part of it. Nothing is known of a
+    store at an address.
 
     Raises:
         CorruptEpisode: nothing is found, and what belongs to an episode is not known.
     """
     if isinstance(store.path, StoreUrl):
         return ()
-    index = read_index(source_of(store.path), store.path, store.run)
-    known = {"zarr.json", EPISODES_GROUP, EPISODES_DOCUMENT}
+    known = {"zarr.json", EPISODES_GROUP, EPISODES_DOCUMENT, NAMES_FILE}
     beyond = list(foreign_in_store(store))
-    if index is not None:
-        zips = {entry.file for entry in index.episodes.values()}
-        known |= {INDEX_FILE, *zips, *(str(PurePosixPath(file).parent) for file in zips)}
-        beyond += unlisted_episodes(store.path, index)
     beyond += [f"{path} (a link)" for path in known if os.path.islink(store.path / path)]
     unknown: CorruptEpisode | None = None
     for episode in map(replace, store.episodes):  # anew: what is read of one goes with it

@@ -51,8 +51,7 @@ def expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dict
         shapes[f"{site.name}/row_sum"] = cells
         shapes[f"{site.name}/atoms"] = (*cells, len(attributes.segments.get(site.name, ())))
         shapes[f"{site.name}/key_role"] = (replans, site.num_keys)
-        if root.store_version > 1:
-            shapes[f"{site.name}/uniform"] = (*cells, site.num_keys)
+        shapes[f"{site.name}/uniform"] = (*cells, site.num_keys)
         if recording.contributions:
             parts = len(attributes.segments.get(site.name, ())) + 1
             shapes[f"{site.name}/contribution"] = (*cells[:3], parts, parts)

@@ -10,7 +10,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, cast
@@ -26,17 +26,9 @@ from vla_attention.schemas.layout import Prompt, Role, prompt_at
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder
 from vla_attention.schemas.stores.episode_shapes import misfits
-from vla_attention.schemas.stores.packed_index import (
-    INDEX_FILE,
-    LIST_AGAIN,
-    NotListed,
-    PackedIndex,
-    read_index,
-    unlisted_episodes,
-)
 from vla_attention.schemas.stores.remote_source import RemoteFailure, at_commit, kept_bytes, source_of
 from vla_attention.schemas.stores.root import group_attributes, list_episodes, read_run
-from vla_attention.schemas.stores.seal import digests_problem, identity_problem, read_seal
+from vla_attention.schemas.stores.seal import identity_problem, read_seal
 from vla_attention.schemas.stores.seal_content import EpisodeSeal
 from vla_attention.schemas.stores.sealed_files import SealedFiles
 from vla_attention.schemas.stores.store_format import (
@@ -50,7 +42,6 @@ from vla_attention.schemas.stores.store_format import (
 )
 from vla_attention.schemas.stores.store_place import refuse_in_store
 from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl, store_place
-from vla_attention.schemas.stores.zip_members import DamagedZip, ZipMembers
 
 if TYPE_CHECKING:
     import zarr
@@ -69,33 +60,22 @@ class StoredEpisode:
     """One episode in its folder. It is read when it is needed, and nothing is read that its seal does not bind.
 
     Attributes:
-        folder: where it is; in a packed store its zip.
+        folder: where it is.
         name: the name of its group, which its seal must have.
         run: digest of the configuration of the run that it must belong to, see `run_digest`.
-        version: that of the store, as the run's configuration states it.
-        place: where its files are read; those in the folder unless it is given.
-        indexed: digest of its seal in the index of a packed store.
     """
 
     folder: StorePlace
     name: str
     run: str
-    version: int
-    place: ByteSource | None = None
-    indexed: str = ""
 
     def __reduce__(self) -> tuple[object, ...]:
         """A pickle holds where the episode is and nothing that was read; another process may run in another folder."""
-        given = (_from_anywhere(self.folder), self.name, self.run, self.version, self.place, self.indexed)
-        return StoredEpisode, given
+        return StoredEpisode, (_from_anywhere(self.folder), self.name, self.run)
 
     @cached_property
     def source(self) -> ByteSource:
         """The episode's files as they are found, not yet compared with the seal."""
-        if isinstance(self.place, ZipMembers):
-            return replace(self.place)  # what it keeps of the zip goes when this object goes
-        if self.place is not None:
-            return self.place
         if isinstance(self.folder, Path) and self.folder.parent.name == EPISODES_GROUP:
             return Folder(self.folder, within=self.folder.parents[1])
         return source_of(self.folder)
@@ -128,16 +108,12 @@ class StoredEpisode:
             seal = read_seal(self.source, fresh=fresh)
         except (RemoteFailure, CorruptEpisode):
             raise
-        except DamagedZip as error:
-            raise CorruptEpisode(f"Episode {self.name} cannot be read: {error}.") from None
         except OSError as error:
             lost = error.strerror or error
             raise CorruptEpisode(f"Episode {self.name} cannot be read: it has lost its seal ({lost}).") from None
         except ValueError as error:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: its seal is damaged ({error}).") from None
-        problem = identity_problem(seal, self.name, self.run) or digests_problem(seal, self.version)
-        if problem is None and self.indexed not in ("", seal.digest):
-            problem = f"its zip holds another seal than the {INDEX_FILE} of the store lists: one of them was changed"
+        problem = identity_problem(seal, self.name, self.run)
         if problem is not None:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: {problem}.")
         return seal
@@ -335,7 +311,6 @@ class StoredEpisode:
             prompt_index=self.read("prompt_index"),
             objects=self.attributes.objects,
             coverage=self.coverage(root, site),
-            num_queries=root.recording.of_site(layout).num_action_queries,
         )
 
     def prompts(self, root: RootAttributes, site: str) -> tuple[Prompt, ...]:
@@ -406,8 +381,7 @@ def open_store(path: str | StorePlace) -> Store:
     """Open a store for reading, at a path or an address; its episodes are in the order of task id and episode index.
 
     What is on the hub is read at one commit, which is in the `path` of the opened store.
-    What lies among the episodes and is none is named in a `Note` and ignored, and so are episodes that the index of a
-    packed store does not list.
+    What lies among the episodes and is none is named in a `Note` and ignored.
 
     Raises:
         StoreNotFound: nothing is there; the error lists the stores nearby.
@@ -418,42 +392,16 @@ def open_store(path: str | StorePlace) -> Store:
     if isinstance(path, StoreUrl) and (kept := kept_bytes()) is not None:
         refuse_in_store(kept.folder, "keep what is fetched in")
     root, run = read_run(path)
-    source, version = source_of(path), root.store_version
-    index = read_index(source, path, run)
-    if index is not None:
-        notes = _said(_unlisted(path, index))
-        in_order = sorted(index.episodes.items(), key=lambda item: parse_episode_name(item[0]))
-        members = {
-            name: ZipMembers(source.bound_to(entry.seal), entry.file, entry.bytes, entry.tail, entry.frame)
-            for name, entry in in_order
-        }
-        packed = (StoredEpisode(path / e.file, name, run, version, members[name], e.seal) for name, e in in_order)
-        return Store(path, root, run, tuple(packed), notes)
     folders, strays = list_episodes(path)
     stray = (
         f"Ignored in {path}, among its episodes: {visible(listing(strays))}; they are no episodes. Move them out of "
         "the store."
     )
-    notes = _said(stray if strays else "")
+    if strays:
+        warnings.warn(stray, Note, stacklevel=2)
     folders.sort(key=lambda folder: parse_episode_name(folder.name))
-    return Store(path, root, run, tuple(StoredEpisode(folder, folder.name, run, version) for folder in folders), notes)
-
-
-def _said(note: str) -> tuple[str, ...]:
-    """Say a note of an opened store, if there is one."""
-    if note:
-        warnings.warn(note, Note, stacklevel=3)
-    return (note,) if note else ()
-
-
-def _unlisted(path: StorePlace, index: PackedIndex) -> str:
-    """What the index of a packed store does not list, as a sentence; empty where it lists everything."""
-    try:
-        unlisted = unlisted_episodes(path, index)
-    except NotListed as error:
-        return f"Whether the {INDEX_FILE} of {path} lists every episode of it was not checked: {error}."
-    left = f"Left out of {path}: what its {INDEX_FILE} does not list, {listing(unlisted)}. {LIST_AGAIN}."
-    return left if unlisted else ""
+    episodes = tuple(StoredEpisode(folder, folder.name, run) for folder in folders)
+    return Store(path, root, run, episodes, (stray,) if strays else ())
 
 
 def _holds_missing(values: NDArray[Any]) -> bool:

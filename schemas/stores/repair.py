@@ -12,19 +12,16 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from vla_attention.schemas.errors import UserError
-from vla_attention.schemas.stores.byte_source import Folder
 from vla_attention.schemas.stores.claims import Claims, Holder, jobs_folder
 from vla_attention.schemas.stores.damaged_episodes import DamagedEpisode, look_at
-from vla_attention.schemas.stores.durable_files import lock_for_writing, publish_file
-from vla_attention.schemas.stores.packed_index import INDEX_FILE, read_index
+from vla_attention.schemas.stores.durable_files import publish_file
 from vla_attention.schemas.stores.partial_folders import no_link, process_tag, remove_if_empty
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.root import group_document, refuse_linked_group
 from vla_attention.schemas.stores.seal import read_seal
 from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, StoreError
 from vla_attention.schemas.stores.store_url import local_path
-from vla_attention.schemas.stores.verify import episode_report, store_faults
+from vla_attention.schemas.stores.verify import store_faults
 from vla_attention.schemas.stores.worker import this_worker
 
 #: Ending of the folder beside the store with the episodes that were moved aside. It may be deleted at any time.
@@ -70,8 +67,6 @@ def repair_store(path: Path, verify: bool = False, dry_run: bool = False) -> lis
     store = open_store(path)
     refuse_linked_group(path)
     _check_root(store)
-    if is_packed(path):
-        return _repair_packed(store, path, verify, dry_run)
     looks = [(episode, look_at(store, episode, verify)) for episode in store.episodes]
     damaged = [(episode, fault) for episode, fault in looks if fault is not None]
     if dry_run or not damaged:
@@ -99,45 +94,6 @@ def _check_root(store: Store) -> None:
         )
 
 
-def is_packed(path: Path) -> bool:
-    """Whether the store at a path has its episodes in zips."""
-    return (path / INDEX_FILE).is_file()
-
-
-def _repair_packed(store: Store, path: Path, verify: bool, dry_run: bool) -> list[Finding]:
-    """Move the zips of damaged episodes aside and write the index without them; nobody packs meanwhile."""
-    damaged = _damaged_zips(store, verify)
-    if dry_run or not damaged:
-        return [Finding(one) for one in damaged]
-    lock = lock_for_writing(path, packing=True)
-    try:
-        damaged = _damaged_zips(open_store(path), verify)  # another process may have packed them again
-        index = read_index(Folder(path), path, store.run)
-        if index is None:
-            return []
-        # The zips first: the index of a repair that is killed here lists zips that are gone, which the next one finds.
-        files = {name: path / entry.file for name, entry in index.episodes.items()}
-        findings = [Finding(one, moved_to=_move_aside(path, files[one.name], one)) for one in damaged]
-        names = {one.name for one in damaged}
-        kept = {name: entry for name, entry in index.episodes.items() if name not in names}
-        _write_whole(path / INDEX_FILE, replace(index, episodes=kept).document())
-        return findings
-    except OSError as error:
-        if isinstance(error, UserError):
-            raise
-        raise StoreError(
-            f"Cannot move damaged episodes of {path} into {damaged_folder(path)}: {error.strerror or error}. Remove "
-            "the cause and run the command again."
-        ) from None
-    finally:
-        os.close(lock)
-
-
-def _damaged_zips(store: Store, verify: bool) -> list[DamagedEpisode]:
-    reports = (episode_report(store, replace(episode), quick=not verify) for episode in store.episodes)
-    return [DamagedEpisode(report.episode, report.problems) for report in reports if report.problems]
-
-
 def _move(store: Store, episode: StoredEpisode, claims: Claims, verify: bool) -> Finding | None:
     """Move one episode aside; None if it is no longer there, or no longer damaged."""
     try:
@@ -159,7 +115,7 @@ def _move(store: Store, episode: StoredEpisode, claims: Claims, verify: bool) ->
 
 
 def _move_aside(store: Path, folder: Path, damaged: DamagedEpisode) -> Path:
-    """Rename an episode's folder or zip into a new entry of `NAME.zarr.damaged`, beside a file with the reason."""
+    """Rename an episode's folder into a new entry of `NAME.zarr.damaged`, beside a file with the reason."""
     for part in folder.relative_to(store).parents:
         if part.parts and (store / part).is_symlink():
             raise StoreError(

@@ -61,8 +61,6 @@ def _leftovers(path: Path, dry_run: bool) -> list[str]:
 
 
 def _lines(path: Path, findings: Sequence[Finding], total: int, verify: bool, dry_run: bool) -> list[str]:
-    from vla_attention.schemas.stores.repair import is_packed
-
     if not findings:
         looked = "every byte was read" if verify else "seals, presence and sizes; without --quick every byte is read"
         return [f"{path}: none of {total} episodes is damaged ({looked})."]
@@ -74,9 +72,5 @@ def _lines(path: Path, findings: Sequence[Finding], total: int, verify: bool, dr
         elif finding.holder is not None:
             lines.append(f"    left in the store, because it is claimed: {finding.holder.describe()}")
     if not dry_run and any(finding.moved_to is not None for finding in findings):
-        lines.append(
-            "Run the same vla-attention store copy --packed to pack what was moved aside again."
-            if is_packed(path)
-            else "Run the same capture with --resume to record what was moved aside again."
-        )
+        lines.append("Run the same capture with --resume to record what was moved aside again.")
     return lines

@@ -1,21 +1,21 @@
 """The root of a store: the run's attributes and the folders of its episodes. Read as plain JSON; zarr is not needed.
 
-`decode_root` decides which versions of the format are read; `docs/store.md` ("Versions") has the rule for changes.
+A copy has one more file, `NAMES_FILE`: web servers list nothing. Where a folder can be listed, it is not read.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
 from vla_attention.schemas.jsonable import MalformedDocument, from_json
-from vla_attention.schemas.limits import ROOT_BYTES
+from vla_attention.schemas.limits import DOCUMENT_BYTES, ROOT_BYTES
 from vla_attention.schemas.regular_files import read_regular
 from vla_attention.schemas.stores.digest import run_digest
-from vla_attention.schemas.stores.packed_index import INDEX_FILE, is_pack_folder
 from vla_attention.schemas.stores.remote_source import RemoteFailure, RemoteFolder, source_of
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
@@ -29,6 +29,10 @@ from vla_attention.schemas.stores.store_format import (
 )
 from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
 
+#: The names of a copy's episodes, a list in JSON.
+NAMES_FILE = "episodes.json"
+#: Ending of an episode in a copy that is to be carried in few files (`store copy --tar`).
+TAR_SUFFIX = ".tar"
 #: What the document of a group may say; zarr-python writes the last one as null.
 _GROUP_FIELDS = {"attributes", "zarr_format", "node_type", "consolidated_metadata"}
 
@@ -99,7 +103,7 @@ def _refuse_inside(path: Path, attributes: dict[str, Any]) -> None:
 
 
 def episode_folders(path: StorePlace) -> list[StorePlace]:
-    """Folders of the complete episodes of the store at `path`, in no particular order; none of them is packed."""
+    """Folders of the complete episodes of the store at `path`, in no particular order."""
     return list_episodes(path)[0]
 
 
@@ -110,18 +114,13 @@ def list_episodes(path: StorePlace) -> tuple[list[StorePlace], list[str]]:
     """
     if isinstance(path, StoreUrl):
         try:
-            names = RemoteFolder(path.url).names(EPISODES_GROUP)
+            names = listed_names(path) or RemoteFolder(path.url).names(EPISODES_GROUP)
         except (OSError, NotImplementedError) as error:
             raise StoreError(
-                f"The episodes of {path} cannot be listed ({str(error).rstrip('.')}), and it has no index; "
-                "vla-attention store copy --packed makes a store that is read without listing."
+                f"The episodes of {path} cannot be listed ({str(error).rstrip('.')}), and it has no {NAMES_FILE}; "
+                "vla-attention store copy writes one: upload a copy."
             ) from None
         is_episode_of = {name: is_episode_name(name) for name in names}
-    elif (path / INDEX_FILE).is_file():
-        raise StoreError(
-            f"{path} is packed: its episodes are zip files, and nothing is added to them or moved. vla-attention store "
-            f"copy {path} NAME.zarr makes a store of folders."
-        )
     else:
         refuse_linked_group(path)
         try:
@@ -131,9 +130,9 @@ def list_episodes(path: StorePlace) -> tuple[list[StorePlace], list[str]]:
             raise StoreError(
                 f"The store {path} cannot be read: its group '{EPISODES_GROUP}': {error.strerror or error}."
             ) from None
-    if any(map(is_pack_folder, is_episode_of)):
+    if any(name.endswith(TAR_SUFFIX) and is_episode_name(name.removesuffix(TAR_SUFFIX)) for name in is_episode_of):
         raise StoreError(
-            f"The store {path} cannot be read: it is packed, and its {INDEX_FILE} is lost; make the packed copy again."
+            f"The episodes of {path} are tar files; vla-attention store copy {path} NAME.zarr makes a store of them."
         )
     strays = sorted(name for name, is_episode in is_episode_of.items() if not is_episode and name != "zarr.json")
     return [path / EPISODES_GROUP / name for name, is_episode in is_episode_of.items() if is_episode], strays
@@ -146,6 +145,28 @@ def refuse_linked_group(path: Path) -> None:
             f"The store {path} cannot be used: its group '{EPISODES_GROUP}' is a link, and what lies elsewhere is no "
             "part of it; put the folder itself in its place."
         )
+
+
+def names_document(names: Sequence[str]) -> bytes:
+    """The content of a copy's `NAMES_FILE`."""
+    return json.dumps(names, indent=0).encode()
+
+
+def listed_names(path: StoreUrl) -> list[str]:
+    """The names that a copy's `NAMES_FILE` lists, for web servers, which list nothing; empty where there is none.
+
+    Raises:
+        StoreError: the file says something else.
+    """
+    try:
+        names = decode_json(source_of(path).whole(NAMES_FILE, most=DOCUMENT_BYTES))
+    except FileNotFoundError:
+        return []
+    except ValueError as error:
+        raise StoreError(f"The store {path} cannot be read: its {NAMES_FILE}: {error}.") from None
+    if not isinstance(names, list) or not all(isinstance(name, str) and is_episode_name(name) for name in names):
+        raise StoreError(f"The store {path} cannot be read: its {NAMES_FILE} is no list of names of episodes.")
+    return names
 
 
 def group_attributes(document: bytes) -> dict[str, Any]:
@@ -181,42 +202,28 @@ def group_document(attributes: dict[str, Any]) -> bytes:
     return json.dumps({"attributes": attributes, "zarr_format": 3, "node_type": "group"}, indent=2).encode()
 
 
-#: What drafts of the format said in place of `store_version`, which no release wrote.
-_DRAFT = "format_version"
-
-
 def decode_root(attributes: dict[str, Any], path: object) -> RootAttributes:
-    """The root attributes of a store of any version that this program reads.
+    """The root attributes of a store.
 
     Raises:
         FormatTooNew: a later version wrote the store.
         StoreError: it is no store of this tool, or its version is none.
-        MalformedDocument, ValueError: its attributes have other fields or values than that version.
+        MalformedDocument, ValueError: its attributes have other fields or values than the format.
     """
-    check_version(attributes, path)
-    return from_json(RootAttributes, attributes)
-
-
-def check_version(attributes: dict[str, Any], path: object) -> None:
-    """Raise unless root attributes belong to a store that this program can read; see `decode_root`."""
     if attributes.get("format") != FORMAT_NAME:
         raise StoreError(
             f"{path} is a Zarr group, but not a store of this tool: its attribute 'format' is not '{FORMAT_NAME}'."
         )
-    if _DRAFT in attributes:
-        raise StoreError(
-            f"{path} says {_DRAFT}: it is of a draft of the format, before version 1, and this program reads versions "
-            f"1 to {STORE_VERSION}; capture the episodes again."
-        )
     version = attributes.get("store_version")
-    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
+    if not isinstance(version, int) or isinstance(version, bool) or version < STORE_VERSION:
         given = f"has the store_version {_short(version)}" if "store_version" in attributes else "has no store_version"
-        raise StoreError(f"{path} {given}; expected a whole number, 1 to {STORE_VERSION}.")
+        raise StoreError(f"{path} {given}; expected {STORE_VERSION}.")
     if version > STORE_VERSION:
         raise FormatTooNew(
-            f"{path} is a store of version {_short(version)}, and this program reads stores up to version "
-            f"{STORE_VERSION}; install a newer version of it."
+            f"{path} is a store of version {_short(version)}, and this program reads version {STORE_VERSION}; install "
+            "a newer version of it."
         )
+    return from_json(RootAttributes, attributes)
 
 
 def _short(value: object) -> str:

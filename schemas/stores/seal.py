@@ -13,7 +13,6 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from vla_attention.schemas.jsonable import from_json, to_json
 from vla_attention.schemas.limits import DOCUMENT_BYTES
@@ -34,14 +33,13 @@ from vla_attention.schemas.stores.store_format import SEAL_GROUP
 SEAL_FILE = f"{SEAL_GROUP}/zarr.json"
 
 
-def seal_episode(folder: Path, name: str, run: str, version: int, copied_from: str = "") -> EpisodeSeal:
+def seal_episode(folder: Path, name: str, run: str, copied_from: str = "") -> EpisodeSeal:
     """Seal an episode whose files are all in `folder`; returns what was written.
 
     Args:
         folder: where the episode is at the moment.
         name: the name of its group in the store.
         run: digest of the run's configuration, see `run_digest`.
-        version: that of the store, which decides what a seal has.
         copied_from: digest of the seal under which the episode was captured, if this is a changed copy.
     """
     (folder / SEAL_FILE).unlink(missing_ok=True)
@@ -54,11 +52,11 @@ def seal_episode(folder: Path, name: str, run: str, version: int, copied_from: s
     records: dict[str, FileRecord] = {}
     for file in files:
         chunks = None if file.name == "zarr.json" else next((shards[at] for at in file.parents if at in shards), None)
-        records[file.relative_to(folder).as_posix()] = _file_record(file, chunks, version)
+        records[file.relative_to(folder).as_posix()] = _file_record(file, chunks)
     seal = EpisodeSeal(name, run, records, digest="", copied_from=copied_from)
-    seal = replace(seal, digest=seal_digest(_attributes(seal)))
+    seal = replace(seal, digest=seal_digest(to_json(seal)))
     (folder / SEAL_GROUP).mkdir(exist_ok=True)
-    group = {"zarr_format": 3, "node_type": "group", "attributes": _attributes(seal)}
+    group = {"zarr_format": 3, "node_type": "group", "attributes": to_json(seal)}
     (folder / SEAL_FILE).write_text(json.dumps(group, separators=(",", ":")), encoding="utf-8")
     return seal
 
@@ -89,26 +87,7 @@ def identity_problem(seal: EpisodeSeal, name: str, run: str) -> str | None:
     return None
 
 
-def digests_problem(seal: EpisodeSeal, version: int) -> str | None:
-    """Why a seal is none of a store of that version, or None: version 1 has no digests of chunks, all others do."""
-    for file, record in seal.files.items():
-        if record.digests and version == 1:
-            return f"its seal lists digests of the chunks of its {file}, which version 1 does not have"
-        if record.chunks and not record.digests and version > 1:
-            return f"its seal lists no digests of the chunks of its {file}, which version {version} has"
-    return None
-
-
-def _attributes(seal: EpisodeSeal) -> dict[str, Any]:
-    """A seal as JSON. A file without digests has no such field: programs that read version 1 alone refuse it."""
-    attributes: dict[str, Any] = to_json(seal)
-    for record in attributes["files"].values():
-        if not record["digests"]:
-            del record["digests"]
-    return attributes
-
-
-def _file_record(path: Path, chunks: int | None, version: int) -> FileRecord:
+def _file_record(path: Path, chunks: int | None) -> FileRecord:
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
         record = FileRecord(size, hashlib.file_digest(file, "sha256").hexdigest())
@@ -122,5 +101,6 @@ def _file_record(path: Path, chunks: int | None, version: int) -> FileRecord:
             chunk = os.pread(file.fileno(), length, offset)
             checksums.append(chunk[-CHECKSUM_BYTES:] or bytes(CHECKSUM_BYTES))
             digests.append(chunk_digest(chunk) if chunk else bytes(CHUNK_DIGEST_BYTES))
-    record = replace(record, index=bytes_digest(stored), chunks=b"".join(checksums).hex())
-    return record if version == 1 else replace(record, digests=b"".join(digests).hex())
+    return replace(
+        record, index=bytes_digest(stored), chunks=b"".join(checksums).hex(), digests=b"".join(digests).hex()
+    )

@@ -25,7 +25,7 @@ class FileRecord:
     index's checksum). `chunks` has the crc32c of every chunk, the 4 bytes at the chunk's end, in the index's order: 8
     hexadecimal digits each, without a separator; `00000000` for a chunk that was not written. `digests` has, in the
     same order, the first 8 bytes of the sha256 of every chunk as it is stored, with its crc32c: 16 hexadecimal digits
-    each; zeros for a chunk that was not written. Version 1 has no digests.
+    each; zeros for a chunk that was not written.
     """
 
     size: int
@@ -43,7 +43,7 @@ class FileRecord:
         if self.digests and not _DIGESTS.fullmatch(self.digests):
             raise BadArgument("the digests of the chunks of a file are not 16 hexadecimal digits each")
         checksums, digests = len(self.chunks) // 8, len(self.digests) // 16
-        if digests not in (0, checksums):
+        if digests != checksums:
             raise BadArgument(f"a file has {digests} digests of chunks and {checksums} checksums; expected one of each")
 
 

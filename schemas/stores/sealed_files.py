@@ -15,7 +15,6 @@ from vla_attention.schemas.stores.remote_source import RemoteFailure
 from vla_attention.schemas.stores.seal_content import FileRecord
 from vla_attention.schemas.stores.shards import SealedShard
 from vla_attention.schemas.stores.store_format import CorruptEpisode
-from vla_attention.schemas.stores.zip_members import DamagedZip
 
 #: Bytes of a file that are in memory at once where no more than its digest is wanted.
 PART_BYTES = 16_000_000
@@ -146,8 +145,6 @@ def _differs(file: str) -> str:
 
 
 def _lost(file: str, error: OSError) -> str:
-    if isinstance(error, DamagedZip):
-        return str(error)
     if isinstance(error, NotRegular):
         return f"its {file} cannot be read: {error.strerror}"
     return f"it has lost its {file} ({error.strerror or error})"

@@ -81,7 +81,7 @@ class SealedShard:
         index_bytes: the index as it is stored, with its checksum.
         index: offset and length of each chunk, shape (chunk, 2); (0, 0): not written.
         checksums: the last `CHECKSUM_BYTES` of each chunk, from the seal.
-        digests: `CHUNK_DIGEST_BYTES` of each chunk, from the seal; empty in version 1.
+        digests: `CHUNK_DIGEST_BYTES` of each chunk, from the seal.
     """
 
     source: ByteSource
@@ -89,7 +89,7 @@ class SealedShard:
     index_bytes: bytes
     index: NDArray[np.uint64]
     checksums: bytes
-    digests: bytes = b""
+    digests: bytes
 
     @classmethod
     def open(cls, source: ByteSource, file: str, record: FileRecord) -> SealedShard:
@@ -152,13 +152,11 @@ class SealedShard:
         encoded, checksum = stored[:-CHECKSUM_BYTES], stored[-CHECKSUM_BYTES:]
         if len(stored) != self.index[number, 1] or checksum.tobytes() != self.checksum(number):
             return f"chunk {number} of its {self.file} does not agree with its seal"
-        if self.digests and chunk_digest(stored.data) == self._digest(number):
+        if chunk_digest(stored.data) == self._digest(number):
             return None  # sha256 says all that crc32c would
         if crc32c(encoded) != int.from_bytes(self.checksum(number), "little"):
             return f"the checksum of chunk {number} of its {self.file} does not fit"
-        if self.digests:
-            return f"chunk {number} of its {self.file} does not agree with its seal, although its checksum fits"
-        return None
+        return f"chunk {number} of its {self.file} does not agree with its seal, although its checksum fits"
 
     def check(self) -> None:
         """Read all chunks that were written; raises `CorruptEpisode` as `chunk` does."""

@@ -1,8 +1,7 @@
 """The store format: its version, the names, axes and attributes of `NAME.zarr`, and its errors. No I/O here.
 
-Within a version nothing here changes once a release wrote it (`docs/store.md`, "Versions"). A new version raises
-`STORE_VERSION` and changes the dataclasses below; a new field has a default, with which stores of lower versions are
-read. Then write the JSON Schema files again (`python -m vla_attention.schemas.json_files`).
+Nothing here changes once a release wrote it (`docs/store.md`, "Versions"). After a change before that, write the JSON
+Schema files, the example stores and the golden stores again.
 
 NAME.zarr/                            attributes: `RootAttributes`
   episodes/task003_episode007/        attributes: `EpisodeAttributes`; listed = complete
@@ -43,7 +42,6 @@ from vla_attention.schemas.limit_checks import check_at_most
 from vla_attention.schemas.limits import (
     AXIS,
     EPISODE_FILES,
-    GROWING_CELLS,
     KEYS,
     PLACES,
     QUERIES,
@@ -56,8 +54,8 @@ from vla_attention.schemas.safe_text import check_free_text, check_inner_path, c
 from vla_attention.schemas.segments import Segment
 
 FORMAT_NAME = "vla-attention"
-#: A whole number, the root attribute `store_version`. A reader accepts every version up to its own.
-STORE_VERSION = 2
+#: The root attribute `store_version`; no other one is read.
+STORE_VERSION = 1
 STORE_SUFFIX = ".zarr"
 EPISODES_GROUP = "episodes"
 #: The document of that group. It states nothing but that it is a group.
@@ -340,15 +338,7 @@ class RootAttributes:
         if len(set(names)) != len(names):
             raise BadArgument(f"The sites {listing(names)} do not have different names.")
         for site in self.sites:
-            recording, growing = self.recording.of_site(site), site.growing_span
-            if growing is not None:
-                cells = recording.num_action_queries * growing.num_keys
-                check_at_most(f"The number of queries x generated keys of site '{site.name}'", cells, GROWING_CELLS)
-
-    @property
-    def version_text(self) -> str:
-        """The version in words."""
-        return f"version {self.store_version}"
+            self.recording.of_site(site)
 
     def site(self, name: str) -> SiteLayout:
         """The site of that name; the error lists the existing ones."""
@@ -389,9 +379,9 @@ class EpisodeAttributes:
     the one that solved the task; 0 where it is not known. The instruction and the prompts are any text; what is shown
     of them is made `safe_text.visible`.
 
-    `task_family`: what tasks of one sentence template share; empty where nobody knows it, and in version 1. `effects`:
-    what the arrays of effects are of; None where none were measured. `steps`: the same of the arrays of steps; None
-    where no simulator of ours ran the episode, and in version 1.
+    `task_family`: what tasks of one sentence template share; empty where nobody knows it. `effects`: what the arrays of
+    effects are of; None where none were measured. `steps`: the same of the arrays of steps; None where no simulator of
+    ours ran the episode.
 
     `NUMBERS` are of each replan, and the noise level or flow time of each recorded denoise step; `env_step` counts the
     waiting steps too, `prompt_index` is the number of a prompt, `dataset_action_count` how many of `dataset_actions`

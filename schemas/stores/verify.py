@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import listing
@@ -15,14 +16,12 @@ from vla_attention.schemas.limits import ROOT_BYTES
 from vla_attention.schemas.stores.digest import seal_digest
 from vla_attention.schemas.stores.episode_checks import content_problems
 from vla_attention.schemas.stores.episode_files import check_presence, foreign_in_episode
-from vla_attention.schemas.stores.packed_index import INDEX_FILE, LIST_AGAIN, NotListed, read_index, unlisted_episodes
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
-from vla_attention.schemas.stores.root import fields_beyond, group_attributes
+from vla_attention.schemas.stores.root import NAMES_FILE, fields_beyond, group_attributes, names_document
 from vla_attention.schemas.stores.seal import SEAL_FILE
 from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, CorruptEpisode, Problem
 from vla_attention.schemas.stores.store_url import StoreUrl
-from vla_attention.schemas.stores.zip_members import ZipMembers
 
 _ROOT_FILES = ("zarr.json", EPISODES_DOCUMENT)
 
@@ -87,27 +86,7 @@ def episode_faults(store: Store, episode: StoredEpisode) -> list[Fault]:
 
 
 def store_faults(store: Store) -> list[Fault]:
-    """What is wrong with a store beside its episodes, see `look_beside`."""
-    return look_beside(store)[0]
-
-
-def look_beside(store: Store) -> tuple[list[Fault], list[str]]:
-    """What is wrong with a store beside its episodes, and sentences on what could not be looked at.
-
-    Faults are those of the `zarr.json` of its two groups, and episodes that the index of a packed store does not list.
-    """
-    faults, unlisted, unchecked = _group_faults(store), tuple[str, ...](), list[str]()
-    index = read_index(source_of(store.path), store.path, store.run)
-    if index is not None:
-        try:
-            unlisted = unlisted_episodes(store.path, index)
-        except NotListed as error:
-            unchecked.append(f"{INDEX_FILE}: whether it lists every episode was not checked: {error}")
-    problem = f"{INDEX_FILE} does not list it, so that nothing reads it. {LIST_AGAIN}"
-    return faults + [Fault(path, problem) for path in unlisted], unchecked
-
-
-def _group_faults(store: Store) -> list[Fault]:
+    """What is wrong with a store beside its episodes: with the `zarr.json` of its two groups, and its list of names."""
     faults = []
     for file in _ROOT_FILES:
         try:
@@ -118,6 +97,10 @@ def _group_faults(store: Store) -> list[Fault]:
             faults.append(Fault(file, f"it is lost ({error.strerror or error})"))
         except (ValueError, RecursionError) as error:
             faults.append(Fault(file, f"it is damaged: {error}"))
+    if isinstance(store.path, Path) and (store.path / NAMES_FILE).is_file():
+        names = [episode.name for episode in store.episodes]
+        if (store.path / NAMES_FILE).read_bytes() != names_document(names):
+            faults.append(Fault(NAMES_FILE, "it lists other episodes than are there; web servers give those it lists"))
     return faults
 
 
@@ -149,7 +132,7 @@ def _problems(store: Store, episode: StoredEpisode, quick: bool) -> list[Problem
 
 
 def _problems_of_bytes(episode: StoredEpisode, known: Container[str | None]) -> Iterator[Problem]:
-    """Bytes that no check before has read: of shards all that is in no chunk, and of a zip what is in no file."""
+    """Bytes that no check before has read: of shards all that is in no chunk."""
     elsewhere = isinstance(episode.folder, StoreUrl)
     for file, record in episode.files.records.items():
         # Every chunk of a shard has been compared with its checksum in the seal: it is not fetched a second time.
@@ -158,6 +141,3 @@ def _problems_of_bytes(episode: StoredEpisode, known: Container[str | None]) -> 
                 episode.files.check(file)
             except CorruptEpisode as error:
                 yield Problem(f"Episode {episode.name} is damaged: {error}.", file)
-    zipped, source = episode.place, episode.source
-    if isinstance(zipped, ZipMembers) and isinstance(source, ZipMembers) and source.frame_digest() != zipped.frame:
-        yield Problem("its zip has other bytes around its files than vla-attention store copy --packed wrote")

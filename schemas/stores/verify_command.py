@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from vla_attention.schemas.stores.verify import EpisodeReport, Fault
 
 DESCRIPTION = (
-    "Read everything back and check it: every file, missing chunks, digests, counts, row sums, the index of packed "
-    "stores. A line for every episode. Foreign files are named; nothing reads them. Exit code 1 if anything is wrong."
+    "Read everything back and check it: every file, missing chunks, digests, counts, row sums. A line for every "
+    "episode. Foreign files are named; nothing reads them. Exit code 1 if anything is wrong."
 )
 EXAMPLES = """examples:
   NAME verify libero_10.zarr                      every byte of every episode
@@ -83,15 +83,14 @@ def run_verify(
     """Check stores, and print what was found; returns the exit code: 1 if anything is wrong."""
     from vla_attention.schemas.stores.episode_files import foreign_in_store
     from vla_attention.schemas.stores.reader import open_store
-    from vla_attention.schemas.stores.verify import look_beside
+    from vla_attention.schemas.stores.verify import store_faults
 
     documents, wrong = [], False
     for path in stores:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Note)  # what lies among the episodes is named below
             store = open_store(path)
-        faults, unchecked = look_beside(store)
-        foreign = foreign_in_store(store)
+        faults, foreign = store_faults(store), foreign_in_store(store)
         reports_of_store = []
         if not as_json:
             _print_faults(path, faults)
@@ -107,10 +106,8 @@ def run_verify(
                     print(f"{path}: {report.episode}: {whole}", flush=True)
         wrong = wrong or bool(faults) or any(report.problems for report in reports_of_store)
         if as_json:
-            documents.append(_document(store, quick, faults, unchecked, foreign, reports_of_store))
+            documents.append(_document(store, quick, faults, foreign, reports_of_store))
         else:
-            for line in unchecked:
-                print_line(f"{path}: {line}")
             _print_foreign(path, foreign, reports_of_store)
             number = len(faults) + sum(len(report.problems) for report in reports_of_store)
             result = "all whole" if not number else "1 fault" if number == 1 else f"{number} faults"
@@ -142,17 +139,15 @@ def _document(
     store: Store,
     quick: bool,
     faults: Sequence[Fault],
-    unchecked: Sequence[str],
     foreign: Sequence[str],
     found: Sequence[EpisodeReport],
 ) -> dict[str, object]:
     return {
         "store": str(store.path),
-        "version": store.attributes.version_text,
+        "version": store.attributes.store_version,
         "quick": quick,
         "whole": not faults and not any(report.problems for report in found),
         "faults": to_json(faults),
-        "unchecked": list(unchecked),
         "foreign": list(foreign),
         "episodes": to_json(found),
     }

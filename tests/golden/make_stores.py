@@ -1,26 +1,25 @@
-"""Make golden stores of today's version and the numbers that they must give: python -m tests.golden.make_stores FOLDER
+"""Make golden stores and the numbers that they must give: python -m tests.golden.make_stores FOLDER
 
-Those of a version are made once, before it is frozen, and stay as they are: today's code has to give the same numbers
+Once the format is frozen they stay as they are: today's code has to give the same numbers
 (`tests/schemas/stores/test_golden_stores.py`). FOLDER is empty or new.
 """
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
 
-from tests.kit.golden_stores import STORES, write_tables
+from tests.kit.golden_stores import NAMES, write_tables
 from tests.kit.small_torch_policy import SmallPolicy, given, small_layout
 from tests.kit.still_scene import capture_without_simulator
 from tests.kit.stores import small_steps, write_store
 from tests.kit.uniform_cases import TABLE, write_case
-from vla_attention.analyze.store.copying import copy_store
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.torch_policies.record import record
-from vla_attention.schemas.stores.reader import open_store
-from vla_attention.schemas.stores.store_format import STORE_VERSION
+from vla_attention.schemas.stores.tar_files import write_tar
 
 _WHERE = ("--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", "0", "1", "--num-episodes", "1")
 
@@ -34,7 +33,6 @@ def make_stores(folder: Path) -> None:
         cosmos = ("--max-steps", "20", "--query-frame", "curr_last", "--no-frames")
         _run("cosmos", *_WHERE, *cosmos, "--output", str(folder / "cosmos.zarr"))
     _record(folder / "library.zarr")
-    copy_store(open_store(folder / "joint.zarr"), folder / "packed.zarr", (), packed=True)
     changes = ("--check", "0", "--knockout", "camera:base_0_rgb")
     _run("rerun", str(folder / "joint.zarr"), *changes, "--output", str(folder / "rerun.zarr"))
     effects = ("--effects", "text,objects", "--effects-readers", "all", "action", "pictures", "text", "--check", "0")
@@ -45,8 +43,10 @@ def make_stores(folder: Path) -> None:
     write_store(
         folder / "steps.zarr", tasks=(0,), replans=2, layers=(0,), heads=(0,), frames=False, plant_steps=small_steps
     )
-    for name in STORES[STORE_VERSION]:
+    for name in NAMES:
         write_tables(folder / f"{name}.zarr", folder / name)
+        write_tar(folder / f"{name}.zarr", folder / f"{name}.tar.xz")
+        shutil.rmtree(folder / f"{name}.zarr")
 
 
 def _run(*words: str) -> None:

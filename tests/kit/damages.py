@@ -43,7 +43,7 @@ SPEC = StoreSpec(
     plant_effects=small_effects,
     plant_steps=small_steps,
 )
-_EPISODE = re.compile(r"episodes/(?:task\d+_\d+/)?(?P<episode>task\d+_episode\d+)(?:\.zip|/(?P<inner>.*))")
+_EPISODE = re.compile(r"episodes/(?P<episode>task\d+_episode\d+)/(?P<inner>.*)")
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,6 @@ _IN_EPISODE = r"episodes/[^/]+/"
 KINDS: tuple[FileKind, ...] = (
     FileKind("root", r"zarr\.json", ("episodes", "spans")),
     FileKind("group of episodes", r"episodes/zarr\.json", ("episodes", "spans")),
-    FileKind("index of a packed store", r"index\.json", ("episodes", "spans")),
-    FileKind("zip of a packed store", r"episodes/[^/]+/[^/]+\.zip", ("patches", "contributions", "objects", "rest")),
     FileKind("attributes of an episode", _IN_EPISODE + r"zarr\.json", ("episodes", "spans", "words")),
     FileKind("seal", _IN_EPISODE + r"seal/zarr\.json", ("episodes", "spans")),
     FileKind("groups of an episode", _IN_EPISODE + r"[^/]+/zarr\.json", ("spans", "patches")),
@@ -204,15 +202,13 @@ class Noticed:
 
 
 def make_subjects(folder: Path) -> dict[str, Subject]:
-    """A store of folders, the same packed, and one of a replayed data set with two sites."""
+    """A store, and one of a replayed data set with two sites."""
     subjects = {}
     for name, other in (("joint", 0), ("other", 1)):
         write_store(folder / f"{name}.zarr", spec=SPEC, seed=other)
-        places = [str(folder / f"{name}{packed}.zarr") for packed in ("", "-packed")]
-        assert analyze(["store", "copy", *places, "--packed"]) == 0
         replayed = SiteStoreSpec(episodes=2, replans=2, dataset_actions=0.5, protocol="dataset", seed=other)
         write_site_store(folder / f"{name}-sites.zarr", replayed)
-    for name in ("", "-packed", "-sites"):
+    for name in ("", "-sites"):
         subjects[f"joint{name}"] = Subject.of(folder / f"joint{name}.zarr", folder / f"other{name}.zarr")
     return subjects
 
@@ -298,9 +294,9 @@ def _episode(path: str) -> str:
 
 
 def _inner(path: str) -> str:
-    """The path inside of the episode; empty for a zip, which is the episode."""
+    """The path inside of the episode."""
     match = _EPISODE.fullmatch(path)
-    return (match["inner"] or "") if match else path
+    return match["inner"] if match else path
 
 
 @contextmanager

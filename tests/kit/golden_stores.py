@@ -1,4 +1,4 @@
-"""The golden stores of each version, and the numbers that a store gives: its arrays, and tables of the analysis."""
+"""The golden stores, and the numbers that a store gives: its arrays, and tables of the analysis."""
 
 from __future__ import annotations
 
@@ -11,25 +11,23 @@ from typing import Any
 import polars as pl
 
 import vla_attention as va
+from tests.kit.archives import unpacked
 from tests.kit.paths import GOLDEN
 from vla_attention.analyze.api import OpenStores
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import NUMBERS
 
-FOLDER = GOLDEN / "stores" / "version1"
-#: joint: pi0.5 of test size. cosmos: sites `self` and `cross`. library: recorded by `va.record`. packed: `joint` again.
-#: rerun: the policy calls of `joint` without one of its cameras.
-NAMES = ("joint", "cosmos", "library", "packed", "rerun")
-#: By version. masks: queries, layers, heads, denoise steps and replans see different keys, which version 1 cannot say.
+FOLDER = GOLDEN / "stores"
+#: joint: pi0.5 of test size. cosmos: sites `self` and `cross`. library: recorded by `va.record`. rerun: the policy
+#: calls of `joint` without one of its cameras. masks: queries, layers, heads, denoise steps and replans see different keys.
 #: effects: the policy calls of `joint` again, with the effects of words and objects for all four readers. steps: made
 #: up, with positions, touches and goals.
-STORES = {1: NAMES, 2: (*NAMES, "masks", "effects", "steps")}
-GOLDEN_STORES = [(version, name) for version, names in STORES.items() for name in names]
+NAMES = ("joint", "cosmos", "library", "rerun", "masks", "effects", "steps")
 
 
-def folder_of(version: int) -> Path:
-    """The folder with the golden stores of a version."""
-    return GOLDEN / "stores" / f"version{version}"
+def golden_store(name: str) -> Path:
+    """A golden store, unpacked."""
+    return unpacked(FOLDER / f"{name}.tar.xz")
 
 
 #: Matrix products of other processors round otherwise; what is stored has to agree to the bit.

@@ -26,6 +26,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
+from tests.kit.archives import unpacked
 from tests.kit.golden_stores import differences
 from tests.kit.paths import GOLDEN, ROOT
 from vla_attention.__main__ import main as vla_attention
@@ -40,12 +41,12 @@ FOLDER = GOLDEN / "tables"
 PUBLISHED_LINES = [
     shlex.split(line) for line in (GOLDEN / "published_lines.txt").read_text(encoding="utf-8").splitlines()
 ]
-#: Name below which a question sees a store -> where it lies. cubes, one_colour: earlier recordings of the example
+#: Name below which a question sees a store -> its archive. cubes, one_colour: earlier recordings of the example
 #: stores, without effects. effects: pi05_cubes with recorded effects of words and cameras, for all four readers.
 #: libero, cosmos, replay: policies of test size.
 STORES = {
-    "one_colour": FOLDER / "stores" / "cubes_one_colour.zarr",
-    **{name: FOLDER / "stores" / f"{name}.zarr" for name in ("cubes", "effects", "libero", "cosmos", "replay")},
+    "one_colour": FOLDER / "stores" / "cubes_one_colour.tar.xz",
+    **{name: FOLDER / "stores" / f"{name}.tar.xz" for name in ("cubes", "effects", "libero", "cosmos", "replay")},
 }
 RERUNS = FOLDER / "stores" / "cubes_reruns"
 
@@ -110,10 +111,11 @@ VARIABLES: dict[str, dict[str, dict[str, str]]] = {
 
 def link_stores(folder: Path) -> None:
     """Give the stores the short names that the questions use: results name a store as it was typed."""
-    for name, place in STORES.items():
-        (folder / f"{name}.zarr").symlink_to(place, target_is_directory=True)
-    for rerun in sorted(RERUNS.glob("*.zarr")):
-        (folder / f"rerun_{rerun.stem}.zarr").symlink_to(rerun, target_is_directory=True)
+    for name, archive in STORES.items():
+        (folder / f"{name}.zarr").symlink_to(unpacked(archive), target_is_directory=True)
+    for archive in sorted(RERUNS.glob("*.tar.xz")):
+        rerun = unpacked(archive)
+        (folder / f"rerun_{rerun.name}").symlink_to(rerun, target_is_directory=True)
 
 
 def tables_of(case: str, folder: Path) -> dict[str, pl.DataFrame]:

@@ -49,7 +49,7 @@ class Served:
 
     def of_episodes(self) -> int:
         """Bytes sent of episodes' files."""
-        return sum(count for path, count in self.sent.items() if path.endswith(".zip"))
+        return sum(count for path, count in self.sent.items() if "/episodes/" in path)
 
 
 @contextmanager

@@ -6,21 +6,22 @@ import polars as pl
 import pytest
 
 import vla_attention as va
+from tests.kit.archives import example_store
 from tests.kit.paths import ROOT
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.example_stores import CUBES, FOLDER, NOISE, ONE_COLOUR
+from vla_attention.example_stores import EXAMPLES, FOLDER
 from vla_attention.example_stores.command import main
 
-STORES = [CUBES, ONE_COLOUR, NOISE]
+CUBES, ONE_COLOUR, NOISE = map(example_store, EXAMPLES)
 
 
-@pytest.mark.parametrize("store", STORES, ids=lambda path: path.stem)
+@pytest.mark.parametrize("store", [CUBES, ONE_COLOUR, NOISE], ids=lambda path: path.stem)
 def test_every_store_is_whole(store, capsys):
     assert analyze(["store", "verify", str(store)]) == 0
 
 
 def test_they_are_small():
-    assert sum(path.stat().st_size for path in FOLDER.rglob("*") if path.is_file()) < 3.3e6
+    assert sum(path.stat().st_size for path in FOLDER.glob("*.tar.xz")) < 2.5e6
 
 
 def test_the_second_run_differs_in_its_weights_alone():
@@ -51,11 +52,10 @@ def test_the_rerun_is_of_the_first_store():
 
 
 def test_no_store_names_a_place_of_the_machine_that_made_it():
-    for file in FOLDER.rglob("*"):
-        if file.is_file() and "__pycache__" not in file.parts:
-            content = file.read_bytes()
-            assert b"/tmp/" not in content, file
-            assert str(ROOT).encode() not in content, file
+    for file in (file for store in (CUBES, ONE_COLOUR, NOISE) for file in store.rglob("*") if file.is_file()):
+        content = file.read_bytes()
+        assert b"/tmp/" not in content, file
+        assert str(ROOT).encode() not in content, file
 
 
 def test_copies_are_readable_and_none_is_written_over(tmp_path, capsys):
@@ -66,3 +66,14 @@ def test_copies_are_readable_and_none_is_written_over(tmp_path, capsys):
     assert va.open(folder / "cubes.zarr").episodes[columns].equals(va.open(CUBES).episodes[columns])
     assert main([str(folder)]) == 2
     assert "cubes.zarr exists; remove it, or name another folder" in capsys.readouterr().err
+
+
+def test_an_example_is_unpacked_once(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    store = va.example("cubes")
+    assert store.is_relative_to(tmp_path)
+    marker = store / "zarr.json"
+    before = marker.stat().st_mtime_ns
+    assert (va.example("cubes"), marker.stat().st_mtime_ns) == (store, before)
+    with pytest.raises(va.UserError, match="cubes_one_colour"):
+        va.example("cube")

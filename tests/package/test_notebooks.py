@@ -8,7 +8,7 @@ import json
 import pytest
 
 from tests.kit.paths import ROOT
-from vla_attention import example_stores
+from vla_attention.example_stores import archive_of
 
 pytestmark = pytest.mark.thorough
 
@@ -41,5 +41,5 @@ def test_outputs_are_not_kept(path):
 def test_what_it_imports_exists(path):
     for source in cells(path, "code"):
         for node in ast.walk(ast.parse(python_of(source))):
-            if isinstance(node, ast.ImportFrom) and node.module == "vla_attention.example_stores":
-                assert all(getattr(example_stores, alias.name).is_dir() for alias in node.names)
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "va.example":
+                assert archive_of(ast.literal_eval(node.args[0])).is_file()

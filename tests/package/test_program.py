@@ -7,12 +7,12 @@ import sys
 
 import pytest
 
+from tests.kit.archives import example_store
 from vla_attention.__main__ import main
-from vla_attention.example_stores import CUBES
 
 
 def test_analyze_is_vla_analyze(capsys):
-    assert main(["analyze", str(CUBES), "--list"]) == 0
+    assert main(["analyze", str(example_store("cubes")), "--list"]) == 0
     assert "touch the red cube" in capsys.readouterr().out
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from vla_attention.example_stores import CUBES, NOISE, ONE_COLOUR
+from vla_attention.example_stores import EXAMPLES, archive_of
 from vla_attention.schemas.command_line import command_parser, run_command
 from vla_attention.schemas.errors import BadArgument
 
@@ -17,16 +16,16 @@ _EXAMPLES = """examples:
 """
 _QUESTIONS = """\
 {cubes}: 6 episodes of 'touch the red (green, blue) cube' by pi05_cubes, a small trained pi0.5
-{one_colour}: the same by a copy of it to which the three colours are one word
-{noise}: the first policy calls of {cubes} again, with other noise
+{cubes_one_colour}: the same by a copy of it to which the three colours are one word
+{cubes_noise}: the first policy calls of {cubes} again, with other noise
 
 Try:
   vla-attention language {cubes}
   vla-attention analyze {cubes}
   vla-attention objects {cubes}
   vla-attention effects {cubes}
-  vla-attention failures {one_colour} --twins {cubes}
-  vla-attention compare {cubes} {one_colour}
+  vla-attention failures {cubes_one_colour} --twins {cubes}
+  vla-attention compare {cubes} {cubes_one_colour}
   vla-attention report {cubes}
   vla-attention view {cubes}
 """
@@ -41,16 +40,15 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _copy(folder: Path) -> int:
-    copies = {"cubes": CUBES, "one_colour": ONE_COLOUR, "noise": NOISE}
-    there = [folder / store.name for store in copies.values() if (folder / store.name).exists()]
-    if there:
+    copies = {name: folder / f"{name}.zarr" for name in EXAMPLES}
+    if there := [store for store in copies.values() if store.exists()]:
         raise BadArgument(f"{there[0]} exists; remove it, or name another folder: vla-attention example FOLDER.")
     from vla_attention.schemas.stores.store_place import refuse_in_store
+    from vla_attention.schemas.stores.tar_files import unpack
 
     refuse_in_store(folder, "copy stores to")
     folder.mkdir(parents=True, exist_ok=True)
-    for store in copies.values():
-        # Files of an installation may be read-only; copies are their owner's.
-        shutil.copytree(store, folder / store.name, copy_function=shutil.copyfile)
-    print(_QUESTIONS.format(**{name: folder / store.name for name, store in copies.items()}), end="")
+    for name in copies:
+        unpack(archive_of(name), folder)
+    print(_QUESTIONS.format(**copies), end="")
     return 0

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
 from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedRate, PublishedScript
-from vla_attention.capture.policies.model_arguments import FORMER_NAMES, UNTRAINED_POLICIES, add_model_arguments
+from vla_attention.capture.policies.model_arguments import UNTRAINED_POLICIES, add_model_arguments
 from vla_attention.schemas.errors import BadArgument
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
         "chunk_size": identity.action_horizon,
     }
     if identity.checkpoint_format == "seeded":
-        return {"checkpoint": FORMER_NAMES.get(identity.name, identity.name), **facts}
+        return {"checkpoint": identity.name, **facts}
     return {
         "checkpoint": identity.checkpoint,
         "config_name": identity.config["configuration"],

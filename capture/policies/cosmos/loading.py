@@ -32,7 +32,7 @@ from vla_attention.capture.policies.cosmos.text import PieceTokenizer, Precomput
 from vla_attention.capture.policies.cosmos.vae import build_encoder, infer_vae_config
 from vla_attention.capture.policies.hub import downloads, hub_version
 from vla_attention.capture.policies.identity import PolicySource
-from vla_attention.capture.policies.model_arguments import UNTRAINED, UNTRAINED_TINY, check_not_renamed
+from vla_attention.capture.policies.model_arguments import UNTRAINED, UNTRAINED_TINY
 from vla_attention.capture.policies.weights import find_dtype
 from vla_attention.schemas.errors import BadArgument
 
@@ -208,7 +208,6 @@ def build_cosmos_policy(
         query_frame=query_frame,
         dtype=find_dtype(dtype) if dtype is not None else None,
     )
-    check_not_renamed(checkpoint)
     if checkpoint in _UNTRAINED:
         policy = _untrained(checkpoint, options, device)
     else:

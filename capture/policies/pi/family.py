@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_attention.capture.environments.episode_protocol import CAMERAS, LEROBOT, OPENPI
 from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedRate, PublishedScript
-from vla_attention.capture.policies.model_arguments import FORMER_NAMES, UNTRAINED_POLICIES, add_model_arguments
+from vla_attention.capture.policies.model_arguments import UNTRAINED_POLICIES, add_model_arguments
 from vla_attention.capture.policies.robot import NONE, Robot, read_camera_choices
 from vla_attention.schemas.jsonable import from_json
 
@@ -154,17 +153,15 @@ def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
     if "denoise_steps" in facts:
         same["compile"] = True
     if identity.checkpoint_format == "seeded":
-        return {"checkpoint": FORMER_NAMES.get(identity.name, identity.name), **same}
+        return {"checkpoint": identity.name, **same}
     settings = {"checkpoint": identity.checkpoint, "dtype": identity.config["dtype"], **same}
     if identity.checkpoint_format in ("openpi_torch", "openpi_jax", "lerobot"):
         settings["checkpoint_format"] = identity.checkpoint_format
     if identity.checkpoint_format.startswith("openpi"):
         settings["discrete_state_input"] = identity.config["config"].get("discrete_state_input", False)
     if "config_name" in identity.config:
-        return settings | {"config_name": identity.config["config_name"]}
-    # Stores of version 1 have the name in these words only, as they were when that version was written.
-    named = re.fullmatch(r"openpi's (\w+)", identity.config["configuration"])
-    return settings | ({"config_name": named[1]} if named else {})
+        settings["config_name"] = identity.config["config_name"]
+    return settings
 
 
 def _run_parity(arguments: argparse.Namespace, device: str) -> int:

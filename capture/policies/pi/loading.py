@@ -12,7 +12,7 @@ import torch
 from vla_attention.capture.policies.checkpoints import UnsupportedCheckpoint
 from vla_attention.capture.policies.hub import downloads, hub_version, split_hub_name
 from vla_attention.capture.policies.identity import PolicySource
-from vla_attention.capture.policies.model_arguments import UNTRAINED, UNTRAINED_TINY, check_not_renamed
+from vla_attention.capture.policies.model_arguments import UNTRAINED, UNTRAINED_TINY
 from vla_attention.capture.policies.parity_case import CASE_FILE
 from vla_attention.capture.policies.pi.case import CONFIG_FILE, read_config, stated_name, states_sizes
 from vla_attention.capture.policies.pi.compiled import compile_steps
@@ -306,7 +306,6 @@ def build_pi_policy(
     )
     if config_name is not None:
         find_config(config_name)  # an unknown name is reported before any download
-    check_not_renamed(checkpoint)
     if checkpoint in _UNTRAINED:
         of_checkpoints = dataclasses.replace(options, dtype=None, cameras={}) != CheckpointOptions()
         if of_checkpoints or options.dtype == torch.bfloat16:

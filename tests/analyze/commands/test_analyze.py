@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 import vla_attention as va
-from tests.kit.paths import ROOT
+from tests.kit.archives import example_store
 
-CUBES = ROOT / "vla_attention/example_stores/cubes.zarr"
+CUBES = example_store("cubes")
 
 
 @pytest.mark.parametrize("by", [(), ("layer",)])

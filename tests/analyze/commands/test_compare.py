@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 from scipy import stats
 
-from tests.kit.paths import ROOT
+from tests.kit.archives import example_store
 from tests.kit.stores import StoreSpec, rerun_source, write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.compare import compare
@@ -277,7 +277,7 @@ def test_a_deaf_policy_is_said_first(example_pair):
 
 @pytest.fixture
 def example_pair():
-    return [str(ROOT / "vla_attention" / "example_stores" / f"{name}.zarr") for name in ("cubes", "cubes_one_colour")]
+    return [str(example_store(name)) for name in ("cubes", "cubes_one_colour")]
 
 
 @pytest.mark.drawn

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import vla_attention as va
+from tests.kit.archives import example_store
 from tests.kit.made_up_behaviour import COLOURS, did, goals_of
-from tests.kit.paths import ROOT
 from tests.kit.questions import question_about
 from tests.kit.stores import StoreSpec, rerun_source, small_steps, write_store
 from vla_attention.analyze.__main__ import main as analyze
@@ -26,7 +26,7 @@ from vla_attention.schemas.stores.reader import open_store
 
 REPLANS, TURN = 8, 3
 SPEC = StoreSpec(tasks=(0, 1), episodes=6, replans=REPLANS, layers=(0,), heads=(0,), denoise_steps=(9,))
-PAIR = [ROOT / f"vla_attention/example_stores/{name}.zarr" for name in ("cubes_one_colour", "cubes")]
+PAIR = [example_store(name) for name in ("cubes_one_colour", "cubes")]
 
 
 def turning(spec, task, episode, steps, turns=True, spread=0.001):

@@ -13,8 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.null_stores import says_it_listens
+from tests.kit.archives import example_store, unpacked
 from tests.kit.made_up_behaviour import COLOURS, did, goals_of
-from tests.kit.paths import ROOT
+from tests.kit.paths import GOLDEN
 from tests.kit.questions import question_about
 from tests.kit.stores import rerun_source, small_steps, write_store
 from vla_attention.analyze.__main__ import main as analyze
@@ -23,7 +24,6 @@ from vla_attention.analyze.core.behaviour import with_choices
 from vla_attention.analyze.statistics.exact_tests import mcnemar, shuffled
 from vla_attention.schemas.interventions import Interventions, PromptChange
 
-SHIPPED = ROOT / "vla_attention/example_stores"
 EIGHT = [task for task in range(3) for _ in range(8)]
 
 
@@ -33,7 +33,7 @@ def said(*args, **options):
 
 @pytest.mark.parametrize(("store", "right", "p"), [("cubes", 6, 1 / 90), ("cubes_one_colour", 2, 1.0)])
 def test_the_shipped_pair(store, right, p):
-    found = language(question_about(SHIPPED / f"{store}.zarr"))
+    found = language(question_about(example_store(store)))
     assert (found.findings[0].numbers["right"], found.findings[0].numbers["n"]) == (right, 6)
     assert found.findings[0].numbers["p"] == pytest.approx(p)
     assert found["told_and_did"]["episodes"].sum() == 6
@@ -159,9 +159,9 @@ def test_null_policies_are_said_to_listen_in_at_most_five_of_a_hundred():
 
 
 def test_effects_say_which_words_decide_and_which_were_not_tested():
-    question = question_about(ROOT / "tests/golden/tables/stores/effects.zarr")
+    question = question_about(unpacked(GOLDEN / "tables/stores/effects.tar.xz"))
     table = language(question)["word_effects"]
-    golden = pl.read_parquet(ROOT / "tests/golden/tables/effects_effects/effects_summary.parquet")
+    golden = pl.read_parquet(GOLDEN / "tables/effects_effects/effects_summary.parquet")
     rows = golden.filter(scope="all", phase="all")
     for reader, ending in (("total", "_queries_all"), ("direct", "")):
         for word, value in table.drop_nulls("total").select("item", reader).iter_rows():

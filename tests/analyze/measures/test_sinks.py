@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.kit.archives import example_store
 from tests.kit.made_up_steps import steps_of
 from tests.kit.questions import question_about
 from tests.kit.raw_rows import FEW, RawEpisode, leaky, raw_episodes, weights_of
@@ -26,7 +27,6 @@ from vla_attention.analyze.measures.sinks import (
     search_sinks,
     without_sinks,
 )
-from vla_attention.example_stores import CUBES
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import Role
 
@@ -101,7 +101,7 @@ def test_sinks_are_the_keys_that_a_loop_over_raw_rows_finds(data):
 
 def test_keys_of_the_policys_own_actions_are_no_sinks():
     """In the example store the action queries read each other: six of their keys take five times their share."""
-    question = question_about(CUBES)
+    question = question_about(example_store("cubes"))
     search = search_sinks(question)
     actions = search.keys.filter(role="action")
     assert (actions["times_uniform"] > 4).any()

@@ -11,8 +11,9 @@ import pytest
 
 from tests.kit.stores import StoreSpec, reseal, small_effects, small_steps, write_store
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.analyze.store.copying import PARTS, copy_store, part_sizes
+from vla_attention.analyze.store.copying import PARTS, copy_store, open_source, part_sizes
 from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.root import NAMES_FILE
 from vla_attention.schemas.stores.store_format import CorruptEpisode, RunMismatch, StoreError
 from vla_attention.schemas.stores.verify import verify_store
 
@@ -67,7 +68,9 @@ def test_a_copy_verifies_and_holds_the_same_numbers(original, tmp_path, without)
     assert copied.left_bytes == sum(sizes[name] for name in without)
     assert sum(part_sizes(copy)[name] for name in without) == 0
     if not without:
-        assert all_bytes(tmp_path / "b.zarr") == before
+        names = json.loads((tmp_path / "b.zarr" / NAMES_FILE).read_text())
+        assert names == [episode.name for episode in store.episodes]
+        assert {**all_bytes(tmp_path / "b.zarr"), NAMES_FILE: b""} == {**before, NAMES_FILE: b""}
 
 
 def test_a_copy_is_brought_up_to_date(tmp_path):
@@ -84,7 +87,7 @@ def test_a_copy_is_brought_up_to_date(tmp_path):
         copy_store(open_store(other), tmp_path / "b.zarr", ("frames",))
 
 
-@pytest.mark.parametrize("words", [(), ("--packed",), ("--without", "frames"), ("--packed", "--without", "frames")])
+@pytest.mark.parametrize("words", [(), ("--tar",), ("--without", "frames"), ("--tar", "--without", "frames")])
 def test_an_episode_that_was_recorded_again_is_not_taken_for_the_copied_one(tmp_path, capsys, words):
     path, target = write_store(tmp_path / "a.zarr", spec=SPEC), tmp_path / "b.zarr"
     assert analyze(["store", "copy", str(path), str(target), *words]) == 0
@@ -162,7 +165,7 @@ def test_command_line(original, tmp_path, capsys):
         ([str(original), str(tmp_path / "x.zarr"), "--without", "frame"], "Did you mean 'frames'?"),
         ([str(original), str(tmp_path / "x")], "ends with '.zarr'"),
         ([str(original), str(original)], "to itself"),
-        ([str(original), str(original / "episodes" / "x.zarr"), "--packed"], "it is inside of the store"),
+        ([str(original), str(original / "episodes" / "x.zarr"), "--tar"], "it is inside of the store"),
         ([str(original), str(original / "sub" / "more" / "x.zarr")], "it is inside of the store"),
         ([str(original), str(tmp_path / "file" / "x.zarr")], "Cannot copy to"),
         ([str(tmp_path / "none.zarr")], "There is no store at"),
@@ -194,7 +197,7 @@ def linked_episode(episode: Path) -> None:
     episode.symlink_to(episode.parents[2] / "elsewhere")
 
 
-@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("tar", [False, True])
 @pytest.mark.parametrize("without", [(), ("frames",)])
 @pytest.mark.parametrize(
     ("change", "problem"),
@@ -205,14 +208,49 @@ def linked_episode(episode: Path) -> None:
         (linked_episode, r"its \. is a link|task000_episode000"),
     ],
 )
-def test_what_is_no_part_of_an_episode_is_refused(original, tmp_path, change, problem, without, packed):
+def test_what_is_no_part_of_an_episode_is_refused(original, tmp_path, change, problem, without, tar):
     path = tmp_path / "a.zarr"
     shutil.copytree(original, path)
     change(path / "episodes/task000_episode000")
     with pytest.raises(StoreError, match=problem):
-        copy_store(open_store(path), tmp_path / "b.zarr", without, packed=packed)
+        copy_store(open_store(path), tmp_path / "b.zarr", without, tar=tar)
     assert not list((tmp_path / "b.zarr").rglob("*payload*"))
-    assert [episode.name for episode in open_store(tmp_path / "b.zarr").episodes] == []
+    assert not list((tmp_path / "b.zarr/episodes").glob("task*"))
+
+
+def test_tar_files_are_the_store_again_and_a_copy_of_them_goes_on(original, tmp_path, capsys):
+    tars, back = tmp_path / "tars.zarr", tmp_path / "back.zarr"
+    copy_store(open_store(original), tars, (), tar=True)
+    names = {path.relative_to(tars).as_posix() for path in tars.rglob("*") if path.is_file()}
+    assert names == {"zarr.json", "episodes/zarr.json", *(f"episodes/task000_episode00{i}.tar" for i in (0, 1))}
+    whole = all_bytes(tars)
+    (tars / "episodes/task000_episode001.tar").unlink()
+    assert copy_store(open_store(original), tars, (), tar=True).added == 1
+    assert all_bytes(tars) == whole
+    assert analyze(["store", "copy", str(tars), str(back)]) == 0
+    assert {**all_bytes(back), NAMES_FILE: b""} == {**all_bytes(original), NAMES_FILE: b""}
+    assert copy_store(open_source(tars), back, ()).present == 2
+    capsys.readouterr()
+    for words, said in (
+        (["analyze", str(tars)], "are tar files; vla-attention store copy"),
+        (["store", "copy", str(original), str(tars)], "are tar files"),
+        (["store", "copy", str(original), str(back), "--tar"], "its episodes are folders"),
+    ):
+        assert analyze(words) == 2
+        assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "change", [lambda tar: tar[:700], lambda tar: tar.replace(b"joint", b"paint"), lambda tar: b""]
+)
+def test_a_damaged_tar_file_is_refused(original, tmp_path, change):
+    tars = tmp_path / "tars.zarr"
+    copy_store(open_store(original), tars, (), tar=True)
+    first = tars / "episodes/task000_episode000.tar"
+    first.write_bytes(change(first.read_bytes()))
+    with pytest.raises(CorruptEpisode, match="task000_episode000"):
+        copy_store(open_source(tars), tmp_path / "back.zarr", ())
+    assert open_store(tmp_path / "back.zarr").episodes == ()
 
 
 def edit(file: Path, change) -> None:
@@ -222,8 +260,8 @@ def edit(file: Path, change) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:Ignored in")
-@pytest.mark.parametrize("packed", [False, True])
-def test_a_copy_has_nothing_but_what_the_format_names(original, tmp_path, packed):
+@pytest.mark.parametrize("tar", [False, True])
+def test_a_copy_has_nothing_but_what_the_format_names(original, tmp_path, tar):
     path = tmp_path / "a.zarr"
     shutil.copytree(original, path)
     episode = path / "episodes/task000_episode000"
@@ -234,9 +272,10 @@ def test_a_copy_has_nothing_but_what_the_format_names(original, tmp_path, packed
     (episode / "link").symlink_to(path / "notes.txt")
     for group in (path, path / "episodes", episode / "seal"):
         edit(group / "zarr.json", lambda document: document.update(payload="rm -rf ~"))
-    copy_store(open_store(path), tmp_path / "b.zarr", (), packed=packed)
-    copy_store(open_store(original), tmp_path / "expected.zarr", (), packed=packed)
+    copy_store(open_store(path), tmp_path / "b.zarr", (), tar=tar)
+    copy_store(open_store(original), tmp_path / "expected.zarr", (), tar=tar)
     copied, expected = all_bytes(tmp_path / "b.zarr"), all_bytes(tmp_path / "expected.zarr")
     assert set(copied) == set(expected)
     assert not any(b"rm -rf" in content or content == b"mine" for content in copied.values())
-    assert verify_store(open_store(tmp_path / "b.zarr")) == []
+    if not tar:
+        assert verify_store(open_store(tmp_path / "b.zarr")) == []

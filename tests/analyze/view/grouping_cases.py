@@ -35,7 +35,7 @@ from vla_attention.schemas.groupings.grouping import (
     parse_ratio_argument,
     with_groups,
 )
-from vla_attention.schemas.groupings.key_counts import uniform_of_version_1, uniform_rows
+from vla_attention.schemas.groupings.key_counts import uniform_rows
 from vla_attention.schemas.groupings.resolve import counted_keys
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vocabulary
 from vla_attention.schemas.jsonable import to_json
@@ -63,10 +63,9 @@ def _case(seed: int, number: int, episodes: Sequence[EpisodeTokens]) -> dict[str
     # Names may exist in another episode of the same layout only: then the group has no key here.
     others = [i for i, other in enumerate(episodes) if other.layout == tokens.layout] if number % 3 else [position]
     rows = _rows(generator, tokens)
-    uniform = _uniform(generator, tokens) if number % 4 else None
-    case = {"episode": position, "vocabulary": others, **given, "rows": rows.ravel().tolist(), "uniform": None}
-    if uniform is not None:
-        case["uniform"] = {"shape": list(uniform.shape), "values": uniform.ravel().tolist()}
+    uniform = _uniform(generator, tokens)
+    case = {"episode": position, "vocabulary": others, **given, "rows": rows.ravel().tolist()}
+    case["uniform"] = {"shape": list(uniform.shape), "values": uniform.ravel().tolist()}
     return {**case, "expected": _expected(given, tokens, [episodes[i] for i in others], rows, uniform)}
 
 
@@ -262,9 +261,9 @@ def _expected(
     tokens: EpisodeTokens,
     others: Sequence[EpisodeTokens],
     rows: NDArray[np.float64],
-    uniform: NDArray[np.float32] | None,
+    uniform: NDArray[np.float32],
 ) -> dict[str, Any]:
-    """What Python makes of a case; `uniform`: what a store of version 2 holds, None for one of version 1."""
+    """What Python makes of a case; `uniform`: what a store holds."""
     attributes = SimpleNamespace(task_id=0, instruction="", episode_index=0, success=None, num_steps=0)
     store, episode = SimpleNamespace(suite="made_up"), SimpleNamespace(attributes=attributes)
     item = SelectedEpisode(store, episode, tokens)  # type: ignore[arg-type] - no more of them is needed
@@ -283,12 +282,7 @@ def _expected(
     layers, denoise, heads = (tuple(range(length)) for length in AXES)
     selection = Selection(layers, layers, layers, denoise, denoise, heads, heads, per_head=False)
     mean = mass.mean(axis=3, keepdims=True)
-    if uniform is None:
-        keys = uniform_of_version_1(tokens.layout, tokens.static_roles, item.valid, tokens.num_queries)
-        of_cells = keys[:, None, None, None]
-    else:
-        of_cells = uniform.mean(axis=(3, 4), dtype=np.float64)[:, :, :, None]
-    expected = uniform_masses(of_cells, weights)
+    expected = uniform_masses(uniform.mean(axis=(3, 4), dtype=np.float64)[:, :, :, None], weights)
     names = len(grouping.names)
     measured = Measured(
         item, selection, items.labels, items.absent, mean[..., :-2], mean[..., :names].sum(axis=-1), mean[..., -1],
@@ -350,5 +344,4 @@ def _episode_json(tokens: EpisodeTokens) -> dict[str, Any]:
             camera: {"shape": list(area.shape), "values": area.ravel().tolist()}
             for camera, area in (tokens.coverage or {}).items()
         },
-        "num_queries": tokens.num_queries,
     }

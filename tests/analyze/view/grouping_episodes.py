@@ -130,7 +130,6 @@ def _tokens(generator: np.random.Generator, layout: SiteLayout, absent: Role, nu
         np.array(index),
         objects,
         _coverage(generator, layout, replans, objects, masked) if objects else None,
-        num_queries=7,
     )
 
 

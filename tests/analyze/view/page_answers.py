@@ -26,7 +26,6 @@ class PageQuestion:
     root: str
     episode: str = "task000_episode000"
     query: str = ""
-    packed: bool = False
     summary: str = ""
 
 

@@ -44,8 +44,8 @@ function ofEffects({ effects, words, replan }) {
   };
 }
 
-async function answerOf({ base, root, packed, episode, query, summary }) {
-  const entry = { name: root.replace(/\/$/, ""), root, episodes: [{ name: episode }], packed, summary };
+async function answerOf({ base, root, episode, query, summary }) {
+  const entry = { name: root.replace(/\/$/, ""), root, episodes: [{ name: episode }], summary };
   const store = await libraryAt(base).openStore(entry);
   const opened = await store.openEpisode(episode);
   if (summary) await store.readEffectUnits();

@@ -13,9 +13,8 @@ import pytest
 
 import vla_attention as va
 from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answers
-from tests.kit.golden_stores import folder_of
+from tests.kit.golden_stores import golden_store
 from tests.kit.http_ranges import serve
-from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.core.action_changes import units_of_recorded
 from vla_attention.analyze.view.summary_process import summary_parts
 from vla_attention.schemas.stores.reader import open_store
@@ -25,7 +24,7 @@ pytestmark = needs_node
 CLOSE = 1e-9
 
 
-def answers_of(stores: Sequence[Path], packed: Sequence[bool] = (), **given: Any) -> list[Any]:
+def answers_of(stores: Sequence[Path], **given: Any) -> list[Any]:
     """What the page shows of each store's first episode; `units`, if given, replace those that Python computes."""
     folder = stores[0].parent
     names = []
@@ -38,8 +37,8 @@ def answers_of(stores: Sequence[Path], packed: Sequence[bool] = (), **given: Any
         (folder / names[-1]).write_text(json.dumps({"complete": True, "episodes": [], **of_store}))
     with serve(folder) as served:
         questions = [
-            PageQuestion(f"{served.url}/", f"{store.name}/", packed=one, summary=f"{served.url}/{name}")
-            for store, name, one in zip(stores, names, packed or [False] * len(stores), strict=True)
+            PageQuestion(f"{served.url}/", f"{store.name}/", summary=f"{served.url}/{name}")
+            for store, name in zip(stores, names, strict=True)
         ]
         return page_answers(folder, questions)
 
@@ -48,18 +47,15 @@ def answers_of(stores: Sequence[Path], packed: Sequence[bool] = (), **given: Any
 def golden(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The golden store with effects of words and objects for all readers; one dimension of it is mostly noise."""
     folder = tmp_path_factory.mktemp("golden")
-    shutil.copytree(folder_of(2) / "effects.zarr", folder / "effects.zarr")
+    shutil.copytree(golden_store("effects"), folder / "effects.zarr")
     return folder / "effects.zarr"
 
 
 @pytest.fixture(scope="module")
 def found(golden: Path) -> list[Any]:
-    """The page's effects of the golden store, of it packed, and of a store without effects."""
-    packed = golden.with_name("packed.zarr")
-    assert main(["store", "copy", str(golden), str(packed), "--packed"]) == 0
-    shutil.copytree(folder_of(2) / "joint.zarr", golden.with_name("joint.zarr"))
-    stores = [golden, packed, golden.with_name("joint.zarr")]
-    return [answer["effects"] for answer in answers_of(stores, [False, True, False])]
+    """The page's effects of the golden store, and of a store without effects."""
+    shutil.copytree(golden_store("joint"), golden.with_name("joint.zarr"))
+    return [answer["effects"] for answer in answers_of([golden, golden.with_name("joint.zarr")])]
 
 
 def on_the_page(condition: str) -> str:

@@ -1,6 +1,6 @@
 """What the page shows of a store is what Python computes: ratios, masses, patches, words, heads, pixels.
 
-The page's own script reads the golden stores over HTTP ranges, as a browser does, folders and zips.
+The page's own script reads the golden stores over HTTP ranges, as a browser does.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from matplotlib import colormaps
 import vla_attention as va
 from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answers
 from tests.end_to_end.test_cameras_of_several_spans import write_spans_store
-from tests.kit.golden_stores import FOLDER
+from tests.kit.golden_stores import golden_store
 from tests.kit.http_ranges import serve
 from vla_attention.analyze.core.camera_maps import camera_names, episode_maps, scale_end, stored_picture
 from vla_attention.analyze.core.patch_pictures import NO_PICTURE, enlarge, upright
@@ -34,32 +34,24 @@ QUERIES = {
     "joint": ("", "?layer=1&denoise=2&head=3&replan=2", "?layer=2&replan=1&measure=raw&smooth=1"),
     "cosmos": ("?site=cross&replan=1", "?site=self&layer=1&head=1&measure=rank"),
     "spans": ("", "?layer=2&measure=raw&replan=1&smooth=1"),
-    "packed": ("?layer=1&replan=2",),
 }
-CASES = [(f"version2/{name}", query) for name, queries in QUERIES.items() for query in queries]
+CASES = [(name, query) for name, queries in QUERIES.items() for query in queries]
 
 
 @pytest.fixture(scope="module")
 def stores(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the golden stores, and one of a camera with tiles, a thumbnail and pooled tokens."""
     folder = tmp_path_factory.mktemp("stores")
-    shutil.copytree(FOLDER.parent / "version2", folder / "version2")
-    write_spans_store(folder / "version2" / "spans.zarr", "tiles and thumbnail")
+    for name in ("joint", "cosmos"):
+        shutil.copytree(golden_store(name), folder / f"{name}.zarr")
+    write_spans_store(folder / "spans.zarr", "tiles and thumbnail")
     return folder
 
 
 @pytest.fixture(scope="module")
 def answers(stores: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str], dict[str, Any]]:
     with serve(stores) as served:
-        questions = [
-            PageQuestion(
-                f"{served.url}/{name.partition('/')[0]}/",
-                f"{name.partition('/')[2]}.zarr/",
-                query=query,
-                packed=name.endswith("packed"),
-            )
-            for name, query in CASES
-        ]
+        questions = [PageQuestion(f"{served.url}/", f"{name}.zarr/", query=query) for name, query in CASES]
         found = page_answers(tmp_path_factory.mktemp("page"), questions)
     assert [answer.get("failure") for answer in found] == [None] * len(CASES)
     return dict(zip(CASES, found, strict=True))

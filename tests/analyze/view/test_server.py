@@ -263,7 +263,6 @@ def test_the_document_lists_stores_and_episodes(server, store):
                 "name": "a.zarr",
                 "root": "stores/0/",
                 "episodes": [{"name": name} for name in names],
-                "packed": False,
                 "summary": "stores/0.summary.json",
                 "path": str(store),
             }
@@ -280,21 +279,18 @@ def test_episodes_that_are_captured_meanwhile_are_listed(tmp_path):
         assert found["episodes"][-1] == {"name": "task000_episode005"}
 
 
-def test_packed_stores_and_stores_elsewhere_are_served(tmp_path, store):
+def test_a_store_elsewhere_is_served(tmp_path, store):
     pytest.importorskip("aiohttp")
-    packed = tmp_path / "packed" / "p.zarr"
-    packed.parent.mkdir()
-    copy_store(open_store(store), packed, (), lambda _: None, packed=True)
-    (name,) = [path.relative_to(packed).as_posix() for path in packed.rglob("task000_episode000.zip")]
-    content = (packed / name).read_bytes()
-    with serve(packed.parent) as elsewhere, served(packed, f"{elsewhere.url}/p.zarr") as running:
+    copy = tmp_path / "copied" / "p.zarr"
+    copy_store(open_store(store), copy, ())
+    (path,) = copy.glob("episodes/task000_episode000/joint/rows/c*")
+    name, content = path.relative_to(copy).as_posix(), path.read_bytes()
+    with serve(copy.parent) as elsewhere, served(copy, f"{elsewhere.url}/p.zarr") as running:
         for number in (0, 1):
-            assert json.loads(ask(running, "stores.json").body)["stores"][number]["packed"] is True
             reply = ask(running, f"stores/{number}/{name}", Range=f"bytes={len(content) - 30}-")
             assert (reply.status, reply.body) == (206, content[-30:])
             assert ask(running, f"stores/{number}/{name}", Range="bytes=4-9").body == content[4:10]
-            assert ask(running, f"stores/{number}/index.json").body == (packed / "index.json").read_bytes()
-            assert ask(running, f"stores/{number}/episodes/nothing.zip").status == 404
+            assert ask(running, f"stores/{number}/episodes/nothing").status == 404
         elsewhere.forget()
         ask(running, f"stores/1/{name}", Range="bytes=100-199")
         assert elsewhere.of_episodes() == 100

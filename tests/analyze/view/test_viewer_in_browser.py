@@ -160,13 +160,11 @@ def test_a_damaged_chunk_is_a_sentence_and_no_number(browser, store, tmp_path):
 
 
 @pytest.mark.thorough
-def test_a_static_site_shows_the_same_and_a_packed_store_too(browser, server, store, tmp_path, capsys):
-    packed = tmp_path / "packed.zarr"
-    assert main(["store", "copy", str(store), str(packed), "--packed"]) == 0
-    assert main(["view", str(store), str(packed), "--site", str(tmp_path / "site")]) == 0
+def test_a_static_site_shows_the_same(browser, server, store, tmp_path, capsys):
+    assert main(["view", str(store), "--site", str(tmp_path / "site")]) == 0
     found = []
     with serve(tmp_path / "site") as site, watched_page(browser) as watched:
-        for link in (server.link, f"{site.url}/index.html", f"{site.url}/index.html?store=1"):
+        for link in (server.link, f"{site.url}/index.html"):
             watched.open(f"{link}{'&' if '?' in link else '?'}replan=1&layer=2")
             found.append(watched.value(f'{MAIN} [data-number="mass-visual"]'))
         assert watched.complaints == []

@@ -28,7 +28,6 @@ function tokensOf(episode) {
     promptIndex: episode.prompt_index,
     objects: episode.objects,
     coverage,
-    numQueries: episode.num_queries,
   });
 }
 
@@ -86,8 +85,7 @@ function measured(one) {
   const [numLayers, denoise, heads] = given.axes.map((length) => [...Array(length).keys()]);
   const uniform = numLayers.map((layer) => {
     const selection = { layers: [layer], denoise, heads, query: "mean" };
-    const keys = one.uniform ? meanUniform(one.uniform, selection) : tokens.uniformOfVersion1;
-    return engine.uniformMasses(keys, weights, tokens.keys);
+    return engine.uniformMasses(meanUniform(one.uniform, selection), weights, tokens.keys);
   });
   // A layer each, and their mean as the last, as in the tables.
   const values = [...numLayers.map((layer) => [layer]), numLayers].map((own) =>

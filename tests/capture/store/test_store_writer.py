@@ -28,7 +28,6 @@ from tests.kit.stores import (
 )
 from tests.kit.strategies import episode_tokens
 from tests.kit.thorough import thorough_except
-from vla_attention.analyze.store.copying import copy_store
 from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.capture.store.codecs import write_whole
 from vla_attention.capture.store.store_writer import open_run
@@ -217,7 +216,6 @@ DOCUMENT = Path(__file__).parents[3] / "docs" / "store.md"
 @pytest.mark.parametrize("example", re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL))
 def test_the_examples_of_the_documentation_run(written, tmp_path, monkeypatch, capsys, example):
     (tmp_path / "run.zarr").symlink_to(written[0])
-    copy_store(open_store(written[0]), tmp_path / "packed.zarr", (), packed=True)
     monkeypatch.chdir(tmp_path)
     exec(compile(example, str(DOCUMENT), "exec"), {})
     printed = capsys.readouterr().out

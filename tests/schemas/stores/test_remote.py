@@ -19,24 +19,23 @@ from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.store.copying import copy_store
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.store_format import StoreError
 from vla_attention.schemas.stores.store_url import StoreUrl, store_place
 from vla_attention.schemas.stores.verify import verify_store
-
-pytestmark = pytest.mark.filterwarnings("ignore:Whether the index.json")
 
 SPEC = StoreSpec(tasks=(0,), episodes=2, replans=2)
 
 
 @pytest.fixture(scope="module")
-def packed(tmp_path_factory) -> Path:
-    made = tmp_path_factory.mktemp("packed")
-    copy_store(open_store(write_store(made / "folder.zarr", spec=SPEC)), made / "a.zarr", (), packed=True)
+def copied(tmp_path_factory) -> Path:
+    made = tmp_path_factory.mktemp("copied")
+    copy_store(open_store(write_store(made / "folder.zarr", spec=SPEC)), made / "a.zarr", ())
     return made / "a.zarr"
 
 
 @pytest.fixture
-def server(packed, tmp_path) -> Iterator[Served]:
-    shutil.copytree(packed, tmp_path / "served" / "a.zarr")
+def server(copied, tmp_path) -> Iterator[Served]:
+    shutil.copytree(copied, tmp_path / "served" / "a.zarr")
     with serve(tmp_path / "served") as served:
         yield served
 
@@ -73,13 +72,6 @@ def read_all(url: str, expected: Path) -> list[str]:
     return said
 
 
-def one_sentence(said: str) -> str:
-    """What a command printed beside the note on what a web server cannot be asked: one line."""
-    lines = [line for line in said.splitlines() if "lists every episode of it was not checked" not in line]
-    assert len(lines) == 1, said
-    return lines[0]
-
-
 def results(folder: Path) -> dict[str, bytes]:
     return {
         str(file.relative_to(folder)): file.read_bytes()
@@ -88,67 +80,78 @@ def results(folder: Path) -> dict[str, bytes]:
     }
 
 
-def test_a_store_is_read_by_its_address(server, packed):
+def test_a_web_server_needs_the_list_that_a_copy_has(server, tmp_path):
+    (tmp_path / "served/a.zarr/episodes.json").write_text('["../x"]')
+    with pytest.raises(StoreError, match="is no list of names of episodes"):
+        open_store(f"{server.url}/a.zarr")
+    (tmp_path / "served/a.zarr/episodes.json").unlink()
+    with pytest.raises(StoreError, match="store copy writes one"):
+        open_store(f"{server.url}/a.zarr")
+
+
+def test_a_store_is_read_by_its_address(server, copied):
     store = open_store(f"{server.url}/a.zarr")
     assert store.path == StoreUrl(f"{server.url}/a.zarr")
-    assert [episode.name for episode in store.episodes] == [episode.name for episode in open_store(packed).episodes]
-    assert read_all(f"{server.url}/a.zarr", packed) == []
+    assert [episode.name for episode in store.episodes] == [episode.name for episode in open_store(copied).episodes]
+    assert read_all(f"{server.url}/a.zarr", copied) == []
     assert verify_store(store) == []
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("cached", [False, True])
-def test_damaged_answers_are_never_a_number(server, packed, cached, request):
+def test_damaged_answers_are_never_a_number(server, copied, cached, request):
     if cached:
         request.getfixturevalue("kept")
     url = f"{server.url}/a.zarr"
     generator = np.random.default_rng(0)
 
     def flip(path: str, content: bytes) -> bytes:
-        if not path.endswith(".zip"):
+        if "/episodes/" not in path:
             return content
         at = int(generator.integers(len(content)))
         return content[:at] + bytes([content[at] ^ 0x20]) + content[at + 1 :]
 
     server.change = flip
     for _ in range(3):
-        assert read_all(url, packed)
+        assert read_all(url, copied)
     server.change = None
-    assert read_all(url, packed) == []  # nothing wrong was kept
+    assert read_all(url, copied) == []  # nothing wrong was kept
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("announce", [False, True])
-def test_short_answers_are_never_a_number(server, packed, announce):
+def test_short_answers_are_never_a_number(server, copied, announce):
     url = f"{server.url}/a.zarr"
     for keep in (0, 1, 0.5):
         server.announce = announce
         server.change = lambda path, content, keep=keep: content[: int(len(content) * keep) if keep < 1 else -1]
-        assert read_all(url, packed)
+        assert read_all(url, copied)
         server.change = lambda path, content, keep=keep: (
-            content[: int(len(content) * keep) if keep < 1 else -1] if path.endswith(".zip") else content
+            content[: int(len(content) * keep) if keep < 1 else -1] if "/episodes/" in path else content
         )
-        assert read_all(url, packed)
+        assert read_all(url, copied)
 
 
 @pytest.mark.thorough
-def test_an_answer_of_another_place_is_never_a_number(server, packed):
+def test_an_answer_of_another_place_is_never_a_number(server, copied):
     """A proxy that answers every part with the beginning of the file."""
-    whole = {f"a.zarr/{file.relative_to(packed)}": file.read_bytes() for file in packed.rglob("*.zip")}
+    whole = {f"a.zarr/{file.relative_to(copied)}": file.read_bytes() for file in copied.rglob("c.*")}
     server.change = lambda path, content: whole[path][: len(content)] if path in whole else content
-    assert read_all(f"{server.url}/a.zarr", packed)
+    assert read_all(f"{server.url}/a.zarr", copied)
 
 
-def test_a_server_without_ranges_is_refused_with_a_sentence(server, packed, capsys):
+def test_a_server_without_ranges_is_refused_with_a_sentence(server, copied, capsys):
     server.ranges = False
-    assert "range requests" in " ".join(read_all(f"{server.url}/a.zarr", packed))
+    assert "range requests" in " ".join(read_all(f"{server.url}/a.zarr", copied))
     assert analyze([f"{server.url}/a.zarr", "--no-plots"]) == 2
-    assert "range requests" in one_sentence(capsys.readouterr().err)
+    said = capsys.readouterr().err
+    assert "range requests" in said
+    assert said.count("\n") == 1
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("cached", [False, True])
-def test_a_store_that_changed_is_noticed(server, packed, tmp_path, cached, request):
+def test_a_store_that_changed_is_noticed(server, copied, tmp_path, cached, request):
     if cached:
         request.getfixturevalue("kept")
     url = f"{server.url}/a.zarr"
@@ -157,7 +160,7 @@ def test_a_store_that_changed_is_noticed(server, packed, tmp_path, cached, reque
     other = write_store(
         tmp_path / "folder.zarr", spec=SPEC, plant_rows=lambda task, episode, tokens, rows: rows[:, ::-1]
     )
-    copy_store(open_store(other), tmp_path / "other.zarr", (), packed=True)
+    copy_store(open_store(other), tmp_path / "other.zarr", ())
     shutil.rmtree(tmp_path / "served" / "a.zarr")
     shutil.copytree(tmp_path / "other.zarr", tmp_path / "served" / "a.zarr")
     assert read_all(url, tmp_path / "other.zarr") == []
@@ -165,7 +168,7 @@ def test_a_store_that_changed_is_noticed(server, packed, tmp_path, cached, reque
     for name in ("joint/rows", "joint/atoms", "joint/row_sum"):
         with suppress(UserError):
             values = opened.episodes[1].read(name)
-            assert np.array_equal(values, open_store(packed).episodes[1].read(name))
+            assert np.array_equal(values, open_store(copied).episodes[1].read(name))
 
 
 @pytest.mark.thorough
@@ -175,7 +178,7 @@ def test_a_network_that_fails_later_leaves_no_episode_out(server, tmp_path, caps
 
     def fail_later(path: str, content: bytes) -> bytes:
         served.append(path)
-        if len([one for one in served if one.endswith(".zip")]) > 3:
+        if len([one for one in served if "/episodes/" in one]) > 3:
             server.status = 503
         return content
 

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.kit.paths import GOLDEN
 from tests.kit.stores import StoreSpec, write_store
-from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.schemas.stores.store_format import STORE_VERSION, FormatTooNew, RunMismatch, StoreError
+from vla_attention.schemas.stores.store_format import STORE_VERSION, FormatTooNew, StoreError
 
 SPEC = StoreSpec(tasks=(0,), episodes=1, replans=1, layers=(0,), heads=(0,), frames=False)
 
@@ -39,33 +36,27 @@ def change_root(path: Path, **changes: Any) -> None:
     (path / "zarr.json").write_text(json.dumps(document))
 
 
-def test_a_new_store_is_of_version_2(original):
+def test_a_new_store_is_of_version_1(original):
     attributes = json.loads((original / "zarr.json").read_text())["attributes"]
-    assert (attributes["format"], attributes["store_version"]) == ("vla-attention", 2)
-    assert open_store(original).attributes.version_text == "version 2"
+    assert (attributes["format"], attributes["store_version"]) == ("vla-attention", 1)
 
 
 def test_a_newer_version_is_refused_and_both_are_named(path):
     change_root(path, store_version=STORE_VERSION + 1, something_new={"a": 1})
-    with pytest.raises(
-        FormatTooNew, match="is a store of version 3, and this program reads stores up to version 2; in"
-    ):
+    with pytest.raises(FormatTooNew, match="is a store of version 2, and this program reads version 1; install"):
         open_store(path)
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"store_version": None}, "has no store_version; expected a whole number, 1 to"),
-        ({"format_version": 5}, "says format_version: it is of a draft of the format, before version 1"),
-        ({"store_version": 0}, "has the store_version 0; expected a whole number"),
-        ({"store_version": 10**40}, "store of version with more than 19 digits, and this program reads stores up to"),
-        ({"store_version": True}, "has the store_version True; expected a whole number"),
-        ({"store_version": "1"}, "has the store_version '1'; expected a whole number"),
-        ({"store_version": 1.0}, "has the store_version 1.0; expected a whole number"),
-        ({"store_version": [1] * 1000}, r"has the store_version \[1, 1.*\.\.\.; expected a whole number"),
-        ({"store_version": None, "format_version": 2}, "of a draft of the format, .*; capture the episodes again"),
-        ({"store_version": None, "format_version": "2"}, "it is of a draft of the format, before version 1"),
+        ({"store_version": None}, "has no store_version; expected 1"),
+        ({"store_version": 0}, "has the store_version 0; expected 1"),
+        ({"store_version": 10**40}, "store of version with more than 19 digits, and this program reads version"),
+        ({"store_version": True}, "has the store_version True; expected 1"),
+        ({"store_version": "1"}, "has the store_version '1'; expected 1"),
+        ({"store_version": 1.0}, "has the store_version 1.0; expected 1"),
+        ({"store_version": [1] * 1000}, r"has the store_version \[1, 1.*\.\.\.; expected 1"),
     ],
 )
 def test_what_is_no_version_is_refused_in_a_sentence(path, changes, message):
@@ -74,10 +65,3 @@ def test_what_is_no_version_is_refused_in_a_sentence(path, changes, message):
         open_store(path)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 500
-
-
-def test_a_store_of_version_1_is_not_continued(tmp_path):
-    shutil.copytree(GOLDEN / "stores" / "version1" / "joint.zarr", tmp_path / "a.zarr")
-    wanted = replace(open_store(tmp_path / "a.zarr").attributes, store_version=STORE_VERSION)
-    with pytest.raises(RunMismatch, match=r"it is of version 1, and captures write version 2; give another --output"):
-        open_run(tmp_path / "a.zarr", wanted, "resume")

@@ -1,7 +1,6 @@
 /** What selectors need of one episode's keys at one site, and the names in it: schemas/groupings/vocabulary.py. */
 import { INVALID_ROLES, ROLES } from "../store/documents";
 import type { GridDocument, PromptDocument, ObjectDocument, SiteDocument, SpanDocument } from "../store/documents";
-import { type UniformKeys, uniformOfVersion1 } from "./key_counts";
 import { BadArgument, casefold, characters, decimalDigits, listing, shortened, unknownName, visible } from "./text";
 import { wordsOf, type Word } from "./words";
 
@@ -31,8 +30,6 @@ export interface TokensOfEpisode {
   readonly objects: readonly ObjectDocument[];
   /** By camera of the site. */
   readonly coverage: ReadonlyMap<string, ObjectCoverage>;
-  /** Action queries of a replan; needed for the baseline of version 1 where the layout has a growing span. */
-  readonly numQueries: number;
 }
 
 /** The tokens, and what follows from them. */
@@ -45,10 +42,8 @@ export class EpisodeTokens {
   readonly promptIndex: readonly number[];
   readonly objects: readonly ObjectDocument[];
   readonly coverage: ReadonlyMap<string, ObjectCoverage>;
-  readonly numQueries: number;
   /** Keys that can hold information, (replan or 1, key). */
   readonly valid: Uint8Array;
-  private uniform: UniformKeys | undefined;
   private wordsOfPrompts: Word[][] | undefined;
 
   constructor(tokens: TokensOfEpisode) {
@@ -60,14 +55,7 @@ export class EpisodeTokens {
     this.promptIndex = tokens.promptIndex;
     this.objects = tokens.objects;
     this.coverage = tokens.coverage;
-    this.numQueries = tokens.numQueries;
     this.valid = this.keyRole.codes.map((code) => (INVALID_ROLES.includes(code) ? 0 : 1));
-  }
-
-  /** What uniform attention gives every key in a store of version 1. */
-  get uniformOfVersion1(): UniformKeys {
-    this.uniform ??= uniformOfVersion1(this.layout, this.keyRole, this.valid, this.numQueries);
-    return this.uniform;
   }
 
   /** The instruction's words for each of `prompts`; throws `BadArgument` for words at keys that do not exist. */

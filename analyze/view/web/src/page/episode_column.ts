@@ -48,9 +48,8 @@ export function episodeColumn(host: HTMLElement, explain: () => void, level: "h1
   const headline = new Headline(explain);
   const note = element("p", { class: "soft" });
   const corrections = element("p", { class: "warning", role: "status", hidden: true });
-  const baseline = element("p", { class: "soft", role: "note", hidden: true });
   host.classList.add("column");
-  host.append(title, about, corrections, baseline, headline.figures, words.host, effects.host, pictures.host, legend.host, inspector.host, note, headline.masses);
+  host.append(title, about, corrections, headline.figures, words.host, effects.host, pictures.host, legend.host, inspector.host, note, headline.masses);
   return {
     host,
     pictures,
@@ -75,8 +74,6 @@ export function episodeColumn(host: HTMLElement, explain: () => void, level: "h1
         .join(" · ");
       corrections.hidden = !shown.corrections;
       corrections.textContent = shown.corrections;
-      baseline.hidden = !shown.baselineNote;
-      baseline.textContent = shown.baselineNote;
       pictures.onScale = (scale) => legend.show(scale, shown.state);
       pictures.show(shown);
       words.show(shown);

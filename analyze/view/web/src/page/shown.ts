@@ -8,7 +8,7 @@ import type { PromptDocument } from "../store/documents";
 import type { Coverage, Episode, Picture, Selection, SiteInfo } from "../store/episode";
 import { StoreError } from "../store/errors";
 import type { Store } from "../store/open";
-import { baselineNote, uniformKeys } from "./baselines";
+import { uniformKeys } from "./baselines";
 import { type EffectsShown, effectsOf } from "./effects_shown";
 import { type EpisodeNumbers, episodeNumbers } from "./episode_numbers";
 import type { OneOrMean, ViewState } from "./state";
@@ -43,7 +43,6 @@ export interface Shown {
   /** What of the state does not exist here, in a sentence; empty: nothing. */
   readonly corrections: string;
   /** What to know of the lifts' baseline, in a sentence; empty: nothing. */
-  readonly baselineNote: string;
 }
 
 /** Numbers of layers, denoise steps and heads. */
@@ -128,7 +127,6 @@ async function readTokens(episode: Episode, site: SiteInfo): Promise<EpisodeToke
     promptIndex: document.prompt_index,
     objects: document.objects,
     coverage: new Map([...coverage].sort(([a], [b]) => cameras.indexOf(a) - cameras.indexOf(b))),
-    numQueries: site.numActionQueries,
   });
 }
 
@@ -221,6 +219,5 @@ export async function loadShown(store: Store, episode: Episode, state: ViewState
     numbers,
     effects,
     corrections: missing.length ? `${missing.join("; ")}.` : "",
-    baselineNote: baselineNote(store.root, store.entry.name),
   };
 }

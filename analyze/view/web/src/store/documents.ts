@@ -75,7 +75,7 @@ export interface CameraDocument {
 }
 
 export interface RootDocument {
-  store_version: 1 | 2;
+  store_version: 1;
   policy: {
     name: string;
     family: string;
@@ -241,12 +241,8 @@ export function parseRoot(document: unknown): RootDocument {
     throw new StoreError("This is no store of vla-capture: the format in its zarr.json is another one.");
   }
   const version = fields.store_version;
-  if (version !== 1 && version !== 2) {
-    throw new StoreError(
-      version === undefined
-        ? "The store is of a draft of the format, before version 1. This page reads versions 1 and 2; capture the episodes again."
-        : `The store has version ${JSON.stringify(version).slice(0, 20)} of the format; this page reads versions 1 and 2.`,
-    );
+  if (version !== 1) {
+    throw new StoreError(`The store has version ${JSON.stringify(version)?.slice(0, 20)} of the format; this page reads version 1.`);
   }
   const policy = object(fields.policy, "policy");
   const protocol = object(fields.protocol, "protocol");

@@ -72,14 +72,14 @@ export class Episode {
         `The rows of site ${layout.name} have the shape (${given.join(", ")}); the attributes say (${expected.join(", ")}).`,
       );
     }
-    const uniformShape = this.root.store_version === 1 ? null : this.#uniformShape(`${layout.name}/uniform`, expected);
+    const uniformShape = this.#uniformShape(`${layout.name}/uniform`, expected);
     const { layer: layers, denoise, head: heads } = axes;
-    return { layout, keys, layers, denoise, heads, numQueries, numActionQueries, segments, uniformShape };
+    return { layout, keys, layers, denoise, heads, numQueries, segments, uniformShape };
   }
 
   #uniformShape(path: string, rows: readonly number[]): readonly number[] {
     const given = this.document.arrays[path]?.shape;
-    if (!given) throw new StoreError(`Episode ${this.name} has no array ${path}, which stores of this version have.`);
+    if (!given) throw new StoreError(`Episode ${this.name} has no array ${path}, which every store has.`);
     const last = rows.length - 1;
     if (given.length !== rows.length || given.some((extent, axis) => extent !== rows[axis] && (axis === last || extent !== 1))) {
       throw new StoreError(
@@ -216,10 +216,9 @@ export class Episode {
     return { replans: this.numReplans, keys: info.keys, values };
   }
 
-  /** The same of uniform attention, of each replan or once; null where the store does not hold it (version 1). */
-  async uniformKeys(site: string, selection: Selection): Promise<UniformKeys | null> {
+  /** The same of uniform attention, of each replan or once. */
+  async uniformKeys(site: string, selection: Selection): Promise<UniformKeys> {
     const { keys, uniformShape } = this.site(site);
-    if (!uniformShape) return null;
     const [replans] = uniformShape as [number];
     const array = this.#array(`${site}/uniform`, "float32");
     const values = await this.#meansOf(array, storedPlaces(uniformShape, selection), 0, replans);

@@ -10,11 +10,9 @@ export interface SiteInfo {
   heads: number[];
   /** Length of the query axis. */
   numQueries: number;
-  /** Action queries of the policy at this site, for keys that not all of them see. */
-  numActionQueries: number;
   segments: SegmentDocument[];
-  /** Lengths of the axes of what uniform attention gives, 1 where nothing changes along one; null: version 1 has none. */
-  uniformShape: readonly number[] | null;
+  /** Lengths of the axes of what uniform attention gives, 1 where nothing changes along one. */
+  uniformShape: readonly number[];
 }
 
 /** Positions on the axes that means are over. */

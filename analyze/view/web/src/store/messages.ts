@@ -1,10 +1,10 @@
 /** What the page asks its workers. Shapes and types come from the episode's attributes; workers check the files. */
 import type { ArrayName } from "./array_reader";
 
-/** Where an episode's files are: a folder, or a zip of a packed store. Addresses end in a slash. */
-export type Place =
-  | { kind: "folder"; url: string }
-  | { kind: "zip"; url: string; file: string; bytes: number; tail: number };
+/** The folder of an episode's files. Addresses end in a slash. */
+export interface Place {
+  url: string;
+}
 
 export type Question =
   | { kind: "document"; path: string; most: number }

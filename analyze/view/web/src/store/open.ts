@@ -2,8 +2,8 @@
 import { type EpisodeDocument, type RootDocument, parseEpisode, parseRoot } from "./documents";
 import { Episode } from "./episode";
 import { sentenceOf, StoreError, visible } from "./errors";
-import { type Fields, flag, list, name, object, parseDocument, text, whole } from "./json_fields";
-import { AXIS, DOCUMENT_BYTES, ROOT_BYTES, ZIP_TAIL_BYTES } from "./limits";
+import { type Fields, flag, list, name, object, parseDocument, text } from "./json_fields";
+import { AXIS, DOCUMENT_BYTES, ROOT_BYTES } from "./limits";
 import type { Place } from "./messages";
 import { type Port, ReaderPool } from "./reader_pool";
 
@@ -12,7 +12,6 @@ export interface StoreEntry {
   /** Address of the store's root, relative to the page; ends in a slash. */
   root: string;
   episodes: { name: string }[];
-  packed: boolean;
   /** Address of what Python measured of every episode, relative to the page. */
   summary: string;
   /** Where the store is, as it was given to `vla-analyze view`; unknown on a site. */
@@ -77,7 +76,6 @@ export async function openStores(): Promise<StoreEntry[]> {
       name: text(entry.name, `stores[${i}].name`),
       root: text(entry.root, `stores[${i}].root`),
       ...(entry.path === undefined ? {} : { path: text(entry.path, `stores[${i}].path`) }),
-      packed: flag(entry.packed, `stores[${i}].packed`),
       summary: text(entry.summary, `stores[${i}].summary`),
       episodes: list(entry.episodes, `stores[${i}].episodes`, MOST_EPISODES).map((one) => ({
         name: checkedName(object(one, "an episode").name),
@@ -123,36 +121,9 @@ export async function summaryOf(entry: StoreEntry): Promise<Summary> {
   };
 }
 
-interface PackedEntry {
-  file: string;
-  bytes: number;
-  tail: number;
-}
-
-function packedEntries(document: unknown): Map<string, PackedEntry> {
-  const fields = object(document, "index.json");
-  if (fields.format !== "vla-attention-index" || fields.version !== 1) {
-    throw new StoreError("The index.json of the packed store is of another format; this page reads version 1.");
-  }
-  const found = new Map<string, PackedEntry>();
-  for (const [key, value] of Object.entries(object(fields.episodes, "episodes of index.json"))) {
-    const entry = object(value, `the entry of ${checkedName(key)}`);
-    const file = text(entry.file, "file");
-    if (file.split("/").some((part) => !part || part === "." || part === "..") || /[\\\p{C}]/u.test(file)) {
-      throw new StoreError("The index.json of the packed store names a file outside of it.");
-    }
-    const bytes = whole(entry.bytes, "bytes", Number.MAX_SAFE_INTEGER, 1);
-    const tail = whole(entry.tail, "tail", bytes - 1);
-    if (bytes - tail > ZIP_TAIL_BYTES) throw new StoreError(`The zip ${file} has a tail of ${bytes - tail} bytes.`);
-    found.set(key, { file, bytes, tail });
-  }
-  return found;
-}
-
 /** One store; episodes are opened when they are asked for. */
 export class Store {
   readonly #episodes = new Map<string, Promise<Episode>>();
-  #packed: Promise<Map<string, PackedEntry>> | undefined;
   #readingUnits: Promise<EffectUnits> | undefined;
   /** The units of recorded effects; null until `readEffectUnits` has them. */
   effectUnits: EffectUnits | null = null;
@@ -186,21 +157,11 @@ export class Store {
     }
   }
 
-  async #placeOf(episode: string): Promise<Place> {
-    if (!this.entry.packed) return { kind: "folder", url: `${this.url}episodes/${encodeURIComponent(episode)}/` };
-    this.#packed ??= this.pool
-      .document({ kind: "folder", url: this.url }, "index.json", DOCUMENT_BYTES)
-      .then(packedEntries);
-    const found = (await this.#packed).get(episode);
-    if (!found) throw new StoreError(`The packed store has no episode ${episode}.`);
-    return { kind: "zip", url: this.url, ...found };
-  }
-
   async #open(episode: string): Promise<Episode> {
     if (!this.entry.episodes.some((each) => each.name === episode)) {
       throw new StoreError(`The store ${this.entry.name} has no episode ${visible(episode)}; choose one from the list.`);
     }
-    const place = await this.#placeOf(episode);
+    const place: Place = { url: `${this.url}episodes/${encodeURIComponent(episode)}/` };
     const document: EpisodeDocument = parseEpisode(await this.pool.document(place, "zarr.json", DOCUMENT_BYTES), episode);
     return Episode.open(this.root, episode, document, place, this.pool);
   }
@@ -237,7 +198,7 @@ export class Library {
     if (!found) {
       const url = new URL(entry.root, this.base).href;
       found = this.#pool
-        .document({ kind: "folder", url }, "zarr.json", ROOT_BYTES)
+        .document({ url }, "zarr.json", ROOT_BYTES)
         .then((document) => new Store(entry, parseRoot(document), url, this.#pool));
       this.#stores.set(entry.root, found);
       found.catch(() => this.#stores.delete(entry.root));

@@ -6,7 +6,6 @@ import { NotThere, sentenceOf } from "./errors";
 import { parseDocument } from "./json_fields";
 import type { Answer, Asked, Place, Question } from "./messages";
 import { addEachHead, addHeads, meanOverQueries } from "./row_means";
-import { ZipSource } from "./zip_members";
 
 /** Decoded chunks that a worker keeps of one episode, and of how many episodes. */
 const CHUNK_CACHE_BYTES = 96_000_000;
@@ -24,8 +23,7 @@ function openedAt(place: Place): Opened {
   let found = opened.get(key);
   if (found) opened.delete(key);
   else {
-    const folder = new FolderSource(place.url);
-    const source = place.kind === "folder" ? folder : new ZipSource(folder, place.file, place.bytes, place.tail);
+    const source = new FolderSource(place.url);
     found = { source, reader: new ArrayReader(source, CHUNK_CACHE_BYTES) };
   }
   opened.set(key, found);
