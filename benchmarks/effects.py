@@ -52,6 +52,7 @@ def cost_table(rounds: int, number: int, threads: int) -> Table:
     import torch
     from scipy.stats import spearmanr
 
+    import vla_attention as va
     from vla_attention.capture.effects.arguments import EffectSettings
     from vla_attention.capture.effects.conditions import UNCHANGED, planned_effects
     from vla_attention.capture.effects.measurement import EffectMeasurement, siblings_of

@@ -214,7 +214,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 write_rows("reliability", {name: PARTS[name][1](results)}, command=command)
         return 0
     fix_threads(1)
-    os.environ["VLA_CACHE"] = os.environ["VLA_REMOTE_CACHE"] = "off"  # what is tried is read
+    os.environ["VLA_CACHE"] = "off"  # what is tried is read
     os.environ.setdefault("MUJOCO_GL", "egl")
     folder = (arguments.folder / arguments.part).resolve()
     folder.mkdir(parents=True, exist_ok=True)

@@ -20,7 +20,7 @@ from vla_attention.schemas.threads import use_threads
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 use_threads()
 # What is tested is measured; tests of the cache switch it on in a folder of their own. Subprocesses inherit it.
-os.environ["VLA_CACHE"] = os.environ["VLA_REMOTE_CACHE"] = "off"
+os.environ["VLA_CACHE"] = "off"
 # Shells start programs in the background with Ctrl-C ignored, and subprocesses inherit that: tests that give it would
 # wait.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -69,19 +69,6 @@ def names_in(files: Any, path: str, within_s: float) -> list[str]:
     return [str(name).rstrip("/").rpartition("/")[2] for name in _not_too_many(paths)]
 
 
-def files_below(files: Any, path: str, within_s: float) -> list[str]:
-    """Paths of all files below a folder, relative to it; raises as `names_in` does.
-
-    Raises:
-        NotImplementedError: the place has no such list, as web servers.
-    """
-    if _is_web(files):
-        raise NotImplementedError("a web server lists no files below a folder")
-    paths = asked_within(files, "find", path, seconds=within_s)
-    base = str(files._strip_protocol(path)).rstrip("/") + "/"
-    return [str(name).removeprefix(base) for name in _not_too_many(paths)]
-
-
 def asked_within(files: Any, method: str, *given: Any, seconds: float, **named: Any) -> Any:
     """What a method of a file system gives; `TooSlow` when it has given nothing after so many seconds."""
     if getattr(files, "async_impl", False):

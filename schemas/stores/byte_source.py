@@ -1,8 +1,7 @@
-"""Where the bytes of a store come from: a folder here, an address elsewhere, or a zip file in either of them.
+"""Where the bytes of a store come from: a folder here, or an address elsewhere.
 
 Nothing here knows what the bytes mean. `sealed_files.py` compares them with an episode's seal before anything else sees
-them, so that a damaged zip, a server that answers with something else, or a damaged cache gives an error and never a
-number.
+them, so that damage, or a server that answers with something else, gives an error and never a number.
 """
 
 from __future__ import annotations
@@ -34,27 +33,20 @@ Memory: TypeAlias = NDArray[np.uint8]
 class ByteSource(Protocol):
     """Files below one place, read whole or in parts. Every method raises `OSError` for what cannot be read.
 
-    `remembers`: bytes may come from a cache; `fresh` asks for them anew. A source can be pickled.
+    A source can be pickled.
     """
 
-    @property
-    def remembers(self) -> bool:
-        """Whether bytes may come from a cache."""
-
-    def whole(self, file: str, *, most: int = WHOLE_FILE_BYTES, fresh: bool = False) -> bytes:
+    def whole(self, file: str, *, most: int = WHOLE_FILE_BYTES) -> bytes:
         """All bytes of a file, which must not have more than `most`."""
 
-    def parts(self, file: str, offset: int, lengths: Sequence[int], *, fresh: bool = False) -> list[bytes]:
+    def parts(self, file: str, offset: int, lengths: Sequence[int]) -> list[bytes]:
         """Neighbouring parts of a file, the first at `offset`; they are shorter where the file ends."""
 
-    def read_into(self, memory: Memory, file: str, offset: int, *, fresh: bool = False) -> int:
+    def read_into(self, memory: Memory, file: str, offset: int) -> int:
         """Fill memory with the bytes of a file from `offset` on; returns how many there were, fewer at its end."""
 
     def size(self, file: str) -> int:
         """Bytes of a file."""
-
-    def bound_to(self, digest: str) -> ByteSource:
-        """The same files, of which it is known that they belong to a seal of this digest; a cache is kept by it."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +63,8 @@ class Folder:
     within: Path | None = None
     _inside: set[str] = field(default_factory=set, repr=False, compare=False)
     _regular: set[str] = field(default_factory=set, repr=False, compare=False)
-    remembers = False
 
-    def whole(self, file: str, *, most: int = WHOLE_FILE_BYTES, fresh: bool = False) -> bytes:
+    def whole(self, file: str, *, most: int = WHOLE_FILE_BYTES) -> bytes:
         """See `ByteSource`."""
         handle, size = self._open(file)
         try:
@@ -85,7 +76,7 @@ class Folder:
         finally:
             os.close(handle)
 
-    def parts(self, file: str, offset: int, lengths: Sequence[int], *, fresh: bool = False) -> list[bytes]:
+    def parts(self, file: str, offset: int, lengths: Sequence[int]) -> list[bytes]:
         """See `ByteSource`."""
         handle, size = self._open(file)
         try:
@@ -98,7 +89,7 @@ class Folder:
         finally:
             os.close(handle)
 
-    def read_into(self, memory: Memory, file: str, offset: int, *, fresh: bool = False) -> int:
+    def read_into(self, memory: Memory, file: str, offset: int) -> int:
         """See `ByteSource`."""
         # A scan reads hundreds of chunks of one file, which was looked at when its index was read.
         handle = os.open(f"{self.path}/{file}", UNFOLLOWED) if file in self._regular else self._open(file)[0]
@@ -171,10 +162,6 @@ class Folder:
                 check_not_sparse(self.path / file, handle, size)
         finally:
             os.close(handle)
-
-    def bound_to(self, digest: str) -> Folder:
-        """See `ByteSource`."""
-        return self
 
 
 def copy_into(memory: Memory, content: bytes) -> int:

@@ -26,7 +26,7 @@ from vla_attention.schemas.layout import Prompt, Role, prompt_at
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder
 from vla_attention.schemas.stores.episode_shapes import misfits
-from vla_attention.schemas.stores.remote_source import RemoteFailure, at_commit, kept_bytes, source_of
+from vla_attention.schemas.stores.remote_source import RemoteFailure, at_commit, source_of
 from vla_attention.schemas.stores.root import group_attributes, list_episodes, read_run
 from vla_attention.schemas.stores.seal import identity_problem, read_seal
 from vla_attention.schemas.stores.seal_content import EpisodeSeal
@@ -40,7 +40,6 @@ from vla_attention.schemas.stores.store_format import (
     episode_name,
     parse_episode_name,
 )
-from vla_attention.schemas.stores.store_place import refuse_in_store
 from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl, store_place
 
 if TYPE_CHECKING:
@@ -97,15 +96,7 @@ class StoredEpisode:
     def seal(self) -> EpisodeSeal:
         """What binds the episode's files to its name and run; `CorruptEpisode` when it is not that of this episode."""
         try:
-            return self._read_seal()
-        except CorruptEpisode:
-            if not self.source.remembers:
-                raise
-            return self._read_seal(fresh=True)  # a cache may have kept damaged bytes
-
-    def _read_seal(self, *, fresh: bool = False) -> EpisodeSeal:
-        try:
-            seal = read_seal(self.source, fresh=fresh)
+            seal = read_seal(self.source)
         except (RemoteFailure, CorruptEpisode):
             raise
         except OSError as error:
@@ -121,7 +112,7 @@ class StoredEpisode:
     @cached_property
     def files(self) -> SealedFiles:
         """The episode's files, as the seal lists them."""
-        return SealedFiles(self.source.bound_to(self.seal.digest), self.seal.files)
+        return SealedFiles(self.source, self.seal.files)
 
     def sealed(self, file: str) -> bytes:
         """All bytes of one file of the episode; raises `CorruptEpisode` when they are not those that were sealed."""
@@ -389,8 +380,6 @@ def open_store(path: str | StorePlace) -> Store:
         FormatTooNew: a later version wrote it.
     """
     path = at_commit(store_place(path))
-    if isinstance(path, StoreUrl) and (kept := kept_bytes()) is not None:
-        refuse_in_store(kept.folder, "keep what is fetched in")
     root, run = read_run(path)
     folders, strays = list_episodes(path)
     stray = (

@@ -1,40 +1,26 @@
-"""Files that are elsewhere, through fsspec (the extra `remote`), and the cache of what was fetched.
+"""Files that are elsewhere, through fsspec (the extra `remote`).
 
-Only the bytes that are asked for are fetched. `hf://datasets/ORG/NAME/PATH` is read by the addresses under which the
-hub serves files, so that a part of a file is one request; fsspec's own file system of the hub asks for a description of
-the file each time. What belongs to a sealed episode is kept in a folder of this machine, by the seal's digest: bytes of
-an episode that was changed are never taken for those of another. `VLA_REMOTE_CACHE` names the folder (`off`: keep
-nothing), `VLA_REMOTE_CACHE_SIZE` its most bytes.
+Only the bytes that are asked for are fetched, and nothing is kept: `vla-attention store copy` brings a store here.
+`hf://datasets/ORG/NAME/PATH` is read by the addresses under which the hub serves files, so that a part of a file is one
+request; fsspec's own file system of the hub asks for a description of the file each time.
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
-import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
-from vla_attention.schemas.byte_counts import parse_bytes
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.limits import ANSWER_WITHIN_S, ROOT_BYTES, SLOWEST_BYTES_A_SECOND, WHOLE_FILE_BYTES
-from vla_attention.schemas.stores.bounded_fetch import TooSlow, asked_within, fetched, files_below, names_in
+from vla_attention.schemas.stores.bounded_fetch import TooSlow, asked_within, fetched, names_in
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder, Memory, copy_into, split
 from vla_attention.schemas.stores.store_url import HUB_PROTOCOL, HubAddress, StorePlace, StoreUrl, stated_commit
-from vla_attention.schemas.user_cache import user_cache
 
-FOLDER_VARIABLE = "VLA_REMOTE_CACHE"
-SIZE_VARIABLE = "VLA_REMOTE_CACHE_SIZE"
-DEFAULT_BYTES = 10_000_000_000
-_OFF = ("off", "0", "no", "false")
-_DIGEST_BYTES = 32
-#: The cache is searched for what to remove after every so many bytes that were added to it.
-_LOOK_EVERY = 64_000_000
 #: Protocols whose addresses may be `//name:password@host`; elsewhere @ stands before a revision.
 _WITH_PASSWORDS = ("http", "https", "ftp", "sftp", "ssh", "smb", "webdav")
 
@@ -103,29 +89,22 @@ class RemoteFolder:
 
     Attributes:
         url: the address.
-        digest: that of the seal or the index to which the files belong; they are kept then.
     """
 
     url: str
-    digest: str = ""
 
-    @property
-    def remembers(self) -> bool:
+    def whole(self, file: str, *, most: int = WHOLE_FILE_BYTES) -> bytes:
         """See `ByteSource`."""
-        return bool(self.digest) and kept_bytes() is not None
+        return self._fetch(file, None, None, most)
 
-    def whole(self, file: str, *, most: int = WHOLE_FILE_BYTES, fresh: bool = False) -> bytes:
-        """See `ByteSource`."""
-        return self._get(file, None, None, fresh, most)
-
-    def parts(self, file: str, offset: int, lengths: Sequence[int], *, fresh: bool = False) -> list[bytes]:
+    def parts(self, file: str, offset: int, lengths: Sequence[int]) -> list[bytes]:
         """See `ByteSource`; one request."""
         length = sum(lengths)
-        return split(self._get(file, offset, offset + length, fresh, length) if length else b"", lengths)
+        return split(self._fetch(file, offset, offset + length, length) if length else b"", lengths)
 
-    def read_into(self, memory: Memory, file: str, offset: int, *, fresh: bool = False) -> int:
+    def read_into(self, memory: Memory, file: str, offset: int) -> int:
         """See `ByteSource`; one request."""
-        return copy_into(memory, self.parts(file, offset, (len(memory),), fresh=fresh)[0])
+        return copy_into(memory, self.parts(file, offset, (len(memory),))[0])
 
     def size(self, file: str) -> int:
         """See `ByteSource`."""
@@ -135,32 +114,8 @@ class RemoteFolder:
 
     def names(self, folder: str) -> list[str]:
         """The names in a folder, where the server lists them."""
-        files, path = self._listing()
+        files, path = _hub_listing(self.url) if self.url.startswith(HUB_PROTOCOL) else _file_system(self.url)
         return sorted(_asked(self.url, lambda: names_in(files, f"{path}/{folder}", ANSWER_WITHIN_S)))
-
-    def files_below(self, folder: str) -> list[str]:
-        """Paths of all files below a folder; `NotImplementedError` where the server has no list of them."""
-        files, path = self._listing()
-        return sorted(_asked(self.url, lambda: files_below(files, f"{path}/{folder}", ANSWER_WITHIN_S)))
-
-    def _listing(self) -> tuple[Any, str]:
-        return _hub_listing(self.url) if self.url.startswith(HUB_PROTOCOL) else _file_system(self.url)
-
-    def bound_to(self, digest: str) -> RemoteFolder:
-        """See `ByteSource`."""
-        return RemoteFolder(self.url, digest)
-
-    def _get(self, file: str, start: int | None, end: int | None, fresh: bool, most: int) -> bytes:
-        kept = kept_bytes() if self.digest else None
-        key = f"{self.digest}\n{file}\n{start}\n{end}"
-        if kept is not None and not fresh:
-            answer = kept.get(key)
-            if answer is not None:
-                return answer
-        content = self._fetch(file, start, end, most)
-        if kept is not None:
-            kept.put(key, content)
-        return content
 
     def _fetch(self, file: str, start: int | None, end: int | None, most: int) -> bytes:
         files, path = _file_system(self.url)
@@ -173,90 +128,6 @@ class RemoteFolder:
                 "every number would cost a whole episode; copy the store here, or use a server that has them."
             )
         raise RemoteFailure(f"{self.url}/{file} has more than the {most:,} bytes that such a file has at most.")
-
-
-@dataclass(frozen=True)
-class KeptBytes:
-    """A folder of bytes that were fetched; every file begins with the sha256 of the rest."""
-
-    folder: Path
-    most_bytes: int
-
-    def get(self, key: str) -> bytes | None:
-        """What was kept, or None; a damaged file is removed and is nothing."""
-        path = self._path(key)
-        try:
-            content = path.read_bytes()
-        except OSError:
-            return None
-        kept = content[_DIGEST_BYTES:]
-        if hashlib.sha256(kept).digest() != content[:_DIGEST_BYTES]:
-            path.unlink(missing_ok=True)
-            return None
-        with suppress(OSError):
-            os.utime(path)  # the least recently used is removed first
-        return kept
-
-    def put(self, key: str, content: bytes) -> None:
-        """Keep bytes; a folder without room or rights keeps nothing."""
-        path = self._path(key)
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            handle, name = tempfile.mkstemp(dir=path.parent, prefix=".new-")
-            try:
-                with os.fdopen(handle, "wb") as file:
-                    file.write(hashlib.sha256(content).digest() + content)
-                os.replace(name, path)
-            except BaseException:
-                Path(name).unlink(missing_ok=True)
-                raise
-        except OSError:
-            return
-        self._note(len(content))
-
-    def _path(self, key: str) -> Path:
-        digest = hashlib.sha256(key.encode()).hexdigest()
-        return self.folder / digest[:2] / digest[2:]
-
-    def _note(self, added: int) -> None:
-        seen = _ADDED.get(self.folder, _LOOK_EVERY) + added
-        _ADDED[self.folder] = 0 if seen >= min(_LOOK_EVERY, self.most_bytes) else seen
-        if not _ADDED[self.folder]:
-            self.prune()
-
-    def prune(self) -> None:
-        """Remove the files that were not used for longest, until the rest is small enough."""
-        files = []
-        for path in self.folder.glob("??/*"):
-            with suppress(OSError):
-                status = path.stat()
-                files.append((status.st_mtime_ns, status.st_size, path))
-        total = sum(size for _, size, _ in files)
-        for _, size, path in sorted(files):
-            if total <= self.most_bytes:
-                break
-            with suppress(OSError):
-                path.unlink()
-                total -= size
-
-
-#: Bytes added to each folder since it was last searched.
-_ADDED: dict[Path, int] = {}
-
-
-def kept_bytes() -> KeptBytes | None:
-    """The cache of this process, or None when it is switched off."""
-    given = os.environ.get(FOLDER_VARIABLE, "").strip()
-    if given.casefold() in _OFF:
-        return None
-    size = os.environ.get(SIZE_VARIABLE, "").strip()
-    most = parse_bytes(size) if size else DEFAULT_BYTES
-    if most is None:
-        raise BadArgument(
-            f"{SIZE_VARIABLE}={size} is no size; expected a number of bytes, or one with a unit, as in 500MB or 10GB. "
-            f"To keep nothing, set {FOLDER_VARIABLE}=off."
-        )
-    return KeptBytes(Path(given).absolute() if given else user_cache("remote"), most)
 
 
 def _file_system(url: str) -> tuple[Any, str]:

@@ -61,15 +61,15 @@ def seal_episode(folder: Path, name: str, run: str, copied_from: str = "") -> Ep
     return seal
 
 
-def read_seal(place: Path | ByteSource, *, fresh: bool = False) -> EpisodeSeal:
-    """Read the seal of the episode whose files are there; `fresh`: not from a cache.
+def read_seal(place: Path | ByteSource) -> EpisodeSeal:
+    """Read the seal of the episode whose files are there.
 
     Raises:
         OSError: it cannot be read.
         ValueError: it is no seal, or its own digest does not fit.
     """
     source = Folder(place) if isinstance(place, Path) else place
-    attributes = group_attributes(source.whole(SEAL_FILE, most=DOCUMENT_BYTES, fresh=fresh))
+    attributes = group_attributes(source.whole(SEAL_FILE, most=DOCUMENT_BYTES))
     if attributes.get("digest") != seal_digest(attributes):
         raise ValueError("its own digest does not fit")
     return from_json(EpisodeSeal, attributes)

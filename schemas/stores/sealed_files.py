@@ -41,17 +41,15 @@ class SealedFiles:
             most = DOCUMENT_BYTES if file.endswith("zarr.json") else record.size
         if record.size > most:
             raise CorruptEpisode(f"its {file} has {record.size:,} bytes; expected at most {most:,}", file)
-        # A cache may have kept damaged bytes: they are asked for anew once.
-        for fresh in (False, True) if self.source.remembers else (False,):
-            try:
-                content = self.source.whole(file, most=most, fresh=fresh)
-            except RemoteFailure:
-                raise
-            except OSError as error:
-                raise CorruptEpisode(_lost(file, error), file) from None
-            if len(content) == record.size and bytes_digest(content) == record.sha256:
-                return content
-        raise CorruptEpisode(_differs(file), file)
+        try:
+            content = self.source.whole(file, most=most)
+        except RemoteFailure:
+            raise
+        except OSError as error:
+            raise CorruptEpisode(_lost(file, error), file) from None
+        if len(content) != record.size or bytes_digest(content) != record.sha256:
+            raise CorruptEpisode(_differs(file), file)
+        return content
 
     def check(self, file: str) -> None:
         """Read a file part by part; raises `CorruptEpisode` as `whole` does."""
@@ -74,35 +72,30 @@ class SealedFiles:
         return record.size
 
     def _parts(self, file: str) -> Iterator[tuple[int, bytes]]:
-        """Offset and bytes of each part of a file; they are those of the seal when all of them have been taken.
-
-        A part may come twice, where a cache had damaged bytes.
-        """
+        """Offset and bytes of each part of a file; they are those of the seal when all of them have been taken."""
         record = self._record(file)
         if record.size <= PART_BYTES:
             yield 0, self.whole(file)
             return
-        for fresh in (False, True) if self.source.remembers else (False,):
-            digest = hashlib.sha256()
-            try:
-                if isinstance(self.source, Folder):
-                    self.source.check_not_sparse(file)
-                for offset in range(0, record.size, PART_BYTES):
-                    length = min(PART_BYTES, record.size - offset)
-                    # One byte more at the end: a file that has grown is not the one that was sealed.
-                    last = offset + length == record.size
-                    part, more = self.source.parts(file, offset, (length, 1 if last else 0), fresh=fresh)
-                    if len(part) != length or more:
-                        break
-                    digest.update(part)
-                    yield offset, part
-            except RemoteFailure:
-                raise
-            except OSError as error:
-                raise CorruptEpisode(_lost(file, error), file) from None
-            if digest.hexdigest() == record.sha256:
-                return
-        raise CorruptEpisode(_differs(file), file)
+        digest = hashlib.sha256()
+        try:
+            if isinstance(self.source, Folder):
+                self.source.check_not_sparse(file)
+            for offset in range(0, record.size, PART_BYTES):
+                length = min(PART_BYTES, record.size - offset)
+                # One byte more at the end: a file that has grown is not the one that was sealed.
+                last = offset + length == record.size
+                part, more = self.source.parts(file, offset, (length, 1 if last else 0))
+                if len(part) != length or more:
+                    break
+                digest.update(part)
+                yield offset, part
+        except RemoteFailure:
+            raise
+        except OSError as error:
+            raise CorruptEpisode(_lost(file, error), file) from None
+        if digest.hexdigest() != record.sha256:
+            raise CorruptEpisode(_differs(file), file)
 
     def shard(self, file: str) -> SealedShard | None:
         """The shard in a file, of which single chunks can be read; None when the seal does not list its chunks."""

@@ -98,14 +98,11 @@ class SealedShard:
         size = index_size(len(checksums) // CHECKSUM_BYTES)
         if record.size < size:
             raise CorruptEpisode(f"its {file} has {record.size} bytes in the seal, and an index of {size}", file)
-        for fresh in (False, True) if source.remembers else (False,):
-            # One byte more: a file that has grown is not the one that was sealed.
-            stored, more = source.parts(file, max(0, record.size - size), (size, 1), fresh=fresh)
-            if len(stored) != size or more:
-                raise CorruptEpisode(f"its {file} does not agree with its seal: it has another size", file)
-            if bytes_digest(stored) == record.index:
-                break
-        else:
+        # One byte more: a file that has grown is not the one that was sealed.
+        stored, more = source.parts(file, max(0, record.size - size), (size, 1))
+        if len(stored) != size or more:
+            raise CorruptEpisode(f"its {file} does not agree with its seal: it has another size", file)
+        if bytes_digest(stored) != record.index:
             raise CorruptEpisode(f"its {file} does not agree with its seal: its index was changed", file)
         try:
             return cls(source, file, stored, read_index(stored, record.size), checksums, bytes.fromhex(record.digests))
@@ -134,18 +131,15 @@ class SealedShard:
         if length <= CHECKSUM_BYTES:
             raise CorruptEpisode(f"its {self.file} lacks chunk {number}: it is missing", self.file)
         stored = np.empty(length, np.uint8) if memory is None else memory[:length]
-        problem: str | None = None
-        for fresh in (False, True) if self.source.remembers else (False,):
-            try:
-                count = self.source.read_into(stored, self.file, offset, fresh=fresh)
-            except RemoteFailure:
-                raise
-            except OSError as error:
-                raise CorruptEpisode(f"its {self.file} cannot be read: {error.strerror or error}", self.file) from None
-            problem = self.problem(number, stored[:count])
-            if problem is None:
-                return stored[:-CHECKSUM_BYTES]
-        raise CorruptEpisode(str(problem), self.file)
+        try:
+            count = self.source.read_into(stored, self.file, offset)
+        except RemoteFailure:
+            raise
+        except OSError as error:
+            raise CorruptEpisode(f"its {self.file} cannot be read: {error.strerror or error}", self.file) from None
+        if problem := self.problem(number, stored[:count]):
+            raise CorruptEpisode(problem, self.file)
+        return stored[:-CHECKSUM_BYTES]
 
     def problem(self, number: int, stored: Memory) -> str | None:
         """How bytes differ from the sealed chunk of that number, with its checksum, or None."""

@@ -19,7 +19,7 @@ from vla_attention.schemas.stores.store_format import NUMBERS
 
 FOLDER = GOLDEN / "stores"
 #: joint: pi0.5 of test size. cosmos: sites `self` and `cross`. library: recorded by `va.record`. rerun: the policy
-#: calls of `joint` without one of its cameras. masks: queries, layers, heads, denoise steps and replans see different keys.
+#: calls of `joint` without a camera. masks: queries, layers, heads, denoise steps and replans see different keys.
 #: effects: the policy calls of `joint` again, with the effects of words and objects for all four readers. steps: made
 #: up, with positions, touches and goals.
 NAMES = ("joint", "cosmos", "library", "rerun", "masks", "effects", "steps")

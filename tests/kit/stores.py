@@ -176,8 +176,7 @@ def num_steps(spec: StoreSpec, episode: int) -> int:
 
 def reseal(folder: Path) -> None:
     """Seal a committed episode anew, after a test has changed its files: it then passes for what was captured."""
-    root, run = read_run(folder.parents[1])
-    seal_episode(folder, folder.name, run, root.store_version)
+    seal_episode(folder, folder.name, read_run(folder.parents[1])[1])
 
 
 def reseal_root(store: Path) -> None:

@@ -12,7 +12,7 @@ import struct
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -66,26 +66,22 @@ class InMemory:
     """A file in memory, as a `ByteSource`, under whatever name it is asked for."""
 
     content: bytes
-    remembers: bool = field(default=False, init=False)
 
-    def whole(self, file: str, *, fresh: bool = False) -> bytes:
+    def whole(self, file: str) -> bytes:
         return self.content
 
-    def parts(self, file: str, offset: int, lengths: Sequence[int], *, fresh: bool = False) -> list[bytes]:
+    def parts(self, file: str, offset: int, lengths: Sequence[int]) -> list[bytes]:
         found = []
         for length in lengths:
             found.append(self.content[offset : offset + length])
             offset += length
         return found
 
-    def read_into(self, memory: Memory, file: str, offset: int, *, fresh: bool = False) -> int:
+    def read_into(self, memory: Memory, file: str, offset: int) -> int:
         return copy_into(memory, self.content[offset : offset + len(memory)])
 
     def size(self, file: str) -> int:
         return len(self.content)
-
-    def bound_to(self, digest: str) -> InMemory:
-        return self
 
 
 @cache

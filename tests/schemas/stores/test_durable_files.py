@@ -65,7 +65,7 @@ def test_merged_stores_are_on_the_disk(store, tmp_path, monkeypatch):
     more = write_store(tmp_path / "more.zarr", spec=StoreSpec(tasks=(1,), episodes=1, replans=2))
     disk = Disk(monkeypatch)
     assert analyze(["store", "copy", str(store), str(more), "-o", str(tmp_path / "all.zarr"), "--copy"]) == 0
-    assert (disk.renamed, disk.owed) == (["all.zarr"], set())
+    assert (disk.renamed, disk.owed) == (["episodes.json", "all.zarr"], set())
 
 
 def test_what_repair_writes_again_is_on_the_disk(store, monkeypatch):

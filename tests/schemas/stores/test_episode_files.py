@@ -10,7 +10,6 @@ import pytest
 from tests.kit.stores import StoreSpec, write_store
 from vla_attention.schemas.stores.episode_files import check_presence
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
-from vla_attention.schemas.stores.store_format import STORE_VERSION
 
 SPEC = StoreSpec(tasks=(0,), episodes=2, replans=2, layers=(0,), heads=(0,), contributions=True)
 ROWS = "joint/rows/c.0.0.0.0.0.0"
@@ -28,7 +27,7 @@ def episode(original, tmp_path) -> Path:
 
 
 def problems(episode: Path) -> list[str]:
-    stored = StoredEpisode(episode, episode.name, open_store(episode.parents[1]).run, STORE_VERSION)
+    stored = StoredEpisode(episode, episode.name, open_store(episode.parents[1]).run)
     return [problem.text for problem in check_presence(stored)]
 
 

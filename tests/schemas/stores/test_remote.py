@@ -40,13 +40,6 @@ def server(copied, tmp_path) -> Iterator[Served]:
         yield served
 
 
-@pytest.fixture
-def kept(tmp_path, monkeypatch) -> Path:
-    """A folder for what was fetched."""
-    monkeypatch.setenv("VLA_REMOTE_CACHE", str(tmp_path / "kept"))
-    return tmp_path / "kept"
-
-
 def read_all(url: str, expected: Path) -> list[str]:
     """The sentences with which reading is refused; all that is read must equal what is in the store here."""
     said: list[str] = []
@@ -98,10 +91,7 @@ def test_a_store_is_read_by_its_address(server, copied):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("cached", [False, True])
-def test_damaged_answers_are_never_a_number(server, copied, cached, request):
-    if cached:
-        request.getfixturevalue("kept")
+def test_damaged_answers_are_never_a_number(server, copied):
     url = f"{server.url}/a.zarr"
     generator = np.random.default_rng(0)
 
@@ -115,7 +105,7 @@ def test_damaged_answers_are_never_a_number(server, copied, cached, request):
     for _ in range(3):
         assert read_all(url, copied)
     server.change = None
-    assert read_all(url, copied) == []  # nothing wrong was kept
+    assert read_all(url, copied) == []
 
 
 @pytest.mark.thorough
@@ -150,10 +140,7 @@ def test_a_server_without_ranges_is_refused_with_a_sentence(server, copied, caps
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("cached", [False, True])
-def test_a_store_that_changed_is_noticed(server, copied, tmp_path, cached, request):
-    if cached:
-        request.getfixturevalue("kept")
+def test_a_store_that_changed_is_noticed(server, copied, tmp_path):
     url = f"{server.url}/a.zarr"
     opened = open_store(url)
     opened.episodes[0].read("joint/rows")

@@ -18,7 +18,7 @@ from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.seal import seal_episode
 from vla_attention.schemas.stores.sealed_files import SealedFiles
 from vla_attention.schemas.stores.shards import SealedShard, ShardedLayers
-from vla_attention.schemas.stores.store_format import STORE_VERSION, CorruptEpisode
+from vla_attention.schemas.stores.store_format import CorruptEpisode
 
 AXES = ["replan", "layer", "denoise", "head", "query", "key"]
 
@@ -41,7 +41,7 @@ def write_array(folder: Path, values: np.ndarray, block: int, **changes) -> zarr
 
 def reader_of(folder: Path) -> ShardedLayers | None:
     """The reader of the array `rows` in a folder, which is sealed here."""
-    files = SealedFiles(Folder(folder.parent), seal_episode(folder.parent, "made up", "a run", STORE_VERSION).files)
+    files = SealedFiles(Folder(folder.parent), seal_episode(folder.parent, "made up", "a run").files)
 
     def shard(file: str) -> SealedShard:
         found = files.shard(f"rows/{file}")
