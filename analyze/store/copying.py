@@ -271,10 +271,9 @@ def _copy_episode(
             continue
         place = folder / file
         place.parent.mkdir(parents=True, exist_ok=True)
+        copied += episode.copy_file(file, place)
         if file == "zarr.json" and without:
-            copied += place.write_bytes(_without_arrays(episode.sealed(file), without))
-        else:
-            copied += episode.copy_file(file, place)
+            place.write_bytes(_without_arrays(json.loads(place.read_bytes()), without))
     seal = folder / SEAL_FILE
     if without:
         seal_episode(folder, episode.name, run, copied_from=_captured(episode))
@@ -320,9 +319,8 @@ def _episodes_document(store: Store) -> bytes:
     return group_document({}) if stated else without_other_fields(content)
 
 
-def _without_arrays(document: bytes, without: tuple[str, ...]) -> bytes:
+def _without_arrays(changed: dict[str, Any], without: tuple[str, ...]) -> bytes:
     """An episode's `zarr.json` that does not list the arrays of these parts."""
-    changed = json.loads(document)
     arrays = changed["attributes"]["arrays"]
     changed["attributes"]["arrays"] = {name: arrays[name] for name in arrays if _part_of(name) not in without}
     for part in (EFFECTS, STEPS):

@@ -8,6 +8,7 @@ are files for, and arrays that would take more memory than their stored bytes ca
 from __future__ import annotations
 
 import functools
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,11 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import listing, shortened
 from vla_attention.schemas.limit_checks import check_decoded
 from vla_attention.schemas.limits import ARRAY_AXES, ARRAY_BYTES
-from vla_attention.schemas.stores.digest import CHECKSUM_BYTES
 from vla_attention.schemas.stores.seal_content import FileRecord
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 
@@ -45,7 +44,7 @@ class ArrayMetadata:
         dtype: of its numbers.
         file_shape: extents of what one file holds: a shard, or a chunk.
         chunk_shape: extents of what is decoded at once.
-        shard_chunks: chunks in each file whose checksums the seal lists; None where it cannot.
+        shard_chunks: chunks in each file, which can be read alone; None where they cannot.
         codecs: those of a chunk, by name.
         endian: the order of bytes in a number; None where it is not stated.
         typesize: bytes that the codec blosc shuffles together.
@@ -87,11 +86,11 @@ class ArrayMetadata:
         _check_decoded("it", math.prod(shape), self.dtype, self.stored)
 
 
-def array_metadata(content: bytes, shape: tuple[int, ...], name: str, files: Mapping[str, FileRecord]) -> ArrayMetadata:
+def array_metadata(document: Any, shape: tuple[int, ...], name: str, files: Mapping[str, FileRecord]) -> ArrayMetadata:
     """Check the `zarr.json` of the array `name`.
 
     Args:
-        content: the bytes of the file.
+        document: what the file says.
         shape: the array's shape in the attributes of its episode.
         name: the array's path in the episode.
         files: the episode's files in its seal.
@@ -99,7 +98,8 @@ def array_metadata(content: bytes, shape: tuple[int, ...], name: str, files: Map
     Raises:
         CorruptEpisode: it is nothing that a capture writes; the message says what, without a full stop.
     """
-    metadata = _described(content) if len(content) <= _KEPT_BYTES else describe_array(content)
+    content = json.dumps(document)
+    metadata = _described(content) if len(content) <= _KEPT_BYTES else describe_array(document)
     if metadata.shape != shape:
         raise CorruptEpisode("it has another shape than its attributes say")
     numbers = [
@@ -112,12 +112,8 @@ def array_metadata(content: bytes, shape: tuple[int, ...], name: str, files: Map
     return replace(metadata, stored=sum(numbers))
 
 
-def describe_array(content: bytes) -> ArrayMetadata:
+def describe_array(document: Any) -> ArrayMetadata:
     """What a `zarr.json` says, without what the seal says of the files."""
-    try:
-        document = decode_json(content)
-    except ValueError as error:
-        raise CorruptEpisode(f"its zarr.json is damaged ({error})") from None
     if not isinstance(document, dict) or (document.get("zarr_format"), document.get("node_type")) != (3, "array"):
         raise CorruptEpisode("its zarr.json does not describe an array of Zarr format 3")
     if document.get("data_type") not in TYPES:
@@ -144,15 +140,10 @@ def describe_array(content: bytes) -> ArrayMetadata:
     )
 
 
-#: Arrays of one run differ in the number of replans only: most are described already.
-_described = functools.lru_cache(maxsize=512)(describe_array)
-
-
-def check_shard(metadata: ArrayMetadata, record: FileRecord, file: str) -> None:
-    """Raise `CorruptEpisode` unless the seal lists as many checksums as a shard has chunks."""
-    listed = len(record.chunks) // (2 * CHECKSUM_BYTES)
-    if listed and listed != metadata.shard_chunks:
-        raise CorruptEpisode(f"its {file} has {metadata.shard_chunks} chunks, and its seal lists {listed}")
+@functools.lru_cache(maxsize=512)
+def _described(content: str) -> ArrayMetadata:
+    """`describe_array`; arrays of one run differ in the number of replans only, so that most are described already."""
+    return describe_array(json.loads(content))
 
 
 def chunks_of_a_shard(metadata: dict[str, Any]) -> int | None:

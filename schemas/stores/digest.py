@@ -19,8 +19,6 @@ from vla_attention.schemas.stores.store_format import JOB_RECORDS, RootAttribute
 
 #: Bytes of the checksum `crc32c`, which stands behind each chunk and each index of a shard.
 CHECKSUM_BYTES = 4
-#: Bytes of sha256 that a seal has of every chunk: by chance, one of 2^64 others would pass.
-CHUNK_DIGEST_BYTES = 8
 
 
 def crc32c(content: bytes | NDArray[np.uint8]) -> int:
@@ -50,11 +48,6 @@ class ArrayDigest:
 def bytes_digest(content: bytes) -> str:
     """The digest of a file, or of a part of it."""
     return hashlib.sha256(content).hexdigest()
-
-
-def chunk_digest(stored: bytes | memoryview) -> bytes:
-    """What a seal lists of a chunk as it is stored, with its checksum: the first `CHUNK_DIGEST_BYTES` of its sha256."""
-    return hashlib.sha256(stored).digest()[:CHUNK_DIGEST_BYTES]
 
 
 def run_configuration(attributes: Mapping[str, Any]) -> dict[str, Any]:

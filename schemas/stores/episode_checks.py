@@ -35,10 +35,10 @@ from vla_attention.schemas.stores.content_rules import (
     unseen_problems,
 )
 from vla_attention.schemas.stores.digest import ArrayDigest
-from vla_attention.schemas.stores.episode_files import files_of_no_array
+from vla_attention.schemas.stores.episode_files import files_of_no_array, metadata_problems
 from vla_attention.schemas.stores.episode_shapes import effect_misfits, expected_shapes, shape_problems, step_misfits
 from vla_attention.schemas.stores.reader import StoredEpisode
-from vla_attention.schemas.stores.root import group_attributes
+from vla_attention.schemas.stores.root import attributes_in
 from vla_attention.schemas.stores.store_format import NUMBERS, CorruptEpisode, Problem, RootAttributes
 
 
@@ -54,7 +54,7 @@ def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[P
     # The files of arrays are compared with the seal when the arrays are read.
     for file in episode.files.records:
         if file.endswith("zarr.json"):
-            yield from _guarded(_metadata_problems(episode, file))
+            yield from metadata_problems(episode, file)
     shapes = expected_shapes(root, attributes)
     numbers = {name: (len(given),) for name in NUMBERS if (given := getattr(attributes, name))}
     listed = {name: record.shape for name, record in attributes.arrays.items()} | numbers
@@ -76,11 +76,6 @@ def _guarded(check: Iterator[str]) -> Iterator[Problem]:
         yield from map(Problem, check)
     except CorruptEpisode as error:
         yield Problem(str(error), error.file)
-
-
-def _metadata_problems(episode: StoredEpisode, file: str) -> Iterator[str]:
-    episode.sealed(file)
-    yield from ()
 
 
 def _array_problems(root: RootAttributes, episode: StoredEpisode, name: str, sha256: str) -> Iterator[str]:
@@ -147,7 +142,7 @@ def _uniform(episode: StoredEpisode, site: str) -> NDArray[np.float32] | None:
 def _axis_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
     """The numbers of layers, denoise steps and heads in the attributes of every site are those of the run."""
     for site in root.sites:
-        given = group_attributes(episode.sealed(f"{site.name}/zarr.json"))
+        given = attributes_in(episode.document(f"{site.name}/zarr.json"))
         expected = to_json(root.recording.of_site(site).axis_numbers)
         if given != expected:
             yield f"the attributes of {site.name} are {given}; expected {expected}"

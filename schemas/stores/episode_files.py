@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path, PurePosixPath
 
+from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.root import NAMES_FILE
 from vla_attention.schemas.stores.seal import SEAL_FILE
@@ -209,8 +210,17 @@ def check_presence(episode: StoredEpisode) -> list[Problem]:
     problems = [Problem(f"Episode {episode.name} is damaged: {problem}.", file) for file, problem in said.items()]
     for file in episode.files.records:
         if file.endswith("zarr.json") and file not in said:
-            try:
-                episode.sealed(file)
-            except CorruptEpisode as error:
-                problems.append(Problem(str(error), error.file))
+            problems += metadata_problems(episode, file)
     return problems
+
+
+def metadata_problems(episode: StoredEpisode, file: str) -> list[Problem]:
+    """Whether a `zarr.json` of an episode is the one that was sealed, and says what the seal repeats of it."""
+    try:
+        same = decode_json(episode.files.whole(file)) == episode.document(file)
+    except CorruptEpisode as error:
+        return [Problem(f"Episode {episode.name} is damaged: {error}.", error.file)]
+    except ValueError:
+        same = False
+    what = f"Episode {episode.name} is damaged: its {file} does not say what its seal repeats of it."
+    return [] if same else [Problem(what, file)]

@@ -27,7 +27,7 @@ from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder
 from vla_attention.schemas.stores.episode_shapes import misfits
 from vla_attention.schemas.stores.remote_source import RemoteFailure, at_commit, source_of
-from vla_attention.schemas.stores.root import group_attributes, list_episodes, read_run
+from vla_attention.schemas.stores.root import attributes_in, list_episodes, read_run
 from vla_attention.schemas.stores.seal import identity_problem, read_seal
 from vla_attention.schemas.stores.seal_content import EpisodeSeal
 from vla_attention.schemas.stores.sealed_files import SealedFiles
@@ -82,9 +82,9 @@ class StoredEpisode:
     @cached_property
     def attributes(self) -> EpisodeAttributes:
         """The episode's attributes."""
-        document = self.sealed("zarr.json")
+        document = self.document("zarr.json")
         try:
-            attributes = from_json(EpisodeAttributes, group_attributes(document))
+            attributes = from_json(EpisodeAttributes, attributes_in(document))
         except ValueError as error:
             raise CorruptEpisode(f"Episode {self.name} cannot be read: its attributes are damaged ({error}).") from None
         stated = episode_name(attributes.task_id, attributes.episode_index)
@@ -114,13 +114,12 @@ class StoredEpisode:
         """The episode's files, as the seal lists them."""
         return SealedFiles(self.source, self.seal.files)
 
-    def sealed(self, file: str) -> bytes:
-        """All bytes of one file of the episode; raises `CorruptEpisode` when they are not those that were sealed."""
-        files = self.files
+    def document(self, file: str) -> Any:
+        """What one `zarr.json` of the episode says, as its seal repeats it; `CorruptEpisode` when it does not."""
         try:
-            return files.whole(file)
-        except CorruptEpisode as error:
-            raise CorruptEpisode(f"Episode {self.name} is damaged: {error}.", error.file) from None
+            return self.seal.documents[file]
+        except KeyError:
+            raise CorruptEpisode(f"Episode {self.name} is damaged: its seal does not list its {file}.", file) from None
 
     def copy_file(self, file: str, path: Path) -> int:
         """Write one file of the episode to `path`, and return its bytes; raises as `sealed` does."""
@@ -178,8 +177,8 @@ class StoredEpisode:
         recorded = self.attributes.arrays.get(name)
         if recorded is None:
             raise CorruptEpisode(f"Episode {self.name} lacks the array {name}: its attributes do not list it.")
-        content = self.sealed(f"{name}/zarr.json")
-        return self._readable(name, lambda: array_metadata(content, tuple(recorded.shape), name, self.files.records))
+        document = self.document(f"{name}/zarr.json")
+        return self._readable(name, lambda: array_metadata(document, tuple(recorded.shape), name, self.files.records))
 
     def reading_step(self, name: str) -> int:
         """Indices along the first axis of an array that are read at once without more memory than is stored for them.
@@ -272,7 +271,8 @@ class StoredEpisode:
         from vla_attention.schemas.stores.shards import ShardedLayers
 
         files = self.files
-        return ShardedLayers.of(self._metadata(name), lambda file: files.shard(f"{name}/{file}"))
+        metadata = self._metadata(name)
+        return ShardedLayers.of(metadata, lambda file: files.shard(f"{name}/{file}", metadata.shard_chunks or 0))
 
     def _readable(self, name: str, read: Callable[[], Read]) -> Read:
         try:

@@ -172,14 +172,20 @@ def listed_names(path: StoreUrl) -> list[str]:
 def group_attributes(document: bytes) -> dict[str, Any]:
     """The attributes in the `zarr.json` of a Zarr v3 group; raises `ValueError` when the bytes are anything else."""
     try:
-        content = decode_json(document)
+        return attributes_in(decode_json(document))
+    except MalformedDocument:
+        raise
     except ValueError as error:
         raise ValueError(f"zarr.json cannot be decoded: {error}") from None
+
+
+def attributes_in(content: Any) -> dict[str, Any]:
+    """The attributes in the decoded `zarr.json` of a group; raises `MalformedDocument` for anything else."""
     if not isinstance(content, dict) or (content.get("zarr_format"), content.get("node_type")) != (3, "group"):
-        raise ValueError("zarr.json does not describe a group of Zarr format 3")
+        raise MalformedDocument("zarr.json does not describe a group of Zarr format 3")
     attributes = content.get("attributes", {})
     if not isinstance(attributes, dict):
-        raise ValueError("zarr.json has no attributes")
+        raise MalformedDocument("zarr.json has no attributes")
     return attributes
 
 

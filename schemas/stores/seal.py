@@ -18,16 +18,10 @@ from vla_attention.schemas.jsonable import from_json, to_json
 from vla_attention.schemas.limits import DOCUMENT_BYTES
 from vla_attention.schemas.stores.array_metadata import chunks_of_a_shard
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder
-from vla_attention.schemas.stores.digest import (
-    CHECKSUM_BYTES,
-    CHUNK_DIGEST_BYTES,
-    bytes_digest,
-    chunk_digest,
-    seal_digest,
-)
+from vla_attention.schemas.stores.digest import bytes_digest, seal_digest
 from vla_attention.schemas.stores.root import group_attributes
 from vla_attention.schemas.stores.seal_content import EpisodeSeal, FileRecord
-from vla_attention.schemas.stores.shards import index_size, read_index
+from vla_attention.schemas.stores.shards import index_size
 from vla_attention.schemas.stores.store_format import SEAL_GROUP
 
 SEAL_FILE = f"{SEAL_GROUP}/zarr.json"
@@ -44,16 +38,14 @@ def seal_episode(folder: Path, name: str, run: str, copied_from: str = "") -> Ep
     """
     (folder / SEAL_FILE).unlink(missing_ok=True)
     files = sorted(file for file in folder.rglob("*") if file.is_file())
-    shards = {
-        document.parent: chunks
-        for document in files
-        if document.name == "zarr.json" and (chunks := chunks_of_a_shard(json.loads(document.read_bytes())))
-    }
+    documents = {file: json.loads(file.read_bytes()) for file in files if file.name == "zarr.json"}
+    shards = {file.parent: chunks for file, document in documents.items() if (chunks := chunks_of_a_shard(document))}
     records: dict[str, FileRecord] = {}
     for file in files:
         chunks = None if file.name == "zarr.json" else next((shards[at] for at in file.parents if at in shards), None)
         records[file.relative_to(folder).as_posix()] = _file_record(file, chunks)
-    seal = EpisodeSeal(name, run, records, digest="", copied_from=copied_from)
+    repeated = {file.relative_to(folder).as_posix(): document for file, document in documents.items()}
+    seal = EpisodeSeal(name, run, records, repeated, digest="", copied_from=copied_from)
     seal = replace(seal, digest=seal_digest(to_json(seal)))
     (folder / SEAL_GROUP).mkdir(exist_ok=True)
     group = {"zarr_format": 3, "node_type": "group", "attributes": to_json(seal)}
@@ -94,13 +86,4 @@ def _file_record(path: Path, chunks: int | None) -> FileRecord:
         if chunks is None:
             return record
         stored = os.pread(file.fileno(), index_size(chunks), max(0, size - index_size(chunks)))
-        # Offset and length 0: a chunk that was not written.
-        places = [(int(offset), int(length)) for offset, length in read_index(stored, size)]
-        checksums, digests = [], []
-        for offset, length in places:
-            chunk = os.pread(file.fileno(), length, offset)
-            checksums.append(chunk[-CHECKSUM_BYTES:] or bytes(CHECKSUM_BYTES))
-            digests.append(chunk_digest(chunk) if chunk else bytes(CHUNK_DIGEST_BYTES))
-    return replace(
-        record, index=bytes_digest(stored), chunks=b"".join(checksums).hex(), digests=b"".join(digests).hex()
-    )
+    return replace(record, index=bytes_digest(stored))

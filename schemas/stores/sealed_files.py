@@ -59,16 +59,13 @@ class SealedFiles:
     def copy(self, file: str, path: Path) -> int:
         """Write a file to `path` part by part, and return its bytes; raises `CorruptEpisode` as `whole` does.
 
-        The chunks of a shard are compared, too, as they were written. What has been written when the error is raised is
-        of no use.
+        What has been written when the error is raised is of no use.
         """
         record = self._record(file)
         with path.open("wb") as copied:
             for offset, part in self._parts(file):
                 copied.seek(offset)
                 copied.write(part)
-        if record.chunks:
-            SealedShard.open(Folder(path.parents[file.count("/")]), file, record).check()
         return record.size
 
     def _parts(self, file: str) -> Iterator[tuple[int, bytes]]:
@@ -97,14 +94,11 @@ class SealedFiles:
         if digest.hexdigest() != record.sha256:
             raise CorruptEpisode(_differs(file), file)
 
-    def shard(self, file: str) -> SealedShard | None:
-        """The shard in a file, of which single chunks can be read; None when the seal does not list its chunks."""
+    def shard(self, file: str, chunks: int) -> SealedShard:
+        """The shard of so many chunks in a file, of which single chunks can be read."""
         if file not in self._shards:
-            record = self._record(file)
-            if not record.chunks:
-                return None
             try:
-                self._shards[file] = SealedShard.open(self.source, file, record)
+                self._shards[file] = SealedShard.open(self.source, file, self._record(file), chunks)
             except RemoteFailure:
                 raise
             except OSError as error:

@@ -6,10 +6,10 @@ analysis of words reads thousands of chunks, and opens hundreds of episodes with
 `ShardedLayers` handles the layout of rows, and `SingleChunk` that of most other arrays, as `create_rows` and
 `write_whole` of `capture/store/codecs.py` write them. An array of any other layout is read with zarr-python.
 
-Nothing that a file says is believed: the index, each chunk, and the checksum at its end are compared with the
-episode's seal, positions with the file's size, and the header of each compressed chunk with the size of the decoded
-one. A frame of Blosc that says it holds fewer bytes than the chunk would otherwise leave the rest of the buffer as it
-was: bytes of the process, which would pass for attention.
+Nothing that a file says is believed: the index is compared with the episode's seal, each chunk with the checksum at
+its end, positions with the file's size, and the header of each compressed chunk with the size of the decoded one. A
+frame of Blosc that says it holds fewer bytes than the chunk would otherwise leave the rest of the buffer as it was:
+bytes of the process, which would pass for attention.
 """
 
 from __future__ import annotations
@@ -28,13 +28,7 @@ from vla_attention.schemas.limit_checks import TooLarge, check_decoded
 from vla_attention.schemas.limits import WHOLE_FILE_BYTES
 from vla_attention.schemas.stores.array_metadata import ArrayMetadata
 from vla_attention.schemas.stores.byte_source import ByteSource, Memory
-from vla_attention.schemas.stores.digest import (
-    CHECKSUM_BYTES,
-    CHUNK_DIGEST_BYTES,
-    bytes_digest,
-    chunk_digest,
-    crc32c,
-)
+from vla_attention.schemas.stores.digest import CHECKSUM_BYTES, bytes_digest, crc32c
 from vla_attention.schemas.stores.remote_source import RemoteFailure
 from vla_attention.schemas.stores.seal_content import FileRecord
 from vla_attention.schemas.stores.store_format import CorruptEpisode
@@ -80,22 +74,22 @@ class SealedShard:
         file: the shard's path there.
         index_bytes: the index as it is stored, with its checksum.
         index: offset and length of each chunk, shape (chunk, 2); (0, 0): not written.
-        checksums: the last `CHECKSUM_BYTES` of each chunk, from the seal.
-        digests: `CHUNK_DIGEST_BYTES` of each chunk, from the seal.
     """
 
     source: ByteSource
     file: str
     index_bytes: bytes
     index: NDArray[np.uint64]
-    checksums: bytes
-    digests: bytes
 
     @classmethod
-    def open(cls, source: ByteSource, file: str, record: FileRecord) -> SealedShard:
-        """Read the index; raises `CorruptEpisode` unless it is the one in the seal, and `OSError` without the file."""
-        checksums = bytes.fromhex(record.chunks)
-        size = index_size(len(checksums) // CHECKSUM_BYTES)
+    def open(cls, source: ByteSource, file: str, record: FileRecord, chunks: int) -> SealedShard:
+        """Read the index of so many chunks.
+
+        Raises:
+            CorruptEpisode: it is not the one in the seal.
+            OSError: the file cannot be read.
+        """
+        size = index_size(chunks)
         if record.size < size:
             raise CorruptEpisode(f"its {file} has {record.size} bytes in the seal, and an index of {size}", file)
         # One byte more: a file that has grown is not the one that was sealed.
@@ -105,7 +99,7 @@ class SealedShard:
         if bytes_digest(stored) != record.index:
             raise CorruptEpisode(f"its {file} does not agree with its seal: its index was changed", file)
         try:
-            return cls(source, file, stored, read_index(stored, record.size), checksums, bytes.fromhex(record.digests))
+            return cls(source, file, stored, read_index(stored, record.size))
         except CorruptEpisode as error:
             raise CorruptEpisode(f"its {file} cannot be read: {error}", file) from None
 
@@ -124,8 +118,7 @@ class SealedShard:
         half a megabyte takes longer than to read it from the system's cache.
 
         Raises:
-            CorruptEpisode: the chunk is missing, or it is not the one that was sealed: its checksum is another one than
-                in the seal or than that of its bytes, or its digest is another one than in the seal.
+            CorruptEpisode: the chunk is missing, or its checksum is not that of its bytes.
         """
         offset, length = (int(value) for value in self.index[number])
         if length <= CHECKSUM_BYTES:
@@ -142,29 +135,12 @@ class SealedShard:
         return stored[:-CHECKSUM_BYTES]
 
     def problem(self, number: int, stored: Memory) -> str | None:
-        """How bytes differ from the sealed chunk of that number, with its checksum, or None."""
-        encoded, checksum = stored[:-CHECKSUM_BYTES], stored[-CHECKSUM_BYTES:]
-        if len(stored) != self.index[number, 1] or checksum.tobytes() != self.checksum(number):
-            return f"chunk {number} of its {self.file} does not agree with its seal"
-        if chunk_digest(stored.data) == self._digest(number):
-            return None  # sha256 says all that crc32c would
-        if crc32c(encoded) != int.from_bytes(self.checksum(number), "little"):
+        """What is wrong with the bytes of a chunk and its checksum, or None."""
+        if len(stored) != self.index[number, 1]:
+            return f"its {self.file} ends in chunk {number}"
+        if crc32c(stored[:-CHECKSUM_BYTES]) != int.from_bytes(stored[-CHECKSUM_BYTES:].tobytes(), "little"):
             return f"the checksum of chunk {number} of its {self.file} does not fit"
-        return f"chunk {number} of its {self.file} does not agree with its seal, although its checksum fits"
-
-    def check(self) -> None:
-        """Read all chunks that were written; raises `CorruptEpisode` as `chunk` does."""
-        memory = np.empty(self.longest(), np.uint8)
-        for number in np.flatnonzero(self.index[:, 1]).tolist():
-            self.chunk(number, memory)
-
-    def _digest(self, number: int) -> bytes:
-        """The digest of one chunk, from the seal."""
-        return self.digests[CHUNK_DIGEST_BYTES * number : CHUNK_DIGEST_BYTES * (number + 1)]
-
-    def checksum(self, number: int) -> bytes:
-        """The checksum of one chunk, from the seal."""
-        return self.checksums[CHECKSUM_BYTES * number : CHECKSUM_BYTES * (number + 1)]
+        return None
 
 
 def check_blosc_frame(frame: bytes | memoryview, decoded_bytes: int, typesize: int) -> None:
@@ -258,14 +234,14 @@ class ShardedLayers:
 
     Attributes:
         metadata: of the array.
-        shard: gives the shard in a file of the array, by its path in the array; None when the seal lists no chunks.
+        shard: gives the shard in a file of the array, by its path in the array.
     """
 
     metadata: ArrayMetadata
-    shard: Callable[[str], SealedShard | None]
+    shard: Callable[[str], SealedShard]
 
     @classmethod
-    def of(cls, metadata: ArrayMetadata, shard_in: Callable[[str], SealedShard | None]) -> ShardedLayers | None:
+    def of(cls, metadata: ArrayMetadata, shard_in: Callable[[str], SealedShard]) -> ShardedLayers | None:
         """The array's reader, or None when it has another layout."""
         shape = metadata.shape
         known = (
@@ -304,16 +280,7 @@ class ShardedLayers:
     def _shards(self) -> tuple[SealedShard, ...]:
         rest = (0,) * (len(self.shape) - 1)
         count = -(-self.num_blocks // self.blocks_per_shard)
-        return tuple(self._open(self.metadata.file((i, *rest))) for i in range(count))
-
-    def _open(self, file: str) -> SealedShard:
-        shard = self.shard(file)
-        if shard is None:
-            raise CorruptEpisode(f"the seal does not list the chunks of its {file}", file)
-        expected = self.blocks_per_shard * self.shape[1] * self.shape[2]
-        if len(shard.index) != expected:
-            raise CorruptEpisode(f"its {file} has {expected} chunks, and its seal lists {len(shard.index)}", file)
-        return shard
+        return tuple(self.shard(self.metadata.file((i, *rest))) for i in range(count))
 
     def memory(self) -> LayerMemory:
         """Memory for `read`; raises `CorruptEpisode` for more than the shards can hold."""

@@ -7,12 +7,12 @@ import shutil
 
 import pytest
 
-from tests.kit.paths import GOLDEN
+from tests.kit.golden_stores import golden_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.stores.store_format import STORE_VERSION
 
-STORED = GOLDEN / "stores/version2/joint.zarr"
+STORED = golden_store("joint")
 DUMMY = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--replan-steps", "4"]
 
 

@@ -37,7 +37,7 @@ from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vo
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.stores.array_metadata import ArrayMetadata, describe_array
 from vla_attention.schemas.stores.byte_source import Memory, copy_into
-from vla_attention.schemas.stores.digest import bytes_digest, chunk_digest, crc32c, seal_digest
+from vla_attention.schemas.stores.digest import bytes_digest, crc32c, seal_digest
 from vla_attention.schemas.stores.episode_checks import content_problems
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.seal import SEAL_FILE, read_seal
@@ -202,7 +202,7 @@ def _read(name: str, file: str, content: bytes) -> None:
 @cache
 def _rows_metadata() -> ArrayMetadata:
     folder = _store("shards") / "episodes" / _original("shards").name
-    return describe_array((folder / _ROWS / "zarr.json").read_bytes())
+    return describe_array(json.loads((folder / _ROWS / "zarr.json").read_bytes()))
 
 
 def shards(content: bytes) -> None:
@@ -214,21 +214,14 @@ def shards(content: bytes) -> None:
     if len(content) < size:
         content = bytes(size - len(content)) + content
     chunks, stored = bytearray(content[:-size]), content[-size:-4]
-    checksums, digests = [], []
     for offset, length in struct.iter_unpack("<QQ", stored):
         end = offset + length
         if length >= 4 and end <= len(chunks):
             chunks[end - 4 : end] = crc32c(bytes(chunks[offset : end - 4])).to_bytes(4, "little")
-            checksums.append(bytes(chunks[end - 4 : end]))
-            digests.append(chunk_digest(bytes(chunks[offset:end])))
-        else:
-            checksums.append(bytes(4))
-            digests.append(bytes(8))
     index = with_checksum(stored)
     content = bytes(chunks) + index
-    listed = [b"".join(of_chunks).hex() for of_chunks in (checksums, digests)]
-    record = FileRecord(len(content), bytes_digest(content), bytes_digest(index), *listed)
-    shard = SealedShard.open(InMemory(content), "c.0", record)
+    record = FileRecord(len(content), bytes_digest(content), bytes_digest(index))
+    shard = SealedShard.open(InMemory(content), "c.0", record, count)
     layers = ShardedLayers.of(metadata, lambda file: shard)
     assert layers is not None
     for layer in range(layers.shape[1]):

@@ -28,7 +28,6 @@ from vla_attention.capture.torch_policies.record import record
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.schemas.stores.root import group_attributes
 from vla_attention.schemas.stores.verify import verify_store
 
 TEXTS = ("pick the bowl", "pick up the red bowl")
@@ -135,7 +134,7 @@ def test_sites_in_some_blocks_of_one_module(tmp_path):
     episode = store.episodes[0]
     own, cross = episode.read("self/rows"), episode.read("cross/rows")
     assert (own.shape, cross.shape) == ((1, 2, 2, HEADS, 1, 8), (1, 2, 2, HEADS, 1, 5))
-    assert group_attributes(episode.sealed("cross/zarr.json"))["layer"] == [1, 3]
+    assert episode.document("cross/zarr.json")["attributes"]["layer"] == [1, 3]
     heads = noise.view(1, 3, HEADS, -1).transpose(1, 2)
     keys = torch.cat([prefix, noise], dim=1).view(1, 8, HEADS, -1).transpose(1, 2)
     first = (heads @ keys.transpose(2, 3) * (WIDTH // HEADS) ** -0.5).softmax(-1).mean(2)

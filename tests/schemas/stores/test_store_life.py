@@ -238,7 +238,7 @@ class StoreLife(RuleBasedStateMachine):
         for episode in open_store(self.folder / store).episodes:
             number = int(episode.name[-3:])
             damage = self.model[store][number]
-            if damage is not None:
+            if damage not in (None, "edit"):  # the seal repeats what was edited
                 with pytest.raises(CorruptEpisode, match=episode.name):
                     episode.read("joint/rows")
             else:

@@ -63,14 +63,6 @@ def _spans(count: int) -> list[dict[str, Any]]:
     return [{"name": f"s{i}", "kind": "state", "start": i, "stop": i + 1} for i in range(count)]
 
 
-def _growing(store: Path) -> None:
-    def change(attributes: dict[str, Any]) -> None:
-        attributes["recording"]["num_action_queries"] = 100_000
-        attributes["sites"][0]["spans"][-1] |= {"growing": True, "stop": 10**6}
-
-    edit_root(store, change)
-
-
 def _far(store: Path) -> None:
     """A camera of a huge grid, with the spans behind it moved."""
 
@@ -115,7 +107,6 @@ ROOT_CASES = [
     Case("root: a grid of 10^9 rows", _far, REFUSED + "The number of rows of a patch grid is 1,000,000,000"),
     Case("root: 10^9 heads", _set(*SITE, "heads", 10**9), REFUSED + "The number of heads of site 'joint'"),
     Case("root: 10^12 queries", _set("recording", "num_action_queries", 10**12), REFUSED + "The number of action quer"),
-    Case("root: many generated keys", _growing, REFUSED + "The number of queries x generated keys of site 'joint'"),
     Case(
         "root: half a million layers",
         _set("recording", "layers", list(range(500_000))),
