@@ -67,7 +67,7 @@ def test_stores_that_cannot_be_read(tmp_path, capsys):
     document = json.loads((newer / "zarr.json").read_text())
     document["attributes"]["store_version"] = STORE_VERSION + 1
     (newer / "zarr.json").write_text(json.dumps(document))
-    expected = f"is a store of version {STORE_VERSION + 1}, and this program reads stores up to version {STORE_VERSION}"
+    expected = f"is a store of version {STORE_VERSION + 1}, and this program reads version {STORE_VERSION}"
     assert expected in run(analyze, [newer], capsys)
 
 

@@ -51,7 +51,7 @@ def test_the_summary_has_the_numbers_of_the_analysis(store):
 def test_a_damaged_episode_has_no_numbers_and_the_others_have(store, tmp_path):
     damaged = tmp_path / "a.zarr"
     shutil.copytree(store, damaged)
-    (damaged / "episodes/task001_episode000/joint/key_role/zarr.json").unlink()
+    (damaged / "episodes/task001_episode000/joint/key_role/c.0.0").unlink()
     parts = list(summary_parts(open_store(damaged)))
     (failed,) = [part["failed"] for part in parts if "failed" in part]
     assert "task001_episode000" in failed
