@@ -141,7 +141,7 @@ def _merge(stores: Sequence[Store], place: Path, progress: Callable[[int], objec
             if progress is not None:
                 progress(1)
     built = open_store(place)
-    for report in reports_of_store(built, False):
+    for report in reports_of_store(built, "files"):
         if report.problems:
             raise CorruptEpisode(
                 f"Cannot merge: {report.episode} of {origin[report.episode].path} is damaged: "

@@ -10,7 +10,7 @@ from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.stores.episode_files import check_presence
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.store_format import StoreError
-from vla_attention.schemas.stores.verify import episode_faults
+from vla_attention.schemas.stores.verify import episode_report
 
 
 class DamagedEpisodesLeft(StoreError):
@@ -36,11 +36,11 @@ class DamagedEpisode:
 def look_at(store: Store, episode: StoredEpisode, verify: bool = False) -> DamagedEpisode | None:
     """Return what is wrong with an episode, or None.
 
-    verify: read all of it, as `vla-attention store verify` does.
+    verify: compare every byte with the seal, as `vla-attention store verify` does.
     """
     problems = [problem.text for problem in check_presence(replace(episode))]
     if verify and not problems:
-        problems = [fault.problem for fault in episode_faults(store, episode)]
+        problems = [*episode_report(store, episode, "files").problems]
     return DamagedEpisode(episode.name, tuple(problems)) if problems else None
 
 

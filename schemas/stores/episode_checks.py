@@ -48,6 +48,19 @@ def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[P
     Raises:
         CorruptEpisode: the episode's attributes or its seal cannot be read.
     """
+    attributes, wrong = episode.attributes, set[str]()
+    for problem in form_problems(root, episode):
+        wrong.add(problem.text.partition(" ")[0])
+        yield problem
+    for name, record in attributes.arrays.items():
+        if name not in wrong:
+            yield from _guarded(_array_problems(root, episode, name, record.sha256))
+    for check in (_axis_problems, _token_problems, _camera_problems, _counter_problems):
+        yield from _guarded(check(root, episode))
+
+
+def form_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[Problem]:
+    """What of an episode's files, metadata and shapes is not as its run and its attributes say; reads no array."""
     attributes = episode.attributes
     for file in files_of_no_array(root, attributes, episode.files.records):
         yield Problem(f"its seal lists {file}, which belongs to no array of an episode")
@@ -61,13 +74,8 @@ def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[P
     for name in sorted(set(shapes) - set(listed)):
         yield Problem(f"{name} is not in the episode")
     for name, shape in listed.items():
-        wrong = list(shape_problems(name, shape, shapes.get(name, (attributes.num_replans,))))
-        yield from map(Problem, wrong)
-        if not wrong and name not in numbers:
-            yield from _guarded(_array_problems(root, episode, name, attributes.arrays[name].sha256))
+        yield from map(Problem, shape_problems(name, shape, shapes.get(name, (attributes.num_replans,))))
     yield from map(Problem, [*effect_misfits(root, attributes), *step_misfits(attributes)])
-    for check in (_axis_problems, _token_problems, _camera_problems, _counter_problems):
-        yield from _guarded(check(root, episode))
 
 
 def _guarded(check: Iterator[str]) -> Iterator[Problem]:

@@ -1,20 +1,20 @@
 """Checking whole stores: every file of every episode, and what lies beside them. Both command lines use it.
 
-A quick look (`quick`) reads seals and metadata, and compares the presence and the size of every file; otherwise
-everything is read (`episode_checks.py`). Foreign files are named and are no faults, because nothing reads them.
+How far is looked is a `Depth`. Foreign files are named and are no faults, because nothing reads them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.limits import ROOT_BYTES
 from vla_attention.schemas.stores.digest import seal_digest
-from vla_attention.schemas.stores.episode_checks import content_problems
+from vla_attention.schemas.stores.episode_checks import content_problems, form_problems
 from vla_attention.schemas.stores.episode_files import check_presence, foreign_in_episode
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
@@ -23,6 +23,9 @@ from vla_attention.schemas.stores.seal import SEAL_FILE
 from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, CorruptEpisode, Problem
 
 _ROOT_FILES = ("zarr.json", EPISODES_DOCUMENT)
+#: quick: seals, metadata, and the presence and size of every file. files: every byte is compared with the seal, too.
+#: values: all arrays are read, and the rules that the writer applies are applied again (`episode_checks.py`).
+Depth = Literal["quick", "files", "values"]
 
 
 @dataclass(frozen=True)
@@ -54,20 +57,17 @@ class EpisodeReport:
         return [Fault(self.episode, problem) for problem in self.problems]
 
 
-def verify_store(store: Store, progress: Callable[[int], object] | None = None, *, quick: bool = False) -> list[Fault]:
-    """Check a store and every episode; `progress` is called with 1 after each. An empty list means: it is whole."""
-    faults = store_faults(store)
-    for episode in store.episodes:
-        faults += episode_report(store, episode, quick=quick).faults
-        if progress is not None:
-            progress(1)
-    return faults
+def verify_store(store: Store, depth: Depth = "values") -> list[Fault]:
+    """Check a store and every episode. An empty list means: it is whole."""
+    return store_faults(store) + [
+        fault for episode in store.episodes for fault in episode_report(store, episode, depth).faults
+    ]
 
 
-def episode_report(store: Store, episode: StoredEpisode, *, quick: bool = False) -> EpisodeReport:
-    """Look at one episode of a store, and read all of it unless `quick`."""
+def episode_report(store: Store, episode: StoredEpisode, depth: Depth) -> EpisodeReport:
+    """Look at one episode of a store."""
     # Several checks may find the same fault.
-    problems = list(dict.fromkeys(problem.text for problem in _problems(store, episode, quick)))
+    problems = list(dict.fromkeys(problem.text for problem in _problems(store, episode, depth)))
     try:
         foreign = foreign_in_episode(episode)
         records = episode.files.records
@@ -77,11 +77,6 @@ def episode_report(store: Store, episode: StoredEpisode, *, quick: bool = False)
     except (CorruptEpisode, OSError):
         return EpisodeReport(episode.name, 0, 0, tuple(problems), ())
     return EpisodeReport(episode.name, len(records) + 1, size, tuple(problems), foreign)
-
-
-def episode_faults(store: Store, episode: StoredEpisode) -> list[Fault]:
-    """Everything that is wrong with one episode of a store; reads all of it."""
-    return episode_report(store, episode).faults
 
 
 def store_faults(store: Store) -> list[Fault]:
@@ -117,15 +112,16 @@ def _group_problems(store: Store, file: str) -> Iterator[str]:
         yield "it was changed: its own digest does not fit"
 
 
-def _problems(store: Store, episode: StoredEpisode, quick: bool) -> list[Problem]:
+def _problems(store: Store, episode: StoredEpisode, depth: Depth) -> list[Problem]:
     try:
         _ = episode.attributes
     except CorruptEpisode as error:
         return [Problem(str(error), error.file)]
-    problems = [] if quick else list(content_problems(store.attributes, episode))
+    look = {"quick": None, "files": form_problems, "values": content_problems}[depth]
+    problems = [] if look is None else list(look(store.attributes, episode))
     said = {problem.file for problem in problems} - {None}
     problems += [one for one in check_presence(episode) if one.file not in said]
-    if not quick:
+    if depth != "quick":
         problems += _problems_of_bytes(episode, {problem.file for problem in problems})
     return problems
 

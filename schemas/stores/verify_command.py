@@ -19,21 +19,22 @@ from vla_attention.schemas.stores.store_url import StorePlace, local_path, store
 
 if TYPE_CHECKING:
     from vla_attention.schemas.stores.reader import Store
-    from vla_attention.schemas.stores.verify import EpisodeReport, Fault
+    from vla_attention.schemas.stores.verify import Depth, EpisodeReport, Fault
 
 DESCRIPTION = (
-    "Read everything back and check it: every file, missing chunks, digests, counts, row sums. A line for every "
-    "episode. Foreign files are named; nothing reads them. Exit code 1 if anything is wrong."
+    "Compare every file with what was sealed, and what an episode says with its run. A line for every episode. Foreign "
+    "files are named; nothing reads them. Exit code 1 if anything is wrong."
 )
 EXAMPLES = """examples:
   NAME verify libero_10.zarr                      every byte of every episode
   NAME verify libero_10.zarr --quick              seals, metadata, presence and sizes: milliseconds an episode
+  NAME verify libero_10.zarr --values             the numbers too: row sums, roles, shares, as the writer checked them
   NAME verify *.zarr --json > report.json         for programs
   NAME verify libero_10.zarr --repair --dry-run   what would be moved aside
   NAME verify libero_10.zarr --repair --quick     move aside what a quick look finds
 """
-#: Reports of the episodes of a store, in their order, looked at quickly or not.
-Reports = Callable[["Store", bool], Iterable["EpisodeReport"]]
+#: Reports of the episodes of a store, in their order, looked at as deep as asked.
+Reports = Callable[["Store", "Depth"], Iterable["EpisodeReport"]]
 
 
 def add_verify_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,6 +44,11 @@ def add_verify_arguments(parser: argparse.ArgumentParser) -> None:
         "--quick",
         action="store_true",
         help="look at seals, metadata, and the presence and size of every file, and read no array",
+    )
+    parser.add_argument(
+        "--values",
+        action="store_true",
+        help="read the arrays, too, and apply the rules that the writer applied: row sums, roles, shares, counts",
     )
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
     parser.add_argument(
@@ -59,26 +65,28 @@ def add_verify_arguments(parser: argparse.ArgumentParser) -> None:
 def run_verify_command(arguments: argparse.Namespace, reports: Reports | None = None) -> int:
     """Check the stores of parsed arguments, or repair them; returns the exit code."""
     if arguments.repair:
-        if arguments.json:
-            raise BadArgument("Cannot use --json with --repair, which prints what it did; verify again with --json.")
+        for option in ("json", "values"):
+            if getattr(arguments, option):
+                raise BadArgument(f"Cannot use --{option} with --repair; verify again with --{option}.")
         places = [local_path(place) for place in arguments.stores]
         return run_repair(places, verify=not arguments.quick, dry_run=arguments.dry_run)
     if arguments.dry_run:
         raise BadArgument("--dry-run goes with --repair: without it nothing is changed anyway.")
-    return run_verify(
-        arguments.stores, quick=arguments.quick, as_json=arguments.json, reports=reports or one_after_the_other
-    )
+    if arguments.quick and arguments.values:
+        raise BadArgument("--quick reads no array and --values reads all; give one of them.")
+    depth: Depth = "quick" if arguments.quick else "values" if arguments.values else "files"
+    return run_verify(arguments.stores, depth, as_json=arguments.json, reports=reports or one_after_the_other)
 
 
-def one_after_the_other(store: Store, quick: bool) -> Iterator[EpisodeReport]:
+def one_after_the_other(store: Store, depth: Depth) -> Iterator[EpisodeReport]:
     """Reports of the episodes, made in this thread."""
     from vla_attention.schemas.stores.verify import episode_report
 
-    return (episode_report(store, episode, quick=quick) for episode in store.episodes)
+    return (episode_report(store, episode, depth) for episode in store.episodes)
 
 
 def run_verify(
-    stores: Sequence[StorePlace], *, quick: bool, as_json: bool, reports: Reports = one_after_the_other
+    stores: Sequence[StorePlace], depth: Depth, *, as_json: bool, reports: Reports = one_after_the_other
 ) -> int:
     """Check stores, and print what was found; returns the exit code: 1 if anything is wrong."""
     from vla_attention.schemas.stores.episode_files import foreign_in_store
@@ -95,7 +103,7 @@ def run_verify(
         if not as_json:
             _print_faults(path, faults)
         with _counter(len(store.episodes), quiet=not as_json and sys.stdout.isatty()) as count:
-            for report in reports(store, quick):
+            for report in reports(store, depth):
                 count()
                 reports_of_store.append(report)
                 if as_json:
@@ -106,14 +114,18 @@ def run_verify(
                     print(f"{path}: {report.episode}: {whole}", flush=True)
         wrong = wrong or bool(faults) or any(report.problems for report in reports_of_store)
         if as_json:
-            documents.append(_document(store, quick, faults, foreign, reports_of_store))
+            documents.append(_document(store, depth, faults, foreign, reports_of_store))
         else:
             _print_foreign(path, foreign, reports_of_store)
             number = len(faults) + sum(len(report.problems) for report in reports_of_store)
             result = "all whole" if not number else "1 fault" if number == 1 else f"{number} faults"
-            looked = " (seals, metadata, presence and sizes; without --quick every byte is read)" if quick else ""
+            looked = {
+                "quick": "seals, metadata, presence and sizes; without --quick every byte is read",
+                "files": "every file; --values looks at the numbers too",
+                "values": "every file and number",
+            }[depth]
             plural = "" if len(reports_of_store) == 1 else "s"
-            print(f"{path}: {len(reports_of_store)} episode{plural}, {result}{looked}.", flush=True)
+            print(f"{path}: {len(reports_of_store)} episode{plural}, {result} ({looked}).", flush=True)
     if as_json:
         print(json.dumps(documents, indent=1))
     return 1 if wrong else 0
@@ -137,7 +149,7 @@ def _print_foreign(path: StorePlace, beside: Sequence[str], found: Iterable[Epis
 
 def _document(
     store: Store,
-    quick: bool,
+    depth: Depth,
     faults: Sequence[Fault],
     foreign: Sequence[str],
     found: Sequence[EpisodeReport],
@@ -145,7 +157,7 @@ def _document(
     return {
         "store": str(store.path),
         "version": store.attributes.store_version,
-        "quick": quick,
+        "depth": depth,
         "whole": not faults and not any(report.problems for report in found),
         "faults": to_json(faults),
         "foreign": list(foreign),

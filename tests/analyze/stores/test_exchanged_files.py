@@ -149,7 +149,7 @@ COMMANDS = {
     "objects": (["--no-plots"], "objects/base_0_rgb"),
     "analyze --by layer,head": (["--csv"], "joint/row_sum"),
     "analyze --list": (["--no-plots"], "joint/key_role"),
-    "overlay": (["--replans", "0"], "frames/base_0_rgb"),
+    "overlay": (["--replans", "0"], "joint/key_role"),
     "report": ([], "joint/key_role"),
 }
 

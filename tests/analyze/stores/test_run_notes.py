@@ -98,7 +98,7 @@ def test_every_command_says_it(stores, tmp_path, monkeypatch, capsys, kind, comm
 def test_the_page_opens_beside_a_damaged_episode(stores, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("vla_attention.analyze.view.server.ViewerServer.serve_forever", lambda self: None)
     damaged = shutil.copytree(stores["cut"], tmp_path / "cut.zarr")
-    (damaged / "episodes/task000_episode001/zarr.json").write_text("no document")
+    (damaged / "episodes/task000_episode001/seal/zarr.json").write_text("no document")
     assert main(["view", str(damaged), "--no-open"]) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "The page: http" in said
