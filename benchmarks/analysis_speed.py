@@ -97,9 +97,8 @@ def decode_only(store: Path, threads: int) -> Callable[[], None]:
 
     def positions(episode: StoredEpisode) -> tuple[Path, list[tuple[int, int]], int]:
         name = next(file for file in episode.files.records if file.startswith("joint/rows/c"))
-        shard = episode.files.shard(name)
-        assert shard is not None
-        replans, *_, heads, queries, keys = episode.shape_of("joint/rows")
+        replans, layers, steps, heads, queries, keys = episode.shape_of("joint/rows")
+        shard = episode.files.shard(name, layers * steps)
         block = -(-replans // 8) * 8
         return (
             episode.folder / name,
