@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     from vla_attention.analyze.published.results_reader import find_results, read_results_file
     from vla_attention.analyze.published.results_tables import labels_of, results_tables
     from vla_attention.analyze.published.results_text import summary_of_files, why_not_pooled
-    from vla_attention.analyze.render.output_files import write_text, writing
+    from vla_attention.analyze.render.files import write_text, writing
     from vla_attention.schemas.errors import BadArgument
     from vla_attention.schemas.progress_bar import progress_bar
 
@@ -115,7 +115,7 @@ def _draw(
     """
     from vla_attention.analyze.published.results_pictures import comparison, figures_of_file
     from vla_attention.analyze.render.figures import save
-    from vla_attention.analyze.render.output_files import replacing, writing
+    from vla_attention.analyze.render.files import replacing, writing
 
     wanted = [
         name

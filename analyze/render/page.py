@@ -6,12 +6,10 @@ import base64
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
-from io import BytesIO
 
 import jinja2
 
 from vla_attention.analyze.core.result import Column, Figure, Result, Table
-from vla_attention.analyze.render import style as style_module
 from vla_attention.analyze.render.figures import draw
 from vla_attention.analyze.render.numbers import cell
 from vla_attention.analyze.render.style import Style
@@ -28,7 +26,7 @@ _SHORT = 12
 def fragment(result: Result) -> str:
     """One result as HTML without a page around it, for notebooks."""
     with _environment() as environment:
-        return environment.get_template("result.html").render(result=result)
+        return environment.get_template("result.html").render(result=result, title="")
 
 
 def page(title: str, results: Sequence[Result], version: str = "") -> str:
@@ -66,16 +64,15 @@ def _tables(result: Result, folded: bool) -> list[Table]:
     return tables[number:] if folded else tables[:number]
 
 
-def _picture(figure: Figure) -> str:
-    """The address of a picture that stands in the page itself; photographs as WebP, half the bytes of PNG."""
-    style = Style(inches=_INCHES)
+def _picture(figure: Figure) -> tuple[str, bool]:
+    """The address of a picture that stands in the page itself, and whether it is wide.
+
+    Photographs are WebP, half the bytes of PNG.
+    """
+    style, kind = Style(inches=_INCHES), "webp" if figure.kind == "pictures" else "png"
     canvas = draw(figure, style)
-    style_module.find_places(canvas, style.dpi)
-    content = BytesIO()
-    kind, options = ("webp", {"quality": 85}) if figure.kind == "pictures" else ("png", {})
-    with style.settings():
-        canvas.savefig(content, format=kind, dpi=style.dpi, pil_kwargs=options)
-    return f"data:image/{kind};base64,{base64.b64encode(content.getvalue()).decode()}"
+    content = base64.b64encode(style.content(canvas, kind)).decode()
+    return f"data:image/{kind};base64,{content}", canvas.get_figwidth() > _INCHES
 
 
 def _sort_key(row: dict[str, object], column: Column) -> str:

@@ -1,21 +1,36 @@
-"""What the axes of plots share: scales, labels, legends, notes beside rows, the line of uniform attention."""
+"""What the axes of plots share: scales, labels, names that fit, and the reason why they are empty."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.analyze.render.plot_colours import BASELINE_COLOR
+from vla_attention.analyze.render.style import NOTE_COLOR
+from vla_attention.schemas.safe_text import visible
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.axis import Axis
 
-#: Legend entry of the line that uniform attention gives.
-BASELINE_LABEL = "uniform attention"
+
+def wrapped(text: str, width: int, lines: int) -> str:
+    """Text in at most so many lines of at most so many characters, with … where it was cut."""
+    return "\n".join(textwrap.wrap(visible(" ".join(text.split())), width, max_lines=lines, placeholder=" …"))
+
+
+def shortened(name: str, width: int) -> str:
+    """A name that must not be broken at spaces, in at most so many characters, with … where it was cut."""
+    return name if len(name) <= width else f"{name[: width - 1]}…"
+
+
+def explain(axes: Axes, text: str) -> None:
+    """Write into the middle of empty axes why they are empty."""
+    axes.set_axis_off()
+    axes.text(0.5, 0.5, textwrap.fill(text, 60), transform=axes.transAxes, ha="center", va="center", color=NOTE_COLOR)
 
 
 def ratio_axis(axis: Any, values: Any) -> None:
@@ -23,7 +38,7 @@ def ratio_axis(axis: Any, values: Any) -> None:
 
     A ratio and its inverse are equally far from 1 on such an axis; on a linear axis the denominator's side is squeezed.
     """
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     shown = np.asarray(values, dtype=np.float64)
     shown = shown[np.isfinite(shown) & (shown > 0)]
@@ -38,8 +53,7 @@ def ratio_axis(axis: Any, values: Any) -> None:
     (axis.axes.set_xlim if is_x else axis.axes.set_ylim)(low, high)
     axis.set_major_locator(LogLocator(subs=digits, numticks=20))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}"))
-    axis.set_minor_locator(LogLocator(subs=tuple(range(1, 10)), numticks=20) if decades < 3 else NullLocator())
-    axis.set_minor_formatter(NullFormatter())
+    axis.set_minor_locator(NullLocator())
 
 
 def whole_numbers(axis: Axis) -> None:
@@ -49,10 +63,9 @@ def whole_numbers(axis: Axis) -> None:
     axis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
 
 
-def share_ticks(axis: Axis, count: int) -> None:
-    """Ticks from 0% to 100% on an axis of shares, `count` of them."""
-    shares = np.linspace(0, 1, count)
-    axis.set_ticks(shares, [f"{share:.0%}" for share in shares])
+def share_ticks(axis: Axis) -> None:
+    """Ticks from 0% to 100% on an axis of shares."""
+    axis.set_ticks(np.linspace(0, 1, 6), [f"{share}%" for share in range(0, 101, 20)])
 
 
 def label_positions(axis: Axis, labels: Sequence[str], most: int) -> None:
@@ -61,27 +74,7 @@ def label_positions(axis: Axis, labels: Sequence[str], most: int) -> None:
     axis.set_ticks(list(positions), [labels[i] for i in positions])
 
 
-def hide_frame(axes: Axes) -> None:
-    """Hide the four lines around the axes."""
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-
-
-def uniform_line(
-    axes: Axes, value: float = 1.0, along: str = "y", linewidth: float = 1.0, label: str | None = None
-) -> None:
-    """A dashed line across the axes at the value of uniform attention on the y axis (or with `along`, the x axis)."""
-    line = axes.axhline if along == "y" else axes.axvline
-    line(value, color=BASELINE_COLOR, linestyle="--", linewidth=linewidth, label=label)
-
-
 def scattered(generator: np.random.Generator, position: float, count: int, spread: float = 0.22) -> NDArray[np.float64]:
     """`count` positions around the middle of a row, at most `spread` from it, so that points do not hide each other."""
     offsets = generator.uniform(-spread, spread, count) if count > 1 else np.zeros(count)
     return np.asarray(position + offsets)
-
-
-def legend_above(axes: Axes, columns: int = 1, handles: Sequence[Any] | None = None, **options: Any) -> None:
-    """A legend above the right end of the axes."""
-    chosen = {} if handles is None else {"handles": handles}
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.1, **chosen, **options)

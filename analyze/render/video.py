@@ -16,7 +16,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.result import Figure
-from vla_attention.analyze.render.output_files import replacing
+from vla_attention.analyze.render.files import replacing
 from vla_attention.analyze.render.pictures import pictures
 from vla_attention.analyze.render.style import Style
 from vla_attention.schemas.errors import BadArgument, MissingDependency

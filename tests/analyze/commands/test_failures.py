@@ -87,7 +87,7 @@ def test_a_store_of_twins_with_the_same_states():
 
 def test_the_strip_shows_the_stored_pictures_upright():
     (strip,) = failures(*(question_about(path) for path in PAIR)).figures
-    shown = [axes.images[0].get_array() for axes in draw(strip).axes]
+    shown = [image.get_array() for image in draw(strip).axes[0].images]
     assert len(shown) == strip.frame.height
     one = strip.frame.row(-1, named=True)
     twin = open_store(PAIR[1]).episodes[0]

@@ -17,7 +17,7 @@ from tests.kit.made_up_steps import (
 )
 from vla_attention.analyze.published import results_writer
 from vla_attention.analyze.published.results_writer import write_results
-from vla_attention.analyze.render.output_files import replacing
+from vla_attention.analyze.render.files import replacing
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.schemas.jsonable import from_json
 from vla_attention.schemas.results import (
