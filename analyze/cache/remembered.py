@@ -1,7 +1,7 @@
 """Measuring episodes once: what the cache holds is taken from it, the rest is measured and put there.
 
 The key of a file is the question (what is measured, with all its arguments, and the arithmetic), the digest of the
-episode's seal, and the state of the episode's files (`fingerprints`). The cache changes no number and raises no error:
+episode's seal, and the state of the episode's files (`file_state`). The cache changes no number and raises no error:
 where it cannot be read or written, everything is measured.
 """
 
@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -19,11 +20,10 @@ from pathlib import Path
 from typing import Any
 
 import vla_attention
-from vla_attention.analyze.cache.fingerprints import file_state
-from vla_attention.analyze.cache.housekeeping import make_room
-from vla_attention.analyze.cache.kept_files import ENDING, Arrays, kept_bytes, read_arrays, write_file
+from vla_attention.analyze.cache.kept_files import ENDING, Arrays, kept_bytes, make_room, read_arrays, write_file
 from vla_attention.analyze.cache.places import CachePlace, cache_place, check_cache_place
 from vla_attention.schemas.stores.reader import StoredEpisode
+from vla_attention.schemas.stores.store_format import SEAL_GROUP
 
 #: The sources that numbers depend on: how bytes become rows, selectors weights, and rows measures.
 _SOURCES = (
@@ -35,6 +35,13 @@ _SOURCES = (
     "analyze/measures/*.py",
     "analyze/core/*.py",
 )
+#: Files that changed less than this ago may change again without a difference that file systems' clocks show.
+SETTLED_SECONDS = 2.0
+#: The state of an episode that is not in a file system of this machine: its seal, which is read there at every opening,
+#: has to suffice.
+_ELSEWHERE = hashlib.sha256(b"elsewhere").digest()
+#: Pictures are in no measure of attention, and are most of the files.
+_NOT_MEASURED = "frames/"
 
 
 @cache
@@ -53,6 +60,37 @@ def arithmetic_version() -> str:
                 digest.update(f"\n{file.relative_to(package)} {len(content)}\n".encode())
                 digest.update(content)
     return digest.hexdigest()
+
+
+def file_state(episode: StoredEpisode) -> bytes | None:
+    """A digest of the present state of an episode's files; None when one is missing or only just changed.
+
+    What is taken from the cache is not read, so that damage would not be seen. Every file has to be the one that was
+    there when it was measured: same inode, size, and times of change. Writing to a file, exchanging it and setting its
+    date all change the time that the file system notes (ctime), which no program can set.
+
+    Raises:
+        CorruptEpisode: its seal cannot be read or is not its own.
+    """
+    place = episode.folder
+    if not isinstance(place, Path):
+        return _ELSEWHERE
+    if place.is_file():
+        paths = {"": str(place)}  # the episode is one zip
+    else:
+        names = [name for name in episode.files.records if not name.startswith(_NOT_MEASURED)]
+        paths = {name: f"{place}/{name}" for name in (*names, f"{SEAL_GROUP}/zarr.json")}
+    newest, stats = 0, []
+    for name, path in paths.items():
+        try:
+            status = os.stat(path)
+        except OSError:
+            return None
+        newest = max(newest, status.st_mtime_ns, status.st_ctime_ns)
+        stats.append(f"{name} {status.st_ino} {status.st_size} {status.st_mtime_ns} {status.st_ctime_ns}")
+    if newest > (time.time() - SETTLED_SECONDS) * 1e9:
+        return None
+    return hashlib.sha256("\n".join(stats).encode()).digest()
 
 
 @dataclass(frozen=True)
@@ -117,7 +155,7 @@ def remembered(
             yield arrays
     finally:
         # Although nothing may have been written: the cache may hold what a larger VLA_CACHE_SIZE had room for.
-        make_room(place)
+        make_room(place.folder, place.most_bytes)
 
 
 class _Files:

@@ -14,8 +14,7 @@ from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens
 from vla_attention.analyze.measures.task_families import sampling_of, units_of
 from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.units import Units
-from vla_attention.analyze.stores.checking import faults_of_each
-from vla_attention.analyze.stores.read_ahead import read_ahead
+from vla_attention.analyze.stores.parallel import episode_reports, read_ahead
 from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.analyze.stores.selection import (
     Selection,
@@ -213,9 +212,9 @@ def _without_faulty(
     """The episodes that are undamaged and hold a replan, and a line on each of the others. Reads everything once."""
     kept, skipped = [], []
     with progress_bar(len(chosen), "episodes checked") as advance:
-        for (store, episode), faults in zip(chosen, faults_of_each(chosen, advance), strict=True):
-            if faults:
-                skipped.append(f"{episode.name} of {store.path} is left out: {faults[0].problem.rstrip('.')}")
+        for (store, episode), report in zip(chosen, episode_reports(chosen, progress=advance), strict=True):
+            if report.faults:
+                skipped.append(f"{episode.name} of {store.path} is left out: {report.faults[0].problem.rstrip('.')}")
             elif episode.attributes.num_replans == 0:
                 skipped.append(f"{episode.name} of {store.path} is left out: it holds no replan")
             else:

@@ -49,6 +49,12 @@ class ResultsTables:
     tasks: pl.DataFrame
     groups: pl.DataFrame
 
+    @property
+    def layer(self) -> str:
+        """What one number is about: "layers_avg" where there is one, else the first layer."""
+        layers = self.tasks.sort("layer_number", "layer", nulls_last=True)["layer"]
+        return LAYERS_AVG if LAYERS_AVG in layers else str(layers[0])
+
 
 @dataclass(frozen=True)
 class Spread:

@@ -28,24 +28,22 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.core.result import Figure
 from vla_attention.analyze.render.pictures import pictures
-from vla_attention.analyze.render.plot_axes import (
-    explain,
-    label_positions,
-    ratio_axis,
-    scattered,
-    share_ticks,
-    shortened,
-    whole_numbers,
-    wrapped,
-)
 from vla_attention.analyze.render.style import (
     BASELINE_COLOR,
     DOT_COLOR,
     NOTE_COLOR,
     SERIES_COLORS,
     Style,
+    explain,
     group_styles,
+    label_positions,
+    ratio_axis,
     save_canvas,
+    scattered,
+    share_ticks,
+    shortened,
+    whole_numbers,
+    wrapped,
 )
 
 if TYPE_CHECKING:

@@ -28,8 +28,7 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.core.patch_pictures import NO_PICTURE, enlarge
 from vla_attention.analyze.core.result import Figure
-from vla_attention.analyze.render.plot_axes import wrapped
-from vla_attention.analyze.render.style import Style
+from vla_attention.analyze.render.style import Style, wrapped
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +17,7 @@ from vla_attention.schemas.threads import add_threads
 if TYPE_CHECKING:
     from vla_attention.schemas.stores.reader import Store
     from vla_attention.schemas.stores.store_url import StorePlace
+    from vla_attention.schemas.stores.verify import EpisodeReport
 
 _EXAMPLES = """examples:
   vla-attention store copy libero_10.zarr                               how large each part is
@@ -98,9 +99,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run_verify(arguments: argparse.Namespace) -> int:
     """Verify every store; 1 if anything is wrong, or with --repair if a damaged episode is left."""
-    from vla_attention.analyze.stores.checking import reports_of_store
+    from vla_attention.analyze.stores.parallel import episode_reports
 
-    return run_verify_command(arguments, reports_of_store)
+    def reports(store: Store, quick: bool) -> Iterator[EpisodeReport]:
+        return episode_reports(((store, episode) for episode in store.episodes), quick)
+
+    return run_verify_command(arguments, reports)
 
 
 def _run_copy(arguments: argparse.Namespace) -> int:

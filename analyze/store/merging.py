@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vla_attention.analyze.store.copying import copy_store
-from vla_attention.analyze.stores.checking import reports_of_store
+from vla_attention.analyze.stores.parallel import episode_reports
 from vla_attention.schemas.errors import BadArgument, UserError, listing, plural
 from vla_attention.schemas.stores.digest import run_differences, with_digest
 from vla_attention.schemas.stores.durable_files import publish
@@ -153,7 +153,7 @@ def _merge(stores: Sequence[Store], place: Path, progress: Callable[[int], objec
             if progress is not None:
                 progress(1)
     built = open_store(place)
-    for report in reports_of_store(built, False):
+    for report in episode_reports((built, episode) for episode in built.episodes):
         if report.problems:
             raise CorruptEpisode(
                 f"Cannot merge: {report.episode} of {origin[report.episode].path} is damaged: "

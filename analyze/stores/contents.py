@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 
 import polars as pl
 
-from vla_attention.analyze.stores.read_ahead import read_ahead
+from vla_attention.analyze.stores.parallel import read_ahead
 from vla_attention.analyze.stores.selection import select_episodes
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS

@@ -16,8 +16,7 @@ from benchmarks.validation.known import NUMBERS
 from benchmarks.validation.mixing import CUTS, GROUPS
 from benchmarks.validation.policies import TITLES
 from benchmarks.validation.prediction import ATTENTION, FAMILIES
-from vla_attention.analyze.render.plot_axes import ratio_axis
-from vla_attention.analyze.render.style import Style
+from vla_attention.analyze.render.style import Style, ratio_axis
 
 STYLE = Style()
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#999999")
