@@ -29,7 +29,7 @@ from vla_attention.analyze.published.results_tables import (
     ZEROS_COUNTED,
     disagreements,
     results_tables,
-    spread_of,
+    spread,
 )
 from vla_attention.schemas.results import ResultsError, ResultsNotFound
 
@@ -60,7 +60,7 @@ def test_our_own_files_read_back_as_the_table_they_were_written_from(tmp_path):
     # Infinities come back, although the file has only null for them.
     assert back["ratio"].to_list() == expected["ratio_mean"].to_list()
     assert expected["ratio"].is_infinite().any()
-    assert disagreements(file) == []
+    assert disagreements(file).is_empty()
 
 
 def as_before(path: Path, actions: dict[tuple[int, int], int]) -> None:
@@ -141,7 +141,7 @@ def test_a_zero_that_stands_for_no_ratio_is_undefined_and_counted(tmp_path):
     assert file.steps.filter(layer="layers_avg")["ratio"].is_null().all()
     assert file.steps.filter(layer="25")["ratio"].is_infinite().all()
     assert file.zeros == 8
-    assert {item.reason for item in disagreements(file)} == {NO_FINITE_AS_ZERO}
+    assert set(disagreements(file)["reason"]) == {NO_FINITE_AS_ZERO}
     # A step at which only some layers are infinite has a ratio; zeros among ratios change the file's own means.
     episodes = pi_episodes(tasks=1, episodes=1, layers=(25, 26), steps=4)
     for name in ("layer_25", "layer_26", "layers_avg"):
@@ -151,9 +151,9 @@ def test_a_zero_that_stands_for_no_ratio_is_undefined_and_counted(tmp_path):
     stated = episodes[0]["summary"]["layers_avg"]["visual_linguistic_ratio"]
     stated["mean"] = float(np.mean([step["visual_linguistic_ratio"] for step in steps]))
     file = read_results_file(write_published(tmp_path, "t", episodes))
-    mean = next(d for d in disagreements(file) if d.stated.layer == "layers_avg" and d.stated.statistic == "mean")
-    assert mean.reason == ZEROS_COUNTED
-    assert mean.computed == pytest.approx(np.mean([step["visual_linguistic_ratio"] for step in steps[1:]]))
+    mean = disagreements(file).filter(layer="layers_avg", statistic="mean").row(0, named=True)
+    assert mean["reason"] == ZEROS_COUNTED
+    assert mean["computed"] == pytest.approx(np.mean([step["visual_linguistic_ratio"] for step in steps[1:]]))
 
 
 def test_a_true_zero_stays_a_ratio(tmp_path):
@@ -302,11 +302,11 @@ def test_any_masses_give_the_numbers_of_numpy(data):
         nothing = [step["visual_mass"] <= 1e-8 and step["linguistic_mass"] <= 1e-8 for step in steps]
         ratios = np.where(nothing, np.nan, [step["visual_linguistic_ratio"] for step in steps])
         averages[layer] = ratios
-        spread = spread_of(file.steps.filter(layer=str(layer)).sort("replan")["ratio"])
+        found = file.steps.filter(layer=str(layer)).select(spread()).row(0, named=True)
         finite = ratios[np.isfinite(ratios)]
-        assert spread.num_finite == finite.size
-        assert spread.num_infinite == np.isinf(ratios).sum()
-        assert spread.mean == (pytest.approx(finite.mean()) if finite.size else None)
+        assert found["replans"] - found["infinite"] - found["undefined"] == finite.size
+        assert found["infinite"] == np.isinf(ratios).sum()
+        assert found["mean"] == (pytest.approx(finite.mean()) if finite.size else None)
     overall = file.steps.filter(layer="layers_avg").sort("replan")["ratio"]
     for column, ratio in zip(averages.T, overall, strict=True):
         finite = column[np.isfinite(column)]
@@ -315,4 +315,4 @@ def test_any_masses_give_the_numbers_of_numpy(data):
         elif not np.isnan(column).any():
             assert ratio == pytest.approx(finite.mean())
     # What differs from the file's summaries always has a known reason.
-    assert all(item.reason for item in disagreements(file))
+    assert disagreements(file).filter(reason="").is_empty()
