@@ -77,20 +77,6 @@ def _solved_text(outcomes: Iterable[bool | None]) -> str:
     return f"{solved} solved" if len(known) == len(given) else f"{solved} of {len(known)} with a known outcome solved"
 
 
-def header_lines(stores: Sequence[Store]) -> list[str]:
-    """Paths, policy, recorded axes and sites of stores of one run."""
-    root = stores[0].attributes
-    policy, recording = root.policy, root.recording
-    untrained = ", UNTRAINED random weights" if policy.untrained else ""
-    return [
-        f"stores   {listing([store.path for store in stores])}",
-        f"policy   {policy.name} ({policy.checkpoint_format}: {policy.checkpoint}){untrained}",
-        f"layers   {listing(recording.layer_labels, 40)}; denoise steps {listing(recording.denoise_steps, 40)}; "
-        f"heads {listing(recording.heads, 40)}",
-        f"sites    {listing(f'{site.name} ({site.num_keys} keys)' for site in root.sites)}",
-    ]
-
-
 def lines_of_store(store: Store, tasks: Sequence[int | str] | None = None) -> Iterator[tuple[str, str]]:
     """What a store holds, as names and texts: run, recorded axes, spans and roles of every site, tasks, objects."""
     episodes = select_episodes(store, tasks)
