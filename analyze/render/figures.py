@@ -17,7 +17,6 @@ NAME_low and NAME_high of a value are its interval; `num_episodes`, if the frame
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -279,10 +278,8 @@ def _scatter(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
 
 
 #: The colours of a map: less than uniform attention (as the linguistic group), as much, more (as the visual group), and
-#: no value. They span at least so much on either side, in powers of two: tiny differences must not look large.
-_STOPS, _NO_VALUE, _LEAST_SPAN = ("#A63C00", "#E69A6B", "#F7F7F7", "#7FB2D3", "#00507D"), "#D9D9D9", 0.5
-#: Marks of the colour bar, on either side of 1.
-_FACTORS = ((1.1, 1.2, 1.3, 1.4), (1.2, 1.5, 2.0), (1.5, 2.0, 3.0))
+#: no value. They span at least this factor on either side of 1: tiny differences must not look large.
+_STOPS, _NO_VALUE, _LEAST_FACTOR = ("#A63C00", "#E69A6B", "#F7F7F7", "#7FB2D3", "#00507D"), "#D9D9D9", 1.4
 #: With more cells than this, numbers in them could not be read; with more in a row, they would touch.
 _MOST_NUMBERS, _MOST_NUMBERED_COLUMNS = 64, 12
 
@@ -292,27 +289,26 @@ def _heat_map(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
 
     In a small map every cell also shows its number.
     """
-    from matplotlib.colors import LinearSegmentedColormap
+    from matplotlib.colors import LinearSegmentedColormap, LogNorm
 
     columns, lines = (rows[o[axis]].unique(maintain_order=True).to_list() for axis in ("x", "y"))
-    log2 = np.full((len(lines), len(columns)), np.nan)
+    factors = np.full((len(lines), len(columns)), np.nan)
     for x, y, value in rows.select(o["x"], o["y"], o["value"]).drop_nulls().iter_rows():
-        with np.errstate(divide="ignore"):
-            log2[lines.index(y), columns.index(x)] = np.log2(value)
-    span = float(np.abs(log2[np.isfinite(log2)]).max(initial=_LEAST_SPAN))
+        factors[lines.index(y), columns.index(x)] = value
+    known = factors[np.isfinite(factors) & (factors > 0)]
+    most = float(np.maximum(known, 1 / known).max(initial=_LEAST_FACTOR))
+    shown = np.clip(factors, 1 / most, most)
     colors = LinearSegmentedColormap.from_list("less_more", _STOPS).with_extremes(bad=_NO_VALUE)
-    image = axes.imshow(np.clip(log2, -span, span), colors, origin="lower", aspect="auto", interpolation="none",
-                        vmin=-span, vmax=span)  # fmt: skip
-    numbered = log2.size <= _MOST_NUMBERS and len(columns) <= _MOST_NUMBERED_COLUMNS
-    for row, column in np.argwhere(np.isinf(log2) | (numbered & ~np.isnan(log2))):
-        value = log2[row, column]
-        text = _factor(value) if np.isfinite(value) else "∞" if value > 0 else "0"
-        ink = "white" if abs(value) > 0.6 * span else "black"
-        axes.text(column, row, text, ha="center", va="center", color=ink, size=7)
+    image = axes.imshow(shown, colors, LogNorm(1 / most, most), origin="lower", aspect="auto", interpolation="none")
+    numbered = factors.size <= _MOST_NUMBERS and len(columns) <= _MOST_NUMBERED_COLUMNS
+    for row, column in np.argwhere(np.isinf(factors) | (factors == 0) | (numbered & ~np.isnan(factors))):
+        ink = "white" if abs(np.log(shown[row, column])) > 0.6 * np.log(most) else "black"
+        axes.text(column, row, _factor(factors[row, column]), ha="center", va="center", color=ink, size=7)
     canvas: Any = axes.figure
     bar = canvas.colorbar(image, axes.inset_axes((1.02, 0.05, 0.025, 0.9)))
-    ticks = _factor_ticks(span)
-    bar.set_ticks(ticks, labels=[_factor(tick) for tick in ticks])
+    ratio_axis(bar.ax.yaxis, [1 / most, most])
+    bar.ax.set_ylim(1 / most, most)
+    bar.ax.yaxis.set_major_formatter(lambda value, _: _factor(value))
     bar.set_label(wrapped(o.get("label", o["value"]), 20, 3))
     bar.outline.set_visible(False)
     label_positions(axes.xaxis, [str(one) for one in columns], _MOST_LABELS)
@@ -321,21 +317,11 @@ def _heat_map(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
     axes.spines[:].set_visible(False)
 
 
-def _factor_ticks(span: float) -> list[float]:
-    """Positions of plain factors on either side of 1, spread over the span."""
-    plain = (tuple(float(np.log2(factor)) for factor in factors) for factors in _FACTORS)
-    powers = ((step, 2.0 * step, 3.0 * step) for step in range(1, 1000))
-    for marks in itertools.chain(plain, powers):
-        chosen = [mark for mark in marks if mark <= span]
-        if chosen and chosen[-1] >= 0.6 * span:
-            return [*(-mark for mark in reversed(chosen)), 0.0, *chosen]
-    return [0.0]
-
-
-def _factor(log2: float) -> str:
-    """2 to the power `log2` as text: 4 or 1/4."""
-    text = f"{2.0 ** abs(log2):.3g}"
-    return f"1/{text}" if log2 < 0 and text != "1" else text
+def _factor(value: float) -> str:
+    """4, 1/4, 0 or ∞."""
+    if value == 0 or np.isinf(value):
+        return "∞" if value else "0"
+    return f"{value:.3g}" if f"{value:.3g}" == "1" or value > 1 else f"1/{1 / value:.3g}"
 
 
 #: Kind -> its function, and the inches that its axes are high.
