@@ -18,20 +18,13 @@ import polars as pl
 
 from vla_attention.analyze.core.result import Result
 from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.stores.store_place import refuse_in_store
 
 #: How libraries in other languages (polars) write the number of an error of the operating system.
 _NUMBER_OF_OS_ERROR = re.compile(r"\bos error ([0-9]{1,4})\b")
-#: So many bytes more are written to a file to see whether the disk takes them.
-_TRIED_BYTES = 1 << 16
 #: Rows that a Parquet file holds together. The writer keeps as many in memory, some 400 bytes each, and 75 kB of
 #: each such group until the file ends.
 _ROWS_TOGETHER = 60_000
-
-
-def _refuse_in_store(path: Path, doing: str) -> None:
-    from vla_attention.schemas.stores.store_place import refuse_in_store
-
-    refuse_in_store(path, doing)
 
 
 @contextmanager
@@ -45,38 +38,21 @@ def replacing(path: Path) -> Iterator[Path]:
         BadArgument: it is in a store.
         OSError: the file cannot be written; also where a library has made an error of its own out of it.
     """
-    _refuse_in_store(path, "write")
+    refuse_in_store(path, "write")
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         yield temporary
         os.replace(temporary, path)
     except BaseException as error:
-        refused = _refusal_in(error, temporary)
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-        if refused is None:
+        # What the operating system refused while the file was written, also where polars says it in its own error.
+        refused = _NUMBER_OF_OS_ERROR.search(str(error)) if isinstance(error, Exception) else None
+        number = int(refused[1]) if refused else error.errno if isinstance(error, OSError) else None
+        if number is None or isinstance(error, UserError) or getattr(error, "filename", None) is not None:
             raise
-        raise OSError(refused.errno, refused.strerror, str(path)) from error
-
-
-def _refusal_in(error: BaseException, file: Path) -> OSError | None:
-    """What the operating system refused while a file was written, also where a library's error does not say so."""
-    if isinstance(error, OSError) and error.errno is not None and error.filename is None:
-        return error
-    if isinstance(error, (UserError, KeyboardInterrupt)) or not isinstance(error, Exception):
-        return None
-    number = _NUMBER_OF_OS_ERROR.search(str(error))
-    if number is not None:
-        return OSError(int(number[1]), os.strerror(int(number[1])))
-    if isinstance(error, OSError) or not file.exists():
-        return None
-    try:  # polars says "transport error" where the end of a Parquet file is refused
-        with file.open("ab") as more:
-            more.write(bytes(_TRIED_BYTES))
-    except OSError as refused:
-        return refused
-    return None
+        raise OSError(number, os.strerror(number), str(path)) from error
 
 
 @contextmanager
@@ -86,7 +62,7 @@ def writing(what: str, path: Path, instead: str = "another --output") -> Iterato
     Raises:
         BadArgument: `path` is in a store, or the block raised an `OSError` that is no `UserError`.
     """
-    _refuse_in_store(path, f"write {what} to")
+    refuse_in_store(path, f"write {what} to")
     try:
         yield
     except OSError as error:
