@@ -132,8 +132,8 @@ FAULTS = (
     Fault(
         "stale cache key: files that changed since",
         "analyze/cache/remembered.py",
-        "hashlib.sha256(self._digest + state + about)",
-        "hashlib.sha256(self._digest + about)",
+        "hashlib.sha256(question + state + about)",
+        "hashlib.sha256(question + about)",
         ("tests/analyze/cache",),
     ),
     Fault(

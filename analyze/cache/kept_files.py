@@ -104,9 +104,9 @@ def _first_line(content: bytes) -> dict[str, Any]:
 def kept_files(folder: Path) -> list[tuple[float, int, Path]]:
     """When each file of a cache was last used, its bytes and its path; files with other names are not the cache's."""
     files = []
-    for question in _entries(folder):
+    for question in entries(folder):
         if _QUESTION.fullmatch(question.name) and question.is_dir(follow_symlinks=False):
-            for entry in _entries(Path(question.path)):
+            for entry in entries(Path(question.path)):
                 if _FILE.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
                     with suppress(OSError):  # another process removed it
                         status = entry.stat()
@@ -127,7 +127,8 @@ def make_room(folder: Path, most_bytes: int) -> None:
             path.parent.rmdir()
 
 
-def _entries(folder: Path) -> list[os.DirEntry[str]]:
+def entries(folder: Path) -> list[os.DirEntry[str]]:
+    """What is in a folder; nothing where it cannot be read."""
     try:
         return list(os.scandir(folder))
     except OSError:

@@ -14,14 +14,22 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import vla_attention
-from vla_attention.analyze.cache.kept_files import ENDING, Arrays, kept_bytes, make_room, read_arrays, write_file
-from vla_attention.analyze.cache.places import CachePlace, cache_place, check_cache_place
+from vla_attention.analyze.cache.kept_files import (
+    ENDING,
+    Arrays,
+    entries,
+    kept_bytes,
+    make_room,
+    read_arrays,
+    write_file,
+)
+from vla_attention.analyze.cache.places import cache_place, check_cache_place
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.store_format import SEAL_GROUP
 
@@ -105,7 +113,7 @@ class CachedQuestion:
     what: str
     arguments: Mapping[str, Any]
 
-    @property
+    @cached_property
     def digest(self) -> bytes:
         """The digest of what is measured and of the arithmetic that does it."""
         given = {"what": self.what, "arguments": self.arguments, "arithmetic": arithmetic_version()}
@@ -135,66 +143,43 @@ def remembered(
         yield from measure(range(len(episodes)))
         return
     check_cache_place(place)
-    files = _Files(question, place)
+    folder, room = place.folder / question.digest.hex()[:32], place.most_bytes
     extra = arguments or [None] * len(episodes)
     # Before anything is measured: a file that changes in the meantime makes what is kept of it invalid.
-    keys = [files.key(episode, one) for episode, one in zip(episodes, extra, strict=True)]
-    missing = files.missing(keys)
+    keys = [_key(question.digest, episode, one) for episode, one in zip(episodes, extra, strict=True)]
+    paths = [folder / f"{(key or b'').hex()[:32]}{ENDING}" for key in keys]
+    kept = {entry.name for entry in entries(folder)}
+    missing = [i for i, (key, path) in enumerate(zip(keys, paths, strict=True)) if key is None or path.name not in kept]
     if progress is not None and len(missing) < len(episodes):
         progress(len(episodes) - len(missing))
     measured = iter(measure(missing) if missing else ())
     to_measure = set(missing)
     try:
-        for i, key in enumerate(keys):
+        for i, (key, path) in enumerate(zip(keys, paths, strict=True)):
             # Read when its turn comes: numbers of thousands of episodes would not fit into memory.
-            arrays = None if i in to_measure or key is None else files.read(key)
+            arrays = None if i in to_measure or key is None else read_arrays(path, key)
             if arrays is None:
                 arrays = next(measured) if i in to_measure else next(iter(measure([i])))
                 if key is not None:
-                    files.keep(key, arrays)
+                    content = kept_bytes(key, arrays)
+                    # A question that alone is larger than the cache keeps its first episodes: dropping them for later
+                    # ones would leave nothing for the next time.
+                    room -= len(content)
+                    try:
+                        if room >= 0:
+                            write_file(path, content)
+                    except OSError:
+                        room = -1  # no room on the disk, or a folder that others own
             yield arrays
     finally:
         # Although nothing may have been written: the cache may hold what a larger VLA_CACHE_SIZE had room for.
         make_room(place.folder, place.most_bytes)
 
 
-class _Files:
-    """The files of one question in the cache. Numbers do not depend on whether they can be read or written."""
-
-    def __init__(self, question: CachedQuestion, place: CachePlace) -> None:
-        self._digest = question.digest
-        self._folder = place.folder / self._digest.hex()[:32]
-        # A question that alone is larger than the cache keeps its first episodes: dropping them for later ones would
-        # leave nothing for the next time.
-        self._room = place.most_bytes
-
-    def key(self, episode: StoredEpisode, arguments: Any) -> bytes | None:
-        """The digest of question and episode, as its files are at the moment; None when these are not to be trusted."""
-        state = file_state(episode)
-        if state is None:
-            return None
-        about = f"{episode.seal.digest}\n{json.dumps(arguments, sort_keys=True)}\n".encode()
-        return hashlib.sha256(self._digest + state + about).digest()
-
-    def missing(self, keys: Sequence[bytes | None]) -> list[int]:
-        """The positions of the keys without a file."""
-        try:
-            names = set(os.listdir(self._folder))
-        except OSError:
-            names = set()
-        return [i for i, key in enumerate(keys) if key is None or self._path(key).name not in names]
-
-    def read(self, key: bytes) -> Arrays | None:
-        return read_arrays(self._path(key), key)
-
-    def keep(self, key: bytes, arrays: Arrays) -> None:
-        content = kept_bytes(key, arrays)
-        self._room -= len(content)
-        if self._room >= 0:
-            try:
-                write_file(self._path(key), content)
-            except OSError:
-                self._room = -1  # no room on the disk, or a folder that others own
-
-    def _path(self, key: bytes) -> Path:
-        return self._folder / f"{key.hex()[:32]}{ENDING}"
+def _key(question: bytes, episode: StoredEpisode, arguments: Any) -> bytes | None:
+    """The digest of question and episode, as its files are at the moment; None when these are not to be trusted."""
+    state = file_state(episode)
+    if state is None:
+        return None
+    about = f"{episode.seal.digest}\n{json.dumps(arguments, sort_keys=True)}\n".encode()
+    return hashlib.sha256(question + state + about).digest()

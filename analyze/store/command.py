@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from vla_attention.schemas.stores.store_url import StorePlace
     from vla_attention.schemas.stores.verify import EpisodeReport
 
+_DESCRIPTION = """Copy a store, for instance without its pictures or packed into few files, or make one store of several
+of one run. Without a place to copy to, print how large each part is."""
 _EXAMPLES = """examples:
   vla-attention store copy libero_10.zarr                               how large each part is
   vla-attention store copy libero_10.zarr slim.zarr --without frames
@@ -37,52 +39,28 @@ Several stores have to be of one run configuration: what differs is named. No tw
 one store shares the files of the given ones (hard links), so that it takes no space; a damage of one is then a damage
 of both, and --copy makes files of its own. What comes from a zip or from elsewhere is always copied.
 """
+_EXAMPLES_OF_VERIFY = EXAMPLES.replace("NAME", "vla-attention store")
 
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-attention store copy STORE ...` and `vla-attention store verify STORE ...`."""
     parser = command_parser("vla-attention store", "Keep stores: copies, one store of several, checks.")
     acts = parser.add_subparsers(required=True, metavar="copy|verify", parser_class=OneSentenceParser)
-    copy = acts.add_parser(
-        "copy",
-        help="a copy: smaller, packed, from elsewhere; or one store of several",
-        description="Copy a store, for instance without its pictures or packed into few files, or make one store of "
-        "several of\none run. Without a place to copy to, print how large each part is.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    copy.add_argument(
-        "stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses; several become one store"
-    )
-    copy.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        metavar="DEST",
-        help="where the copy goes, NAME.zarr; of two names without --output the second one is DEST",
-    )
-    copy.add_argument(
-        "--without",
-        nargs="+",
-        default=[],
-        metavar="PART",
-        help="frames, objects, contributions, effects, steps (default: copy all)",
-    )
-    copy.add_argument(
-        "--packed",
-        action="store_true",
-        help="one zip file an episode and an index of them; every command reads it in place, here and elsewhere",
-    )
-    copy.add_argument(
-        "--copy", action="store_true", help="of several stores: copy every file, instead of sharing it (hard links)"
-    )
-    verify = acts.add_parser(
-        "verify",
-        help="read everything back and check it; --repair moves damaged episodes aside",
-        description=DESCRIPTION,
-        epilog=EXAMPLES.replace("NAME", "vla-attention store"),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    as_is = argparse.RawDescriptionHelpFormatter
+    what = "a copy: smaller, packed, from elsewhere; or one store of several"
+    copy = acts.add_parser("copy", help=what, description=_DESCRIPTION, epilog=_EXAMPLES, formatter_class=as_is)
+    given = "NAME.zarr or addresses; several become one store"
+    copy.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help=given)
+    where = "where the copy goes, NAME.zarr; of two names without --output the second one is DEST"
+    copy.add_argument("-o", "--output", type=Path, metavar="DEST", help=where)
+    parts = "frames, objects, contributions, effects, steps (default: copy all)"
+    copy.add_argument("--without", nargs="+", default=[], metavar="PART", help=parts)
+    packed = "one zip file an episode and an index of them; every command reads it in place, here and elsewhere"
+    copy.add_argument("--packed", action="store_true", help=packed)
+    files = "of several stores: copy every file, instead of sharing it (hard links)"
+    copy.add_argument("--copy", action="store_true", help=files)
+    what, examples = "read everything back and check it; --repair moves damaged episodes aside", _EXAMPLES_OF_VERIFY
+    verify = acts.add_parser("verify", help=what, description=DESCRIPTION, epilog=examples, formatter_class=as_is)
     add_verify_arguments(verify)
     for act, answer in ((copy, _run_copy), (verify, _run_verify)):
         act.set_defaults(act=answer)
@@ -143,8 +121,7 @@ def _copy(place: StorePlace, target: Path, without: Sequence[str], *, packed: bo
         copied = copy_store(store, target, without, advance, packed=packed)
     already = f" ({copied.present} were there already)" if copied.present else ""
     left = f", {format_bytes(copied.left_bytes)} left behind: {', '.join(without)}" if without else ""
-    added = plural(copied.added, "episode")
-    print(f"{target}: {added} added{already}, {format_bytes(copied.copied_bytes)}{left}.")
+    print(f"{target}: {plural(copied.added, 'episode')} added{already}, {format_bytes(copied.copied_bytes)}{left}.")
     return 0
 
 

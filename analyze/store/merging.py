@@ -15,7 +15,7 @@ from pathlib import Path
 
 from vla_attention.analyze.store.copying import copy_store
 from vla_attention.analyze.stores.parallel import episode_reports
-from vla_attention.schemas.errors import BadArgument, UserError, listing, plural
+from vla_attention.schemas.errors import BadArgument, UserError, listing, plural, shortened
 from vla_attention.schemas.stores.digest import run_differences, with_digest
 from vla_attention.schemas.stores.durable_files import publish
 from vla_attention.schemas.stores.episode_files import refuse_links
@@ -119,7 +119,7 @@ def _check_same_run(one: Store, other: Store) -> None:
             "the store format, and no store has episodes of both. Analyses take several stores: give them both."
         )
     differences = [
-        f"{where} is {_short(here)} in the one and {_short(second)} in the other"
+        f"{where} is {shortened(repr(here))} in the one and {shortened(repr(second))} in the other"
         for where, here, second in run_differences(one.attributes, other.attributes)
     ]
     if one.run == other.run:
@@ -131,11 +131,6 @@ def _check_same_run(one: Store, other: Store) -> None:
 
 def _left_out(store: Store) -> str:
     return store.attributes.provenance.get("copied_without", "")
-
-
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _merge(stores: Sequence[Store], place: Path, progress: Callable[[int], object] | None, link: bool) -> Merged:
