@@ -7,9 +7,7 @@ points, and in no other:
     a ratio of 0 where no ratio exists               undefined: both masses 0, or "layers_avg" of layers without a
                                                      finite ratio
     no "layers_avg", no action fields, no summary    as they are; see `ResultsFile`
-    no numbers of keys, no total mass                unknown; ours from before lack them, too
-    no "num_steps_definition"                        the loop's counter in their files; in ours from before the number
-                                                     of executed actions, from which the counter is computed
+    no numbers of keys, no total mass                unknown
     unknown fields                                   skipped, and named in `ResultsFile.unused`
     one episode that is not in a list                a list of one
 """
@@ -52,7 +50,7 @@ NO_MASS = 1e-8
 RATIO = "visual_linguistic_ratio"
 #: The fields of the Cosmos scripts that name the latent frames of the queries, the visual and the text side.
 FRAME_FIELDS = ("query_frame", "visual_frame", "text_frame")
-#: Fields that only newer files of ours have, and their columns.
+#: Fields that only files of ours have, and their columns.
 _COUNTS = {"total_mass": "total_mass", "num_visual_tokens": "visual_keys", "num_text_tokens": "linguistic_keys"}
 #: The largest accepted fraction: fractions are quotients of sums in float32.
 _ONE = 1 + 1e-4
@@ -101,15 +99,14 @@ class ResultsFile:
         suite: its suite, from the file name.
         kind: the definition of its masses.
         episodes: one row per episode, in the file's order: episode (position), task_id, instruction, episode_index,
-            success (null where it is not known), num_steps (the loop's counter, `results.loop_counter`; null where it
-            cannot be known), num_replans (0 for an episode without steps).
+            success (null where it is not known), num_steps (the loop's counter, `results.loop_counter`), num_replans (0
+            for an episode without steps).
         steps: one row per (episode, replan, layer): episode (position), replan, env_step, layer (the number as a
             string, or "layers_avg"), layer_number, ratio (infinite; null where undefined), visual_mass,
             linguistic_mass, visual_fraction, linguistic_fraction (null where undefined), total_mass, visual_keys,
             linguistic_keys (null where the file has none) and, with `kind.has_action`, action_mass and action_fraction.
         summaries: the numbers of the file's own summaries: episode (position), layer, measure, statistic, value.
         zeros: how many ratios of 0 stand for "no ratio" and were read as undefined.
-        counts_actions: `num_steps` of the file is the number of executed actions, as in our files from before.
         unused: names of unknown fields, which were skipped.
     """
 
@@ -120,7 +117,6 @@ class ResultsFile:
     steps: pl.DataFrame
     summaries: pl.DataFrame
     zeros: int
-    counts_actions: bool
     unused: tuple[str, ...]
 
 
@@ -213,15 +209,8 @@ def _file(path: Path, document: Any) -> ResultsFile:
             raise _Problem(f"episodes {seen[name]} and {number} are both {name[:-1]}.")
         seen[name] = number
     steps, zeros = _with_undefined(_frame(rows))
-    of_steps = steps.group_by("episode").agg(num_replans=pl.col("env_step").n_unique(), first=pl.col("env_step").min())
+    of_steps = steps.group_by("episode").agg(num_replans=pl.col("env_step").n_unique().cast(pl.Int64))
     table = _frame(episodes).join(of_steps, on="episode", how="left", maintain_order="left")
-    # Ours differ from the published scripts' in that every summary counts the ratios that are not finite; in those from
-    # before the field that says what `num_steps` is, it is the number of actions: see `results.loop_counter`.
-    ours = any(row["statistic"] == "num_nonfinite" for row in stated)
-    counts_actions = ours and all(given.get("num_steps_definition") is None for given in document)
-    if counts_actions:
-        counter = pl.col("first") + pl.col("num_steps") - pl.col("success").cast(pl.Int64)
-        table = table.with_columns(num_steps=counter)
     unknown = [name for given in document for name in given if name not in _EPISODE_FIELDS]
     each = (step for given in document for layer in given["per_step_ratios"].values() for step in layer)
     unknown += [name for step in each for name in step if name not in _STEP_FIELDS]
@@ -229,11 +218,10 @@ def _file(path: Path, document: Any) -> ResultsFile:
         path=path,
         suite=suite_of_results_file(path),
         kind=next(iter(kinds)),
-        episodes=table.with_columns(pl.col("num_replans").fill_null(0).cast(pl.Int64)).drop("first"),
+        episodes=table.with_columns(pl.col("num_replans").fill_null(0)),
         steps=steps,
         summaries=pl.DataFrame(stated, schema=_STATED),
         zeros=zeros,
-        counts_actions=counts_actions,
         unused=tuple(dict.fromkeys(unknown)),
     )
 

@@ -246,12 +246,6 @@ def _notes(file: ResultsFile, layer: str, named: bool) -> list[str]:
     lacking = with_steps - file.steps.filter(layer=own)["episode"].n_unique()
     if lacking:
         notes.append(f"{plural(lacking, 'episode')} with steps, but without any in {_named(own)}.")
-    if file.counts_actions:
-        notes.append(
-            "num_steps is the number of executed actions in this file, which does not say so because it is an old one "
-            "of this tool; the waiting steps (the step of the first replan) are added here, and the action that solves "
-            "a task is not counted, as in the published scripts."
-        )
     if file.zeros:
         notes.append(
             f"{file.zeros} ratios of 0 stand for 'no ratio' (nothing on either side, or no layer with a finite ratio) "

@@ -63,36 +63,14 @@ def test_our_own_files_read_back_as_the_table_they_were_written_from(tmp_path):
     assert disagreements(file).is_empty()
 
 
-def as_before(path: Path, actions: dict[tuple[int, int], int]) -> None:
-    """Make a file of ours one from before: `num_steps` is the number of actions, and nothing says so."""
-    document = json.loads(path.read_text())
-    new = ("num_steps_definition", "grouping", "grouping_description", "denoise_steps")
-    for episode in document:
-        for name in new:
-            del episode[name]
-        episode["num_steps"] = actions[episode["task_id"], episode["episode_idx"]]
-        for steps in episode["per_step_ratios"].values():
-            for step in steps:
-                for name in ("total_mass", "num_visual_tokens", "num_text_tokens"):
-                    del step[name]
-    path.write_text(json.dumps(document))
-
-
-def test_num_steps_is_the_loops_counter_whoever_wrote_the_file_and_when(tmp_path):
+def test_num_steps_is_the_loops_counter_whoever_wrote_the_file(tmp_path):
     path, replans = ours(tmp_path)
     cells = replans.cells.unique(["task_id", "episode_index"]).sort("task_id", "episode_index")
-    actions = {(row["task_id"], row["episode_index"]): row["num_steps"] for row in cells.iter_rows(named=True)}
     expected = [10 + row["num_steps"] - row["success"] for row in cells.iter_rows(named=True)]
-    new = read_results_file(path)
-    assert (new.episodes["num_steps"].to_list(), new.counts_actions) == (expected, False)
-    as_before(path, actions)
-    old = read_results_file(path)
-    assert (old.episodes["num_steps"].to_list(), old.counts_actions) == (expected, True)
-    assert old.steps["visual_keys"].is_null().all()
+    assert read_results_file(path).episodes["num_steps"].to_list() == expected
     episodes = pi_episodes()
     theirs = read_results_file(write_published(tmp_path, "theirs", episodes))
     assert theirs.episodes["num_steps"].to_list() == [episode["num_steps"] for episode in episodes]
-    assert not theirs.counts_actions
 
 
 def test_files_that_say_how_many_keys_each_side_has_get_a_baseline_and_a_lift(tmp_path):
