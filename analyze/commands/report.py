@@ -17,8 +17,8 @@ from vla_attention.schemas.errors import UserError
 QUESTIONS = ("language", "failures", "analyze", "words", "objects", "effects", "overlay")
 #: Of these the answer depends on the grouping; the others have items of their own.
 _OF_GROUPS = ("analyze",)
-#: The picture beside it says nearly the same.
-_ELSEWHERE = {"ratio_distribution"}
+#: Pictures that say little beside the others; the commands draw them.
+_ELSEWHERE = {"ratio_distribution", "effects_over_time"}
 
 
 def report(question: Question, num_episodes: int = 2, num_replans: int = 8) -> list[Result]:

@@ -26,6 +26,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.result import Figure
+from vla_attention.analyze.render.files import replacing, write_text
 from vla_attention.analyze.render.pictures import pictures
 from vla_attention.analyze.render.style import (
     BASELINE_COLOR,
@@ -37,7 +38,6 @@ from vla_attention.analyze.render.style import (
     group_styles,
     label_positions,
     ratio_axis,
-    save_canvas,
     scattered,
     share_ticks,
     shortened,
@@ -60,6 +60,11 @@ _MOST_LABELS = 24
 #: What the line that evenly spread attention gives is called.
 BASELINE_NAME = "evenly spread attention"
 
+_FOR_LATEX = str.maketrans({
+    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#", "_": r"\_", "%": r"\%",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+})  # fmt: skip
+
 
 def draw(figure: Figure, style: Style | None = None) -> Canvas:
     """The picture as a matplotlib figure."""
@@ -69,9 +74,20 @@ def draw(figure: Figure, style: Style | None = None) -> Canvas:
 
 
 def save(figure: Figure, folder: Path, style: Style | None = None, formats: Sequence[str] = ()) -> list[Path]:
-    """Draw into a folder; returns the paths of the files."""
+    """Draw into a folder: NAME.png (and other formats), for a paper NAME_caption.md and .tex too; returns the paths."""
     style = style or Style()
-    return save_canvas(draw(figure, style), figure, folder, style, formats)
+    canvas, paths = draw(figure, style), []
+    # A paper's pictures are vectors; the PNG is to look at.
+    for kind in formats or (("png", "pdf") if style.paper else ("png",)):
+        paths.append(folder / f"{figure.name}.{kind}")
+        with replacing(paths[-1]) as temporary:
+            temporary.write_bytes(style.content(canvas, kind))
+    caption = f"{figure.title}. {figure.caption}".strip()
+    captions = {"md": caption, "tex": f"\\caption{{{caption.translate(_FOR_LATEX)}}}"} if style.paper else {}
+    for ending, text in captions.items():
+        paths.append(folder / f"{figure.name}_caption.{ending}")
+        write_text(paths[-1], f"{text}\n")
+    return paths
 
 
 def _plot(figure: Figure, style: Style) -> Canvas:

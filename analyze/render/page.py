@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from functools import partial
+from collections.abc import Sequence
+from functools import cache, partial
 
 import jinja2
 
-from vla_attention.analyze.core.result import Column, Figure, Result, Table
+from vla_attention.analyze.core.result import Figure, Result, Table
 from vla_attention.analyze.render.figures import draw
 from vla_attention.analyze.render.numbers import cell
 from vla_attention.analyze.render.style import Style
@@ -25,18 +24,16 @@ _SHORT = 12
 
 def fragment(result: Result) -> str:
     """One result as HTML without a page around it, for notebooks."""
-    with _environment() as environment:
-        return environment.get_template("result.html").render(result=result, title="")
+    return _environment().get_template("result.html").render(result=result, title="")
 
 
 def page(title: str, results: Sequence[Result], version: str = "") -> str:
     """The page. It needs no network and nothing beside it."""
-    with _environment() as environment:
-        return environment.get_template("page.html").render(title=title, results=results, version=version)
+    return _environment().get_template("page.html").render(title=title, results=results, version=version)
 
 
-@contextmanager
-def _environment() -> Iterator[jinja2.Environment]:
+@cache
+def _environment() -> jinja2.Environment:
     """The folder `templates/`. Every text is escaped and `visible`; an unknown name in a template is an error."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("vla_attention.analyze.render"),
@@ -47,10 +44,10 @@ def _environment() -> Iterator[jinja2.Environment]:
         lstrip_blocks=True,
     )
     environment.globals.update(
-        cell=cell, picture=_picture, most=_MOST_ROWS, sort_key=_sort_key, open_tables=partial(_tables, folded=False),
+        cell=cell, picture=_picture, most=_MOST_ROWS, open_tables=partial(_tables, folded=False),
         folded_tables=partial(_tables, folded=True),
     )  # fmt: skip
-    yield environment
+    return environment
 
 
 def _tables(result: Result, folded: bool) -> list[Table]:
@@ -73,9 +70,3 @@ def _picture(figure: Figure) -> tuple[str, bool]:
     canvas = draw(figure, style)
     content = base64.b64encode(style.content(canvas, kind)).decode()
     return f"data:image/{kind};base64,{content}", canvas.get_figwidth() > _INCHES
-
-
-def _sort_key(row: dict[str, object], column: Column) -> str:
-    """What a cell is sorted by."""
-    value = row[column.name]
-    return "" if value is None else str(value)

@@ -7,14 +7,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.analyze.core.result import Figure
-from vla_attention.analyze.render.files import replacing, write_text
 from vla_attention.schemas.safe_text import visible
 
 if TYPE_CHECKING:
@@ -146,28 +143,6 @@ class Style:
                 # Without a creation date the same data give the same file.
                 canvas.savefig(file, format=kind, metadata={"CreationDate": None} if kind == "pdf" else None)
         return file.getvalue()
-
-
-def save_canvas(canvas: Canvas, figure: Figure, folder: Path, style: Style, formats: Sequence[str] = ()) -> list[Path]:
-    """Save NAME.png (and other formats), for a paper NAME_caption.md and .tex too; returns the paths."""
-    paths = []
-    # A paper's pictures are vectors; the PNG is to look at.
-    for kind in formats or (("png", "pdf") if style.paper else ("png",)):
-        paths.append(folder / f"{figure.name}.{kind}")
-        with replacing(paths[-1]) as temporary:
-            temporary.write_bytes(style.content(canvas, kind))
-    if style.paper:
-        caption = f"{figure.title}. {figure.caption}".strip()
-        for ending, text in (("md", caption), ("tex", f"\\caption{{{caption.translate(_FOR_LATEX)}}}")):
-            paths.append(folder / f"{figure.name}_caption.{ending}")
-            write_text(paths[-1], f"{text}\n")
-    return paths
-
-
-_FOR_LATEX = str.maketrans({
-    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#", "_": r"\_", "%": r"\%",
-    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
-})  # fmt: skip
 
 
 def wrapped(text: str, width: int, lines: int) -> str:

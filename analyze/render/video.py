@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
@@ -98,15 +97,13 @@ def write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> No
 
 def _colours_of(pictures: Sequence[Image]) -> NDArray[np.uint8]:
     """A picture (1, number, 3) of the colours of all pictures; the more pixels one has, the more often, by root."""
-    counts: Counter[int] = Counter()
-    for picture in pictures:
-        coarse = np.asarray(picture, dtype=np.uint32) >> 2
-        codes, numbers = np.unique((coarse[..., 0] << 12) | (coarse[..., 1] << 6) | coarse[..., 2], return_counts=True)
-        counts.update(dict(zip(codes.tolist(), numbers.tolist(), strict=True)))
-    codes = np.array(list(counts))
-    colours = np.stack([codes >> 12, (codes >> 6) & 63, codes & 63], axis=-1) * 255 // 63
-    often = np.ceil(np.sqrt(np.array(list(counts.values())))).clip(1, 8).astype(int)
-    return np.repeat(colours, often, axis=0)[None].astype(np.uint8)
+    coarse = (np.asarray(picture, dtype=np.uint32) >> 2 for picture in pictures)
+    codes = ((one[..., 0] << 12) | (one[..., 1] << 6) | one[..., 2] for one in coarse)
+    found = [np.unique(one, return_counts=True) for one in codes]
+    colours, place = np.unique(np.concatenate([one for one, _ in found]), return_inverse=True)
+    often = np.ceil(np.sqrt(np.bincount(place, np.concatenate([counts for _, counts in found])))).clip(1, 8)
+    parts = np.stack([colours >> 12, (colours >> 6) & 63, colours & 63], axis=-1) * 255 // 63
+    return np.repeat(parts, often.astype(int), axis=0)[None].astype(np.uint8)
 
 
 def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> None:

@@ -147,7 +147,7 @@ def _sizes_text(store: Store, without: Sequence[str]) -> str:
     total = sum(sizes.values())
     lines = [f"{store.path}: {plural(len(store.episodes), 'episode')}, {format_bytes(total)}"]
     for name, size in sizes.items():
-        purpose = "rows, atoms, roles, actions: always copied" if name == REST else PARTS[name].purpose
+        purpose = "rows, atoms, roles, actions: always copied" if name == REST else PARTS[name][0]
         share = f"{size / total if total else 0.0:.0%}"
         mark = "  left behind" if name in without else ""
         lines.append(f"  {name:<13} {format_bytes(size):>8}  {share:>4}  {purpose}{mark}")

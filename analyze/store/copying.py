@@ -38,23 +38,15 @@ from vla_attention.schemas.stores.store_format import (
 from vla_attention.schemas.stores.store_place import check_place
 from vla_attention.schemas.stores.store_url import HUB_PROTOCOL, MAIN, HubAddress, StoreUrl
 
-
-@dataclass(frozen=True)
-class Part:
-    """Arrays that a copy may omit: their purpose, and a pattern of their names and of their files' names."""
-
-    purpose: str
-    pattern: str
-
-
 EFFECTS, STEPS = "effects", "steps"
-#: The parts that may be omitted. Rows, atoms, roles and the small arrays are always copied.
-PARTS: dict[str, Part] = {
-    "frames": Part("the cameras' pictures; overlays and reruns need them", r"^(camera_)?frames/"),
-    "objects": Part("what each patch shows; object: groups need it", r"^objects/"),
-    "contributions": Part("value-weighted contributions; their norms need them", r"/contribution(/|$)"),
-    EFFECTS: Part("changes of the action without an item; effects needs them", r"^effects/|/cut(/|$)"),
-    STEPS: Part("positions, touches and goals; what was done and why it failed need them", r"^steps/"),
+#: The parts that may be omitted: their purpose, and a pattern of their arrays' and files' names. Rows, atoms, roles and
+#: the small arrays are always copied.
+PARTS: dict[str, tuple[str, str]] = {
+    "frames": ("the cameras' pictures; overlays and reruns need them", r"^(camera_)?frames/"),
+    "objects": ("what each patch shows; object: groups need it", r"^objects/"),
+    "contributions": ("value-weighted contributions; their norms need them", r"/contribution(/|$)"),
+    EFFECTS: ("changes of the action without an item; effects needs them", r"^effects/|/cut(/|$)"),
+    STEPS: ("positions, touches and goals; what was done and why it failed need them", r"^steps/"),
 }
 REST = "rest"
 #: What a copy's provenance calls the address on the hub that it was copied from, with its commit.
@@ -291,7 +283,7 @@ def _without_arrays(document: bytes, without: tuple[str, ...]) -> bytes:
 
 def _part_of(path: str) -> str | None:
     """The part that an array, or a file of the episode, belongs to."""
-    return next((name for name, part in PARTS.items() if re.search(part.pattern, path)), None)
+    return next((name for name, (_, pattern) in PARTS.items() if re.search(pattern, path)), None)
 
 
 def _rename_new(source: Path, target: Path) -> None:
