@@ -15,7 +15,8 @@ from vla_attention.analyze.core.measure import Measured, means
 from vla_attention.analyze.measures.frames import LAYERS_AVG, float_values, layer_name
 from vla_attention.analyze.render.figures import lines, stacked
 from vla_attention.analyze.render.numbers import format_number
-from vla_attention.analyze.render.style import NOTE_COLOR, Style, explain, shortened, wrapped
+from vla_attention.analyze.render.style import NOTE_COLOR, Style, explain, wrapped
+from vla_attention.analyze.render.terminal import shortened
 from vla_attention.analyze.statistics.summaries import geometric_mean, summarize
 from vla_attention.schemas.errors import plural
 from vla_attention.schemas.groupings.grouping import Grouping

@@ -40,10 +40,10 @@ from vla_attention.analyze.render.style import (
     ratio_axis,
     scattered,
     share_ticks,
-    shortened,
     whole_numbers,
     wrapped,
 )
+from vla_attention.analyze.render.terminal import shortened
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

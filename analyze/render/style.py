@@ -150,11 +150,6 @@ def wrapped(text: str, width: int, lines: int) -> str:
     return "\n".join(textwrap.wrap(visible(" ".join(text.split())), width, max_lines=lines, placeholder=" …"))
 
 
-def shortened(name: str, width: int) -> str:
-    """A name that must not be broken at spaces, in at most so many characters, with … where it was cut."""
-    return name if len(name) <= width else f"{name[: width - 1]}…"
-
-
 def explain(axes: Axes, text: str) -> None:
     """Write into the middle of empty axes why they are empty."""
     axes.set_axis_off()

@@ -130,7 +130,7 @@ def _copy(
             for episode in store.episodes:
                 if episode.name not in present:
                     folder = building / episode.name
-                    sizes = _copy_episode(store, episode, folder, without, run)
+                    sizes = copy_episode(store, episode, folder, without, run)
                     copied, left, added = copied + sizes[0], left + sizes[1], added + 1
                     if pack is None:
                         _rename_new(folder, target / EPISODES_GROUP / episode.name)
@@ -201,10 +201,18 @@ def _captured(episode: StoredEpisode) -> str:
     return episode.seal.copied_from or episode.seal.digest
 
 
-def _copy_episode(
-    store: Store, episode: StoredEpisode, folder: Path, without: tuple[str, ...], run: str
-) -> tuple[int, int]:
-    """Write the copy of one episode; returns (bytes copied, bytes omitted)."""
+def copy_episode(
+    store: Store,
+    episode: StoredEpisode,
+    folder: Path,
+    without: tuple[str, ...],
+    run: str,
+    linked: Callable[[str, Path], bool] = lambda _file, _place: False,
+) -> tuple[int, int, int]:
+    """Write the copy of one episode; returns the bytes that were copied, omitted and shared.
+
+    linked: shares a file of the episode with a place, where it can.
+    """
     if beyond := files_of_no_array(store.attributes, episode.attributes, episode.files.records):
         raise CorruptEpisode(
             f"Episode {episode.name} has files that belong to no array: {listing(beyond, 5)}. They are not copied, and "
@@ -214,14 +222,16 @@ def _copy_episode(
     for name in episode.attributes.arrays:
         if _part_of(name) not in without and f"{name}/zarr.json" not in episode.files.records:
             raise CorruptEpisode(f"Episode {episode.name} lacks the array {name}: its files are gone.")
-    copied = left = 0
+    copied = left = shared = 0
     for file, record in episode.files.records.items():
         if _part_of(file) in without:
             left += record.size
             continue
         place = folder / file
         place.parent.mkdir(parents=True, exist_ok=True)
-        if file == "zarr.json" and without:
+        if linked(file, place):
+            shared += record.size
+        elif file == "zarr.json" and without:
             copied += place.write_bytes(_without_arrays(episode.sealed(file), without))
         else:
             copied += episode.copy_file(file, place)
@@ -231,7 +241,7 @@ def _copy_episode(
     else:
         seal.parent.mkdir()
         seal.write_bytes(without_other_fields(episode.source.whole(SEAL_FILE)))
-    return copied + seal.stat().st_size, left
+    return copied + seal.stat().st_size, left, shared
 
 
 def _root_document(store: Store, without: tuple[str, ...]) -> bytes:
