@@ -177,17 +177,12 @@ def _agrees(name: str) -> pl.Expr:
 
 def labels_of(files: Sequence[ResultsFile]) -> list[str]:
     """A name for each file: its suite, with as much of its folder as it takes to tell files of one suite apart."""
-    return [_label(i, files) for i in range(len(files))]
-
-
-def _label(number: int, files: Sequence[ResultsFile]) -> str:
-    file = files[number]
-    same = [(*other.path.resolve().parent.parts[1:], other.path.stem) for other in files if other.suite == file.suite]
-    parts = (*file.path.resolve().parent.parts[1:], file.path.stem)
-    if len(same) == 1:
-        return file.suite
-    # x.json and attention_ratio_results_x.json are about one suite: their file names tell them apart, else folders do.
-    depth = next(
-        depth for depth in range(1, len(parts) + 1) if sum(path[-depth:] == parts[-depth:] for path in same) == 1
-    )
-    return file.path.stem if depth == 1 else "/".join((*parts[-depth:-1], file.suite))
+    places = [(file.suite, (*file.path.resolve().parent.parts[1:], file.path.stem)) for file in files]
+    labels = []
+    for suite, parts in places:
+        same = [other for its, other in places if its == suite]
+        # x.json and attention_ratio_results_x.json are about one suite: their names tell them apart, else folders do.
+        depths = (d for d in range(1, len(parts) + 1) if sum(path[-d:] == parts[-d:] for path in same) == 1)
+        depth = 0 if len(same) == 1 else next(depths)
+        labels.append(parts[-1] if depth == 1 else "/".join((*parts[-depth:-1], suite)) if depth else suite)
+    return labels

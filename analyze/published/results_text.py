@@ -133,15 +133,14 @@ def _dataset(episodes: pl.DataFrame) -> list[str]:
     rate = f"{_percent(solved / known)} ({solved} of {known})" if known else "not known"
     if 0 < known < episodes.height:
         rate += f"; of {episodes.height - known} episodes it is not known"
+    steps = format_number(episodes.select(pl.col("num_steps").mean()).item())
     lines = [
         "Dataset:",
         f"  Episodes: {episodes.height}",
         f"  Tasks: {episodes.select('file', 'task_id').n_unique()}",
         f"  Success Rate: {rate}",
+        f"  Steps: {steps} (mean; the loop's counter at the end, waiting steps included)",
     ]
-    steps = _float(episodes["num_steps"].mean())
-    if steps is not None:
-        lines.append(f"  Steps: {format_number(steps)} (mean; the loop's counter at the end, waiting steps included)")
     if without.height:
         named = [f"task {row['task_id']} episode {row['episode_index']}" for row in without.iter_rows(named=True)]
         lines.append(f"  Without a single step, and so in no ratio: {listing(named, 6)}")
@@ -208,9 +207,10 @@ def _fractions(rows: pl.DataFrame) -> list[str]:
     lines = []
     for name in ("visual", "linguistic", "action"):
         if f"{name}_fraction" in rows.columns:
-            known = rows[f"{name}_fraction"].cast(pl.Float64).drop_nulls()
-            text = f"{_percent(_float(known.mean()))} ± {_percent(_float(known.std(ddof=0)))}"
-            lines.append(f"  {name.capitalize() + ':':<12}{text if len(known) else 'undefined'}")
+            share = pl.col(f"{name}_fraction").cast(pl.Float64)
+            mean, std = rows.select(share.mean(), share.std(ddof=0).alias("std")).row(0)
+            text = "undefined" if mean is None else f"{_percent(mean)} ± {_percent(std)}"
+            lines.append(f"  {name.capitalize() + ':':<12}{text}")
     return lines
 
 
@@ -273,9 +273,5 @@ def _named(layer: str) -> str:
     return layer_name(layer, LAYERS_AVG)
 
 
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.1f}%"
-
-
-def _float(value: object) -> float | None:
-    return value if isinstance(value, float) else None
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f}%"

@@ -245,15 +245,14 @@ def stoppable_threads(number: int, name: str) -> Iterator[ThreadPoolExecutor]:
     (`stop_signals.end_program`).
     """
     executor = ThreadPoolExecutor(number, thread_name_prefix=f"{UNAWAITED}-{name}")
+    waits = True
     try:
         yield executor
     except (KeyboardInterrupt, GeneratorExit):  # the latter where the one who takes the results was interrupted
-        executor.shutdown(wait=False, cancel_futures=True)
+        waits = False
         raise
-    except BaseException:
-        executor.shutdown(wait=True, cancel_futures=True)
-        raise
-    executor.shutdown(wait=True)
+    finally:
+        executor.shutdown(wait=waits, cancel_futures=True)
 
 
 def in_order(submit: Callable[[Item], Future[Result]], items: Iterable[Item], begun_at_once: int) -> Iterator[Result]:
