@@ -105,6 +105,8 @@ def why_not_pooled(files: Sequence[ResultsFile], side_by_side: bool) -> str:
     kinds: dict[ResultsKind, list[ResultsFile]] = {}
     for file in files:
         kinds.setdefault(file.kind, []).append(file)
+    repeated = sorted({file.suite for file in files if sum(file.suite == other.suite for other in files) > 1})
+    why = ""
     if len(kinds) > 1:
         parts = "; ".join(f"{listing([file.path for file in of_kind], 3)}: {kind}" for kind, of_kind in kinds.items())
         if not side_by_side:
@@ -112,19 +114,11 @@ def why_not_pooled(files: Sequence[ResultsFile], side_by_side: bool) -> str:
                 f"These results files hold masses of different kinds, which cannot be summarised together ({parts}); "
                 "give one kind at a time, or see them side by side with --plot-comparison."
             )
-        return _paragraph(f"No COMBINED: the files hold masses of different kinds ({parts}).")
-    repeated = sorted({file.suite for file in files if sum(file.suite == other.suite for other in files) > 1})
-    if repeated:
-        paths = [file.path for file in files if file.suite in repeated]
-        return _paragraph(
-            f"No COMBINED: {listing(paths, 4)} are about the same suite ({listing(repeated)}), that is, different runs "
-            "of it."
-        )
-    return ""
-
-
-def _paragraph(text: str) -> str:
-    return "\n".join(wrapped([text])) + "\n"
+        why = f"No COMBINED: the files hold masses of different kinds ({parts})."
+    elif repeated:
+        same, suites = listing([file.path for file in files if file.suite in repeated], 4), listing(repeated)
+        why = f"No COMBINED: {same} are about the same suite ({suites}), that is, different runs of it."
+    return "\n".join([*wrapped([why]), ""]) if why else ""
 
 
 def _dataset(episodes: pl.DataFrame) -> list[str]:

@@ -21,7 +21,6 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import replace
 from functools import partial
-from importlib.metadata import version
 from multiprocessing.connection import wait as wait_for_end
 from types import ModuleType
 from typing import Any, TypeVar
@@ -230,11 +229,9 @@ def _cluster(address: str) -> Iterator[tuple[Executor, int]]:
 
 
 def _package_version() -> str:
-    """The version of the installed package; empty without it."""
-    try:
-        return version("vla-attention")
-    except ImportError:
-        return ""
+    from vla_attention import __version__
+
+    return __version__
 
 
 @contextmanager
