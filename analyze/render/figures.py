@@ -110,7 +110,7 @@ def _plot(figure: Figure, style: Style) -> Canvas:
         axes.set_ylabel(o.get("ylabel", "" if figure.kind == "forest" else o.get("y") or o["value"]))
         if figure.kind in ("forest", "lines") and "num_episodes" in rows.columns:
             _say_counts(axes, rows, style)
-    _framed(canvas, figure, (height if isinstance(height, float) else height(rows, o)), style)
+    _framed(canvas, figure, height(rows, o), style)
     return canvas
 
 
@@ -341,14 +341,11 @@ def _factor(value: float) -> str:
 
 
 #: Kind -> its function, and the inches that its axes are high.
-_KINDS: dict[
-    str, tuple[Callable[[Axes, pl.DataFrame, Options], None], float | Callable[[pl.DataFrame, Options], float]]
-]
-_KINDS = {
+_KINDS: dict[str, tuple[Callable[[Axes, pl.DataFrame, Options], None], Callable[[pl.DataFrame, Options], float]]] = {
     "forest": (_forest, lambda rows, o: 0.55 + (0.17 if rows.height > 30 else 0.21) * max(rows.height, 2)),
-    "lines": (lines, 3.0),
-    "stacked": (stacked, 3.0),
-    "distribution": (_distribution, 3.0),
+    "lines": (lines, lambda rows, o: 3.0),
+    "stacked": (stacked, lambda rows, o: 3.0),
+    "distribution": (_distribution, lambda rows, o: 3.0),
     "heat_map": (_heat_map, lambda rows, o: 0.9 + min(6.0, 0.3 * rows[o["y"]].n_unique())),
-    "scatter": (_scatter, 3.4),
+    "scatter": (_scatter, lambda rows, o: 3.4),
 }

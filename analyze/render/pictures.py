@@ -88,13 +88,15 @@ def pictures(figure: Figure, style: Style) -> Canvas:
     # As wide as a plot, unless the texts at the pictures would touch.
     wide = (style.width(wide=False) - margin) / across < _LEAST
     side = min((style.width(wide) - margin) / across - _GAP, _LARGEST)
-    for name in {"above", "below"}.intersection(frame.columns):
+    heights_of = dict.fromkeys(("above", "below"), 0.0)
+    for name in heights_of.keys() & set(frame.columns):
         texts = frame[name].fill_null("").str.split("\n").to_list()
         broken = ["\n".join(wrapped(line, int(_LETTERS * side), 3) for line in text) for text in texts]
+        heights_of[name] = _LINE * max(text.count("\n") + bool(text) for text in broken)
         frame = frame.with_columns(pl.Series(name, broken))
     shown = [(one, *_lit(one, o)) for one in frame.iter_rows(named=True)]
     heights = {row: max(side * len(at) / len(at[0]) for one, at, _ in shown if one["row"] == row) for row in rows}
-    above, below = (_LINE * _lines_of(frame, name) for name in ("above", "below"))
+    above, below = heights_of.values()
     high = sum(heights.values()) + len(rows) * (above + below + 0.14)
     top = 0.06 if style.paper else _BAND
     words, has_map = _words(frame), any(values is not None for *_, values in shown)
@@ -146,10 +148,6 @@ def _lit(one: Mapping[str, Any], o: Mapping[str, Any]) -> tuple[NDArray[np.uint8
         return picture, None
     values = np.array(one["map"], dtype=np.float64)
     return lit(picture, values, o["high"], bool(o.get("smooth"))), values
-
-
-def _lines_of(frame: pl.DataFrame, name: str) -> int:
-    return max((text.count("\n") + 1 for text in frame[name] if text), default=0) if name in frame.columns else 0
 
 
 def _around(
