@@ -25,9 +25,9 @@ from vla_attention.analyze.core.same_calls import held_by_one
 from vla_attention.analyze.core.words_of_numbers import with_interval
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.task_families import sampling_of
-from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.exact_tests import mcnemar
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
+from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.safe_text import visible

@@ -109,10 +109,7 @@ def noise_of(pairs: Sequence[tuple[Array, Array]], spread: Array) -> Noise:
     # Several episodes that do not differ agree on the value; a single one says nothing of others.
     alike = (np.nan, np.nan) if len(pairs) < 2 else None
     intervals = [(one.interval(), one.value) for one in spreads]
-    ends = np.array(
-        [(interval.low, interval.high) if interval else alike or (value, value) for interval, value in intervals],
-        np.float64,
-    )
+    ends = np.array([interval or alike or (value, value) for interval, value in intervals], np.float64)
     values = np.array([[one.value for one in spreads], *ends.T], dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         change, low, high = np.where(spread > 0, np.sqrt(values) / spread, np.nan)

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping
 import polars as pl
 
 from vla_attention.analyze.core.result import Column
-from vla_attention.analyze.statistics.episode_intervals import Sampling
+from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 
 #: Axis -> its columns in tables of `core.measure` and how they are shown; those of an episode come with each row.

@@ -34,7 +34,7 @@ from vla_attention.analyze.core.runs import Run
 from vla_attention.analyze.core.word_items import items_of
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.statistics.episode_intervals import Sampling
+from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.errors import BadArgument
 
 #: What is compared -> the columns that name an item of it, and inside of which looks are counted.

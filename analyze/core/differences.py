@@ -18,9 +18,8 @@ from vla_attention.analyze.core.estimate import estimate, with_q
 from vla_attention.analyze.core.levels import Levels
 from vla_attention.analyze.core.runs import Run, RunsDiffer
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, float_values
-from vla_attention.analyze.statistics.episode_intervals import Sampling, about_row
-from vla_attention.analyze.statistics.intervals import ends
 from vla_attention.analyze.statistics.two_samples import mean_difference
+from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.stores.store_format import episode_name
 
@@ -131,10 +130,10 @@ def differences_unpaired(
             is_other, units = part["_other"].to_numpy(), sampling.units(part)
             if is_other.all() or not is_other.any():
                 continue  # a task of one run only
-            one = mean_difference(float_values(part["value"]), is_other, units, decide=True)
-            low, high = ends(one.difference.interval())
+            one = mean_difference(float_values(part["value"]), is_other, units)
+            low, high = one.difference.interval() or (None, None)
             rows.append(
-                {**part.select(*names, *item).row(0, named=True), "num_tasks": units.num_tasks, **about_row(units)}
+                {**part.select(*names, *item).row(0, named=True), "num_tasks": units.num_tasks, **units.about}
                 | {"intervals": one.estimand.value, "num_first": one.num_second, "num_other": one.num_first}
                 | {"mean_first": one.mean_second, "mean_other": one.mean_first, "difference": one.difference.value}
                 | {"difference_low": low, "difference_high": high, "difference_p": one.difference.p_value(0.0)}

@@ -21,7 +21,7 @@ from vla_attention.analyze.core.runs import Run
 from vla_attention.analyze.core.same_calls import check_same_calls
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.masses import finite_mean
-from vla_attention.analyze.statistics.episode_intervals import Sampling
+from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.errors import BadArgument
 
 _SCALES: dict[str, Scale] = {

@@ -12,8 +12,7 @@ from vla_attention.analyze.measures.baselines import baseline_notes, contributio
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
 from vla_attention.analyze.measures.task_families import sampling_of, units_of
-from vla_attention.analyze.statistics.episode_intervals import Sampling
-from vla_attention.analyze.statistics.units import Units
+from vla_attention.analyze.statistics.units import Sampling, Units
 from vla_attention.analyze.stores.checking import faults_of_each
 from vla_attention.analyze.stores.read_ahead import read_ahead
 from vla_attention.analyze.stores.run_notes import run_notes

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.statistics.episode_intervals import Sampling, TaskName
-from vla_attention.analyze.statistics.units import Estimand, Units
+from vla_attention.analyze.statistics.units import Estimand, Sampling, Units
 from vla_attention.schemas.errors import UserError, listing
 from vla_attention.schemas.safe_text import visible
 
@@ -26,7 +25,7 @@ def sampling_of(estimand: Estimand, selected: Iterable[SelectedEpisode]) -> Samp
     Raises:
         MixedFamilies: episodes of a task know different ones, and intervals are by families.
     """
-    families: dict[TaskName, str] = {}
+    families: dict[tuple[str, int], str] = {}
     for item in selected:
         family, task = item.episode.attributes.task_family, item.task
         known = families.setdefault(task, family) if family else ""

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from vla_attention.analyze.core.levels import over_replans, task_cells, task_groups
 from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG, float_values
 from vla_attention.analyze.published.results_reader import ResultsFile, ResultsKind, SummaryNumber
-from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.summaries import SampleSummary, summarize
+from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 
 #: The group of what is left: 1 minus the known fractions.

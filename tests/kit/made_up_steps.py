@@ -15,7 +15,7 @@ from vla_attention.analyze.core.levels import SIDES, Levels, task_cells, task_gr
 from vla_attention.analyze.core.measure import Measured
 from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS
 from vla_attention.analyze.published.results_writer import documents_of, write_results
-from vla_attention.analyze.statistics.episode_intervals import Sampling
+from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.schemas.results import FrameProxy, results_file_name
