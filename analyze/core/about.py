@@ -10,7 +10,7 @@ import polars as pl
 
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.task_families import units_of, unknown_families
+from vla_attention.analyze.measures.task_families import unknown_families
 from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Units
 from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.schemas.errors import listing, plural
@@ -70,7 +70,7 @@ def _held(units: Units) -> str:
 def only(question: Question, episodes: pl.DataFrame) -> Question:
     """The question about the episodes in a table, by `EPISODE_ID`; about all where the table is empty."""
     wanted = set(episodes.select(EPISODE_ID).iter_rows())
-    left = [item for item in question.selected if (*item.task, item.episode.attributes.episode_index) in wanted]
+    left = [item for item in question.selected if item.key in wanted]
     return replace(question, selected=tuple(left) or question.selected)
 
 
@@ -104,7 +104,7 @@ def enough(question: Question, what: str = "the numbers") -> str:
     units = question.units
     if units.estimand.of_other_tasks:
         return ""
-    families = units_of(question.sampling, question.selected).num_families
+    families = question.sampling.units(question.tasks).num_families
     if families is None or families >= FEWEST_FAMILIES:
         return ""
     kinds = "one kind" if families == 1 else f"{families} kinds"

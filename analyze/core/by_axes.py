@@ -9,11 +9,9 @@ import numpy as np
 import polars as pl
 
 from vla_attention.analyze.core.axes import OF_ROWS
-from vla_attention.analyze.core.lazy_frames import frame_of_episodes
 from vla_attention.analyze.core.levels import MORE, Levels, cells_of
 from vla_attention.analyze.core.measure import Measured, means
-from vla_attention.analyze.measures.alignment import episode_timing
-from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG
+from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG, frame_of_episodes
 
 #: Parts of an episode's time.
 TIME_PARTS = 20
@@ -92,11 +90,9 @@ def with_time(rows: pl.DataFrame, measured: Sequence[Measured]) -> pl.DataFrame:
     wanted = set(rows.select(EPISODE_ID).unique().rows())
     parts = []
     for one in measured:
-        attributes = one.item.episode.attributes
-        key = (one.item.store.suite, attributes.task_id, attributes.episode_index)
-        if key not in wanted:
+        if (key := one.item.key) not in wanted:
             continue
-        starts, num_steps = episode_timing(one.item.store.attributes, one.item.episode, one.env_step)
+        starts, num_steps = one.item.timing(one.env_step)
         edges = np.linspace(0.0, 1.0, TIME_PARTS + 1)
         ends = np.append(starts[1:], num_steps)
         shares = np.minimum(edges[1:, None], ends / num_steps) - np.maximum(edges[:-1, None], starts / num_steps)

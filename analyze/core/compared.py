@@ -210,7 +210,7 @@ def strip_of_pair(
     items, rows = [], []
     for row, (side, of) in enumerate((("first", part.first), ("other", part.other))):
         key = (pair["suite"], pair["task_id"], pair[f"episode_{side}"])
-        named = {(*item.task, item.episode.attributes.episode_index): item for item in of.run.question.selected}
+        named = {item.key: item for item in of.run.question.selected}
         items.append(item := named[key])
         last, steps = item.episode.attributes.num_replans - 1, item.episode.attributes.env_step
         cameras = [camera.name for camera in item.store.attributes.policy.cameras]

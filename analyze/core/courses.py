@@ -9,7 +9,6 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.alignment import episode_timing
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.statistics.leaving import Array, band, by_replan, distance, leaves_at, path_of
 from vla_attention.schemas.episode_steps import HAND, POSES
@@ -65,7 +64,7 @@ def course_of(item: SelectedEpisode) -> Course | None:
     if steps is None:
         return None
     poses = item.episode.read(POSES).astype(np.float64)[..., :3]
-    starts, _ = episode_timing(item.store.attributes, item.episode, item.episode.read("env_step").astype(np.int64))
+    starts, _ = item.timing(item.episode.read("env_step").astype(np.int64))
     named = {thing.name for thing in item.episode.attributes.objects if thing.of_interest}
     things = [i for i, name in enumerate(steps.bodies) if name != HAND]
     things = [i for i in things if steps.bodies[i] in named] or things

@@ -33,8 +33,7 @@ def pairing(run: Run, ignore_seed: bool) -> pl.DataFrame:
     """`EPISODE_ID`, instruction and `PAIR` of each selected episode; of other seeds too where they may differ."""
     rows = [
         (
-            *item.task,
-            item.episode.attributes.episode_index,
+            *item.key,
             item.episode.attributes.instruction,
             item.episode.attributes.initial_state,
             0 if ignore_seed else item.store.attributes.protocol.seed,

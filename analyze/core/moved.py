@@ -71,8 +71,7 @@ def moved_episodes(base: Run, reruns: Sequence[Run]) -> pl.DataFrame:
         (
             run.name,
             is_noise(run),
-            *member.item.task,
-            member.item.episode.attributes.episode_index,
+            *member.item.key,
             len(others),
             *finite_mean(changes_of(member, others, spread)).tolist(),
         )

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.baselines import uniform_keys
+from vla_attention.analyze.measures.masses import uniform_keys
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
@@ -141,7 +141,7 @@ def mean_rows(item: SelectedEpisode, selection: Selection, site: str) -> NDArray
     """
     total, count = 0.0, 0
     for part in layer_rows(item.store.attributes, item.episode, selection, site, per_head=True):
-        if selection.is_first_of_block(part.layer):
+        if part.layer in selection.once:
             total, count = total + part.rows.mean(axis=1, dtype=np.float64), count + 1
     return np.asarray(total) / count
 
@@ -149,6 +149,5 @@ def mean_rows(item: SelectedEpisode, selection: Selection, site: str) -> NDArray
 def mean_uniform(item: SelectedEpisode, selection: Selection) -> NDArray[np.float64]:
     """What `mean_rows` is for uniform attention, shape (replan or 1, key)."""
     uniform = uniform_keys(item, selection).mean(axis=(2, 3))
-    once = [i for i in range(len(selection.blocks)) if selection.is_first_of_block(i)]
-    means: NDArray[np.float64] = (uniform[:, once] if uniform.shape[1] > 1 else uniform).mean(axis=1)
+    means: NDArray[np.float64] = (uniform[:, list(selection.once)] if uniform.shape[1] > 1 else uniform).mean(axis=1)
     return means

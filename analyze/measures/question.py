@@ -8,10 +8,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from vla_attention.analyze.measures.baselines import baseline_notes, contribution_notes
-from vla_attention.analyze.measures.question_settings import AnalysisSettings
+import polars as pl
+
+from vla_attention.analyze.measures.question_settings import AnalysisSettings, union_of
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
-from vla_attention.analyze.measures.task_families import sampling_of, units_of
+from vla_attention.analyze.measures.task_families import sampling_of
 from vla_attention.analyze.statistics.units import Sampling, Units
 from vla_attention.analyze.stores.checking import faults_of_each
 from vla_attention.analyze.stores.read_ahead import read_ahead
@@ -30,7 +31,7 @@ from vla_attention.schemas.groupings.grouping import Grouping, parse_group_argum
 from vla_attention.schemas.groupings.vocabulary import Vocabulary
 from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
-from vla_attention.schemas.stores.store_format import RootAttributes, StoreError
+from vla_attention.schemas.stores.store_format import CALLERS_MODULES, RootAttributes, StoreError
 
 DEFAULT_GROUPING = "default"
 
@@ -72,21 +73,17 @@ class Question:
     @property
     def remarks(self) -> tuple[str, ...]:
         """The lines that every result with numbers has: what was left out, what the baselines are of, and the notes."""
-        return (*self._remarks_on_numbers, *self.notes)
+        return (*self.skipped, *run_notes(self.episodes), *baseline_notes(self.stores), *self.notes)
 
     @property
-    def _remarks_on_numbers(self) -> tuple[str, ...]:
-        return (
-            *self.skipped,
-            *run_notes(self.episodes),
-            *baseline_notes(self.stores),
-            *contribution_notes(self.stores),
-        )
+    def tasks(self) -> pl.DataFrame:
+        """The task of each episode: suite, task_id."""
+        return pl.DataFrame([item.task for item in self.selected], schema=["suite", "task_id"], orient="row")
 
     @property
     def units(self) -> Units:
         """The units of intervals over all selected episodes."""
-        return units_of(self.sampling, self.selected).decided()
+        return self.sampling.units(self.tasks).decided()
 
     @property
     def num_tasks(self) -> int:
@@ -102,6 +99,27 @@ class Question:
     def untrained(self) -> bool:
         """Whether a store's policy has random weights."""
         return any(store.attributes.policy.untrained for store in self.stores)
+
+
+def baseline_notes(stores: Sequence[Store]) -> tuple[str, ...]:
+    """Lines about stores of version 1 whose baseline may be that of too many keys, or contributions not what keys add.
+
+    In policies that `vla-capture` builds all queries of a replan see the same keys, but for a growing span, which is
+    counted; in other policies of torch nobody noted who sees what.
+    """
+    old = [
+        (store.path.name, root.recording.contributions)
+        for store in stores
+        if (root := store.attributes).store_version == 1 and root.policy.checkpoint_format == CALLERS_MODULES
+    ]
+    names, contributions = [name for name, _ in old], [name for name, has in old if has]
+    lines = (
+        (names, "Baselines of {} (version 1) are of the keys that any query of any layer sees; where queries or layers "
+         "see different keys, lifts are off. A new recording has baselines by query and layer."),
+        (contributions, "Contributions of {} (version 1) end at the output projection; where the policy has a gate or "
+         "a norm behind it, they are off. A new recording follows them to the residual stream."),
+    )  # fmt: skip
+    return tuple(line.format(listing(which)) for which, line in lines if which)
 
 
 #: Site and tasks -> the episodes with their tokens, and their vocabulary.
@@ -138,19 +156,9 @@ def ask(stores: Sequence[Store], settings: AnalysisSettings, known: KnownEpisode
         if known is not None and not settings.skip_corrupt:
             known[site, settings.tasks] = selected, vocabulary
     grouping = choose_grouping(settings, vocabulary)
-    notes = _denoise_notes(root, selection, grouping)
-    sampling = sampling_of(settings.intervals, selected)
+    sampling, notes = sampling_of(settings.intervals, selected), _denoise_notes(root, selection, grouping)
     return Question(
-        stores=tuple(stores),
-        settings=settings,
-        selection=selection,
-        site=site,
-        selected=selected,
-        grouping=grouping,
-        vocabulary=vocabulary,
-        sampling=sampling,
-        skipped=tuple(skipped),
-        notes=notes,
+        tuple(stores), settings, selection, site, selected, grouping, vocabulary, sampling, tuple(skipped), notes
     )
 
 
@@ -174,17 +182,13 @@ def choose_grouping(settings: AnalysisSettings, vocabulary: Vocabulary) -> Group
         default = find_grouping(DEFAULT_GROUPING, vocabulary).groups
         wanted = dict.fromkeys((*ratio.numerator, *ratio.denominator))
         known = {name for name, _ in own}
-        own += [(name, _union(default[name])) for name in wanted if name in default and name not in known]
+        own += [(name, union_of(default[name])) for name in wanted if name in default and name not in known]
     base = None
     if settings.grouping is not None or not settings.groups:
         base = find_grouping(settings.grouping or DEFAULT_GROUPING, vocabulary)
     grouping = with_groups(base, own) if own else base
     assert grouping is not None
     return grouping if ratio is None else replace(grouping, ratio=ratio)
-
-
-def _union(selectors: Sequence[str]) -> str:
-    return " | ".join(f"({selector})" for selector in selectors)
 
 
 def _denoise_notes(root: RootAttributes, selection: Selection, grouping: Grouping) -> tuple[str, ...]:

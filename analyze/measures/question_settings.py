@@ -112,10 +112,11 @@ def _groups(value: Mapping[str, str | Sequence[str]] | Sequence[str]) -> tuple[s
         return (value,)
     if not isinstance(value, Mapping):
         return tuple(value)
-    return tuple(f"{name}={_union(selectors)}" for name, selectors in value.items())
+    return tuple(f"{name}={union_of(selectors)}" for name, selectors in value.items())
 
 
-def _union(selectors: str | Sequence[str]) -> str:
+def union_of(selectors: str | Sequence[str]) -> str:
+    """Selectors as one."""
     return selectors if isinstance(selectors, str) else " | ".join(f"({selector})" for selector in selectors)
 
 
