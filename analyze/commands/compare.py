@@ -9,7 +9,7 @@ import polars as pl
 
 from vla_attention.analyze.commands.compare_tables import ALL, figures_of, tables_of
 from vla_attention.analyze.commands.language import SHOWN_AT, listens, whatever
-from vla_attention.analyze.core.about import UNTRAINED, notes, solved
+from vla_attention.analyze.core.about import UNTRAINED, notes, solved, with_interval
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.compared import (
     Compared,
@@ -18,11 +18,9 @@ from vla_attention.analyze.core.compared import (
     compared,
 )
 from vla_attention.analyze.core.differences import PAIR
-from vla_attention.analyze.core.moved import is_noise, moved, moved_episodes
+from vla_attention.analyze.core.reruns import held_by_one, is_noise, moved, moved_episodes
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
 from vla_attention.analyze.core.runs import Run, check_comparable, noted_differences
-from vla_attention.analyze.core.same_calls import held_by_one
-from vla_attention.analyze.core.words_of_numbers import with_interval
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.task_families import sampling_of
 from vla_attention.analyze.statistics.exact_tests import mcnemar

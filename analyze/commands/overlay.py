@@ -21,9 +21,9 @@ from vla_attention.analyze.core.camera_maps import (
     patch_table,
     scale_end,
     stored_picture,
+    upright,
 )
 from vla_attention.analyze.core.levels import levels_of
-from vla_attention.analyze.core.patch_pictures import upright
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.question import Question

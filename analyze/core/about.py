@@ -1,25 +1,54 @@
-"""What every result says of its run first, and what it notes beside its numbers."""
+"""What every result says of its run first, what it notes beside its numbers, columns and phrases that several share."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import polars as pl
 
+from vla_attention.analyze.core.result import Column
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.task_families import unknown_families
 from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Units
 from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.schemas.errors import listing, plural
+from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.stores.store_format import RootAttributes
 
 #: With fewer units than these, an interval about other tasks covers less where these are skewed.
 _FEW = 10
 #: What untrained weights mean for every number.
 UNTRAINED = "The weights are untrained (random): the numbers show that the pipeline works, and nothing about a policy."
+GROUP_COLUMNS = (
+    Column("group", "text"),
+    Column("fraction", "percent", "of the attention", "part of the attention to all groups"),
+    Column(
+        "lift", "factor", "times even", "attention per token, over what it would be if spread evenly over all tokens"
+    ),
+    Column("keys", "number", "tokens"),
+)
+RATIO_COLUMNS = (
+    Column(
+        "geometric_mean",
+        "factor",
+        "ratio",
+        "attention to one side over the other, geometric mean over layers, calls and tasks",
+    ),
+    Column("uniform_ratio", "number", "if even", "the ratio if attention were spread evenly over all tokens"),
+    Column("ratio_lift", "factor", "per token", "ratio / ratio if even"),
+)
+NORM_COLUMNS = (
+    Column("layer", "text"),
+    Column("visual_norm", "number", "pictures", "length of the vector that the keys add to the residual stream"),
+    Column("linguistic_norm", "number", "text"),
+    Column("geometric_mean", "factor", "ratio"),
+    Column("uniform_ratio", "number", "if even", "the ratio if attention were shared out evenly between the segments"),
+    Column("ratio_lift", "factor", "over even", "ratio / ratio if even"),
+)
 
 
 def about(question: Question) -> list[str]:
@@ -111,3 +140,20 @@ def enough(question: Question, what: str = "the numbers") -> str:
     return (
         f"The {tasks} tasks are of {kinds} (sentences of one template): {what} are about these tasks, not about others."
     )
+
+
+def sides(grouping: Grouping) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The groups on both sides of the ratio."""
+    assert grouping.ratio is not None
+    return grouping.ratio.numerator, grouping.ratio.denominator
+
+
+def inverse(value: float, low: float | None, high: float | None) -> list[float | None]:
+    """1 / value with its interval."""
+    return [1 / value, None if high is None else 1 / high, None if low is None else 1 / low]
+
+
+def with_interval(row: Mapping[str, Any], name: str) -> str:
+    """`2.89 [2.13, 3.93]`; the value alone without an interval."""
+    low, high = row[f"{name}_low"], row[f"{name}_high"]
+    return f"{row[name]:.3g}" + ("" if low is None else f" [{low:.3g}, {high:.3g}]")

@@ -21,6 +21,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.core.camera_maps import PictureMap
 from vla_attention.analyze.core.object_shares import ALL_CAMERAS, ITEM, cameras_of, covered, names_of
 from vla_attention.analyze.core.pointing_and_iou import (
     centre_of_mass,
@@ -39,7 +40,6 @@ from vla_attention.analyze.core.pointing_and_iou import (
 from vla_attention.analyze.measures.frames import EPISODE_KEYS, Axis, head_axis, layer_axis, long_table, with_average
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.not_in_memory import OnDisk
-from vla_attention.analyze.measures.patch_maps import PictureMap
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, positions_by_task
 from vla_attention.analyze.stores.parallel import each_episode

@@ -26,8 +26,7 @@ from vla_attention.analyze.core.action_changes import (
     root_mean_square_change,
     units_of_recorded,
 )
-from vla_attention.analyze.core.axes import with_families
-from vla_attention.analyze.core.by_axes import weighted
+from vla_attention.analyze.core.axes import weighted, with_families
 from vla_attention.analyze.core.contributions import joint_norm, selected_gram, whole_segments
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.measure import Items, Measured, means, measure

@@ -13,12 +13,11 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.core.about import enough
+from vla_attention.analyze.core.about import enough, with_interval
 from vla_attention.analyze.core.action_changes import ActionSpread, action_spread
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.core.result import Column, Figure, Finding, Table
-from vla_attention.analyze.core.words_of_numbers import with_interval
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, long_table, replan_axis
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.question import Question

@@ -18,9 +18,9 @@ from tests.kit.stores import StoreSpec, rerun_source, small_steps, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.commands.failures import failures
 from vla_attention.analyze.core.behaviour import NO_TOUCH, OTHER_GOAL, OTHER_TOUCH, TOLD_SO, UNFINISHED
-from vla_attention.analyze.core.patch_pictures import upright
+from vla_attention.analyze.core.camera_maps import upright
+from vla_attention.analyze.core.courses import TOGETHER, band, by_replan, distance, leaves_at, path_of
 from vla_attention.analyze.render.figures import draw
-from vla_attention.analyze.statistics.leaving import TOGETHER, band, by_replan, distance, leaves_at, path_of
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.reader import open_store
 
