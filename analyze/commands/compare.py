@@ -12,12 +12,12 @@ from vla_attention.analyze.commands.language import SHOWN_AT, listens, whatever
 from vla_attention.analyze.core.about import UNTRAINED, notes, solved, with_interval
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.compared import (
+    PAIR,
     Compared,
     RunValues,
     by_themselves,
     compared,
 )
-from vla_attention.analyze.core.differences import PAIR
 from vla_attention.analyze.core.reruns import held_by_one, is_noise, moved, moved_episodes
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
 from vla_attention.analyze.core.runs import Run, check_comparable, noted_differences

@@ -123,13 +123,13 @@ def without_a_side(root: RootAttributes, site: str) -> str:
     )
 
 
-def enough(question: Question, what: str = "the numbers") -> str:
+def enough(question: Question) -> str:
     """Whether the data suffice to say something about other episodes and tasks, as a sentence; empty where they do."""
     episodes, tasks = len(question.selected), question.num_tasks
     if episodes == 1:
         return "One episode shows nothing about others: there is no interval."
     if tasks == 1:
-        return f"One task of {episodes} episodes: {what} show nothing about other tasks."
+        return f"One task of {episodes} episodes: the numbers show nothing about other tasks."
     units = question.units
     if units.estimand.of_other_tasks:
         return ""
@@ -137,9 +137,8 @@ def enough(question: Question, what: str = "the numbers") -> str:
     if families is None or families >= FEWEST_FAMILIES:
         return ""
     kinds = "one kind" if families == 1 else f"{families} kinds"
-    return (
-        f"The {tasks} tasks are of {kinds} (sentences of one template): {what} are about these tasks, not about others."
-    )
+    which = f"The {tasks} tasks are of {kinds} (sentences of one template)"
+    return f"{which}: the numbers are about these tasks, not about others."
 
 
 def sides(grouping: Grouping) -> tuple[tuple[str, ...], tuple[str, ...]]:

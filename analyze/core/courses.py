@@ -127,31 +127,33 @@ def _apart(course: Course, others: Sequence[Course]) -> Array:
 
 
 def strip_of(one: Leaving) -> pl.DataFrame:
-    """Where the pictures around the replan lie at which an episode leaves; none where the store has no pictures.
+    """The `strip` of the failed episode, and below it of its twin, around the replan at which the first leaves."""
+    items, last = (one.item, one.twin), one.item.episode.attributes.num_replans - 1
+    moments = [replan for shift in _SHOWN if 0 <= (replan := (one.replan or 0) + shift) <= last]
+    shown = []
+    for who, item in zip(("failed", "solved"), items, strict=True):
+        end = item.episode.attributes.num_replans - 1
+        marks = {one.replan: ", leaves"} if item is one.item else {}
+        labels = {at: f"{who}, step {int(one.starts[at])}{marks.get(at, '')}" for at in moments}
+        shown.append([(at, text) if at <= end else (end, f"{who}, at its end") for at, text in labels.items()])
+    return strip(items, shown)
+
+
+def strip(items: Sequence[SelectedEpisode], shown: Sequence[Sequence[tuple[int, str]]]) -> pl.DataFrame:
+    """Where stored pictures of episodes lie, below each other; of an episode without pictures none.
+
+    shown: of each episode its replans, and what stands above their pictures.
 
     Returns:
-        One row per picture: row (0: the failed episode, 1: its twin), column, above, replan, camera.
+        One row per picture: row, column, above, replan, camera.
     """
-    last, rows = one.item.episode.attributes.num_replans - 1, []
-    shown = [replan for shift in _SHOWN if 0 <= (replan := (one.replan or 0) + shift) <= last]
-    for row, (who, item) in enumerate((("failed", one.item), ("solved", one.twin))):
+    rows: list[tuple[int, int, str, int, str]] = []
+    for row, (item, moments) in enumerate(zip(items, shown, strict=True)):
         cameras = [camera.name for camera in item.store.attributes.policy.cameras]
-        camera = next((name for name in cameras if f"frames/{name}" in item.episode.attributes.arrays), None)
-        for column, replan in enumerate(shown if camera else []):
-            mark = ", leaves" if (row, replan) == (0, one.replan) else ""
-            own = min(replan, item.episode.attributes.num_replans - 1)
-            label = f"{who}, step {int(one.starts[replan])}{mark}" if own == replan else f"{who}, at its end"
-            rows.append((row, column, label, own, camera))
-    return pl.DataFrame(rows, schema=PICTURES, orient="row")
-
-
-#: Columns of a strip of stored pictures.
-PICTURES = {
-    **dict.fromkeys(("row", "column"), pl.Int64),
-    "above": pl.String,
-    "replan": pl.Int64,
-    "camera": pl.String,
-}
+        camera = next((name for name in cameras if item.episode.has(f"frames/{name}")), None)
+        rows += [(row, column, above, at, camera) for column, (at, above) in enumerate(moments) if camera is not None]
+    schema = {"row": pl.Int64, "column": pl.Int64, "above": pl.String, "replan": pl.Int64, "camera": pl.String}
+    return pl.DataFrame(rows, schema=schema, orient="row")
 
 
 def path_of(hand: Array, things: Sequence[Array]) -> Array:
@@ -186,11 +188,11 @@ def band(distances: Sequence[Array], length: int) -> Array:
     return beside
 
 
-def leaves_at(apart: Array, within: Array, fewest: int = FEWEST) -> int | None:
+def leaves_at(apart: Array, within: Array) -> int | None:
     """The replan from which on an episode is farther apart than `within`, each (replan,), to its end; None: never.
 
-    Being outside in fewer than `fewest` last replans is no leaving.
+    Being outside in fewer than `FEWEST` last replans is no leaving.
     """
     inside = np.flatnonzero(apart <= within)
     first = int(inside[-1]) + 1 if len(inside) else 0
-    return first if first + min(fewest, len(apart)) <= len(apart) else None
+    return first if first + min(FEWEST, len(apart)) <= len(apart) else None
