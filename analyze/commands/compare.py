@@ -26,7 +26,6 @@ from vla_attention.analyze.measures.task_families import sampling_of
 from vla_attention.analyze.statistics.exact_tests import mcnemar
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.analyze.statistics.units import Sampling
-from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.safe_text import visible
 
@@ -62,7 +61,7 @@ def compare(runs: Sequence[Run], allow_mismatch: Collection[str] = ()) -> Result
             findings += _behaved(part, told[first.name], told[part.name])
         findings += [*_needs(part), _attention(part)]
     about = [f"{run.name}: {_outcome(run, first)}." for run in runs]
-    about += dict.fromkeys(line for run in runs for line in run_notes(run.question.episodes))
+    about += dict.fromkeys(line for run in runs for line in run.question.told)
     about += [UNTRAINED] if any(run.question.untrained for run in runs) else []
     beside = dict.fromkeys(line for run in runs for line in notes(run.question) if line not in about)
     of_pairs = [_pairing(part, "seed" in allow_mismatch) for part in parts]

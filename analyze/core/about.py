@@ -14,7 +14,6 @@ from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.task_families import unknown_families
 from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Units
-from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.stores.store_format import RootAttributes
@@ -57,7 +56,7 @@ def about(question: Question) -> list[str]:
     suites = listing(dict.fromkeys(store.suite for store in question.stores), 4)
     outcomes = [item.episode.attributes.success for item in question.selected]
     line = f"{policy.name} on {suites}: {solved(outcomes, question.num_tasks)}."
-    return [line, *run_notes(question.episodes), *([UNTRAINED] if question.untrained else [])]
+    return [line, *question.told, *([UNTRAINED] if question.untrained else [])]
 
 
 def solved(outcomes: Iterable[bool | None], num_tasks: int) -> str:
@@ -78,11 +77,11 @@ def notes(question: Question) -> list[str]:
     recorded = question.stores[0].attributes.recording_of(question.site).layers
     every = len(set(question.selection.blocks)) == len(recorded)
     which = "mean over all layers" if every else f"layer{'s' * (len(labels) > 1)} {listing(labels, 40)}"
-    told, root = set(run_notes(question.episodes)), question.stores[0].attributes
+    root = question.stores[0].attributes
     others = [other.name for other in root.sites if other.name != question.site]
     return [
         f"Site '{question.site}', {which}. Intervals: {_held(question.units)}, about {question.units.words}.",
-        *(remark for remark in question.remarks if remark not in told),
+        *(remark for remark in question.remarks if remark not in question.told),
         *filter(None, [question.selection.note, without_a_side(root, question.site), unknown_families(
             question.sampling, question.selected)]),
         *([f"Of site '{question.site}' only; {listing(others)} are softmaxes of their own: choose by --site, and never "

@@ -372,7 +372,7 @@ def _by_scope(
     rows = pl.concat(named, how="diagonal_relaxed")
     missing = [name for name in _TASK if name not in rows.columns]
     rows = rows.with_columns(pl.lit(None, values.schema[name]).alias(name) for name in missing)
-    if not several:
+    if values.height and not several:
         rows = rows.with_columns(suite=pl.lit(values["suite"][0]))
     front = ["scope", *_TASK, *item, "paired", "num_tasks", "num_families", "intervals", "num_first", "num_other"]
     return rows.select(*front, "mean_first", "mean_other", pl.col(r"^difference.*$"))

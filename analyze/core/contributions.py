@@ -22,7 +22,7 @@ much of one direction they are. Unlike masses, both may be given for sides at di
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, TypeAlias
@@ -215,7 +215,7 @@ def side_norms(question: Question) -> Norms | None:
     if not all(item.store.attributes.recording.contributions for item in selected):
         return None
     each = partial(_sides_of_episode, selection=selection, layers=question.settings.layers)
-    norms: OnDisk[_Episode] = OnDisk(each_episode(each, selected), lambda i, arrays: (selected[i], arrays))
+    norms: OnDisk[_Episode] = OnDisk(each_episode(each, _fresh(selected)), lambda i, arrays: (selected[i], arrays))
     if not all(arrays for _, arrays in norms):
         return None
     return Norms(norms, selection, *_SIDES)
@@ -227,14 +227,18 @@ def group_norms(question: Question) -> Norms | None:
     if not all(store.attributes.recording.contributions for store in question.stores):
         return None
     # A group that cannot be measured in one episode would be a mean over the others only.
-    measurable = set.intersection(*(set(_whole_groups(item, question.site, grouping)) for item in selected))
+    measurable = set.intersection(*(set(_whole_groups(item, question.site, grouping)) for item in _fresh(selected)))
     names = tuple(name for name in grouping.names if name in measurable)
     if not names:
         return None
     each = partial(_groups_of_episode, selection=selection, site=question.site, grouping=grouping, names=names)
-    norms: OnDisk[_Episode] = OnDisk(each_episode(each, selected), lambda i, arrays: (selected[i], arrays))
+    norms: OnDisk[_Episode] = OnDisk(each_episode(each, _fresh(selected)), lambda i, arrays: (selected[i], arrays))
     sides = ("numerator_norm", "denominator_norm") if "numerator_norm" in norms[0][1] else ("", "")
     return Norms(norms, selection, *sides, groups=names)
+
+
+def _fresh(selected: Sequence[SelectedEpisode]) -> Iterator[SelectedEpisode]:
+    return (item.fresh() for item in selected)
 
 
 def _sides_of_episode(item: SelectedEpisode, selection: Selection, layers: Sequence[int] | None) -> dict[str, Any]:

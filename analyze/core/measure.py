@@ -116,14 +116,16 @@ def measure(
         check: called before anything is measured with the most keys of the items at a replan, (1, item) per episode.
     """
     chosen, selection = question.selected, replace(question.selection, per_head="head" in keep)
-    described = list(each_episode(partial(_described, items_of=items_of), chosen))
+    fresh = (item.fresh() for item in chosen)
+    described: OnDisk[_Described] = OnDisk(each_episode(partial(_described, items_of=items_of), fresh))
     check([one.keys for one in described])
     each = partial(_measured, items_of=items_of, selection=selection, site=question.site, denoise="denoise" in keep)
     arguments, digests = {"denoise": "denoise" in keep}, [one.digest for one in described]
     arrays = measured_once("items", chosen, selection, question.site, each, arguments, digests)
 
     def made(i: int, content: dict[str, NDArray[Any]]) -> Measured:
-        return Measured(chosen[i], selection, described[i].labels, described[i].absent, **content)
+        about = described[i]
+        return Measured(chosen[i], selection, about.labels, about.absent, **content)
 
     return OnDisk(arrays, made)
 

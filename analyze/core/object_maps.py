@@ -102,7 +102,7 @@ def object_maps(question: Question, heads: bool, layers: bool, iou: bool) -> Seq
     selection = replace(question.selection, per_head=heads)
     read = partial(_of_episode, selection=selection, site=question.site, layers=layers, iou=iou)
     with progress_bar(len(question.selected), "episodes") as advance:
-        return OnDisk(each_episode(read, question.selected, advance))
+        return OnDisk(each_episode(read, (item.fresh() for item in question.selected), advance))
 
 
 def enrichment_elsewhere(question: Question, found: Sequence[ObjectMaps]) -> pl.DataFrame:

@@ -139,8 +139,8 @@ def _differing_inputs(base: StoredEpisode, own: StoredEpisode, free: set[str]) -
 
 def _prompts(episode: StoredEpisode) -> list[str]:
     """The text of each replan's prompt."""
-    attributes = episode.attributes
-    return [attributes.prompts[index].text for index in attributes.prompt_index]
+    texts = [prompt.text for prompt in episode.attributes.prompts]
+    return [texts[index] for index in episode.attributes.prompt_index]
 
 
 def _called(name: str, plural: str = "") -> str:

@@ -49,7 +49,7 @@ def measured_once(
     with progress_bar(len(selected), "episodes") as advance:
 
         def scan(positions: Sequence[int]) -> Iterator[dict[str, NDArray[Any]]]:
-            return each_episode(measure, [selected[i] for i in positions], advance)
+            return each_episode(measure, (selected[i].fresh() for i in positions), advance)
 
         yield from remembered(question, [item.episode for item in selected], scan, extra, advance)
 

@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 import polars as pl
 
 from vla_attention.analyze.measures.question_settings import AnalysisSettings, union_of
-from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
+from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens
 from vla_attention.analyze.measures.task_families import sampling_of
 from vla_attention.analyze.statistics.units import Sampling, Units
 from vla_attention.analyze.stores.checking import faults_of_each
-from vla_attention.analyze.stores.read_ahead import read_ahead
-from vla_attention.analyze.stores.run_notes import run_notes
+from vla_attention.analyze.stores.run_notes import RunNotes
 from vla_attention.analyze.stores.selection import (
     Selection,
     check_combinable,
@@ -28,7 +27,7 @@ from vla_attention.analyze.stores.selection import (
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.builtin_groupings import find_grouping
 from vla_attention.schemas.groupings.grouping import Grouping, parse_group_argument, parse_ratio_argument, with_groups
-from vla_attention.schemas.groupings.vocabulary import Vocabulary
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Names, Vocabulary
 from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import CALLERS_MODULES, RootAttributes, StoreError
@@ -52,6 +51,7 @@ class Question:
         skipped: a line for all that was left out: what the stores say of foreign and unlisted files among their
             episodes, and every episode that is damaged or empty (`skip_corrupt`).
         notes: further lines for every result, for instance which denoise steps it is of or which keys were taken out.
+        told: what every answer says of runs that were changed or told something else (`RunNotes`).
     """
 
     stores: tuple[Store, ...]
@@ -64,6 +64,7 @@ class Question:
     sampling: Sampling
     skipped: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    told: tuple[str, ...] = ()
 
     @property
     def episodes(self) -> list[tuple[Store, StoredEpisode]]:
@@ -73,7 +74,7 @@ class Question:
     @property
     def remarks(self) -> tuple[str, ...]:
         """The lines that every result with numbers has: what was left out, what the baselines are of, and the notes."""
-        return (*self.skipped, *run_notes(self.episodes), *baseline_notes(self.stores), *self.notes)
+        return (*self.skipped, *self.told, *baseline_notes(self.stores), *self.notes)
 
     @property
     def tasks(self) -> pl.DataFrame:
@@ -122,8 +123,10 @@ def baseline_notes(stores: Sequence[Store]) -> tuple[str, ...]:
     return tuple(line.format(listing(which)) for which, line in lines if which)
 
 
-#: Site and tasks -> the episodes with their tokens, and their vocabulary.
-KnownEpisodes = dict[tuple[str, tuple[int | str, ...] | None], tuple[tuple[SelectedEpisode, ...], Vocabulary]]
+#: Site and tasks -> the episodes with their tokens, their vocabulary, and the notes on their runs.
+KnownEpisodes = dict[
+    tuple[str, tuple[int | str, ...] | None], tuple[tuple[SelectedEpisode, ...], Vocabulary, tuple[str, ...]]
+]
 
 
 def ask(stores: Sequence[Store], settings: AnalysisSettings, known: KnownEpisodes | None = None) -> Question:
@@ -144,21 +147,26 @@ def ask(stores: Sequence[Store], settings: AnalysisSettings, known: KnownEpisode
     selection = select(root, settings.layers, settings.denoise, settings.heads, settings.per_head, site)
     skipped = [note for store in stores for note in store.notes]
     if known is not None and not settings.skip_corrupt and (site, settings.tasks) in known:
-        selected, vocabulary = known[site, settings.tasks]
+        selected, vocabulary, told = known[site, settings.tasks]
     else:
         chosen = [(store, episode) for store in stores for episode in select_episodes(store, settings.tasks)]
         if settings.skip_corrupt:
             chosen, faulty = _without_faulty(chosen)
             skipped += faulty
-        _refuse_empty(chosen)
-        selected = tuple(load_tokens(chosen, site))
-        vocabulary = vocabulary_of(selected)
+        names, notes_of_runs = Names(), RunNotes()
+
+        def look(store: Store, episode: StoredEpisode, tokens: EpisodeTokens) -> None:
+            names.add(tokens)
+            notes_of_runs.add(store, episode.attributes)
+
+        selected = tuple(load_tokens(chosen, site, look))
+        vocabulary, told = names.vocabulary(), notes_of_runs.lines
         if known is not None and not settings.skip_corrupt:
-            known[site, settings.tasks] = selected, vocabulary
+            known[site, settings.tasks] = selected, vocabulary, told
     grouping = choose_grouping(settings, vocabulary)
     sampling, notes = sampling_of(settings.intervals, selected), _denoise_notes(root, selection, grouping)
     return Question(
-        tuple(stores), settings, selection, site, selected, grouping, vocabulary, sampling, tuple(skipped), notes
+        tuple(stores), settings, selection, site, selected, grouping, vocabulary, sampling, tuple(skipped), notes, told
     )
 
 
@@ -228,17 +236,3 @@ def _without_faulty(
             f"None of the {len(chosen)} selected episodes can be used; the first: {skipped[0]}. Capture them again."
         )
     return kept, skipped
-
-
-def _refuse_empty(chosen: Sequence[tuple[Store, StoredEpisode]]) -> None:
-    opened = read_ahead(episode for _, episode in chosen)
-    empty = [
-        f"{episode.name} of {store.path}"
-        for (store, _), episode in zip(chosen, opened, strict=True)
-        if not episode.attributes.num_replans
-    ]
-    if empty:
-        raise StoreError(
-            f"{listing(empty)} hold{'s' if len(empty) == 1 else ''} no replan, so there is no attention to measure; "
-            "leave such episodes out with --skip-corrupt."
-        )

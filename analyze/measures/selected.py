@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.analyze.stores.contents import read_one_by_one
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import EmptyGroup, ResolvedGrouping, check_names, counted_keys, resolve
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary, collect_vocabulary
+from vla_attention.schemas.layout import Prompt
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
-from vla_attention.schemas.stores.store_format import StoreError
+from vla_attention.schemas.stores.store_format import RootAttributes, StoreError
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,26 @@ class SelectedEpisode:
     episode: StoredEpisode
     tokens: EpisodeTokens
     without: tuple[int, ...] = ()
+
+    @classmethod
+    def brief(cls, store: Store, episode: StoredEpisode, tokens: EpisodeTokens) -> SelectedEpisode:
+        """An episode that was read, without what it keeps of that: of thousands it would fill the memory.
+
+        Prompts, which change with the robot's state and are most of it, are read again when they are asked for.
+        """
+        kept, attributes = replace(episode), copy(episode.attributes)
+        number, site = len(attributes.prompts), tokens.layout.name
+        object.__setattr__(attributes, "prompts", _Prompts(replace(episode), number) if number else ())
+        vars(kept)["attributes"] = attributes
+        prompts = _Prompts(replace(episode), number, store.attributes, site) if tokens.prompts else ()
+        return cls(store, kept, replace(tokens, prompts=prompts)).fresh()
+
+    def fresh(self) -> SelectedEpisode:
+        """The same, with nothing that was read of it since it was selected."""
+        episode = replace(self.episode)
+        vars(episode)["attributes"] = self.episode.attributes
+        coverage = episode.coverage(self.store.attributes, self.tokens.layout.name)
+        return replace(self, episode=episode, tokens=replace(self.tokens, coverage=coverage))
 
     @property
     def task(self) -> tuple[str, int]:
@@ -81,6 +105,26 @@ class SelectedEpisode:
         return starts, num_steps
 
 
+@dataclass(frozen=True)
+class _Prompts(Sequence[Prompt]):
+    """The prompts of an episode, as the keys of a site if one is given: read whenever one is asked for."""
+
+    episode: StoredEpisode
+    number: int
+    root: RootAttributes | None = None
+    site: str = ""
+
+    def __len__(self) -> int:
+        return self.number
+
+    def __iter__(self) -> Iterator[Prompt]:
+        episode = replace(self.episode)
+        return iter(episode.attributes.prompts if self.root is None else episode.prompts(self.root, self.site))
+
+    def __getitem__(self, index: Any) -> Any:
+        return tuple(self)[index]
+
+
 def positions_by_task(selected: Sequence[SelectedEpisode]) -> dict[tuple[str, int], list[int]]:
     """Positions of each task's episodes, tasks in order of appearance."""
     positions: dict[tuple[str, int], list[int]] = {}
@@ -89,9 +133,33 @@ def positions_by_task(selected: Sequence[SelectedEpisode]) -> dict[tuple[str, in
     return positions
 
 
-def load_tokens(chosen: Sequence[tuple[Store, StoredEpisode]], site: str) -> list[SelectedEpisode]:
-    """Read the tokens of every episode; reads no rows."""
-    return [SelectedEpisode(store, episode, episode.tokens(store.attributes, site)) for store, episode in chosen]
+def load_tokens(
+    chosen: Sequence[tuple[Store, StoredEpisode]],
+    site: str,
+    look: Callable[[Store, StoredEpisode, EpisodeTokens], object] = lambda _store, _episode, _tokens: None,
+) -> list[SelectedEpisode]:
+    """Read the tokens of every episode; reads no rows.
+
+    look: called with each episode while it is read whole.
+
+    Raises:
+        StoreError: an episode holds no replan.
+    """
+    found, empty = [], []
+    opened = read_one_by_one(episode for _, episode in chosen)
+    for (store, _), episode in zip(chosen, opened, strict=True):
+        if not episode.attributes.num_replans:
+            empty.append(f"{episode.name} of {store.path}")
+            continue
+        tokens = episode.tokens(store.attributes, site)
+        look(store, episode, tokens)
+        found.append(SelectedEpisode.brief(store, episode, tokens))
+    if empty:
+        raise StoreError(
+            f"{listing(empty)} hold{'s' if len(empty) == 1 else ''} no replan, so there is no attention to measure; "
+            "leave such episodes out with --skip-corrupt."
+        )
+    return found
 
 
 def find_episode(selected: Sequence[SelectedEpisode], task: int | None, episode: int | None) -> SelectedEpisode:
