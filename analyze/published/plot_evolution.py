@@ -13,7 +13,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.levels import MORE, Levels, replan_cells
-from vla_attention.analyze.core.measure import Measured, means
+from vla_attention.analyze.core.measure import means
 from vla_attention.analyze.measures.frames import LAYERS_AVG, float_values, layer_name
 from vla_attention.analyze.measures.masses import ratio
 from vla_attention.analyze.render.numbers import format_number
@@ -61,20 +61,20 @@ def evolution_files(levels: Levels) -> dict[str, Callable[[Path], None]]:
 
     They are in the folder `episodes`, with a folder for each suite where there are several.
     """
-    several = len({one.item.store.suite for one in levels.measured}) > 1
+    several = len({item.store.suite for item in levels.question.selected}) > 1
     layers = [*map(str, levels.question.selection.layer_labels), LAYERS_AVG]
     files: dict[str, Callable[[Path], None]] = {}
-    for one in levels.measured:
-        about = one.item.episode.attributes
-        folder = f"episodes/{file_part(one.item.store.suite)}" if several else "episodes"
+    for i, item in enumerate(levels.question.selected):
+        about = item.episode.attributes
+        folder = f"episodes/{file_part(item.store.suite)}" if several else "episodes"
         for layer in dict.fromkeys(layers):
             stem = evolution_stem(about.task_id, about.instruction, about.episode_index, layer)
-            files[f"{folder}/{stem}.png"] = partial(_write, one=one, grouping=levels.grouping, layer=layer)
+            files[f"{folder}/{stem}.png"] = partial(_write, levels=levels, number=i, layer=layer)
     return files
 
 
-def _write(path: Path, one: Measured, grouping: Grouping, layer: str) -> None:
-    rows = means(one, ("replan", "layer"), MORE)
+def _write(path: Path, levels: Levels, number: int, layer: str) -> None:
+    rows, grouping = means(levels.measured[number], ("replan", "layer"), MORE), levels.grouping
     cells = replan_cells(rows, grouping).filter(layer=layer)
     groups = rows.filter(kind="group", layer=layer).rename({"share": "fraction"})
     with Style().settings():

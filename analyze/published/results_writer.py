@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import polars as pl
 
 from vla_attention.analyze.core.levels import MORE, SIDES, Levels, replan_cells
@@ -36,28 +35,28 @@ def results_files(levels: Levels) -> dict[str, Callable[[Path], None]]:
     proxy = frame_proxy(question.stores[0].attributes, question.selected[0].tokens.layout, grouping)
 
     def write(path: Path, suite: str) -> None:
-        of_suite = [one for one in levels.measured if one.item.store.suite == suite]
-        write_results(path, documents_of(of_suite, grouping, question.selection.denoise_steps, proxy))
+        positions = [i for i, item in enumerate(question.selected) if item.store.suite == suite]
+        write_results(path, documents_of(levels.measured, positions, grouping, question.selection.denoise_steps, proxy))
 
     suites = dict.fromkeys(item.store.suite for item in question.selected)
     return {results_file_name(suite): partial(write, suite=suite) for suite in suites}
 
 
 def documents_of(
-    measured: Sequence[Measured], grouping: Grouping, denoise_steps: Sequence[int], proxy: FrameProxy | None = None
+    measured: Sequence[Measured],
+    positions: Sequence[int],
+    grouping: Grouping,
+    denoise_steps: Sequence[int],
+    proxy: FrameProxy | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """`episode_documents` of the episodes of a suite, by task and number."""
+    """`episode_documents` of the episodes of a suite, by task and number; one of them is in memory at a time."""
     first = len(grouping.names)  # behind the groups, both sides of the ratio
-    whole = [
-        name
-        for i, name in enumerate(_KEYS)
-        if all((one.keys[:, first + i] == np.floor(one.keys[:, first + i])).all() for one in measured)
-    ]
-    order = sorted(
-        range(len(measured)),
-        key=lambda i: (measured[i].item.episode.attributes.task_id, measured[i].item.episode.attributes.episode_index),
-    )
-    rows = (means(measured[i], ("replan", "layer"), (*MORE, "whole")) for i in order)
+    whole, order = set(_KEYS), []
+    for i in positions:
+        one = measured[i]
+        order.append((one.item.key, i))
+        whole -= {name for k, name in enumerate(_KEYS) if (one.keys[:, first + k] % 1).any()}
+    rows = (means(measured[i], ("replan", "layer"), (*MORE, "whole")) for _, i in sorted(order))
     return episode_documents(rows, grouping, denoise_steps, proxy, whole)
 
 
