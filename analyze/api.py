@@ -14,7 +14,7 @@ import polars as pl
 
 from vla_attention.analyze.measures.question import KnownEpisodes, Question, ask
 from vla_attention.analyze.measures.question_settings import SettingKeywords, settings_from_keywords
-from vla_attention.analyze.stores.contents import episodes_table, header_lines, one_line
+from vla_attention.analyze.stores.contents import episodes_table, one_line
 from vla_attention.analyze.stores.selection import check_combinable
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.reader import Store, open_store
@@ -265,13 +265,8 @@ class OpenStores:
     def __str__(self) -> str:
         return f"OpenStores of {one_line(self.stores)}"
 
-    def __repr__(self) -> str:
-        lines = [
-            *header_lines(self.stores),
-            "ask with .analyze() .words() .objects() .compare(other) .effects() .overlay()",
-            "         .report(path) .to_xarray()",
-        ]
-        return "\n  ".join([str(self), *lines])
+    #: At Python's prompt too.
+    __repr__ = __str__
 
 
 def _names(given: str | Sequence[str]) -> tuple[str, ...]:

@@ -96,7 +96,7 @@ def write_page(
     place: a file that ends with .html, or a folder, in which NAME.html is written.
     """
     from vla_attention import __version__
-    from vla_attention.analyze.render.output_files import write_text, writing
+    from vla_attention.analyze.render.files import write_text, writing
     from vla_attention.analyze.render.page import page
     from vla_attention.schemas.errors import BadArgument
 

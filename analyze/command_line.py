@@ -6,7 +6,7 @@ import argparse
 import gc
 import os
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import ExitStack
 from importlib import import_module
 from pathlib import Path
 
@@ -55,7 +55,16 @@ def _run(name: str, arguments: Sequence[str], program: str) -> int:
     use_threads(parsed.threads)
     os.environ.update(dict.fromkeys(_ONE_THREAD_EACH, "1"))
     try:
-        with _cache_of(parsed), _engine(parsed):
+        with ExitStack() as stack:
+            if getattr(parsed, "no_cache", False):
+                from vla_attention.analyze.cache.places import switched_off
+
+                stack.enter_context(switched_off())
+            where = getattr(parsed, "scheduler", None) or getattr(parsed, "workers", None)
+            if where is not None:
+                from vla_attention.analyze.stores.parallel import workers
+
+                stack.enter_context(workers(where))
             if not COMMANDS[name].folder:
                 return run_question(name, parsed)
             code: int = import_module(f"vla_attention.analyze.{name}.command").run(parsed)
@@ -72,36 +81,11 @@ def build_parser(name: str) -> argparse.ArgumentParser:
     else:
         parser = question_parser(name)
     if not COMMANDS[name].keeps:
-        add_threads(
-            parser,
-            "threads that measure episodes, at most 4 (default: OMP_NUM_THREADS, else the cores of this process)",
-        )
-        parser.add_argument(
-            "--no-cache",
-            action="store_true",
-            help="measure again what was measured before (VLA_CACHE=off does the same)",
-        )
+        what = "threads that measure episodes, at most 4 (default: OMP_NUM_THREADS, else the cores of this process)"
+        add_threads(parser, what)
+        again = "measure again what was measured before (VLA_CACHE=off does the same)"
+        parser.add_argument("--no-cache", action="store_true", help=again)
     return parser
-
-
-def _cache_of(parsed: argparse.Namespace) -> AbstractContextManager[None]:
-    """The cache that the arguments leave to the command."""
-    if not getattr(parsed, "no_cache", False):
-        return nullcontext()
-    from vla_attention.analyze.cache.places import switched_off
-
-    return switched_off()
-
-
-def _engine(parsed: argparse.Namespace) -> AbstractContextManager[object]:
-    """Where `options.add_workers` says that episodes are worked on; nothing is imported for the default."""
-    where = getattr(parsed, "scheduler", None)
-    where = getattr(parsed, "workers", None) if where is None else where
-    if where is None:
-        return nullcontext()
-    from vla_attention.analyze.stores.parallel import workers
-
-    return workers(where)
 
 
 def _with_way_out(error: UserError, can_skip: bool) -> UserError:

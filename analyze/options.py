@@ -110,9 +110,7 @@ def results_place(text: str, page: bool = False) -> Path:
     """The type of `--output`: a folder, or for a page a file that ends with .html."""
     path = output_place(text)
     if path.suffix.lower() in _FILES - (_PAGES if page else set()) and not path.is_dir():
-        expected = (
-            "a folder, or a file FILE.html" if page else "a folder, in which result.json, tables and pictures are"
-        )
+        expected = f"a folder, {'or a file FILE.html' if page else 'in which result.json, tables and pictures are'}"
         raise argparse.ArgumentTypeError(f"{text} is called like a file of another kind; expected {expected}")
     return path
 
@@ -129,21 +127,18 @@ def add_question(parser: argparse.ArgumentParser, names: tuple[str, ...]) -> Non
     add_task(parser, "tasks", "tasks")
     for name in names:
         parser.add_argument(f"--{name.replace('_', '-')}", **OPTIONS[name])
-    parser.add_argument(
-        "--skip-corrupt", action="store_true", help="leave out episodes that are damaged or empty, by name"
-    )
+    damaged = "leave out episodes that are damaged or empty, by name"
+    parser.add_argument("--skip-corrupt", action="store_true", help=damaged)
     add_workers(parser)
 
 
 def add_output(parser: argparse.ArgumentParser, command: str, page: bool = False) -> None:
     """--output; of a question, whose answer is no page, also --csv, --no-plots, --pdf and --style."""
+    where = f"folder{', or a file FILE.html' if page else ''} (default: results/PATH OF STORE/{command})"
+    place = partial(results_place, page=page)
+    parser.add_argument("--output", type=place, metavar="PATH" if page else "FOLDER", help=where)
     if page:
-        where = f"folder, or a file FILE.html (default: results/PATH OF STORE/{command})"
-        parser.add_argument("--output", type=partial(results_place, page=True), metavar="PATH", help=where)
         return
-    parser.add_argument(
-        "--output", type=results_place, metavar="FOLDER", help=f"folder (default: results/PATH OF STORE/{command})"
-    )
     parser.add_argument("--csv", action="store_true", help="tables as CSV instead of Parquet")
     pictures = parser.add_mutually_exclusive_group()
     pictures.add_argument("--no-plots", action="store_true", help="numbers only")

@@ -34,6 +34,7 @@ class Command:
 
 _ROWS = ("layers", "denoise", "heads", "site", "intervals")
 _GROUPING = ("grouping", "group", "ratio")
+_STRIPS = ("episode", "replans", "cameras", "outline", "smooth", "video", "fps")
 _NO_WORDS = "its keys spell no words; choose a site with text by --site (Cosmos: cross)"
 _NO_PICTURES = "its keys are no patches of pictures; choose a site with cameras by --site (Cosmos: self)"
 
@@ -95,19 +96,7 @@ COMMANDS: dict[str, Command] = {
     ),
     "overlay": Command(
         "attention on the stored pictures: strips, GIF or MP4",
-        (
-            *_ROWS,
-            *_GROUPING,
-            "episode",
-            "replans",
-            "cameras",
-            "outline",
-            "smooth",
-            "video",
-            "fps",
-            "num_episodes",
-            "num_replans",
-        ),
+        (*_ROWS, *_GROUPING, *_STRIPS, "num_episodes", "num_replans"),
         ("image", "latent"),
         _NO_PICTURES,
         (

@@ -63,8 +63,7 @@ class StepRatio:
     frames' masses). `num_visual_tokens` and `num_text_tokens` are the numbers of keys on the two sides, fractional
     where objects cover parts of patches; their quotient is the ratio that uniform attention gives, and they are null
     where it is another one, because queries, layers or heads see different keys. The three are absent in files of the
-    published scripts and in ours from before. The last four fields are set only for a ratio of latent
-    frames (see `FrameProxy`).
+    published scripts. The last four fields are set only for a ratio of latent frames (see `FrameProxy`).
     """
 
     step: int
@@ -123,9 +122,8 @@ class EpisodeResult:
     """One episode. Keys of `summary` and `per_step_ratios`: `layer_N` for every layer, and `layers_avg`.
 
     `num_steps` is the counter of the published scripts' loop when it stops (`loop_counter`); `num_steps_definition`
-    says so, and is absent in their files and in ours from before, whose `num_steps` is the number of executed actions.
-    `grouping` and `grouping_description` say what visual and linguistic are, `denoise_steps` which denoise steps the
-    masses are means over; all three are absent in those files, too.
+    says so, and is absent in their files. `grouping` and `grouping_description` say what visual and linguistic are,
+    `denoise_steps` which denoise steps the masses are means over; all three are absent in those files, too.
     """
 
     task_id: int

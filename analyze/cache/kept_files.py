@@ -14,6 +14,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import secrets
 from contextlib import suppress
 from pathlib import Path
@@ -32,6 +33,8 @@ _DIGEST_BYTES = 32
 #: Longer first lines are damage.
 _LONGEST_LINE = 65_536
 _TYPES = ("<f8", "<f4", "<i8", "<i4", "|u1", "|b1")
+_QUESTION = re.compile(r"[0-9a-f]{32}")
+_FILE = re.compile(rf"[0-9a-f]{{32}}({re.escape(ENDING)}|{re.escape(UNFINISHED)})")
 
 
 def kept_bytes(key: bytes, arrays: Arrays) -> bytes:
@@ -96,3 +99,37 @@ def _first_line(content: bytes) -> dict[str, Any]:
     except ValueError:
         return {}
     return first if isinstance(first, dict) and first.get("format") == FORMAT else {}
+
+
+def kept_files(folder: Path) -> list[tuple[float, int, Path]]:
+    """When each file of a cache was last used, its bytes and its path; files with other names are not the cache's."""
+    files = []
+    for question in entries(folder):
+        if _QUESTION.fullmatch(question.name) and question.is_dir(follow_symlinks=False):
+            for entry in entries(Path(question.path)):
+                if _FILE.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
+                    with suppress(OSError):  # another process removed it
+                        status = entry.stat()
+                        files.append((status.st_mtime, status.st_size, Path(entry.path)))
+    return files
+
+
+def make_room(folder: Path, most_bytes: int) -> None:
+    """Remove files, least recently used first, until the cache is within its size."""
+    files = sorted(kept_files(folder))
+    total = sum(size for _, size, _ in files)
+    for _, size, path in files:
+        if total <= most_bytes:
+            return
+        with suppress(OSError):  # it belongs to somebody else; or other files are in the folder
+            path.unlink(missing_ok=True)
+            total -= size
+            path.parent.rmdir()
+
+
+def entries(folder: Path) -> list[os.DirEntry[str]]:
+    """What is in a folder; nothing where it cannot be read."""
+    try:
+        return list(os.scandir(folder))
+    except OSError:
+        return []

@@ -40,10 +40,16 @@ def cache_place() -> CachePlace | None:
     given = os.environ.get(FOLDER_VARIABLE, "").strip()
     if given.casefold() in _OFF:
         return None
-    size = os.environ.get(SIZE_VARIABLE, "").strip()
+    text = os.environ.get(SIZE_VARIABLE, "").strip()
+    size = parse_bytes(text) if text else DEFAULT_BYTES
+    if size is None:
+        raise BadArgument(
+            f"{SIZE_VARIABLE}={text} is no size; expected a number of bytes, or one with a unit, as in 500MB or 2GB. "
+            f"To switch the cache off, set {FOLDER_VARIABLE}=off."
+        )
     # Absolute: the working directory may change while a store is open.
     folder = DEFAULT_FOLDER if given.casefold() in _ON else Path(given)
-    return CachePlace(folder.absolute(), parse_size(size) if size else DEFAULT_BYTES)
+    return CachePlace(folder.absolute(), size)
 
 
 def check_cache_place(place: CachePlace) -> None:
@@ -67,18 +73,3 @@ def switched_off() -> Iterator[None]:
             del os.environ[FOLDER_VARIABLE]
         else:
             os.environ[FOLDER_VARIABLE] = before
-
-
-def parse_size(text: str) -> int:
-    """A size such as "500MB" or "2 GB" in bytes, as `parse_bytes` reads it.
-
-    Raises:
-        BadArgument: it is no size.
-    """
-    size = parse_bytes(text)
-    if size is None:
-        raise BadArgument(
-            f"{SIZE_VARIABLE}={text} is no size; expected a number of bytes, or one with a unit, as in 500MB or 2GB. "
-            f"To switch the cache off, set {FOLDER_VARIABLE}=off."
-        )
-    return size

@@ -1,7 +1,7 @@
 """Measuring episodes once: what the cache holds is taken from it, the rest is measured and put there.
 
 The key of a file is the question (what is measured, with all its arguments, and the arithmetic), the digest of the
-episode's seal, and the state of the episode's files (`fingerprints`). The cache changes no number and raises no error:
+episode's seal, and the state of the episode's files (`file_state`). The cache changes no number and raises no error:
 where it cannot be read or written, everything is measured.
 """
 
@@ -11,19 +11,27 @@ import hashlib
 import json
 import os
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import vla_attention
-from vla_attention.analyze.cache.fingerprints import file_state
-from vla_attention.analyze.cache.housekeeping import make_room
-from vla_attention.analyze.cache.kept_files import ENDING, Arrays, kept_bytes, read_arrays, write_file
-from vla_attention.analyze.cache.places import CachePlace, cache_place, check_cache_place
+from vla_attention.analyze.cache.kept_files import (
+    ENDING,
+    Arrays,
+    entries,
+    kept_bytes,
+    make_room,
+    read_arrays,
+    write_file,
+)
+from vla_attention.analyze.cache.places import cache_place, check_cache_place
 from vla_attention.schemas.stores.reader import StoredEpisode
+from vla_attention.schemas.stores.store_format import SEAL_GROUP
 
 #: The sources that numbers depend on: how bytes become rows, selectors weights, and rows measures.
 _SOURCES = (
@@ -35,6 +43,13 @@ _SOURCES = (
     "analyze/measures/*.py",
     "analyze/core/*.py",
 )
+#: Files that changed less than this ago may change again without a difference that file systems' clocks show.
+SETTLED_SECONDS = 2.0
+#: The state of an episode that is not in a file system of this machine: its seal, which is read there at every opening,
+#: has to suffice.
+_ELSEWHERE = hashlib.sha256(b"elsewhere").digest()
+#: Pictures are in no measure of attention, and are most of the files.
+_NOT_MEASURED = "frames/"
 
 
 @cache
@@ -55,6 +70,34 @@ def arithmetic_version() -> str:
     return digest.hexdigest()
 
 
+def file_state(episode: StoredEpisode) -> bytes | None:
+    """A digest of the present state of an episode's files; None when one is missing or only just changed.
+
+    What is taken from the cache is not read, so that damage would not be seen. Every file has to be the one that was
+    there when it was measured: same inode, size, and times of change. Writing to a file, exchanging it and setting its
+    date all change the time that the file system notes (ctime), which no program can set.
+
+    Raises:
+        CorruptEpisode: its seal cannot be read or is not its own.
+    """
+    place = episode.folder
+    if not isinstance(place, Path):
+        return _ELSEWHERE
+    names = [name for name in episode.files.records if not name.startswith(_NOT_MEASURED)]
+    paths = {name: f"{place}/{name}" for name in (*names, f"{SEAL_GROUP}/zarr.json")}
+    newest, stats = 0, []
+    for name, path in paths.items():
+        try:
+            status = os.stat(path)
+        except OSError:
+            return None
+        newest = max(newest, status.st_mtime_ns, status.st_ctime_ns)
+        stats.append(f"{name} {status.st_ino} {status.st_size} {status.st_mtime_ns} {status.st_ctime_ns}")
+    if newest > (time.time() - SETTLED_SECONDS) * 1e9:
+        return None
+    return hashlib.sha256("\n".join(stats).encode()).digest()
+
+
 @dataclass(frozen=True)
 class CachedQuestion:
     """What is measured of each episode.
@@ -67,7 +110,7 @@ class CachedQuestion:
     what: str
     arguments: Mapping[str, Any]
 
-    @property
+    @cached_property
     def digest(self) -> bytes:
         """The digest of what is measured and of the arithmetic that does it."""
         given = {"what": self.what, "arguments": self.arguments, "arithmetic": arithmetic_version()}
@@ -97,66 +140,43 @@ def remembered(
         yield from measure(range(len(episodes)))
         return
     check_cache_place(place)
-    files = _Files(question, place)
+    folder, room = place.folder / question.digest.hex()[:32], place.most_bytes
     extra = arguments or [None] * len(episodes)
     # Before anything is measured: a file that changes in the meantime makes what is kept of it invalid.
-    keys = [files.key(episode, one) for episode, one in zip(episodes, extra, strict=True)]
-    missing = files.missing(keys)
+    keys = [_key(question.digest, episode, one) for episode, one in zip(episodes, extra, strict=True)]
+    paths = [folder / f"{(key or b'').hex()[:32]}{ENDING}" for key in keys]
+    kept = {entry.name for entry in entries(folder)}
+    missing = [i for i, (key, path) in enumerate(zip(keys, paths, strict=True)) if key is None or path.name not in kept]
     if progress is not None and len(missing) < len(episodes):
         progress(len(episodes) - len(missing))
     measured = iter(measure(missing) if missing else ())
     to_measure = set(missing)
     try:
-        for i, key in enumerate(keys):
+        for i, (key, path) in enumerate(zip(keys, paths, strict=True)):
             # Read when its turn comes: numbers of thousands of episodes would not fit into memory.
-            arrays = None if i in to_measure or key is None else files.read(key)
+            arrays = None if i in to_measure or key is None else read_arrays(path, key)
             if arrays is None:
                 arrays = next(measured) if i in to_measure else next(iter(measure([i])))
                 if key is not None:
-                    files.keep(key, arrays)
+                    content = kept_bytes(key, arrays)
+                    # A question that alone is larger than the cache keeps its first episodes: dropping them for later
+                    # ones would leave nothing for the next time.
+                    room -= len(content)
+                    try:
+                        if room >= 0:
+                            write_file(path, content)
+                    except OSError:
+                        room = -1  # no room on the disk, or a folder that others own
             yield arrays
     finally:
         # Although nothing may have been written: the cache may hold what a larger VLA_CACHE_SIZE had room for.
-        make_room(place)
+        make_room(place.folder, place.most_bytes)
 
 
-class _Files:
-    """The files of one question in the cache. Numbers do not depend on whether they can be read or written."""
-
-    def __init__(self, question: CachedQuestion, place: CachePlace) -> None:
-        self._digest = question.digest
-        self._folder = place.folder / self._digest.hex()[:32]
-        # A question that alone is larger than the cache keeps its first episodes: dropping them for later ones would
-        # leave nothing for the next time.
-        self._room = place.most_bytes
-
-    def key(self, episode: StoredEpisode, arguments: Any) -> bytes | None:
-        """The digest of question and episode, as its files are at the moment; None when these are not to be trusted."""
-        state = file_state(episode)
-        if state is None:
-            return None
-        about = f"{episode.seal.digest}\n{json.dumps(arguments, sort_keys=True)}\n".encode()
-        return hashlib.sha256(self._digest + state + about).digest()
-
-    def missing(self, keys: Sequence[bytes | None]) -> list[int]:
-        """The positions of the keys without a file."""
-        try:
-            names = set(os.listdir(self._folder))
-        except OSError:
-            names = set()
-        return [i for i, key in enumerate(keys) if key is None or self._path(key).name not in names]
-
-    def read(self, key: bytes) -> Arrays | None:
-        return read_arrays(self._path(key), key)
-
-    def keep(self, key: bytes, arrays: Arrays) -> None:
-        content = kept_bytes(key, arrays)
-        self._room -= len(content)
-        if self._room >= 0:
-            try:
-                write_file(self._path(key), content)
-            except OSError:
-                self._room = -1  # no room on the disk, or a folder that others own
-
-    def _path(self, key: bytes) -> Path:
-        return self._folder / f"{key.hex()[:32]}{ENDING}"
+def _key(question: bytes, episode: StoredEpisode, arguments: Any) -> bytes | None:
+    """The digest of question and episode, as its files are at the moment; None when these are not to be trusted."""
+    state = file_state(episode)
+    if state is None:
+        return None
+    about = f"{episode.seal.digest}\n{json.dumps(arguments, sort_keys=True)}\n".encode()
+    return hashlib.sha256(question + state + about).digest()

@@ -17,6 +17,8 @@ from vla_attention.schemas.errors import UserError
 QUESTIONS = ("language", "failures", "analyze", "words", "objects", "effects", "overlay")
 #: Of these the answer depends on the grouping; the others have items of their own.
 _OF_GROUPS = ("analyze",)
+#: Pictures that say little beside the others; the commands draw them.
+_ELSEWHERE = {"ratio_distribution", "effects_over_time"}
 
 
 def report(question: Question, num_episodes: int = 2, num_replans: int = 8) -> list[Result]:
@@ -42,7 +44,7 @@ def report(question: Question, num_episodes: int = 2, num_replans: int = 8) -> l
         later = {one.name for other in rest for one in other.figures} | {
             one.name for other in rest for one in other.tables
         }
-        figures = [figure for figure in result.figures if figure.name not in later]
+        figures = [figure for figure in result.figures if figure.name not in (later | _ELSEWHERE)]
         tables = [table for table in result.tables if table.name not in later]
         kept = [line for line in result.about if line not in said] if shown else result.about
         notes = [note for note in result.notes if note not in told]

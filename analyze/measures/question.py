@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from vla_attention.analyze.measures.question_settings import AnalysisSettings
-from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
-from vla_attention.analyze.measures.task_families import sampling_of, units_of
-from vla_attention.analyze.statistics.episode_intervals import Sampling
-from vla_attention.analyze.statistics.units import Units
-from vla_attention.analyze.stores.checking import faults_of_each
-from vla_attention.analyze.stores.read_ahead import read_ahead
-from vla_attention.analyze.stores.run_notes import run_notes
+import polars as pl
+
+from vla_attention.analyze.measures.question_settings import AnalysisSettings, union_of
+from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens
+from vla_attention.analyze.measures.task_families import sampling_of
+from vla_attention.analyze.statistics.units import Sampling, Units
+from vla_attention.analyze.stores.parallel import episode_reports
+from vla_attention.analyze.stores.run_notes import RunNotes
 from vla_attention.analyze.stores.selection import (
     Selection,
     check_combinable,
@@ -24,10 +24,9 @@ from vla_attention.analyze.stores.selection import (
     select,
     select_episodes,
 )
-from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.builtin_groupings import find_grouping
 from vla_attention.schemas.groupings.grouping import Grouping, parse_group_argument, parse_ratio_argument, with_groups
-from vla_attention.schemas.groupings.vocabulary import Vocabulary
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Names, Vocabulary
 from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import RootAttributes, StoreError
@@ -51,6 +50,7 @@ class Question:
         skipped: a line for all that was left out: what the stores say of foreign and unlisted files among their
             episodes, and every episode that is damaged or empty (`skip_corrupt`).
         notes: further lines for every result, for instance which denoise steps it is of or which keys were taken out.
+        told: what every answer says of runs that were changed or told something else (`RunNotes`).
     """
 
     stores: tuple[Store, ...]
@@ -63,6 +63,7 @@ class Question:
     sampling: Sampling
     skipped: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    told: tuple[str, ...] = ()
 
     @property
     def episodes(self) -> list[tuple[Store, StoredEpisode]]:
@@ -71,17 +72,18 @@ class Question:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """The lines that every result with numbers has: what was left out, what the baselines are of, and the notes."""
-        return (*self._remarks_on_numbers, *self.notes)
+        """The lines that every result with numbers has: what was left out, what was told, and the notes."""
+        return (*self.skipped, *self.told, *self.notes)
 
     @property
-    def _remarks_on_numbers(self) -> tuple[str, ...]:
-        return (*self.skipped, *run_notes(self.episodes))
+    def tasks(self) -> pl.DataFrame:
+        """The task of each episode: suite, task_id."""
+        return pl.DataFrame([item.task for item in self.selected], schema=["suite", "task_id"], orient="row")
 
     @property
     def units(self) -> Units:
         """The units of intervals over all selected episodes."""
-        return units_of(self.sampling, self.selected).decided()
+        return self.sampling.units(self.tasks).decided()
 
     @property
     def num_tasks(self) -> int:
@@ -99,8 +101,10 @@ class Question:
         return any(store.attributes.policy.untrained for store in self.stores)
 
 
-#: Site and tasks -> the episodes with their tokens, and their vocabulary.
-KnownEpisodes = dict[tuple[str, tuple[int | str, ...] | None], tuple[tuple[SelectedEpisode, ...], Vocabulary]]
+#: Site and tasks -> the episodes with their tokens, their vocabulary, and the notes on their runs.
+KnownEpisodes = dict[
+    tuple[str, tuple[int | str, ...] | None], tuple[tuple[SelectedEpisode, ...], Vocabulary, tuple[str, ...]]
+]
 
 
 def ask(stores: Sequence[Store], settings: AnalysisSettings, known: KnownEpisodes | None = None) -> Question:
@@ -121,31 +125,26 @@ def ask(stores: Sequence[Store], settings: AnalysisSettings, known: KnownEpisode
     selection = select(root, settings.layers, settings.denoise, settings.heads, settings.per_head, site)
     skipped = [note for store in stores for note in store.notes]
     if known is not None and not settings.skip_corrupt and (site, settings.tasks) in known:
-        selected, vocabulary = known[site, settings.tasks]
+        selected, vocabulary, told = known[site, settings.tasks]
     else:
         chosen = [(store, episode) for store in stores for episode in select_episodes(store, settings.tasks)]
         if settings.skip_corrupt:
             chosen, faulty = _without_faulty(chosen)
             skipped += faulty
-        _refuse_empty(chosen)
-        selected = tuple(load_tokens(chosen, site))
-        vocabulary = vocabulary_of(selected)
+        names, notes_of_runs = Names(), RunNotes()
+
+        def look(store: Store, episode: StoredEpisode, tokens: EpisodeTokens) -> None:
+            names.add(tokens)
+            notes_of_runs.add(store, episode.attributes)
+
+        selected = tuple(load_tokens(chosen, site, look))
+        vocabulary, told = names.vocabulary(), notes_of_runs.lines
         if known is not None and not settings.skip_corrupt:
-            known[site, settings.tasks] = selected, vocabulary
+            known[site, settings.tasks] = selected, vocabulary, told
     grouping = choose_grouping(settings, vocabulary)
-    notes = _denoise_notes(root, selection, grouping)
-    sampling = sampling_of(settings.intervals, selected)
+    sampling, notes = sampling_of(settings.intervals, selected), _denoise_notes(root, selection, grouping)
     return Question(
-        stores=tuple(stores),
-        settings=settings,
-        selection=selection,
-        site=site,
-        selected=selected,
-        grouping=grouping,
-        vocabulary=vocabulary,
-        sampling=sampling,
-        skipped=tuple(skipped),
-        notes=notes,
+        tuple(stores), settings, selection, site, selected, grouping, vocabulary, sampling, tuple(skipped), notes, told
     )
 
 
@@ -169,17 +168,13 @@ def choose_grouping(settings: AnalysisSettings, vocabulary: Vocabulary) -> Group
         default = find_grouping(DEFAULT_GROUPING, vocabulary).groups
         wanted = dict.fromkeys((*ratio.numerator, *ratio.denominator))
         known = {name for name, _ in own}
-        own += [(name, _union(default[name])) for name in wanted if name in default and name not in known]
+        own += [(name, union_of(default[name])) for name in wanted if name in default and name not in known]
     base = None
     if settings.grouping is not None or not settings.groups:
         base = find_grouping(settings.grouping or DEFAULT_GROUPING, vocabulary)
     grouping = with_groups(base, own) if own else base
     assert grouping is not None
     return grouping if ratio is None else replace(grouping, ratio=ratio)
-
-
-def _union(selectors: Sequence[str]) -> str:
-    return " | ".join(f"({selector})" for selector in selectors)
 
 
 def _denoise_notes(root: RootAttributes, selection: Selection, grouping: Grouping) -> tuple[str, ...]:
@@ -207,9 +202,9 @@ def _without_faulty(
     """The episodes that are undamaged and hold a replan, and a line on each of the others. Reads everything once."""
     kept, skipped = [], []
     with progress_bar(len(chosen), "episodes checked") as advance:
-        for (store, episode), faults in zip(chosen, faults_of_each(chosen, advance), strict=True):
-            if faults:
-                skipped.append(f"{episode.name} of {store.path} is left out: {faults[0].problem.rstrip('.')}")
+        for (store, episode), report in zip(chosen, episode_reports(chosen, "values", advance), strict=True):
+            if report.faults:
+                skipped.append(f"{episode.name} of {store.path} is left out: {report.faults[0].problem.rstrip('.')}")
             elif episode.attributes.num_replans == 0:
                 skipped.append(f"{episode.name} of {store.path} is left out: it holds no replan")
             else:
@@ -219,17 +214,3 @@ def _without_faulty(
             f"None of the {len(chosen)} selected episodes can be used; the first: {skipped[0]}. Capture them again."
         )
     return kept, skipped
-
-
-def _refuse_empty(chosen: Sequence[tuple[Store, StoredEpisode]]) -> None:
-    opened = read_ahead(episode for _, episode in chosen)
-    empty = [
-        f"{episode.name} of {store.path}"
-        for (store, _), episode in zip(chosen, opened, strict=True)
-        if not episode.attributes.num_replans
-    ]
-    if empty:
-        raise StoreError(
-            f"{listing(empty)} hold{'s' if len(empty) == 1 else ''} no replan, so there is no attention to measure; "
-            "leave such episodes out with --skip-corrupt."
-        )

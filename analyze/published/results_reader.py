@@ -7,9 +7,7 @@ points, and in no other:
     a ratio of 0 where no ratio exists               undefined: both masses 0, or "layers_avg" of layers without a
                                                      finite ratio
     no "layers_avg", no action fields, no summary    as they are; see `ResultsFile`
-    no numbers of keys, no total mass                unknown; ours from before lack them, too
-    no "num_steps_definition"                        the loop's counter in their files; in ours from before the number
-                                                     of executed actions, from which the counter is computed
+    no numbers of keys, no total mass                unknown
     unknown fields                                   skipped, and named in `ResultsFile.unused`
     one episode that is not in a list                a list of one
 """
@@ -19,8 +17,8 @@ from __future__ import annotations
 import glob
 import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any, get_args
 
@@ -38,7 +36,6 @@ from vla_attention.schemas.results import (
     ResultsError,
     ResultsNotFound,
     StepRatio,
-    loop_counter,
     suite_of_results_file,
 )
 from vla_attention.schemas.safe_text import visible
@@ -50,14 +47,21 @@ _MOST_COUNTED = 10**12
 _MOST_MEASURED = 1e300
 #: The published scripts treat a mass of up to this as zero, and write a ratio of 0 where both masses are zero.
 NO_MASS = 1e-8
+RATIO = "visual_linguistic_ratio"
 #: The fields of the Cosmos scripts that name the latent frames of the queries, the visual and the text side.
 FRAME_FIELDS = ("query_frame", "visual_frame", "text_frame")
-_MASSES = ("visual_mass", "linguistic_mass")
-_FRACTIONS = ("visual_fraction", "linguistic_fraction")
-#: Fields that only newer files of ours have, and their columns.
+#: Fields that only files of ours have, and their columns.
 _COUNTS = {"total_mass": "total_mass", "num_visual_tokens": "visual_keys", "num_text_tokens": "linguistic_keys"}
 #: The largest accepted fraction: fractions are quotients of sums in float32.
 _ONE = 1 + 1e-4
+_EPISODE_FIELDS = [field.name for field in fields(EpisodeResult)]
+_NEEDED = [field.name for field in fields(EpisodeResult) if field.default is MISSING and field.name != "summary"]
+_STEP_FIELDS = [field.name for field in fields(StepRatio)]
+_TYPES = {
+    "success": pl.Boolean, "num_steps": pl.Int64, "ratio": pl.Float64,
+    **dict.fromkeys(("visual_fraction", "linguistic_fraction", *_COUNTS.values()), pl.Float64),
+}  # fmt: skip
+_STATED = {"episode": pl.Int64, "layer": pl.String, "measure": pl.String, "statistic": pl.String, "value": pl.Float64}
 
 
 @dataclass(frozen=True)
@@ -87,17 +91,6 @@ class ResultsKind:
 
 
 @dataclass(frozen=True)
-class SummaryNumber:
-    """A number in a file's own summary, with its episode (position in the file), layer, measure and statistic."""
-
-    episode: int
-    layer: str
-    measure: str
-    statistic: str
-    value: float | None
-
-
-@dataclass(frozen=True)
 class ResultsFile:
     """One results file.
 
@@ -106,15 +99,14 @@ class ResultsFile:
         suite: its suite, from the file name.
         kind: the definition of its masses.
         episodes: one row per episode, in the file's order: episode (position), task_id, instruction, episode_index,
-            success (null where it is not known), num_steps (the loop's counter, `results.loop_counter`; null where it
-            cannot be known), num_replans (0 for an episode without steps).
+            success (null where it is not known), num_steps (the loop's counter, `results.loop_counter`), num_replans (0
+            for an episode without steps).
         steps: one row per (episode, replan, layer): episode (position), replan, env_step, layer (the number as a
             string, or "layers_avg"), layer_number, ratio (infinite; null where undefined), visual_mass,
             linguistic_mass, visual_fraction, linguistic_fraction (null where undefined), total_mass, visual_keys,
             linguistic_keys (null where the file has none) and, with `kind.has_action`, action_mass and action_fraction.
-        summary_numbers: the numbers of the file's own summaries.
+        summaries: the numbers of the file's own summaries: episode (position), layer, measure, statistic, value.
         zeros: how many ratios of 0 stand for "no ratio" and were read as undefined.
-        counts_actions: `num_steps` of the file is the number of executed actions, as in our files from before.
         unused: names of unknown fields, which were skipped.
     """
 
@@ -123,9 +115,8 @@ class ResultsFile:
     kind: ResultsKind
     episodes: pl.DataFrame
     steps: pl.DataFrame
-    summary_numbers: tuple[SummaryNumber, ...]
+    summaries: pl.DataFrame
     zeros: int
-    counts_actions: bool
     unused: tuple[str, ...]
 
 
@@ -188,7 +179,7 @@ def read_results_file(path: Path) -> ResultsFile:
     except ValueError as error:
         raise ResultsError(f"{path} is not a results file: not valid JSON ({error}).") from None
     try:
-        return _Reading(path).read(document)
+        return _file(path, document)
     except _Problem as problem:
         raise ResultsError(f"{path}: {problem}") from None
 
@@ -197,202 +188,158 @@ class _Problem(ValueError):
     """A fault in a results file; the message does not name the file."""
 
 
-class _Reading:
-    """One pass over a document: collects rows, numbers of summaries, kinds of masses and unknown fields."""
+def _file(path: Path, document: Any) -> ResultsFile:
+    if isinstance(document, dict) and "per_step_ratios" in document:
+        document = [document]
+    if not isinstance(document, list):
+        raise _Problem(f"it is not a results file: expected a list of episodes, found {_kind_of(document)}.")
+    if not document:
+        raise _Problem("it holds no episode: there is nothing to summarise.")
+    episodes = [_episode(number, given) for number, given in enumerate(document)]
+    names = [f"episode {row['episode']} (task {row['task_id']}, episode {row['episode_index']})" for row in episodes]
+    kinds: dict[ResultsKind, str] = {}
+    both = list(zip(document, names, strict=True))
+    rows = [row for number, (given, where) in enumerate(both) for row in _steps(number, given, where, kinds)]
+    stated = [row for number, (given, where) in enumerate(both) for row in _summary(number, given, where)]
+    if not rows:
+        raise _Problem(f"none of its {len(episodes)} episodes has a single step: there is nothing to summarise.")
+    seen: dict[str, int] = {}
+    for number, name in enumerate(one.partition(" (")[2] for one in names):
+        if name in seen:
+            raise _Problem(f"episodes {seen[name]} and {number} are both {name[:-1]}.")
+        seen[name] = number
+    steps, zeros = _with_undefined(_frame(rows))
+    of_steps = steps.group_by("episode").agg(num_replans=pl.col("env_step").n_unique().cast(pl.Int64))
+    table = _frame(episodes).join(of_steps, on="episode", how="left", maintain_order="left")
+    unknown = [name for given in document for name in given if name not in _EPISODE_FIELDS]
+    each = (step for given in document for layer in given["per_step_ratios"].values() for step in layer)
+    unknown += [name for step in each for name in step if name not in _STEP_FIELDS]
+    return ResultsFile(
+        path=path,
+        suite=suite_of_results_file(path),
+        kind=next(iter(kinds)),
+        episodes=table.with_columns(pl.col("num_replans").fill_null(0)),
+        steps=steps,
+        summaries=pl.DataFrame(stated, schema=_STATED),
+        zeros=zeros,
+        unused=tuple(dict.fromkeys(unknown)),
+    )
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.rows: list[dict[str, Any]] = []
-        self.summary_numbers: list[SummaryNumber] = []
-        self.unused: dict[str, None] = {}
-        self.kinds: dict[ResultsKind, str] = {}
-        self.zeros = 0
-        self.ours = False
 
-    def read(self, document: object) -> ResultsFile:
-        """The whole file."""
-        if isinstance(document, dict) and "per_step_ratios" in document:
-            document = [document]
-        if not isinstance(document, list):
-            raise _Problem(f"it is not a results file: expected a list of episodes, found {_kind_of(document)}.")
-        if not document:
-            raise _Problem("it holds no episode: there is nothing to summarise.")
-        episodes = [self._episode(number, given) for number, given in enumerate(document)]
-        if not self.rows:
-            raise _Problem(f"none of its {len(episodes)} episodes has a single step: there is nothing to summarise.")
-        seen: dict[tuple[int, int], int] = {}
-        for episode in episodes:
-            identity = (episode["task_id"], episode["episode_index"])
-            if identity in seen:
-                raise _Problem(f"episodes {seen[identity]} and {episode['episode']} are both {_of(*identity)}.")
-            seen[identity] = episode["episode"]
-        counts_actions = self._counts_actions(document)
-        for episode in episodes:
-            first = episode.pop("first_step")
-            if counts_actions:
-                given = (episode["num_steps"], episode["success"])
-                episode["num_steps"] = None if first is None or given[1] is None else loop_counter(first, *given)
-        kind = next(iter(self.kinds))
-        floats = ("ratio", "visual_fraction", "linguistic_fraction", *_COUNTS.values())
-        schema = dict.fromkeys(floats, pl.Float64)
-        return ResultsFile(
-            path=self.path,
-            suite=suite_of_results_file(self.path),
-            kind=kind,
-            episodes=pl.DataFrame(
-                episodes, schema_overrides={"num_steps": pl.Int64, "success": pl.Boolean}, infer_schema_length=None
-            ),
-            steps=pl.DataFrame(
-                self.rows, schema_overrides={**schema, "layer_number": pl.Int64}, infer_schema_length=None
-            ),
-            summary_numbers=tuple(self.summary_numbers),
-            zeros=self.zeros,
-            counts_actions=counts_actions,
-            unused=tuple(self.unused),
-        )
+def _frame(rows: list[dict[str, Any]]) -> pl.DataFrame:
+    types = {name: kind for name, kind in _TYPES.items() if name in rows[0]}
+    return pl.DataFrame(rows, schema_overrides=types, infer_schema_length=None)
 
-    def _episode(self, number: int, given: object) -> dict[str, Any]:
-        where = f"episode {number}"
-        episode = _expect(given, dict, where)
-        names = [field.name for field in fields(EpisodeResult)]
-        needed = [field.name for field in fields(EpisodeResult) if field.default is MISSING and field.name != "summary"]
-        missing = [name for name in needed if name not in episode]
-        if missing:
-            what = "it is not a results file: " if number == 0 and len(missing) > 3 else ""
-            raise _Problem(f"{what}{where} lacks {listing(map(repr, missing))}.")
-        self._note_unused(episode, names)
-        identity: dict[str, Any] = {
-            "episode": number,
-            "task_id": _whole(episode["task_id"], f"{where}, task_id"),
-            "instruction": visible(_expect(episode["task_description"], str, f"{where}, task_description")),
-            "episode_index": _whole(episode["episode_idx"], f"{where}, episode_idx"),
-            # Null where a run did not know the outcome.
-            "success": None if episode["success"] is None else _expect(episode["success"], bool, f"{where}, success"),
-            "num_steps": _whole(episode["num_steps"], f"{where}, num_steps"),
-        }
-        where = f"{where} ({_of(identity['task_id'], identity['episode_index'])})"
-        about = self._about(episode, where)
-        layers = _expect(episode["per_step_ratios"], dict, f"{where}, per_step_ratios")
-        steps = self._steps(number, layers, about, where)
-        self._read_summary(number, _expect(episode.get("summary", {}), dict, f"{where}, summary"), where)
-        replans = {row["env_step"] for row in steps}
-        return {**identity, "num_replans": len(replans), "first_step": min(replans, default=None)}
 
-    def _about(self, episode: Mapping[str, Any], where: str) -> ResultsKind:
-        """The definitions that an episode states; the steps add the rest."""
-        stated = episode.get("num_steps_definition")
-        if stated not in (None, *get_args(NumStepsDefinition)):
-            known = listing(map(repr, get_args(NumStepsDefinition)))
-            raise _Problem(f"{where}, num_steps_definition is {shortened(repr(stated))}; expected {known}, or nothing.")
-        grouping, steps = None, None
-        if episode.get("grouping") is not None:
-            texts = (episode["grouping"], episode.get("grouping_description") or "")
-            grouping = tuple(_expect(text, str, f"{where}, grouping") for text in texts)
-        if episode.get("denoise_steps") is not None:
-            given = _expect(episode["denoise_steps"], list, f"{where}, denoise_steps")
-            steps = tuple(_whole(step, f"{where}, denoise_steps") for step in given)
-        return ResultsKind(None, False, grouping, steps)
+def _episode(number: int, given: object) -> dict[str, Any]:
+    """What identifies an episode, checked."""
+    where = f"episode {number}"
+    episode = _expect(given, dict, where)
+    missing = [name for name in _NEEDED if name not in episode]
+    if missing:
+        what = "it is not a results file: " if number == 0 and len(missing) > 3 else ""
+        raise _Problem(f"{what}{where} lacks {listing(map(repr, missing))}.")
+    stated = episode.get("num_steps_definition")
+    if stated not in (None, *get_args(NumStepsDefinition)):
+        known = listing(map(repr, get_args(NumStepsDefinition)))
+        raise _Problem(f"{where}, num_steps_definition is {shortened(repr(stated))}; expected {known}, or nothing.")
+    return {
+        "episode": number,
+        "task_id": _whole(episode["task_id"], f"{where}, task_id"),
+        "instruction": visible(_expect(episode["task_description"], str, f"{where}, task_description")),
+        "episode_index": _whole(episode["episode_idx"], f"{where}, episode_idx"),
+        # Null where a run did not know the outcome.
+        "success": None if episode["success"] is None else _expect(episode["success"], bool, f"{where}, success"),
+        "num_steps": _whole(episode["num_steps"], f"{where}, num_steps"),
+    }
 
-    def _counts_actions(self, document: Sequence[Mapping[str, Any]]) -> bool:
-        """Whether `num_steps` is the number of actions: in our files from before the field that says what it is.
 
-        Ours differ from the published scripts' in that every summary counts the ratios that are not finite.
-        """
-        return self.ours and all(episode.get("num_steps_definition") is None for episode in document)
+def _steps(
+    number: int, episode: Mapping[str, Any], where: str, kinds: dict[ResultsKind, str]
+) -> Iterator[dict[str, Any]]:
+    """The steps of an episode, checked; `kinds` takes the definition of their masses, which has to be one."""
+    grouping, denoise = episode.get("grouping"), episode.get("denoise_steps")
+    if grouping is not None:
+        texts = (grouping, episode.get("grouping_description") or "")
+        grouping = tuple(_expect(text, str, f"{where}, grouping") for text in texts)
+    if denoise is not None:
+        given = _expect(denoise, list, f"{where}, denoise_steps")
+        denoise = tuple(_whole(step, f"{where}, denoise_steps") for step in given)
+    for name, steps in _expect(episode["per_step_ratios"], dict, f"{where}, per_step_ratios").items():
+        layer, before = _layer_of(name, f"{where}, per_step_ratios"), -1
+        for position, step in enumerate(_expect(steps, list, f"{where}, per_step_ratios.{name}")):
+            at = f"{where}, {name}[{position}]"
+            row, frames = _step(_expect(step, dict, at), at)
+            kind = ResultsKind(frames, "action_mass" in row, grouping, denoise)
+            if kind not in kinds and kinds:
+                other, first = next(iter(kinds.items()))
+                raise _Problem(f"{at} holds masses of another kind ({kind}) than {first} ({other}).")
+            kinds.setdefault(kind, at)
+            if row["env_step"] <= before:
+                raise _Problem(f"{at}.step is {row['env_step']}, after {before}: steps must rise.")
+            before = row["env_step"]
+            if step[RATIO] is None and layer != LAYERS_AVG and row["visual_mass"] > NO_MASS >= row["linguistic_mass"]:
+                # Our files write null for infinite and for undefined ratios; the masses tell which it is.
+                row["ratio"] = math.inf
+            yield {"episode": number, "layer": layer, **row}
 
-    def _steps(self, number: int, layers: Mapping[str, object], about: ResultsKind, where: str) -> list[dict[str, Any]]:
-        rows: list[dict[str, Any]] = []
-        for name, given in layers.items():
-            label, layer_number = _layer_of(name, f"{where}, per_step_ratios")
-            before = -1
-            for position, step in enumerate(_expect(given, list, f"{where}, per_step_ratios.{name}")):
-                at = f"{where}, {name}[{position}]"
-                row = self._step(_expect(step, dict, at), about, at)
-                if step["visual_linguistic_ratio"] is None and label != LAYERS_AVG:
-                    # Our files write null for infinite and for undefined ratios; the masses tell which it is.
-                    row["ratio"] = math.inf if row["visual_mass"] > NO_MASS >= row["linguistic_mass"] else None
-                if row["env_step"] <= before:
-                    raise _Problem(f"{at}.step is {row['env_step']}, after {before}: steps must rise.")
-                before = row["env_step"]
-                rows.append({"episode": number, "layer": label, "layer_number": layer_number, **row})
-        replans = {step: i for i, step in enumerate(sorted({row["env_step"] for row in rows}))}
-        single = [row for row in rows if row["layer"] != LAYERS_AVG]
-        for row in single:
-            row["replan"] = replans[row["env_step"]]
-            if row["ratio"] == 0 and max(row["visual_mass"], row["linguistic_mass"]) <= NO_MASS:
-                row["ratio"] = None
-                self.zeros += 1
-        measured = {row["env_step"] for row in single}
-        finite = {row["env_step"] for row in single if _is_finite(row["ratio"])}
-        for row in rows:
-            if row["layer"] == LAYERS_AVG:
-                row["replan"] = replans[row["env_step"]]
-                if row["ratio"] == 0 and row["env_step"] in measured - finite:
-                    row["ratio"] = None
-                    self.zeros += 1
-        self.rows += rows
-        return rows
 
-    def _step(self, step: Mapping[str, Any], about: ResultsKind, where: str) -> dict[str, Any]:
-        has_action = "action_mass" in step
-        masses, fractions = [*_MASSES], [*_FRACTIONS]
-        if has_action:
-            masses, fractions = [*masses, "action_mass"], [*fractions, "action_fraction"]
-        has_frames = any(step.get(name) is not None for name in FRAME_FIELDS)
-        required = ["step", "visual_linguistic_ratio", *masses, *fractions, *(FRAME_FIELDS if has_frames else ())]
-        missing = [name for name in required if name not in step]
-        if missing:
-            raise _Problem(f"{where} lacks {listing(map(repr, missing))}.")
-        self._note_unused(step, [*(field.name for field in fields(StepRatio)), *FRAME_FIELDS, "selected_call_S"])
-        self._note_kind(step, replace(about, has_action=has_action), has_frames, where)
-        row: dict[str, Any] = {"env_step": _whole(step["step"], f"{where}.step")}
-        for name in masses:
-            row[name] = _number(step[name], f"{where}.{name}", math.inf)
-            if not _is_finite(row[name]):
-                raise _Problem(f"{where}.{name} is {shortened(repr(step[name]))}; expected a finite mass.")
-        for name in fractions:
-            row[name] = _number(step[name], f"{where}.{name}", _ONE)
-        for name, column in _COUNTS.items():
-            row[column] = _number(step.get(name), f"{where}.{name}", math.inf)
-        row["ratio"] = _number(step["visual_linguistic_ratio"], f"{where}.visual_linguistic_ratio", math.inf)
-        return row
+def _step(step: Mapping[str, Any], at: str) -> tuple[dict[str, Any], tuple[str, str, str] | None]:
+    """A row of a step, and the names of its latent frames."""
+    sides = ("visual", "linguistic", *(["action"] if "action_mass" in step else []))
+    has_frames = any(step.get(name) is not None for name in FRAME_FIELDS)
+    needed = ["step", RATIO, *(f"{side}_{kind}" for side in sides for kind in ("mass", "fraction"))]
+    missing = [name for name in (*needed, *(FRAME_FIELDS if has_frames else ())) if name not in step]
+    if missing:
+        raise _Problem(f"{at} lacks {listing(map(repr, missing))}.")
+    row: dict[str, Any] = {"env_step": _whole(step["step"], f"{at}.step")}
+    row["ratio"] = _number(step[RATIO], f"{at}.{RATIO}", math.inf)
+    for side in sides:
+        mass = row[f"{side}_mass"] = _number(step[f"{side}_mass"], f"{at}.{side}_mass", math.inf)
+        if mass is None or math.isinf(mass):
+            raise _Problem(f"{at}.{side}_mass is {shortened(repr(step[f'{side}_mass']))}; expected a finite mass.")
+        row[f"{side}_fraction"] = _number(step[f"{side}_fraction"], f"{at}.{side}_fraction", _ONE)
+    for name, column in _COUNTS.items():
+        row[column] = _number(step.get(name), f"{at}.{name}", math.inf)
+    if not has_frames:
+        return row, None
+    query, visual, text = (_expect(step[name], str, f"{at}.{name}") for name in FRAME_FIELDS)
+    return row, (query, visual, text)
 
-    def _note_kind(self, step: Mapping[str, Any], kind: ResultsKind, has_frames: bool, where: str) -> None:
-        if has_frames:
-            query, visual, text = (_expect(step[name], str, f"{where}.{name}") for name in FRAME_FIELDS)
-            kind = replace(kind, frames=(query, visual, text))
-        if self.kinds and kind not in self.kinds:
-            other, first = next(iter(self.kinds.items()))
-            raise _Problem(f"{where} holds masses of another kind ({kind}) than {first} ({other}).")
-        self.kinds.setdefault(kind, where)
 
-    def _read_summary(self, number: int, summary: Mapping[str, object], where: str) -> None:
-        for name, given in summary.items():
-            label, _ = _layer_of(name, f"{where}, summary")
-            for measure, statistics in _expect(given, dict, f"{where}, summary.{name}").items():
-                if measure == "num_steps":
-                    continue
+def _with_undefined(steps: pl.DataFrame) -> tuple[pl.DataFrame, int]:
+    """Steps with replan and layer_number, and null for a ratio of 0 that stands for none; how many those were."""
+    average, zero = pl.col("layer") == LAYERS_AVG, pl.col("ratio") == 0
+    nothing = ~average & zero & (pl.max_horizontal("visual_mass", "linguistic_mass") <= NO_MASS)
+    steps = steps.with_columns(
+        nothing.fill_null(False).alias("none"),
+        pl.col("layer").cast(pl.Int64, strict=False).alias("layer_number"),
+        (pl.col("env_step").rank("dense").over("episode").cast(pl.Int64) - 1).alias("replan"),
+    )
+    finite = ~average & pl.col("ratio").is_finite() & ~pl.col("none")
+    measured, known = ((one.fill_null(False)).any().over("episode", "replan") for one in (~average, finite))
+    steps = steps.with_columns(none=pl.col("none") | (average & zero & measured & ~known).fill_null(False))
+    return steps.with_columns(ratio=pl.when(~pl.col("none")).then("ratio")).drop("none"), int(steps["none"].sum())
+
+
+def _summary(number: int, episode: Mapping[str, Any], where: str) -> Iterator[dict[str, Any]]:
+    """The numbers that an episode states of its steps."""
+    for name, given in _expect(episode.get("summary", {}), dict, f"{where}, summary").items():
+        layer = _layer_of(name, f"{where}, summary")
+        for measure, statistics in _expect(given, dict, f"{where}, summary.{name}").items():
+            if measure != "num_steps":
                 at = f"{where}, summary.{name}.{measure}"
                 for statistic, value in _expect(statistics, dict, at).items():
-                    if statistic == "num_nonfinite":
-                        self.ours = True
-                    else:
-                        stated = _number(value, f"{at}.{statistic}", math.inf)
-                        self.summary_numbers.append(SummaryNumber(number, label, measure, statistic, stated))
-
-    def _note_unused(self, given: Mapping[str, object], known: Sequence[str]) -> None:
-        for name in given:
-            if name not in known:
-                self.unused.setdefault(name)
+                    stated = _number(value, f"{at}.{statistic}", math.inf)
+                    one = {"episode": number, "layer": layer, "measure": measure, "statistic": statistic}
+                    yield {**one, "value": stated}
 
 
-def _layer_of(name: str, where: str) -> tuple[str, int | None]:
-    if name == LAYERS_AVG:
-        return LAYERS_AVG, None
+def _layer_of(name: str, where: str) -> str:
     match = _LAYER.fullmatch(name)
-    if match is None:
+    if match is None and name != LAYERS_AVG:
         raise _Problem(f"{where} has '{visible(shortened(name))}'; expected layer_N or {LAYERS_AVG}.")
-    return match[1], int(match[1])
+    return match[1] if match else LAYERS_AVG
 
 
 def _expect(value: Any, kind: type, where: str) -> Any:
@@ -420,14 +367,6 @@ def _number(value: Any, where: str, most: float) -> float | None:
     if not 0 <= value <= most:
         raise _Problem(f"{where} is {value}; expected a number from 0{'' if math.isinf(most) else ' to 1'}.")
     return float(value)
-
-
-def _is_finite(value: float | None) -> bool:
-    return value is not None and math.isfinite(value)
-
-
-def _of(task_id: int, episode_index: int) -> str:
-    return f"task {task_id}, episode {episode_index}"
 
 
 _NAMES: dict[type, str] = {dict: "an object", list: "a list", str: "a text", bool: "true or false"}

@@ -10,8 +10,6 @@ The options of a figure, by kind:
     distribution  x, value: a box for each x, with a dot for each row. uniform, log, xlabel, ylabel.
     heat_map      x, y, value: factors around 1. xlabel, ylabel, label.
     scatter       x, y, label: points with names, NAME_low and NAME_high as bars. log (both axes), xlabel, ylabel.
-    pictures      none; see `pictures.pictures` for the columns.
-
     pictures      see `render.pictures`.
 
 NAME_low and NAME_high of a value are its interval; `num_episodes`, if the frame has it, is said.
@@ -19,115 +17,165 @@ NAME_low and NAME_high of a value are its interval; `num_episodes`, if the frame
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.result import Figure
+from vla_attention.analyze.render.files import replacing, write_text
 from vla_attention.analyze.render.pictures import pictures
-from vla_attention.analyze.render.plot_axes import label_positions, ratio_axis, scattered, share_ticks, whole_numbers
-from vla_attention.analyze.render.plot_colours import (
+from vla_attention.analyze.render.style import (
     BASELINE_COLOR,
     DOT_COLOR,
     NOTE_COLOR,
     SERIES_COLORS,
+    Style,
+    explain,
     group_styles,
+    label_positions,
+    ratio_axis,
+    scattered,
+    share_ticks,
+    whole_numbers,
+    wrapped,
 )
-from vla_attention.analyze.render.plot_heat_map import draw_log2_map, label_axis
-from vla_attention.analyze.render.plot_text import explain, shortened, wrapped
-from vla_attention.analyze.render.style import Style, new_canvas, save_canvas
+from vla_attention.analyze.render.terminal import shortened
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Canvas
 
+#: Columns and looks of a figure.
+Options: TypeAlias = Mapping[str, Any]
 #: Rows of a forest; the table has all.
 _MOST_ROWS = 60
 #: With more values than this a box has no dots.
 _MOST_DOTS = 300
+#: More labels than this along an axis would touch.
+_MOST_LABELS = 24
 #: What the line that evenly spread attention gives is called.
 BASELINE_NAME = "evenly spread attention"
+
+_FOR_LATEX = str.maketrans({
+    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#", "_": r"\_", "%": r"\%",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+})  # fmt: skip
 
 
 def draw(figure: Figure, style: Style | None = None) -> Canvas:
     """The picture as a matplotlib figure."""
     style = style or Style()
     with style.settings():
-        return _KINDS[figure.kind](figure, style)
+        return pictures(figure, style) if figure.kind == "pictures" else _plot(figure, style)
 
 
 def save(figure: Figure, folder: Path, style: Style | None = None, formats: Sequence[str] = ()) -> list[Path]:
-    """Draw into a folder; returns the paths of the files."""
+    """Draw into a folder: NAME.png (and other formats), for a paper NAME_caption.md and .tex too; returns the paths."""
     style = style or Style()
-    with style.settings():
-        return save_canvas(_KINDS[figure.kind](figure, style), figure, folder, style, formats)
+    canvas, paths = draw(figure, style), []
+    # A paper's pictures are vectors; the PNG is to look at.
+    for kind in formats or (("png", "pdf") if style.paper else ("png",)):
+        paths.append(folder / f"{figure.name}.{kind}")
+        with replacing(paths[-1]) as temporary:
+            temporary.write_bytes(style.content(canvas, kind))
+    caption = f"{figure.title}. {figure.caption}".strip()
+    captions = {"md": caption, "tex": f"\\caption{{{caption.translate(_FOR_LATEX)}}}"} if style.paper else {}
+    for ending, text in captions.items():
+        paths.append(folder / f"{figure.name}_caption.{ending}")
+        write_text(paths[-1], f"{text}\n")
+    return paths
 
 
-def _titled(canvas: Canvas, figure: Figure, style: Style) -> None:
-    """One line of title on a screen; none in a paper, whose caption file has it."""
+def _plot(figure: Figure, style: Style) -> Canvas:
+    o: Options = figure.options
+    rows = figure.frame
+    if figure.kind not in ("lines", "heat_map"):  # these show where a value is missing
+        measured = [o["value"]] if "value" in o else [o["x"], o["y"]]
+        values = [pl.col(name).cast(pl.Float64) for name in measured]
+        rows = rows.filter(value.is_finite() & ((value > 0) | (not o.get("log"))) for value in values)
+    rows = rows.head(_MOST_ROWS) if figure.kind == "forest" else rows
+    kind, height = _KINDS[figure.kind]
+    canvas = style.canvas(style.width(wide=False), 1)
+    axes = canvas.add_subplot()
+    if rows.is_empty() or (figure.kind == "lines" and not rows[o["value"]].cast(pl.Float64).is_finite().any()):
+        explain(axes, "No value is finite and positive: there is nothing to draw.")
+    else:
+        kind(axes, rows, o)
+        xlabel = o.get("xlabel", o["value"] if figure.kind == "forest" else o["x"])
+        axes.set_xlabel(wrapped(xlabel, int(10 * canvas.get_figwidth()), 2))
+        axes.set_ylabel(o.get("ylabel", "" if figure.kind == "forest" else o.get("y") or o["value"]))
+        if figure.kind in ("forest", "lines") and "num_episodes" in rows.columns:
+            _say_counts(axes, rows, style)
+    _framed(canvas, figure, height(rows, o), style)
+    return canvas
+
+
+def _framed(canvas: Canvas, figure: Figure, height: float, style: Style) -> None:
+    """Title and legend above the axes, which get `height` inches of a screen, and everything in its place.
+
+    A paper has no title: its caption file has it. Sizes are counted in letters; only the axes' own texts are measured.
+    """
+    handles, labels = canvas.axes[0].get_legend_handles_labels()
+    width, letter = canvas.get_figwidth(), 0.062 if style.paper else 0.07
+    lengths = [0.42 + letter * len(label) for label in labels]
+    columns = len(labels) if sum(lengths) < width - 0.1 else max(1, int((width - 0.1) / max(lengths)))
+    title = 0.05 if style.paper else 0.28
+    top = title + (0.17 * -(-len(labels) // columns) if labels else 0)
+    whole = top + height * (0.72 if style.paper else 1)
+    canvas.set_figheight(whole)
     if not style.paper:
-        width = int(canvas.get_figwidth() * style.characters_per_inch)
-        canvas.suptitle(wrapped(figure.title, width, 1), x=0.01, ha="left", size=10)
+        canvas.text(0.08 / width, 1 - 0.07 / whole, wrapped(figure.title, int(12.5 * width), 1), va="top", size=10)
+    if handles:
+        canvas.legend(handles, labels, loc="upper left", bbox_to_anchor=(0.03 / width, 1 - title / whole),
+                      ncols=columns, borderaxespad=0, handlelength=1.4, columnspacing=1.0, borderpad=0.1)  # fmt: skip
+    # Labels are measured once: layouts of matplotlib measure them several times, which takes longer than all else.
+    axes = canvas.axes[0]
+    axes.set_position((0.1, 0.1, 0.8, 0.8))
+    outer: Any = axes.get_tightbbox(for_layout_only=True)
+    room = np.abs(outer.extents - axes.get_window_extent().extents) / canvas.dpi + 0.06
+    left, bottom, right, over = room / (width, whole, width, whole)
+    axes.set_position((left, bottom, 1 - left - right, 1 - bottom - over - top / whole))
 
 
-def _forest(figure: Figure, style: Style) -> Canvas:
-    o: Any = figure.options
-    known = pl.col(o["value"]).is_not_null()
-    rows = figure.frame.filter(known & (pl.col(o["value"]) > 0) if o.get("log") else known).head(_MOST_ROWS)
-    high_row = 0.19 if rows.height > 30 else 0.26
-    canvas = new_canvas(style.width(wide=False), style.scaled(1.2 + high_row * max(rows.height, 2)))
-    _titled(canvas, figure, style)
-    axes = canvas.subplots()
-    if rows.is_empty():
-        explain(axes, "There is nothing to draw.")
-        return canvas
+def _forest(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
     value, low, high = _bounds(rows, o["value"])
     uniform = rows[o["uniform"]].cast(pl.Float64).to_numpy() if "uniform" in o else np.array([])
-    dots = o.get("dots")
-    baseline = o.get("baseline")
+    baseline, dots, name = o.get("baseline"), o.get("dots"), o.get("baseline_name")
+    places, colors = np.arange(rows.height), _colors_of(axes, rows, o)
+    if dots is not None:
+        _dots(axes, rows, dots, o)
     if o.get("log"):
         single = dots[o["value"]].drop_nulls().to_numpy() if dots is not None else np.array([])
         fixed = [baseline] if baseline is not None else []
         ratio_axis(axes.xaxis, np.concatenate([value, low[low > 0], high[np.isfinite(high)], uniform, single, fixed]))
     left, right = axes.get_xlim() if o.get("log") else (-np.inf, np.inf)
-    places = np.arange(rows.height)
-    if dots is not None:
-        _dots(axes, rows, dots, o)
-    colors = _colors_of(rows, o)
     axes.hlines(places, np.clip(low, left, right), np.clip(high, left, right), color=colors, linewidth=2)
     axes.scatter(value, places, c=colors, s=20, zorder=3)
-    name = o.get("baseline_name")
+    line: Any = {"color": BASELINE_COLOR, "linestyle": "--", "linewidth": 1, "label": name}
     if baseline is not None:
-        axes.axvline(baseline, color=BASELINE_COLOR, linestyle="--", linewidth=1, label=name)
+        axes.axvline(baseline, **line)
     if uniform.size:
-        axes.vlines(uniform, places - 0.4, places + 0.4, color=BASELINE_COLOR, linestyle="--", linewidth=1, label=name)
-    axes.set_yticks(places, [shortened(str(label), 24 if style.paper else 44) for label in rows[o["label"]]])
+        axes.vlines(uniform, places - 0.4, places + 0.4, **line)
+    axes.set_yticks(places, [shortened(str(label), 44) for label in rows[o["label"]]])
     axes.tick_params(axis="y", length=0)
     axes.set_ylim(rows.height - 0.4, -0.6)
-    axes.set_xlabel(str(o.get("xlabel", o["value"])))
     axes.grid(axis="x")
-    _say_counts(axes, rows, style)
-    _legend(axes, rows, o)
-    return canvas
 
 
 def _bounds(rows: pl.DataFrame, name: str) -> tuple[NDArray[np.float64], ...]:
     """Values and both ends of their intervals; the value itself where there is none."""
-    value = rows[name].cast(pl.Float64).to_numpy()
-    ends = (
-        rows.select(pl.coalesce(pl.col(f"{name}_{end}", name)).cast(pl.Float64)).to_series().to_numpy()
-        if f"{name}_{end}" in rows.columns
-        else value
+    ends = [
+        pl.coalesce(f"{name}_{end}", name) if f"{name}_{end}" in rows.columns else pl.col(name)
         for end in ("low", "high")
-    )
-    return value, *ends
+    ]
+    return tuple(rows.select(one.cast(pl.Float64)).to_series().to_numpy() for one in (pl.col(name), *ends))
 
 
-def _dots(axes: Axes, rows: pl.DataFrame, dots: pl.DataFrame, o: Any) -> None:
+def _dots(axes: Axes, rows: pl.DataFrame, dots: pl.DataFrame, o: Options) -> None:
     """Single episodes, around the middle of their row."""
     generator = np.random.default_rng(0)
     for place, label in enumerate(rows[o["label"]]):
@@ -136,99 +184,65 @@ def _dots(axes: Axes, rows: pl.DataFrame, dots: pl.DataFrame, o: Any) -> None:
                      label="one episode" if place == 0 else None)  # fmt: skip
 
 
-def _colors_of(rows: pl.DataFrame, o: Any) -> list[str]:
+def _colors_of(axes: Axes, rows: pl.DataFrame, o: Options) -> list[str]:
+    """The colour of each row, and an entry of the legend for each category."""
     if "color" not in o:
         return [SERIES_COLORS[0]] * rows.height
-    kinds = rows[o["color"]].unique(maintain_order=True).to_list()
-    given = o.get("colors", {})
-    of = {kind: given.get(kind, SERIES_COLORS[i % len(SERIES_COLORS)]) for i, kind in enumerate(kinds)}
+    of = {
+        kind: o.get("colors", {}).get(kind, SERIES_COLORS[i % len(SERIES_COLORS)])
+        for i, kind in enumerate(rows[o["color"]].unique(maintain_order=True))
+    }
+    for kind, color in of.items():
+        axes.plot([], [], "o", color=color, markersize=4, label=str(o.get("names", {}).get(kind, kind)))
     return [of[kind] for kind in rows[o["color"]]]
 
 
 def _say_counts(axes: Axes, rows: pl.DataFrame, style: Style) -> None:
     """How many episodes: once where all rows have as many (in a paper the caption says it), else beside each row."""
-    if "num_episodes" not in rows.columns:
-        return
     counts = rows["num_episodes"].to_list()
     small: Any = {"color": NOTE_COLOR, "size": 7}
     if len(set(counts)) == 1:
-        if style.paper:
-            return
-        axes.text(1.0, 1.01, f"n = {counts[0]} episodes", transform=axes.transAxes, ha="right", **small)
-        return
-    axes.text(1.01, -0.75, "n", transform=axes.get_yaxis_transform(), va="center", **small)
-    for place, count in enumerate(counts):
-        axes.text(1.01, place, str(count), transform=axes.get_yaxis_transform(), va="center", **small)
+        if not style.paper:
+            axes.text(1.0, 1.01, f"n = {counts[0]} episodes", transform=axes.transAxes, ha="right", **small)
+    elif axes.yaxis_inverted():  # a forest
+        for place, text in zip((-0.75, *range(len(counts))), ("n", *map(str, counts)), strict=True):
+            axes.text(1.01, place, text, transform=axes.get_yaxis_transform(), va="center", **small)
 
 
-def _legend(axes: Axes, rows: pl.DataFrame, o: Any) -> None:
-    handles, labels = axes.get_legend_handles_labels()
-    if "color" in o:
-        names = o.get("names", {})
-        for kind, color in dict(zip(rows[o["color"]], _colors_of(rows, o), strict=True)).items():
-            handles.append(axes.plot([], [], "o", color=color, markersize=4)[0])
-            labels.append(str(names.get(kind, kind)))
-    if handles:
-        _legend_above(axes, handles, labels)
-
-
-def _legend_above(axes: Axes, handles: Sequence[Any], labels: Sequence[str]) -> None:
-    figure = axes.get_figure(root=True)
-    width = 8.4 if figure is None else figure.get_figwidth()
-    columns = 4 if width > 6 else 3 if width > 4 else 2
-    axes.legend(handles, labels, loc="lower left", bbox_to_anchor=(0, 1), ncols=columns, borderaxespad=0.1,
-                handlelength=1.4, columnspacing=1.0)  # fmt: skip
-
-
-def _lines(figure: Figure, style: Style) -> Canvas:
-    o: Any = figure.options
-    rows = figure.frame.filter(pl.col(o["value"]).is_not_null())
-    canvas = new_canvas(style.width(wide=False), style.scaled(3.6))
-    _titled(canvas, figure, style)
-    axes = canvas.subplots()
-    if rows.is_empty():
-        explain(axes, "There is nothing to draw.")
-        return canvas
+def lines(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
+    """Lines over a numerical axis, broken where a value does not exist."""
     names = rows[o["color"]].unique(maintain_order=True).to_list() if "color" in o else [None]
     styles = group_styles([str(name) for name in names]) if "color" in o else {"None": {"color": SERIES_COLORS[0]}}
     for name in names:
         part = rows if name is None else rows.filter(pl.col(o["color"]) == name)
-        x, (value, low, high) = part[o["x"]].to_numpy(), _bounds(part, o["value"])
+        value, low, high = _bounds(part, o["value"])
         color = o.get("colors", {}).get(name) or styles[str(name)]["color"]
-        axes.plot(x, value, "o-", color=color, markersize=3, label=None if name is None else str(name))
-        axes.fill_between(x, low, high, color=color, alpha=0.18, linewidth=0)
+        shown = np.where(np.isfinite(value) & ((value > 0) | (not o.get("log"))), value, np.nan)
+        axes.plot(part[o["x"]], shown, "o-", color=color, markersize=3, label=None if name is None else str(name))
+        axes.fill_between(
+            part[o["x"]].to_numpy(), low, high, color=color, alpha=0.18 if len(names) < 4 else 0.08, linewidth=0
+        )
     if "uniform" in o:
         part = rows.filter(pl.col(o["uniform"]).is_not_null()).unique(o["x"], maintain_order=True)
         axes.plot(part[o["x"]], part[o["uniform"]], "--", color=BASELINE_COLOR, linewidth=1, label=BASELINE_NAME)
     if o.get("log"):
         uniform = rows[o["uniform"]].drop_nulls().to_list() if "uniform" in o else []
         value, low, high = _bounds(rows, o["value"])
+        finite = value[np.isfinite(value) & (value > 0)]
         # A band that runs far beyond all values is cut at the frame.
-        ends = np.clip([low, high], value.min() / 3, value.max() * 3).ravel()
-        ratio_axis(axes.yaxis, np.concatenate([value, ends, uniform]))
+        ends = np.clip([low, high], finite.min() / 3, finite.max() * 3).ravel()
+        ratio_axis(axes.yaxis, np.concatenate([finite, ends, uniform]))
     else:
         axes.set_ylim(bottom=0)
     if rows[o["x"]].dtype.is_integer():
         whole_numbers(axes.xaxis)
-    axes.set_xlabel(str(o.get("xlabel", o["x"])))
-    axes.set_ylabel(str(o.get("ylabel", o["value"])))
     axes.grid(axis="y")
-    if "num_episodes" in rows.columns and rows["num_episodes"].n_unique() == 1:
-        _say_counts(axes, rows, style)
-    handles, labels = axes.get_legend_handles_labels()
-    if handles:
-        _legend_above(axes, handles, labels)
-    return canvas
 
 
-def _stacked(figure: Figure, style: Style) -> Canvas:
-    o: Any = figure.options
-    rows = figure.frame.filter(pl.col(o["value"]).is_not_null())
+def stacked(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
+    """Bars of parts that are stacked in their order."""
     names = rows.filter(pl.col(o["value"]) > 0)[o["color"]].unique(maintain_order=True).to_list()
     places = rows[o["x"]].unique(maintain_order=True).to_list()
-    canvas = new_canvas(style.width(wide=False), style.scaled(3.8))
-    _titled(canvas, figure, style)
-    axes = canvas.subplots()
     styles, bottom = group_styles(names), np.zeros(len(places))
     for name in names:
         part = dict(rows.filter(pl.col(o["color"]) == name).select(o["x"], o["value"]).iter_rows())
@@ -236,28 +250,13 @@ def _stacked(figure: Figure, style: Style) -> Canvas:
         axes.bar(range(len(places)), values, 0.8, bottom, facecolor=styles[name]["color"], hatch=styles[name]["hatch"],
                  edgecolor="white", linewidth=0.4, label=shortened(name, 26))  # fmt: skip
         bottom = bottom + values
-    label_positions(axes.xaxis, [str(place) for place in places], 24)
+    label_positions(axes.xaxis, [str(place) for place in places], _MOST_LABELS)
     axes.set_ylim(0, max(1.0, float(bottom.max(initial=0))))
-    share_ticks(axes.yaxis, 6)
-    axes.set_xlabel(str(o.get("xlabel", o["x"])))
-    axes.set_ylabel(str(o.get("ylabel", o["value"])))
-    handles, labels = axes.get_legend_handles_labels()
-    canvas.legend(handles[::-1], labels[::-1], loc="outside right center")
-    return canvas
+    share_ticks(axes.yaxis)
 
 
-def _distribution(figure: Figure, style: Style) -> Canvas:
-    o: Any = figure.options
-    rows = figure.frame.filter(pl.col(o["value"]).is_finite())
-    if o.get("log"):
-        rows = rows.filter(pl.col(o["value"]) > 0)
+def _distribution(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
     places = rows[o["x"]].unique(maintain_order=True).to_list()
-    canvas = new_canvas(style.width(wide=False), style.scaled(3.8))
-    _titled(canvas, figure, style)
-    axes = canvas.subplots()
-    if rows.is_empty():
-        explain(axes, "No value is finite and positive: there is nothing to draw.")
-        return canvas
     generator = np.random.default_rng(0)
     for place, name in enumerate(places):
         values = rows.filter(pl.col(o["x"]) == name)[o["value"]].to_numpy()
@@ -275,66 +274,78 @@ def _distribution(figure: Figure, style: Style) -> Canvas:
     if uniform.size:
         axes.axhspan(uniform.min(), uniform.max(), color="#E6E6E6", linewidth=0, zorder=0)
         axes.axhline(float(np.median(uniform)), color=BASELINE_COLOR, linestyle="--", linewidth=1, label=BASELINE_NAME)
-        _legend_above(axes, *axes.get_legend_handles_labels())
-    label_positions(axes.xaxis, [str(place) for place in places], 24)
-    axes.set_xlabel(str(o.get("xlabel", o["x"])))
-    axes.set_ylabel(str(o.get("ylabel", o["value"])))
+    label_positions(axes.xaxis, [str(place) for place in places], _MOST_LABELS)
     axes.grid(axis="y")
-    return canvas
 
 
-def _heat_map(figure: Figure, style: Style) -> Canvas:
-    o: Any = figure.options
-    frame = figure.frame
-    columns, lines = (frame[o[axis]].unique(maintain_order=True).to_list() for axis in ("x", "y"))
-    values = np.full((len(lines), len(columns)), np.nan)
-    for x, y, value in frame.select(o["x"], o["y"], o["value"]).iter_rows():
-        with np.errstate(divide="ignore"):
-            values[lines.index(y), columns.index(x)] = np.nan if value is None else np.log2(value)
-    canvas = new_canvas(style.width(wide=False), style.scaled(1.3 + min(6.0, 0.3 * len(lines))))
-    _titled(canvas, figure, style)
-    axes = canvas.subplots()
-    certain = np.zeros(values.shape, dtype=bool)
-    draw_log2_map(canvas, axes, values, certain, str(o.get("label", o["value"])))
-    label_axis(axes, "x", [str(column) for column in columns])
-    label_axis(axes, "y", [str(line) for line in lines])
-    axes.set_xlabel(str(o.get("xlabel", o["x"])))
-    axes.set_ylabel(str(o.get("ylabel", o["y"])))
-    return canvas
-
-
-def _scatter(figure: Figure, style: Style) -> Canvas:
-    o: Any = figure.options
-    rows = figure.frame.filter(pl.col(o["x"]).is_not_null() & pl.col(o["y"]).is_not_null())
-    canvas = new_canvas(style.width(wide=False), style.scaled(4.2))
-    _titled(canvas, figure, style)
-    axes = canvas.subplots()
-    if rows.is_empty():
-        explain(axes, "There is nothing to draw.")
-        return canvas
+def _scatter(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
     (x, left, right), (y, low, high) = _bounds(rows, o["x"]), _bounds(rows, o["y"])
-    colors = _colors_of(rows, o)
+    colors = _colors_of(axes, rows, o)
     axes.hlines(y, left, right, color=colors, linewidth=1)
     axes.vlines(x, low, high, color=colors, linewidth=1)
     axes.scatter(x, y, c=colors, s=18, zorder=3)
-    for at, up, label in zip(x, y, rows[o["label"]], strict=True):
-        axes.annotate(shortened(str(label), 24), (at, up), (4, 3), textcoords="offset points", size=7)
+    for number, i in enumerate(np.argsort(-y)):  # above and below their points in turn, so that neighbours do not touch
+        name, offset = shortened(str(rows[o["label"]][int(i)]), 24), (4, -8 if number % 2 else 3)
+        axes.annotate(name, (x[i], y[i]), offset, textcoords="offset points", size=7)
     if o.get("log"):
         ratio_axis(axes.xaxis, np.concatenate([x, left, right]))
         ratio_axis(axes.yaxis, np.concatenate([y, low, high]))
-    axes.set_xlabel(str(o.get("xlabel", o["x"])))
-    axes.set_ylabel(str(o.get("ylabel", o["y"])))
     axes.grid()
-    _legend(axes, rows, o)
-    return canvas
 
 
-_KINDS: dict[str, Callable[[Figure, Style], Canvas]] = {
-    "forest": _forest,
-    "lines": _lines,
-    "stacked": _stacked,
-    "distribution": _distribution,
-    "heat_map": _heat_map,
-    "scatter": _scatter,
-    "pictures": pictures,
+#: The colours of a map: less than uniform attention (as the linguistic group), as much, more (as the visual group), and
+#: no value. They span at least this factor on either side of 1: tiny differences must not look large.
+_STOPS, _NO_VALUE, _LEAST_FACTOR = ("#A63C00", "#E69A6B", "#F7F7F7", "#7FB2D3", "#00507D"), "#D9D9D9", 1.4
+#: With more cells than this, numbers in them could not be read; with more in a row, they would touch.
+_MOST_NUMBERS, _MOST_NUMBERED_COLUMNS = 64, 12
+
+
+def _heat_map(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
+    """Factors as colours around 1, the first row at the bottom; infinite ones and 0 have the ends of the colours.
+
+    In a small map every cell also shows its number.
+    """
+    from matplotlib.colors import LinearSegmentedColormap, LogNorm
+
+    columns, lines = (rows[o[axis]].unique(maintain_order=True).to_list() for axis in ("x", "y"))
+    factors = np.full((len(lines), len(columns)), np.nan)
+    for x, y, value in rows.select(o["x"], o["y"], o["value"]).drop_nulls().iter_rows():
+        factors[lines.index(y), columns.index(x)] = value
+    known = factors[np.isfinite(factors) & (factors > 0)]
+    most = float(np.maximum(known, 1 / known).max(initial=_LEAST_FACTOR))
+    shown = np.clip(factors, 1 / most, most)
+    colors = LinearSegmentedColormap.from_list("less_more", _STOPS).with_extremes(bad=_NO_VALUE)
+    image = axes.imshow(shown, colors, LogNorm(1 / most, most), origin="lower", aspect="auto", interpolation="none")
+    numbered = factors.size <= _MOST_NUMBERS and len(columns) <= _MOST_NUMBERED_COLUMNS
+    for row, column in np.argwhere(np.isinf(factors) | (factors == 0) | (numbered & ~np.isnan(factors))):
+        ink = "white" if abs(np.log(shown[row, column])) > 0.6 * np.log(most) else "black"
+        axes.text(column, row, _factor(factors[row, column]), ha="center", va="center", color=ink, size=7)
+    canvas: Any = axes.figure
+    bar = canvas.colorbar(image, axes.inset_axes((1.02, 0.05, 0.025, 0.9)))
+    ratio_axis(bar.ax.yaxis, [1 / most, most])
+    bar.ax.set_ylim(1 / most, most)
+    bar.ax.yaxis.set_major_formatter(lambda value, _: _factor(value))
+    bar.set_label(wrapped(o.get("label", o["value"]), 20, 3))
+    bar.outline.set_visible(False)
+    label_positions(axes.xaxis, [str(one) for one in columns], _MOST_LABELS)
+    label_positions(axes.yaxis, [str(one) for one in lines], _MOST_LABELS)
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+
+
+def _factor(value: float) -> str:
+    """4, 1/4, 0 or ∞."""
+    if value == 0 or np.isinf(value):
+        return "∞" if value else "0"
+    return f"{value:.3g}" if f"{value:.3g}" == "1" or value > 1 else f"1/{1 / value:.3g}"
+
+
+#: Kind -> its function, and the inches that its axes are high.
+_KINDS: dict[str, tuple[Callable[[Axes, pl.DataFrame, Options], None], Callable[[pl.DataFrame, Options], float]]] = {
+    "forest": (_forest, lambda rows, o: 0.55 + (0.17 if rows.height > 30 else 0.21) * max(rows.height, 2)),
+    "lines": (lines, lambda rows, o: 3.0),
+    "stacked": (stacked, lambda rows, o: 3.0),
+    "distribution": (_distribution, lambda rows, o: 3.0),
+    "heat_map": (_heat_map, lambda rows, o: 0.9 + min(6.0, 0.3 * rows[o["y"]].n_unique())),
+    "scatter": (_scatter, lambda rows, o: 3.4),
 }

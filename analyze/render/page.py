@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from functools import partial
-from io import BytesIO
+from collections.abc import Sequence
+from functools import cache, partial
 
 import jinja2
 
-from vla_attention.analyze.core.result import Column, Figure, Result, Table
-from vla_attention.analyze.render import style as style_module
+from vla_attention.analyze.core.result import Figure, Result, Table
 from vla_attention.analyze.render.figures import draw
 from vla_attention.analyze.render.numbers import cell
 from vla_attention.analyze.render.style import Style
@@ -27,18 +24,16 @@ _SHORT = 12
 
 def fragment(result: Result) -> str:
     """One result as HTML without a page around it, for notebooks."""
-    with _environment() as environment:
-        return environment.get_template("result.html").render(result=result)
+    return _environment().get_template("result.html").render(result=result, title="")
 
 
 def page(title: str, results: Sequence[Result], version: str = "") -> str:
     """The page. It needs no network and nothing beside it."""
-    with _environment() as environment:
-        return environment.get_template("page.html").render(title=title, results=results, version=version)
+    return _environment().get_template("page.html").render(title=title, results=results, version=version)
 
 
-@contextmanager
-def _environment() -> Iterator[jinja2.Environment]:
+@cache
+def _environment() -> jinja2.Environment:
     """The folder `templates/`. Every text is escaped and `visible`; an unknown name in a template is an error."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("vla_attention.analyze.render"),
@@ -49,10 +44,10 @@ def _environment() -> Iterator[jinja2.Environment]:
         lstrip_blocks=True,
     )
     environment.globals.update(
-        cell=cell, picture=_picture, most=_MOST_ROWS, sort_key=_sort_key, open_tables=partial(_tables, folded=False),
+        cell=cell, picture=_picture, most=_MOST_ROWS, open_tables=partial(_tables, folded=False),
         folded_tables=partial(_tables, folded=True),
     )  # fmt: skip
-    yield environment
+    return environment
 
 
 def _tables(result: Result, folded: bool) -> list[Table]:
@@ -66,19 +61,12 @@ def _tables(result: Result, folded: bool) -> list[Table]:
     return tables[number:] if folded else tables[:number]
 
 
-def _picture(figure: Figure) -> str:
-    """The address of a picture that stands in the page itself; photographs as WebP, half the bytes of PNG."""
-    style = Style(inches=_INCHES)
+def _picture(figure: Figure) -> tuple[str, bool]:
+    """The address of a picture that stands in the page itself, and whether it is wide.
+
+    Photographs are WebP, half the bytes of PNG.
+    """
+    style, kind = Style(inches=_INCHES), "webp" if figure.kind == "pictures" else "png"
     canvas = draw(figure, style)
-    style_module.find_places(canvas, style.dpi)
-    content = BytesIO()
-    kind, options = ("webp", {"quality": 85}) if figure.kind == "pictures" else ("png", {})
-    with style.settings():
-        canvas.savefig(content, format=kind, dpi=style.dpi, pil_kwargs=options)
-    return f"data:image/{kind};base64,{base64.b64encode(content.getvalue()).decode()}"
-
-
-def _sort_key(row: dict[str, object], column: Column) -> str:
-    """What a cell is sorted by."""
-    value = row[column.name]
-    return "" if value is None else str(value)
+    content = base64.b64encode(style.content(canvas, kind)).decode()
+    return f"data:image/{kind};base64,{content}", canvas.get_figwidth() > _INCHES

@@ -19,17 +19,16 @@ words_high, as high, of the words.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.core.patch_pictures import NO_PICTURE, enlarge
+from vla_attention.analyze.core.camera_maps import NO_PICTURE, enlarge
 from vla_attention.analyze.core.result import Figure
-from vla_attention.analyze.render.plot_text import wrapped
-from vla_attention.analyze.render.style import Style, new_canvas
+from vla_attention.analyze.render.style import Style, wrapped
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -38,8 +37,10 @@ if TYPE_CHECKING:
 
 #: More pictures than this go into a further line of the same row.
 _COLUMNS = 8
-#: Inches of a picture's side, at most.
-_LARGEST = 2.4
+#: Inches of a picture's side, at least and at most; between pictures; of a line of text; of title, words and legend.
+_LEAST, _LARGEST, _GAP, _LINE, _BAND = 1.25, 2.4, 0.07, 0.13, 0.28
+#: Letters of the text at a picture, in an inch.
+_LETTERS = 20
 #: Surroundings: part of the picture that is kept, of that the part in colour, and the grey that the rest is.
 _KEPT, _COLOUR_KEPT, _GREY = 0.5, 0.55, 165.0
 #: Without a picture, attention is blue on grey.
@@ -48,6 +49,8 @@ _BLUE = (0.0, 58.0, 112.0)
 _LINES = (1.0, 2.2)
 _OUTLINES = ("#00B5CC", "#E040A0", "#7A5CFF", "#5CB800")
 _WORD = "#E69F00"
+#: Ends of a line (x0, y0, x1, y1).
+Segment = tuple[float, float, float, float]
 
 
 def strength(values: NDArray[np.floating], high: float) -> NDArray[np.float64]:
@@ -76,101 +79,111 @@ def lit(
 
 
 def pictures(figure: Figure, style: Style) -> Canvas:
-    """All pictures of the frame; see the module."""
-    o: Any = figure.options
+    """All pictures of the frame; see the module. One pair of axes holds all of them, in inches from the top left."""
+    o: Mapping[str, Any] = figure.options
     frame = figure.frame
     rows, columns = (frame[name].unique(maintain_order=True).to_list() for name in ("row", "column"))
-    lines = -(-len(columns) // _COLUMNS)
-    across = min(len(columns), _COLUMNS)
-    margin = 0.3 if frame.schema["row"] == pl.String else 0.1
-    side = min((style.width(wide=True) - margin) / across, _LARGEST)
-    shown = {(one["row"], one["column"]): (one, o["picture"](one)) for one in frame.iter_rows(named=True)}
-    heights = dict.fromkeys(rows, 0.0)
-    for (row, _), (one, picture) in shown.items():
-        height, width = picture.shape[:2] if picture is not None else np.shape(one["map"])
-        heights[row] = max(heights[row], side * height / width)
-    of_text = sum(_lines_of(frame, name) for name in ("above", "below")) * 0.15 + 0.1
-    of_rows = [height + of_text for height in heights.values()]
-    has_map, words = "map" in frame.columns and frame["map"].null_count() < frame.height, _words(frame)
-    blocks = [*([0.28] if words else []), *([sum(of_rows)] * lines), *([0.28] if has_map else [])]
-    canvas = new_canvas(max(margin + across * side, 3.3), sum(blocks) + (0.05 if style.paper else 0.35))
+    across, named = min(len(columns), _COLUMNS), frame.schema["row"] == pl.String
+    margin = 0.08 + 0.2 * named
+    # As wide as a plot, unless the texts at the pictures would touch.
+    wide = (style.width(wide=False) - margin) / across < _LEAST
+    side = min((style.width(wide) - margin) / across - _GAP, _LARGEST)
+    heights_of = dict.fromkeys(("above", "below"), 0.0)
+    for name in heights_of.keys() & set(frame.columns):
+        texts = frame[name].fill_null("").str.split("\n").to_list()
+        broken = ["\n".join(wrapped(line, int(_LETTERS * side), 3) for line in text) for text in texts]
+        heights_of[name] = _LINE * max(text.count("\n") + bool(text) for text in broken)
+        frame = frame.with_columns(pl.Series(name, broken))
+    shown = [(one, *_lit(one, o)) for one in frame.iter_rows(named=True)]
+    heights = {row: max(side * len(at) / len(at[0]) for one, at, _ in shown if one["row"] == row) for row in rows}
+    above, below = heights_of.values()
+    high = sum(heights.values()) + len(rows) * (above + below + 0.14)
+    top = 0.06 if style.paper else _BAND
+    words, has_map = _words(frame), any(values is not None for *_, values in shown)
+    start = top + _BAND * bool(words)
+    width = max(margin + across * (side + _GAP), 3.3)
+    height = start + high * -(-len(columns) // _COLUMNS) + (_BAND if has_map else 0.0)
+    canvas = style.canvas(width, height)
+    axes = canvas.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0), autoscale_on=False)
+    axes.set_axis_off()
     if not style.paper:
-        room = int(canvas.get_figwidth() * style.characters_per_inch)
-        canvas.suptitle(wrapped(figure.title, room, 2), x=0.01, ha="left", size=10)
-    parts = canvas.add_gridspec(len(blocks), 1, height_ratios=blocks)
-    if words:
-        _draw_words(canvas.add_subplot(parts[0]), words, float(o.get("words_high", 4.0)))
-    grids = [parts[line + bool(words)].subgridspec(len(rows), across, height_ratios=of_rows) for line in range(lines)]
-    for (row, column), (one, picture) in shown.items():
-        line, place = divmod(columns.index(column), _COLUMNS)
-        axes = canvas.add_subplot(grids[line][rows.index(row), place])
-        _draw_one(axes, one, picture, o, row if place == 0 and isinstance(row, str) else "")
+        axes.text(0.08, 0.07, wrapped(figure.title, int(12.5 * width), 1), va="top", size=10)
+    _draw_words(axes, words, float(o.get("words_high", 4.0)), top + _BAND / 2)
+    levels = list(o.get("levels", ()))
+    looks = [("black", points, f"{level:g} times even or more") for level, points in zip(levels, _LINES, strict=False)]
+    looks += [
+        (_OUTLINES[i % len(_OUTLINES)], 1.4, wrapped(name, 30, 1)) for i, name in enumerate(o.get("outlines", ()))
+    ]
+    around: list[list[Segment]] = [[] for _ in looks]
+    for one, picture, values in shown:
+        line, place = divmod(columns.index(one["column"]), _COLUMNS)
+        before = rows[: rows.index(one["row"])]
+        x = margin + place * (side + _GAP)
+        y = start + line * high + sum(heights[row] + above + below + 0.14 for row in before) + above
+        down = side * len(picture) / len(picture[0])
+        axes.imshow(picture, extent=(x, x + side, y + down, y), aspect="auto", interpolation="nearest")
+        if one.get("above"):
+            axes.text(x + side / 2, y - 0.04, one["above"], ha="center", va="bottom", size=7.5)
+        if one.get("below"):
+            axes.text(x + side / 2, y + down + 0.03, one["below"], ha="center", va="top", size=7)
+        if named and place == 0:
+            name = wrapped(one["row"], 22, 2)
+            axes.text(x - 0.04, y + down / 2, name, ha="right", va="center", size=7.5, rotation=90)
+        regions: list[NDArray[np.bool_] | None] = [None if values is None else values >= level for level in levels]
+        regions += [np.array(member, dtype=bool) for member in one.get("members") or ()]
+        for number, region in enumerate(regions):
+            if region is not None:
+                around[number] += _around(region, 0.12 * (number >= len(levels)), (x, y), (side, down))
+    for segments, (color, points, _) in zip(around, looks, strict=True):
+        _draw_lines(axes, segments, color, points)
     if has_map:
-        _draw_legend(canvas.add_subplot(parts[len(blocks) - 1]), o)
+        _draw_legend(axes, looks, (0.08, height - _BAND / 2), width)
     return canvas
 
 
-def _lines_of(frame: pl.DataFrame, name: str) -> int:
-    return max((text.count("\n") + 1 for text in frame[name] if text), default=0) if name in frame.columns else 0
-
-
-def _draw_one(axes: Axes, one: dict[str, Any], picture: NDArray[np.uint8] | None, o: Any, name: str) -> None:
-    values = None if one.get("map") is None else np.array(one["map"], dtype=np.float64)
-    if values is not None:
-        picture = lit(picture, values, o["high"], bool(o.get("smooth")))
-    assert picture is not None
-    axes.imshow(picture, interpolation="nearest")
-    axes.set_xticks([])
-    axes.set_yticks([])
-    for spine in axes.spines.values():
-        spine.set_visible(False)
-    size = 7.5
-    if values is not None:
-        for level, width in zip(o.get("levels", ()), _LINES, strict=False):
-            _around(axes, values >= level, picture.shape, width, "black", "white")
-    for i, member in enumerate(one.get("members") or ()):
-        _around(
-            axes, np.array(member, dtype=bool), picture.shape, 1.4, _OUTLINES[i % len(_OUTLINES)], "white", inside=0.12
-        )
-    if one.get("above"):
-        axes.set_title(one["above"], size=size, pad=3)
-    if one.get("below"):
-        axes.set_xlabel(one["below"], size=size - 0.5, labelpad=2)
-    if name:
-        axes.set_ylabel(wrapped(name, 22, 2), size=size, labelpad=2)
+def _lit(one: Mapping[str, Any], o: Mapping[str, Any]) -> tuple[NDArray[np.uint8], NDArray[np.float64] | None]:
+    """A picture as it is shown, and the values of its patches."""
+    picture = o["picture"](one)
+    if one.get("map") is None:
+        return picture, None
+    values = np.array(one["map"], dtype=np.float64)
+    return lit(picture, values, o["high"], bool(o.get("smooth"))), values
 
 
 def _around(
-    axes: Axes,
-    member: NDArray[np.bool_],
-    shape: Sequence[int],
-    width: float,
-    color: str,
-    border: str,
-    inside: float = 0.0,
-) -> None:
-    """A line around the member patches (row, column), `inside` of a patch within them; dark on a light border."""
-    from matplotlib.collections import LineCollection
-
-    down, across = shape[0] / member.shape[0], shape[1] / member.shape[1]
+    member: NDArray[np.bool_], inside: float, start: tuple[float, float], sides: tuple[float, float]
+) -> list[Segment]:
+    """The borders of the member patches (row, column), `inside` of a patch within them."""
+    patch = np.array([sides[0] / member.shape[1], sides[1] / member.shape[0]] * 2)
     wide = np.pad(member, 1)
     segments = []
     for row, column in zip(*np.nonzero(member), strict=True):
         above, below, left, right = (
-            not wide[row + down_by, column + across_by] for down_by, across_by in ((0, 1), (2, 1), (1, 0), (1, 2))
+            not wide[row + down, column + across] for down, across in ((0, 1), (2, 1), (1, 0), (1, 2))
         )
         top, bottom = row + inside * above, row + 1 - inside * below
-        start, end = column + inside * left, column + 1 - inside * right
-        for drawn, (x0, y0, x1, y1) in (
-            (above, (start, top, end, top)), (below, (start, bottom, end, bottom)),
-            (left, (start, top, start, bottom)), (right, (end, top, end, bottom)),
-        ):  # fmt: skip
-            if drawn:
-                segments.append([(x0 * across - 0.5, y0 * down - 0.5), (x1 * across - 0.5, y1 * down - 0.5)])
-    for one, points in ((border, width + 1.2), (color, width)):
-        axes.add_collection(
-            LineCollection(segments, colors=one, linewidths=points, capstyle="projecting", clip_on=False), False
+        first, last = column + inside * left, column + 1 - inside * right
+        ends = (
+            (first, top, last, top),
+            (first, bottom, last, bottom),
+            (first, top, first, bottom),
+            (last, top, last, bottom),
         )
+        segments += [
+            tuple(np.array(one) * patch + start * 2)
+            for one, drawn in zip(ends, (above, below, left, right), strict=True)
+            if drawn
+        ]
+    return segments
+
+
+def _draw_lines(axes: Axes, segments: Sequence[Segment], color: str, points: float) -> None:
+    """Lines on a light border."""
+    from matplotlib.collections import LineCollection
+
+    ends = [(one[:2], one[2:]) for one in segments]
+    for ink, wide in (("white", points + 1.2), (color, points)):
+        axes.add_collection(LineCollection(ends, colors=ink, linewidths=wide, capstyle="projecting"), autolim=False)
 
 
 def _words(frame: pl.DataFrame) -> list[tuple[str, float]]:
@@ -181,46 +194,28 @@ def _words(frame: pl.DataFrame) -> list[tuple[str, float]]:
     return list(zip(frame["words"][0].to_list(), np.nanmean(lifts, axis=0).tolist(), strict=True))
 
 
-def _draw_words(axes: Axes, words: Sequence[tuple[str, float]], high: float) -> None:
+def _draw_words(axes: Axes, words: Sequence[tuple[str, float]], high: float, down: float) -> None:
     """The words side by side, each on a shade of its value."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.colors import to_rgba
 
-    axes.set_axis_off()
-    canvas = axes.figure.canvas
-    assert isinstance(canvas, FigureCanvasAgg)
-    renderer, dpi = canvas.get_renderer(), axes.figure.dpi  # type: ignore[no-untyped-call]
-    place = 4.0
+    before: Any = "data"
     for word, value in words:
-        box = {
-            "boxstyle": "round,pad=0.25",
-            "facecolor": (*_rgb(_WORD), float(strength(np.array(value), high))),
-            "linewidth": 0,
-        }
-        text = axes.annotate(word, (0, 0.5), (place, 0), textcoords="offset points", va="center", size=9, bbox=box)
-        place += text.get_window_extent(renderer).width * 72 / dpi + 9
-        text.set_in_layout(False)
+        box = {"boxstyle": "round,pad=0.25", "linewidth": 0,
+               "facecolor": to_rgba(_WORD, float(strength(np.array(value), high)))}  # fmt: skip
+        place, offset = ((0.12, down), (0, 0)) if before == "data" else ((1, 0.5), (9, 0))
+        before = axes.annotate(word, place, offset, xycoords=before, textcoords="offset points", va="center", size=9,
+                               bbox=box)  # fmt: skip
 
 
-def _rgb(color: str) -> tuple[float, float, float]:
-    red, green, blue = (int(color[i : i + 2], 16) / 255 for i in (1, 3, 5))
-    return red, green, blue
-
-
-def _draw_legend(axes: Axes, o: Any) -> None:
+def _draw_legend(axes: Axes, looks: Sequence[tuple[str, float, str]], place: tuple[float, float], width: float) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
     from matplotlib.patheffects import withStroke
 
-    axes.set_axis_off()
-    handles: list[Artist] = [Patch(facecolor="#A0A0A0", label="pale: no more than even attention")]
-    for level, width in zip(o.get("levels", ()), _LINES, strict=False):
-        effect = [withStroke(linewidth=width + 1.2, foreground="white")]
-        handles.append(
-            Line2D([], [], color="black", linewidth=width, path_effects=effect, label=f"{level:g} times even and more")
-        )
-    for i, name in enumerate(o.get("outlines", ())):
-        handles.append(Patch(facecolor="none", edgecolor=_OUTLINES[i % len(_OUTLINES)], label=wrapped(name, 30, 1)))
-    canvas = axes.get_figure(root=True)
-    columns = 4 if canvas is None or canvas.get_figwidth() > 5 or len(handles) < 3 else 2
-    axes.legend(handles=handles, loc="center left", ncols=columns, bbox_to_anchor=(0, 0.5), borderaxespad=0.0,
-                handlelength=1.6, columnspacing=1.2, fontsize=7.5)  # fmt: skip
+    handles: list[Artist] = [Patch(facecolor="#A0A0A0", label="pale: no more than even")]
+    for color, points, label in looks:
+        effect = [withStroke(linewidth=points + 1.2, foreground="white")]
+        handles.append(Line2D([], [], color=color, linewidth=points, path_effects=effect, label=label))
+    columns = 4 if width > 5 or len(handles) < 3 else 2
+    axes.legend(handles=handles, loc="center left", ncols=columns, bbox_to_anchor=place, borderaxespad=0.0,
+                bbox_transform=axes.transData, handlelength=1.6, columnspacing=1.2, fontsize=7.5)  # fmt: skip

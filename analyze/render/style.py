@@ -1,17 +1,22 @@
-"""How pictures look: on a screen, or in a paper; where they are saved, and the caption files of the latter."""
+"""How pictures look: on a screen, or in a paper; colours, axes and names that fit; how they are saved."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from io import BytesIO
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from vla_attention.analyze.core.result import Figure
-from vla_attention.analyze.render.output_files import replacing, write_text
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.schemas.safe_text import visible
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure as Canvas
 
 StyleName: TypeAlias = Literal["screen", "paper"]
@@ -32,6 +37,38 @@ _SETTINGS: dict[str, Any] = {
     "svg.fonttype": "none",
     "text.parse_math": False,  # instructions and group names may hold $ and _
 }
+#: Okabe & Ito's colours, which colour-blind people can tell apart, one for each group that always exists.
+_FIXED_COLORS = {
+    "visual": "#0072B2",
+    "linguistic": "#D55E00",
+    "action": "#009E73",
+    "state": "#CC79A7",
+    "padding": "#C8C8C8",
+    "null": "#BDB7A8",
+    "masked": "#8F8F8F",
+    "other": "#4D4D4D",
+    "rest": "#4D4D4D",
+}
+#: Colours of other groups, in this order: the rest of Okabe & Ito's, then Tol's muted scheme.
+_FURTHER_COLORS = ("#E69F00", "#56B4E9", "#F0E442", "#332288", "#117733", "#882255", "#44AA99", "#999933", "#AA4499")
+#: Patterns that tell groups apart when there are more groups than colours.
+_HATCHES = ("", "///", "...", "xxx")
+#: Colours of runs, files and the like, in this order (Okabe & Ito's; neighbours differ in lightness too).
+SERIES_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+#: Of the value that uniform attention gives, of small print, and of single episodes beside their mean.
+BASELINE_COLOR, NOTE_COLOR, DOT_COLOR = "#000000", "#555555", "#56B4E9"
+
+
+def group_styles(names: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Colour and hatch of each group: fixed for the usual names, else the next free colour, then hatches."""
+    taken = {_FIXED_COLORS[name] for name in names if name in _FIXED_COLORS}
+    palette = [*_FURTHER_COLORS, *(color for color in dict.fromkeys(_FIXED_COLORS.values()) if color not in taken)]
+    others = [name for name in names if name not in _FIXED_COLORS]
+    looks = [(color, hatch) for hatch in _HATCHES for color in palette]
+    of = {name: looks[i % len(looks)] for i, name in enumerate(others)}
+    return {
+        name: dict(zip(("color", "hatch"), of.get(name) or (_FIXED_COLORS[name], ""), strict=True)) for name in names
+    }
 
 
 @dataclass(frozen=True)
@@ -50,11 +87,6 @@ class Style:
         return self.name == "paper"
 
     @property
-    def formats(self) -> tuple[str, ...]:
-        """A paper's pictures are vectors; the PNG is to look at."""
-        return ("png", "pdf") if self.paper else ("png",)
-
-    @property
     def dpi(self) -> int:
         """Dots per inch of a PNG."""
         return 300 if self.paper else 150
@@ -64,15 +96,6 @@ class Style:
         if self.paper:
             return _BOTH_COLUMNS if wide else _ONE_COLUMN
         return max(self.inches, _WIDE) if wide else self.inches
-
-    def scaled(self, inches: float) -> float:
-        """A height that is right on a screen, in this style."""
-        return inches * (0.72 if self.paper else 1.0)
-
-    @property
-    def characters_per_inch(self) -> float:
-        """Of running text in its title size, on the safe side."""
-        return 14 if self.paper else 11
 
     @contextmanager
     def settings(self) -> Iterator[None]:
@@ -95,51 +118,86 @@ class Style:
         with mpl.rc_context(more):
             yield
 
+    def canvas(self, width: float, height: float) -> Canvas:
+        """A matplotlib figure of width x height inches on the Agg canvas: no window system, no state of pyplot."""
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure as Canvas
 
-def new_canvas(width: float, height: float) -> Canvas:
-    """A matplotlib figure of width x height inches on the Agg canvas: no window system, no global state of pyplot."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure as Canvas
+        canvas = Canvas(figsize=(width, height), dpi=self.dpi)
+        FigureCanvasAgg(canvas)
+        return canvas
 
-    canvas = Canvas(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(canvas)
-    return canvas
+    def content(self, canvas: Canvas, kind: str) -> bytes:
+        """A picture as the bytes of a file; it is drawn once."""
+        from PIL import Image
 
-
-def save_canvas(canvas: Canvas, figure: Figure, folder: Path, style: Style, formats: Sequence[str] = ()) -> list[Path]:
-    """Save NAME.png (and other formats), for a paper NAME_caption.md and .tex too; returns the paths."""
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    find_places(canvas, style.dpi)
-    for kind in formats or style.formats:
-        path = folder / f"{figure.name}.{kind}"
-        # Without a creation date the same data give the same file.
-        metadata = {"CreationDate": None} if kind == "pdf" else None
-        with replacing(path) as temporary:
-            canvas.savefig(temporary, format=kind, dpi=style.dpi, metadata=metadata)
-        paths.append(path)
-    if style.paper:
-        caption = f"{figure.title}. {figure.caption}".strip()
-        for ending, text in (("md", caption), ("tex", f"\\caption{{{_for_latex(caption)}}}")):
-            paths.append(folder / f"{figure.name}_caption.{ending}")
-            write_text(paths[-1], f"{text}\n")
-    return paths
+        file = BytesIO()
+        with self.settings():
+            if kind in ("png", "webp"):
+                pixels: Any = canvas.canvas
+                pixels.draw()
+                image = Image.fromarray(np.asarray(pixels.buffer_rgba())).convert("RGB")
+                options: Any = {"quality": 85, "method": 1} if kind == "webp" else {"dpi": (self.dpi, self.dpi)}
+                image.save(file, kind, **options)
+            else:
+                # Without a creation date the same data give the same file.
+                canvas.savefig(file, format=kind, metadata={"CreationDate": None} if kind == "pdf" else None)
+        return file.getvalue()
 
 
-def find_places(canvas: Canvas, dpi: int) -> None:
-    """Find them once, for every format. While a figure has a layout engine, matplotlib draws all of it twice."""
-    engine = canvas.get_layout_engine()
-    if engine is not None:
-        canvas.set_dpi(dpi)
-        engine.execute(canvas)
-        canvas.set_layout_engine(None)
+def wrapped(text: str, width: int, lines: int) -> str:
+    """Text in at most so many lines of at most so many characters, with … where it was cut."""
+    return "\n".join(textwrap.wrap(visible(" ".join(text.split())), width, max_lines=lines, placeholder=" …"))
 
 
-_LATEX = {
-    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&", "#": r"\#", "_": r"\_", "%": r"\%",
-    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
-}  # fmt: skip
+def explain(axes: Axes, text: str) -> None:
+    """Write into the middle of empty axes why they are empty."""
+    axes.set_axis_off()
+    axes.text(0.5, 0.5, textwrap.fill(text, 60), transform=axes.transAxes, ha="center", va="center", color=NOTE_COLOR)
 
 
-def _for_latex(text: str) -> str:
-    return "".join(_LATEX.get(character, character) for character in text)
+def ratio_axis(axis: Any, values: Any) -> None:
+    """Make an x or y axis logarithmic around finite positive values, with decimal numbers (0.5, 20) as labels.
+
+    A ratio and its inverse are equally far from 1 on such an axis; on a linear axis the denominator's side is squeezed.
+    """
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    shown = np.asarray(values, dtype=np.float64)
+    shown = shown[np.isfinite(shown) & (shown > 0)]
+    low, high = (shown.min(), shown.max()) if shown.size else (0.5, 2.0)
+    # At least half a factor of two on either side, so that tiny differences do not look large.
+    margin = max(0.06 * np.log(high / low), 0.5 * (np.log(2.0) - np.log(high / low)), 0.05)
+    low, high = low * np.exp(-margin), high * np.exp(margin)
+    decades = np.log10(high / low)
+    digits = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0) if decades < 1.0 else (1.0, 2.0, 5.0) if decades < 3 else (1.0,)
+    is_x = axis.axis_name == "x"
+    (axis.axes.set_xscale if is_x else axis.axes.set_yscale)("log")
+    (axis.axes.set_xlim if is_x else axis.axes.set_ylim)(low, high)
+    axis.set_major_locator(LogLocator(subs=digits, numticks=20))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}"))
+    axis.set_minor_locator(NullLocator())
+
+
+def whole_numbers(axis: Axis) -> None:
+    """Ticks of a linear axis at whole numbers only, for counts and steps."""
+    from matplotlib.ticker import MaxNLocator
+
+    axis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+
+
+def share_ticks(axis: Axis) -> None:
+    """Ticks from 0% to 100% on an axis of shares."""
+    axis.set_ticks(np.linspace(0, 1, 6), [f"{share}%" for share in range(0, 101, 20)])
+
+
+def label_positions(axis: Axis, labels: Sequence[str], most: int) -> None:
+    """Labels at the positions 0, 1, 2 ...; every second, third ... label where more than `most` would touch."""
+    positions = range(0, len(labels), max(1, -(-len(labels) // most)))
+    axis.set_ticks(list(positions), [labels[i] for i in positions])
+
+
+def scattered(generator: np.random.Generator, position: float, count: int, spread: float = 0.22) -> NDArray[np.float64]:
+    """`count` positions around the middle of a row, at most `spread` from it, so that points do not hide each other."""
+    offsets = generator.uniform(-spread, spread, count) if count > 1 else np.zeros(count)
+    return np.asarray(position + offsets)

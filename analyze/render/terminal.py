@@ -103,7 +103,7 @@ def _laid_out(table: Table, rows: int) -> list[str]:
     for row in cells:
         last = textwrap.wrap(row[len(columns) - 1], rest) if columns[-1].kind == "prose" else [row[len(columns) - 1]]
         parts = [
-            _cut(text, width).ljust(width) if column.kind in ("text", "prose") else text.rjust(width)
+            shortened(text, width).ljust(width) if column.kind in ("text", "prose") else text.rjust(width)
             for text, width, column in zip([*row[: len(columns) - 1], (last or [""])[0]], widths, columns, strict=True)
         ]
         lines.append("  ".join(parts).rstrip())
@@ -111,5 +111,6 @@ def _laid_out(table: Table, rows: int) -> list[str]:
     return lines
 
 
-def _cut(text: str, width: int) -> str:
-    return text if len(text) <= width else f"{text[: width - 1]}…"
+def shortened(name: str, width: int) -> str:
+    """A name that must not be broken at spaces, in at most so many characters, with … where it was cut."""
+    return name if len(name) <= width else f"{name[: width - 1]}…"

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import subprocess
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from fractions import Fraction
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -16,7 +14,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.result import Figure
-from vla_attention.analyze.render.output_files import replacing
+from vla_attention.analyze.render.files import replacing
 from vla_attention.analyze.render.pictures import pictures
 from vla_attention.analyze.render.style import Style
 from vla_attention.schemas.errors import BadArgument, MissingDependency
@@ -32,10 +30,6 @@ _GIF_COLORS = 255
 _CRF = 15
 
 
-class FfmpegFailed(Exception):
-    """ffmpeg ended with an error, of which this is the last line."""
-
-
 def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, kind: VideoFormat) -> Path:
     """Write pictures (row, column, 3) uint8 of one size, `fps` of them a second; returns the path.
 
@@ -49,8 +43,9 @@ def write_video(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float, kin
     try:
         with replacing(path) as temporary:
             (write_gif if kind == "gif" else write_mp4)(temporary, frames, fps)
-    except FfmpegFailed as error:
-        raise BadArgument(f"ffmpeg could not write {path}: {visible(str(error))}; choose --video gif.") from None
+    except subprocess.CalledProcessError as error:
+        said = error.stderr.decode(errors="replace").strip().splitlines() or [f"exit code {error.returncode}"]
+        raise BadArgument(f"ffmpeg could not write {path}: {visible(said[-1])}; choose --video gif.") from None
     return path
 
 
@@ -102,15 +97,13 @@ def write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> No
 
 def _colours_of(pictures: Sequence[Image]) -> NDArray[np.uint8]:
     """A picture (1, number, 3) of the colours of all pictures; the more pixels one has, the more often, by root."""
-    counts: Counter[int] = Counter()
-    for picture in pictures:
-        coarse = np.asarray(picture, dtype=np.uint32) >> 2
-        codes, numbers = np.unique((coarse[..., 0] << 12) | (coarse[..., 1] << 6) | coarse[..., 2], return_counts=True)
-        counts.update(dict(zip(codes.tolist(), numbers.tolist(), strict=True)))
-    codes = np.array(list(counts))
-    colours = np.stack([codes >> 12, (codes >> 6) & 63, codes & 63], axis=-1) * 255 // 63
-    often = np.ceil(np.sqrt(np.array(list(counts.values())))).clip(1, 8).astype(int)
-    return np.repeat(colours, often, axis=0)[None].astype(np.uint8)
+    coarse = (np.asarray(picture, dtype=np.uint32) >> 2 for picture in pictures)
+    codes = ((one[..., 0] << 12) | (one[..., 1] << 6) | one[..., 2] for one in coarse)
+    found = [np.unique(one, return_counts=True) for one in codes]
+    colours, place = np.unique(np.concatenate([one for one, _ in found]), return_inverse=True)
+    often = np.ceil(np.sqrt(np.bincount(place, np.concatenate([counts for _, counts in found])))).clip(1, 8)
+    parts = np.stack([colours >> 12, (colours >> 6) & 63, colours & 63], axis=-1) * 255 // 63
+    return np.repeat(parts, often.astype(int), axis=0)[None].astype(np.uint8)
 
 
 def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> None:
@@ -120,53 +113,32 @@ def write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], fps: float) -> No
     a video would pass for all of it.
 
     Raises:
-        FfmpegFailed: ffmpeg ended with an error.
+        CalledProcessError: ffmpeg ended with an error.
     """
     check_video("mp4")
-    drawn = _same_size(frames)
-    first = next(drawn)
-    height, width = (side + side % 2 for side in first.shape[:2])
-    program = subprocess.Popen(
-        _ffmpeg(path, width, height, fps),
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        process_group=0,  # Ctrl-C is for this process, which then ends ffmpeg
-    )
-    with program:
-        assert program.stdin is not None
-        try:
-            for picture in chain((first,), drawn):
-                margins = ((0, height - picture.shape[0]), (0, width - picture.shape[1]), (0, 0))
-                program.stdin.write(np.pad(picture, margins, mode="edge").tobytes())
-            said = program.communicate()[1]
-        except BrokenPipeError:  # it has ended; why is in what it says
-            said = program.communicate()[1]
-        except BaseException:
-            program.kill()
-            raise
-    if program.returncode != 0:
-        lines = said.decode(errors="replace").strip().splitlines() or [f"exit code {program.returncode}"]
-        raise FfmpegFailed(lines[-1])
-
-
-def _ffmpeg(path: Path, width: int, height: int, fps: float) -> list[str]:
-    """The command that makes a video of raw pictures from its standard input."""
     import imageio_ffmpeg
 
-    rate = str(Fraction(fps).limit_denominator())
-    given = f"-f rawvideo -vcodec rawvideo -s {width}x{height} -pix_fmt rgb24 -r {rate} -i -"
+    drawn = list(_same_size(frames))
+    height, width = drawn[0].shape[:2]
+    even = ((0, height % 2), (0, width % 2), (0, 0))
+    given = f"-f rawvideo -vcodec rawvideo -s {width + width % 2}x{height + height % 2} -pix_fmt rgb24"
+    given += f" -r {Fraction(fps).limit_denominator()} -i -"
     made = f"-an -vcodec libx264 -pix_fmt yuv420p -crf {_CRF} -v error -f mp4 -movflags +faststart"
-    return [imageio_ffmpeg.get_ffmpeg_exe(), "-y", *given.split(), *made.split(), str(path)]
+    subprocess.run(
+        [imageio_ffmpeg.get_ffmpeg_exe(), "-y", *given.split(), *made.split(), str(path)],
+        input=b"".join(np.pad(picture, even, mode="edge").tobytes() for picture in drawn),
+        capture_output=True,
+        check=True,
+        process_group=0,  # Ctrl-C is for this process, which then ends ffmpeg
+    )
 
 
 def _same_size(frames: Iterable[NDArray[np.uint8]]) -> Iterator[NDArray[np.uint8]]:
-    first: tuple[int, ...] | None = None
+    first: tuple[int, ...] = ()
     for frame in frames:
-        if first is None:
-            first = frame.shape
+        first = first or frame.shape
         if frame.shape != first:
             raise BadArgument(f"A video's pictures have one size; got {frame.shape} after {first}.")
         yield frame
-    if first is None:
+    if not first:
         raise BadArgument("A video needs at least one picture.")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +17,10 @@ from vla_attention.schemas.threads import add_threads
 if TYPE_CHECKING:
     from vla_attention.schemas.stores.reader import Store
     from vla_attention.schemas.stores.store_url import StorePlace
+    from vla_attention.schemas.stores.verify import Depth, EpisodeReport
 
+_DESCRIPTION = """Copy a store, for instance without its pictures or as a tar file an episode, or make one store of
+several of one run. Without a place to copy to, print how large each part is."""
 _EXAMPLES = """examples:
   vla-attention store copy libero_10.zarr                               how large each part is
   vla-attention store copy libero_10.zarr slim.zarr --without frames
@@ -37,52 +40,28 @@ Several stores have to be of one run configuration: what differs is named. No tw
 one store shares the files of the given ones (hard links), so that it takes no space; a damage of one is then a damage
 of both, and --copy makes files of its own. What comes from elsewhere is always copied.
 """
+_EXAMPLES_OF_VERIFY = EXAMPLES.replace("NAME", "vla-attention store")
 
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-attention store copy STORE ...` and `vla-attention store verify STORE ...`."""
     parser = command_parser("vla-attention store", "Keep stores: copies, one store of several, checks.")
     acts = parser.add_subparsers(required=True, metavar="copy|verify", parser_class=OneSentenceParser)
-    copy = acts.add_parser(
-        "copy",
-        help="a copy: smaller, in tar files, from elsewhere; or one store of several",
-        description="Copy a store, for instance without its pictures or as a tar file an episode, or make one store "
-        "of several of\none run. Without a place to copy to, print how large each part is.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    copy.add_argument(
-        "stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses; several become one store"
-    )
-    copy.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        metavar="DEST",
-        help="where the copy goes, NAME.zarr; of two names without --output the second one is DEST",
-    )
-    copy.add_argument(
-        "--without",
-        nargs="+",
-        default=[],
-        metavar="PART",
-        help="frames, objects, contributions, effects, steps (default: copy all)",
-    )
-    copy.add_argument(
-        "--tar",
-        action="store_true",
-        help="one tar file an episode, where many files are a burden; store copy makes a store of them again",
-    )
-    copy.add_argument(
-        "--copy", action="store_true", help="of several stores: copy every file, instead of sharing it (hard links)"
-    )
-    verify = acts.add_parser(
-        "verify",
-        help="read everything back and check it; --repair moves damaged episodes aside",
-        description=DESCRIPTION,
-        epilog=EXAMPLES.replace("NAME", "vla-attention store"),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    as_is = argparse.RawDescriptionHelpFormatter
+    what = "a copy: smaller, in tar files, from elsewhere; or one store of several"
+    copy = acts.add_parser("copy", help=what, description=_DESCRIPTION, epilog=_EXAMPLES, formatter_class=as_is)
+    given = "NAME.zarr or addresses; several become one store"
+    copy.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help=given)
+    where = "where the copy goes, NAME.zarr; of two names without --output the second one is DEST"
+    copy.add_argument("-o", "--output", type=Path, metavar="DEST", help=where)
+    parts = "frames, objects, contributions, effects, steps (default: copy all)"
+    copy.add_argument("--without", nargs="+", default=[], metavar="PART", help=parts)
+    tars = "one tar file an episode, where many files are a burden; store copy makes a store of them again"
+    copy.add_argument("--tar", action="store_true", help=tars)
+    files = "of several stores: copy every file, instead of sharing it (hard links)"
+    copy.add_argument("--copy", action="store_true", help=files)
+    what, examples = "read everything back and check it; --repair moves damaged episodes aside", _EXAMPLES_OF_VERIFY
+    verify = acts.add_parser("verify", help=what, description=DESCRIPTION, epilog=examples, formatter_class=as_is)
     add_verify_arguments(verify)
     for act, answer in ((copy, _run_copy), (verify, _run_verify)):
         act.set_defaults(act=answer)
@@ -99,9 +78,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run_verify(arguments: argparse.Namespace) -> int:
     """Verify every store; 1 if anything is wrong, or with --repair if a damaged episode is left."""
-    from vla_attention.analyze.stores.checking import reports_of_store
+    from vla_attention.analyze.stores.parallel import episode_reports
 
-    return run_verify_command(arguments, reports_of_store)
+    def reports(store: Store, depth: Depth) -> Iterator[EpisodeReport]:
+        return episode_reports(((store, episode) for episode in store.episodes), depth)
+
+    return run_verify_command(arguments, reports)
 
 
 def _run_copy(arguments: argparse.Namespace) -> int:
@@ -140,8 +122,7 @@ def _copy(place: StorePlace, target: Path, without: Sequence[str], *, tar: bool)
         copied = copy_store(store, target, without, advance, tar=tar)
     already = f" ({copied.present} were there already)" if copied.present else ""
     left = f", {format_bytes(copied.left_bytes)} left behind: {', '.join(without)}" if without else ""
-    added = plural(copied.added, "episode")
-    print(f"{target}: {added} added{already}, {format_bytes(copied.copied_bytes)}{left}.")
+    print(f"{target}: {plural(copied.added, 'episode')} added{already}, {format_bytes(copied.copied_bytes)}{left}.")
     return 0
 
 
@@ -167,7 +148,7 @@ def _sizes_text(store: Store, without: Sequence[str]) -> str:
     total = sum(sizes.values())
     lines = [f"{store.path}: {plural(len(store.episodes), 'episode')}, {format_bytes(total)}"]
     for name, size in sizes.items():
-        purpose = "rows, atoms, roles, actions: always copied" if name == REST else PARTS[name].purpose
+        purpose = "rows, atoms, roles, actions: always copied" if name == REST else PARTS[name][0]
         share = f"{size / total if total else 0.0:.0%}"
         mark = "  left behind" if name in without else ""
         lines.append(f"  {name:<13} {format_bytes(size):>8}  {share:>4}  {purpose}{mark}")

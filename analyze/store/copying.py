@@ -49,23 +49,15 @@ from vla_attention.schemas.stores.store_place import check_place
 from vla_attention.schemas.stores.store_url import HUB_PROTOCOL, MAIN, HubAddress, StorePlace, StoreUrl
 from vla_attention.schemas.stores.tar_files import unpack, write_tar
 
-
-@dataclass(frozen=True)
-class Part:
-    """Arrays that a copy may omit: their purpose, and a pattern of their names and of their files' names."""
-
-    purpose: str
-    pattern: str
-
-
 EFFECTS, STEPS = "effects", "steps"
-#: The parts that may be omitted. Rows, atoms, roles and the small arrays are always copied.
-PARTS: dict[str, Part] = {
-    "frames": Part("the cameras' pictures; overlays and reruns need them", r"^(camera_)?frames/"),
-    "objects": Part("what each patch shows; object: groups need it", r"^objects/"),
-    "contributions": Part("value-weighted contributions; their norms need them", r"/contribution(/|$)"),
-    EFFECTS: Part("changes of the action without an item; effects needs them", r"^effects/|/cut(/|$)"),
-    STEPS: Part("positions, touches and goals; what was done and why it failed need them", r"^steps/"),
+#: The parts that may be omitted: their purpose, and a pattern of their arrays' and files' names. Rows, atoms, roles and
+#: the small arrays are always copied.
+PARTS: dict[str, tuple[str, str]] = {
+    "frames": ("the cameras' pictures; overlays and reruns need them", r"^(camera_)?frames/"),
+    "objects": ("what each patch shows; object: groups need it", r"^objects/"),
+    "contributions": ("value-weighted contributions; their norms need them", r"/contribution(/|$)"),
+    EFFECTS: ("changes of the action without an item; effects needs them", r"^effects/|/cut(/|$)"),
+    STEPS: ("positions, touches and goals; what was done and why it failed need them", r"^steps/"),
 }
 REST = "rest"
 #: What a copy's provenance calls the address on the hub that it was copied from, with its commit.
@@ -176,7 +168,7 @@ def _copy(
         for episode in store.episodes:
             if episode.name not in present:
                 folder = building / episode.name
-                sizes = _copy_episode(store, _unpacked(episode, building), folder, without, run)
+                sizes = copy_episode(store, _unpacked(episode, building), folder, without, run)
                 copied, left, added = copied + sizes[0], left + sizes[1], added + 1
                 if tar:
                     file = building / f"{episode.name}{TAR_SUFFIX}"
@@ -251,10 +243,18 @@ def _captured(episode: StoredEpisode) -> str:
     return episode.seal.copied_from or episode.seal.digest
 
 
-def _copy_episode(
-    store: Store, episode: StoredEpisode, folder: Path, without: tuple[str, ...], run: str
-) -> tuple[int, int]:
-    """Write the copy of one episode; returns (bytes copied, bytes omitted)."""
+def copy_episode(
+    store: Store,
+    episode: StoredEpisode,
+    folder: Path,
+    without: tuple[str, ...],
+    run: str,
+    linked: Callable[[str, Path], bool] = lambda _file, _place: False,
+) -> tuple[int, int, int]:
+    """Write the copy of one episode; returns the bytes that were copied, omitted and shared.
+
+    linked: shares a file of the episode with a place, where it can.
+    """
     if beyond := files_of_no_array(store.attributes, episode.attributes, episode.files.records):
         raise CorruptEpisode(
             f"Episode {episode.name} has files that belong to no array: {listing(beyond, 5)}. They are not copied, and "
@@ -264,13 +264,16 @@ def _copy_episode(
     for name in episode.attributes.arrays:
         if _part_of(name) not in without and f"{name}/zarr.json" not in episode.files.records:
             raise CorruptEpisode(f"Episode {episode.name} lacks the array {name}: its files are gone.")
-    copied = left = 0
+    copied = left = shared = 0
     for file, record in episode.files.records.items():
         if _part_of(file) in without:
             left += record.size
             continue
         place = folder / file
         place.parent.mkdir(parents=True, exist_ok=True)
+        if linked(file, place):
+            shared += record.size
+            continue
         copied += episode.copy_file(file, place)
         if file == "zarr.json" and without:
             place.write_bytes(_without_arrays(json.loads(place.read_bytes()), without))
@@ -280,7 +283,7 @@ def _copy_episode(
     else:
         seal.parent.mkdir()
         seal.write_bytes(without_other_fields(episode.source.whole(SEAL_FILE)))
-    return copied + seal.stat().st_size, left
+    return copied + seal.stat().st_size, left, shared
 
 
 def _root_document(store: Store, without: tuple[str, ...]) -> bytes:
@@ -331,7 +334,7 @@ def _without_arrays(changed: dict[str, Any], without: tuple[str, ...]) -> bytes:
 
 def _part_of(path: str) -> str | None:
     """The part that an array, or a file of the episode, belongs to."""
-    return next((name for name, part in PARTS.items() if re.search(part.pattern, path)), None)
+    return next((name for name, (_, pattern) in PARTS.items() if re.search(pattern, path)), None)
 
 
 def _rename_new(source: Path, target: Path) -> None:

@@ -11,19 +11,18 @@ import errno
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
-from vla_attention.analyze.store.copying import write_names
-from vla_attention.analyze.stores.checking import reports_of_store
-from vla_attention.schemas.errors import BadArgument, UserError, listing, plural
+from vla_attention.analyze.store.copying import copy_episode, write_names
+from vla_attention.analyze.stores.parallel import episode_reports
+from vla_attention.schemas.errors import BadArgument, UserError, listing, plural, shortened
 from vla_attention.schemas.stores.digest import run_differences, with_digest
 from vla_attention.schemas.stores.durable_files import publish
-from vla_attention.schemas.stores.episode_files import refuse_links
 from vla_attention.schemas.stores.partial_folders import partial_of, remove_dead_partials
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.remote_source import source_of
 from vla_attention.schemas.stores.root import group_attributes, group_document
-from vla_attention.schemas.stores.seal import SEAL_FILE
 from vla_attention.schemas.stores.store_format import (
     EPISODES_DOCUMENT,
     EPISODES_GROUP,
@@ -107,7 +106,7 @@ def _check_same_run(one: Store, other: Store) -> None:
     if one.run == other.run and _left_out(one) == _left_out(other):
         return
     differences = [
-        f"{where} is {_short(here)} in the one and {_short(second)} in the other"
+        f"{where} is {shortened(repr(here))} in the one and {shortened(repr(second))} in the other"
         for where, here, second in run_differences(one.attributes, other.attributes)
     ]
     if one.run == other.run:
@@ -121,11 +120,6 @@ def _left_out(store: Store) -> str:
     return store.attributes.provenance.get("copied_without", "")
 
 
-def _short(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
 def _merge(stores: Sequence[Store], place: Path, progress: Callable[[int], object] | None, link: bool) -> Merged:
     """Make the store at `place`, and read it back."""
     (place / EPISODES_GROUP).mkdir(parents=True)
@@ -135,13 +129,18 @@ def _merge(stores: Sequence[Store], place: Path, progress: Callable[[int], objec
     origin: dict[str, Store] = {}
     for store in stores:
         for episode in store.episodes:
-            sizes = _bring(replace(episode), place / EPISODES_GROUP / episode.name, link)
-            linked, copied = linked + sizes[0], copied + sizes[1]
+            fresh = replace(episode)  # what is read of it is not kept
+            how = (partial(_linked, fresh),) if link else ()
+            try:
+                sizes = copy_episode(store, fresh, place / EPISODES_GROUP / episode.name, (), store.run, *how)
+            except CorruptEpisode as error:
+                raise CorruptEpisode(f"Cannot merge: {error} Repair the store first.") from None
+            copied, linked = copied + sizes[0], linked + sizes[2]
             origin[episode.name] = store
             if progress is not None:
                 progress(1)
     built = open_store(place)
-    for report in reports_of_store(built, "files"):
+    for report in episode_reports(((built, episode) for episode in built.episodes), "files"):
         if report.problems:
             raise CorruptEpisode(
                 f"Cannot merge: {report.episode} of {origin[report.episode].path} is damaged: "
@@ -162,27 +161,6 @@ def _root_document(stores: Sequence[Store]) -> bytes:
 def _named(place: StorePlace) -> str:
     """What a store is called in the provenance: its name, or its address on the hub with the commit."""
     return str(place) if str(place).startswith(HUB_PROTOCOL) else place.name
-
-
-def _bring(episode: StoredEpisode, folder: Path, link: bool) -> tuple[int, int]:
-    """Link or copy the files of an episode that its seal lists; returns the bytes that were linked and copied."""
-    linked = copied = 0
-    try:
-        refuse_links(episode)
-        files = [*episode.files.records, SEAL_FILE]
-        for file in files:
-            place = folder / file
-            place.parent.mkdir(parents=True, exist_ok=True)
-            if link and _linked(episode, file, place):
-                linked += place.stat().st_size
-                continue
-            if file == SEAL_FILE:
-                copied += place.write_bytes(episode.source.whole(file))
-            else:
-                copied += episode.copy_file(file, place)
-    except CorruptEpisode as error:
-        raise CorruptEpisode(f"Cannot merge: {error} Repair the store first.") from None
-    return linked, copied
 
 
 def _linked(episode: StoredEpisode, file: str, place: Path) -> bool:

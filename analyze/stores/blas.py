@@ -15,18 +15,9 @@ from itertools import product
 
 import numpy as np
 
-
-class _Limit:
-    """The blocks that are open in all threads, and the number of threads before the first of them."""
-
-    def __init__(self) -> None:
-        self.lock = threading.Lock()
-        self.num_open = 0
-        self.before = 0
-
-
-#: The number of threads belongs to the library, so there is one limit for the process.
-_LIMIT = _Limit()
+#: The number of threads belongs to the library, so there is one limit for the process: how many there were when each
+#: block that is open began.
+_LOCK, _BEFORE = threading.Lock(), list[int]()
 
 
 @contextmanager
@@ -42,18 +33,14 @@ def one_blas_thread() -> Iterator[None]:
         yield
         return
     get, limit = functions
-    with _LIMIT.lock:
-        if _LIMIT.num_open == 0:
-            _LIMIT.before = get()
-            limit(1)
-        _LIMIT.num_open += 1
+    with _LOCK:
+        _BEFORE.append(get())
+        limit(1)
     try:
         yield
     finally:
-        with _LIMIT.lock:
-            _LIMIT.num_open -= 1
-            if _LIMIT.num_open == 0:
-                limit(_LIMIT.before)
+        with _LOCK:
+            limit(_BEFORE.pop())  # 1, unless it is the last block
 
 
 @cache

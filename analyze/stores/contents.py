@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import polars as pl
 
-from vla_attention.analyze.stores.read_ahead import read_ahead
+from vla_attention.analyze.stores.parallel import read_ahead
 from vla_attention.analyze.stores.selection import select_episodes
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS
@@ -77,20 +77,6 @@ def _solved_text(outcomes: Iterable[bool | None]) -> str:
     return f"{solved} solved" if len(known) == len(given) else f"{solved} of {len(known)} with a known outcome solved"
 
 
-def header_lines(stores: Sequence[Store]) -> list[str]:
-    """Paths, policy, recorded axes and sites of stores of one run."""
-    root = stores[0].attributes
-    policy, recording = root.policy, root.recording
-    untrained = ", UNTRAINED random weights" if policy.untrained else ""
-    return [
-        f"stores   {listing([store.path for store in stores])}",
-        f"policy   {policy.name} ({policy.checkpoint_format}: {policy.checkpoint}){untrained}",
-        f"layers   {listing(recording.layer_labels, 40)}; denoise steps {listing(recording.denoise_steps, 40)}; "
-        f"heads {listing(recording.heads, 40)}",
-        f"sites    {listing(f'{site.name} ({site.num_keys} keys)' for site in root.sites)}",
-    ]
-
-
 def lines_of_store(store: Store, tasks: Sequence[int | str] | None = None) -> Iterator[tuple[str, str]]:
     """What a store holds, as names and texts: run, recorded axes, spans and roles of every site, tasks, objects."""
     episodes = select_episodes(store, tasks)
@@ -102,8 +88,25 @@ def lines_of_store(store: Store, tasks: Sequence[int | str] | None = None) -> It
     yield "run", f"suite {protocol.suite}, protocol {protocol_text(protocol)}"
     if root.data_set is not None:
         yield "data set", root.data_set.describe()
-    summary = _EpisodeSummary.of(root, episodes)
-    yield "episodes", f"{len(episodes)} ({_solved_text(summary.success)}), tasks {listing(store.task_ids, 100)}"
+    success: list[bool | None] = []
+    of_tasks: dict[int, tuple[str, str]] = {}  # instruction, and objects of interest in the first episode
+    num_episodes: Counter[int] = Counter()
+    first: dict[str, EpisodeTokens] = {}
+    names: dict[str, Names] = defaultdict(Names)
+    for episode in read_one_by_one(episodes):
+        attributes = episode.attributes
+        success.append(attributes.success)
+        num_episodes[attributes.task_id] += 1
+        interest = listing([thing.name for thing in attributes.objects if thing.of_interest])
+        of_tasks.setdefault(attributes.task_id, (visible(attributes.instruction), interest))
+        for site in root.sites:
+            if site.name not in first:
+                first[site.name] = episode.tokens(root, site.name)
+            # Words and objects are in the attributes: no array of the other episodes is read.
+            names[site.name].add_words(words_of(prompt) for prompt in episode.prompts(root, site.name))
+            if episode.coverage(root, site.name):
+                names[site.name].add_objects(attributes.objects)
+    yield "episodes", f"{len(episodes)} ({_solved_text(success)}), tasks {listing(store.task_ids, 100)}"
     labels = [
         f"{label} (block {block})" if label != block else str(block)
         for label, block in zip(
@@ -122,54 +125,15 @@ def lines_of_store(store: Store, tasks: Sequence[int | str] | None = None) -> It
         note = f" ({own_parts(root, site.name)})" if site.layers or site.heads or site.num_action_queries else ""
         yield f"site {site.name}", f"{site.num_keys} keys{note}; span, keys, roles (their number at the first replan)"
         for span in site.spans:
-            yield "  span", _describe_span(span, summary.first[site.name])
-        vocabulary = summary.names[site.name].vocabulary()
+            yield "  span", _describe_span(span, first[site.name])
+        vocabulary = names[site.name].vocabulary()
         yield "  words", listing(vocabulary.words, 200)
         yield "  objects", listing(vocabulary.objects, 200)
-    for task, (instruction, interest) in summary.tasks.items():
-        held = f"({plural(summary.num_episodes[task], 'episode')}; objects of interest: {interest})"
+    for task, (instruction, interest) in of_tasks.items():
+        held = f"({plural(num_episodes[task], 'episode')}; objects of interest: {interest})"
         yield f"task {task}", f"{instruction}  {held}"
     for name, kind in SELECTOR_KINDS.items():
         yield f"{name}:", f"takes {kind.takes}"
-
-
-@dataclass
-class _EpisodeSummary:
-    """What `_lines` says of episodes, read one after the other.
-
-    Attributes:
-        success: outcome of each.
-        tasks: instruction and objects of interest of each task's first episode.
-        num_episodes: by task.
-        first: the first episode's tokens, by site.
-        names: all words and objects, by site.
-    """
-
-    success: list[bool | None] = field(default_factory=list)
-    tasks: dict[int, tuple[str, str]] = field(default_factory=dict)
-    num_episodes: Counter[int] = field(default_factory=Counter)
-    first: dict[str, EpisodeTokens] = field(default_factory=dict)
-    names: dict[str, Names] = field(default_factory=lambda: defaultdict(Names))
-
-    @classmethod
-    def of(cls, root: RootAttributes, episodes: Iterable[StoredEpisode]) -> _EpisodeSummary:
-        summary = cls()
-        for episode in read_one_by_one(episodes):
-            attributes = episode.attributes
-            summary.success.append(attributes.success)
-            summary.num_episodes[attributes.task_id] += 1
-            if attributes.task_id not in summary.tasks:
-                interest = listing([thing.name for thing in attributes.objects if thing.of_interest])
-                summary.tasks[attributes.task_id] = visible(attributes.instruction), interest
-            for site in root.sites:
-                if site.name not in summary.first:
-                    summary.first[site.name] = episode.tokens(root, site.name)
-                # Words and objects are in the attributes: no array of the other episodes is read.
-                names = summary.names[site.name]
-                names.add_words(words_of(prompt) for prompt in episode.prompts(root, site.name))
-                if episode.coverage(root, site.name):
-                    names.add_objects(attributes.objects)
-        return summary
 
 
 def _describe_span(span: Span, tokens: EpisodeTokens) -> str:
@@ -188,18 +152,15 @@ def protocol_text(protocol: Protocol) -> str:
             f"waiting steps, a replan every {protocol.replan_steps} steps, at most {protocol.max_steps} steps"
         )
     loop = "a replayed data set" if protocol.name == "dataset" else "the caller's own loop"
-    known = [
-        (protocol.image_size, f"pictures of {protocol.image_size} pixels"),
-        (protocol.replan_steps, f"a replan every {protocol.replan_steps} steps"),
-        (protocol.max_steps, f"at most {protocol.max_steps} steps"),
-    ]
-    parts = [f"{protocol.name} ({loop})", f"seed {protocol.seed}", *(text for number, text in known if number)]
-    missing = [
-        name
-        for (number, _), name in zip(known, ("picture size", "replan steps", "most steps"), strict=True)
-        if not number
-    ]
-    return ", ".join(parts) + (f"; not known: {listing(missing)}" if missing else "")
+    known = {
+        "picture size": (protocol.image_size, f"pictures of {protocol.image_size} pixels"),
+        "replan steps": (protocol.replan_steps, f"a replan every {protocol.replan_steps} steps"),
+        "most steps": (protocol.max_steps, f"at most {protocol.max_steps} steps"),
+    }
+    stated = [text for number, text in known.values() if number]
+    missing = [name for name, (number, _) in known.items() if not number]
+    parts = ", ".join([f"{protocol.name} ({loop})", f"seed {protocol.seed}", *stated])
+    return parts + (f"; not known: {listing(missing)}" if missing else "")
 
 
 def own_parts(root: RootAttributes, site: str) -> str:

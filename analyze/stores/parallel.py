@@ -17,9 +17,10 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from importlib.metadata import version
+from dataclasses import replace
+from functools import partial
 from multiprocessing.connection import wait as wait_for_end
 from types import ModuleType
 from typing import Any, TypeVar
@@ -27,6 +28,9 @@ from typing import Any, TypeVar
 from vla_attention.analyze.stores.blas import one_blas_thread
 from vla_attention.schemas.errors import BadArgument, MissingDependency, UserError
 from vla_attention.schemas.stop_signals import UNAWAITED, stops_kept_from_children
+from vla_attention.schemas.stores.reader import Store, StoredEpisode
+from vla_attention.schemas.stores.store_url import StoreUrl
+from vla_attention.schemas.stores.verify import Depth, EpisodeReport, episode_report
 from vla_attention.schemas.threads import threads_of_this_process, use_threads
 
 Item = TypeVar("Item")
@@ -39,6 +43,8 @@ _MOST_AT_ONCE = 4
 _BEGUN_AHEAD = 2
 #: So many are begun at least on a cluster: one that grows with its work starts workers for waiting episodes.
 _BEGUN_AT_LEAST = 16
+#: Episodes of a store that is elsewhere that are opened at once.
+_AHEAD = 16
 #: Seconds after which a wait for a result looks whether the program was stopped, and within which a scheduler answers.
 _LOOK_UP_S, _ANSWER_WITHIN = 0.2, 15
 
@@ -223,11 +229,9 @@ def _cluster(address: str) -> Iterator[tuple[Executor, int]]:
 
 
 def _package_version() -> str:
-    """The version of the installed package; empty without it."""
-    try:
-        return version("vla-attention")
-    except ImportError:
-        return ""
+    from vla_attention import __version__
+
+    return __version__
 
 
 @contextmanager
@@ -238,15 +242,14 @@ def stoppable_threads(number: int, name: str) -> Iterator[ThreadPoolExecutor]:
     (`stop_signals.end_program`).
     """
     executor = ThreadPoolExecutor(number, thread_name_prefix=f"{UNAWAITED}-{name}")
+    waits = True
     try:
         yield executor
     except (KeyboardInterrupt, GeneratorExit):  # the latter where the one who takes the results was interrupted
-        executor.shutdown(wait=False, cancel_futures=True)
+        waits = False
         raise
-    except BaseException:
-        executor.shutdown(wait=True, cancel_futures=True)
-        raise
-    executor.shutdown(wait=True)
+    finally:
+        executor.shutdown(wait=waits, cancel_futures=True)
 
 
 def in_order(submit: Callable[[Item], Future[Result]], items: Iterable[Item], begun_at_once: int) -> Iterator[Result]:
@@ -273,3 +276,38 @@ def _awaited(future: Future[Result]) -> Result:
     while not future.done():
         wait([future], timeout=_LOOK_UP_S)
     return future.result()
+
+
+def read_ahead(episodes: Iterable[StoredEpisode]) -> Iterator[StoredEpisode]:
+    """The same episodes in their order; what cannot be read raises where the caller reads it.
+
+    Opening an episode that is elsewhere is a request, most of whose time is waiting: some are opened ahead. Hundreds of
+    them, one after the other, would take a minute.
+    """
+    with stoppable_threads(_AHEAD, "ahead") as executor:
+        yield from in_order(lambda episode: _begun(executor, episode), episodes, _AHEAD)
+
+
+def _begun(executor: ThreadPoolExecutor, episode: StoredEpisode) -> Future[StoredEpisode]:
+    if isinstance(episode.folder, StoreUrl):
+        return executor.submit(_opened, episode)
+    here: Future[StoredEpisode] = Future()
+    here.set_result(episode)
+    return here
+
+
+def _opened(episode: StoredEpisode) -> StoredEpisode:
+    with suppress(UserError):
+        _ = episode.attributes
+    return episode
+
+
+def episode_reports(
+    episodes: Iterable[tuple[Store, StoredEpisode]], depth: Depth, progress: Callable[[int], object] | None = None
+) -> Iterator[EpisodeReport]:
+    """What `verify` says of each episode, in their order; keeps nothing that was read."""
+    return each_episode(partial(_report, depth=depth), ((store, replace(one)) for store, one in episodes), progress)
+
+
+def _report(pair: tuple[Store, StoredEpisode], depth: Depth) -> EpisodeReport:
+    return episode_report(*pair, depth)

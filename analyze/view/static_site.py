@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 
-from vla_attention.analyze.render.output_files import write_text, writing
+from vla_attention.analyze.render.files import write_text, writing
 from vla_attention.analyze.view.paths import PAGE_FILES, STORES_DOCUMENT
 from vla_attention.analyze.view.served_stores import ServedStore, stores_document
 from vla_attention.schemas.errors import BadArgument, listing

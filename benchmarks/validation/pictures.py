@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 from matplotlib.transforms import Bbox
 
@@ -15,8 +16,7 @@ from benchmarks.validation.known import NUMBERS
 from benchmarks.validation.mixing import CUTS, GROUPS
 from benchmarks.validation.policies import TITLES
 from benchmarks.validation.prediction import ATTENTION, FAMILIES
-from vla_attention.analyze.render.plot_axes import ratio_axis
-from vla_attention.analyze.render.style import Style, new_canvas
+from vla_attention.analyze.render.style import Style, ratio_axis
 
 STYLE = Style()
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#999999")
@@ -39,7 +39,7 @@ SHOWN = {
 def draw_known(results: Mapping[str, Any], path: Path) -> None:
     """Numbers of the policies whose dependence is known, one point per training with its interval over tasks."""
     controls = [name for name in TITLES if any(policy["control"] == name for policy in results["policies"])]
-    figure = new_canvas(10.0, 4.8)
+    figure = Figure(figsize=(10.0, 4.8), layout="constrained")
     axes = figure.subplots(2, (len(SHOWN) + 1) // 2)
     for axis, name in zip(axes.flat, SHOWN, strict=False):
         for place, control in enumerate(controls):
@@ -67,7 +67,7 @@ def draw_known(results: Mapping[str, Any], path: Path) -> None:
 @STYLE.settings()
 def draw_prediction(results: Mapping[str, Any], path: Path) -> None:
     """Rank correlations with intervals, and mass against effect for the action queries and for all queries."""
-    figure = new_canvas(10.5, 4.2)
+    figure = Figure(figsize=(10.5, 4.2), layout="constrained")
     forest, direct, everywhere = figure.subplots(1, 3, width_ratios=[1.2, 1, 1])
     families = [name for name in FAMILIES if any(row["family"] == name for row in results["prediction"])]
     for j, measure in enumerate(ATTENTION):
@@ -146,7 +146,7 @@ def _name_points(axes: Axes, points: Sequence[tuple[str, float, float]]) -> None
 def draw_mixing(results: Mapping[str, Any], path: Path) -> None:
     """Effects of knocking out words and pictures under each cut of the prefix."""
     of = {(row["cut"], row["group"]): row for row in results["mixing"]}
-    figure = new_canvas(8.0, 3.2)
+    figure = Figure(figsize=(8.0, 3.2), layout="constrained")
     axis = figure.subplots()
     for j, (cut, what) in enumerate(CUTS.items()):
         for i, group in enumerate(GROUPS):

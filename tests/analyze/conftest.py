@@ -11,38 +11,26 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from matplotlib.figure import Figure
 from PIL import Image
 
-from vla_attention.analyze.render import style
+from vla_attention.analyze.render.style import Style
 
-HERE, DRAW = Path(__file__).parent, Figure.savefig
+HERE, DRAW = Path(__file__).parent, Style.content
 
 
-def white_pixel(kind: str) -> bytes:
+def blank(_style: Style, _canvas: Any, kind: str) -> bytes:
+    """A whole file of one white pixel, and what PDF files begin with."""
+    if kind == "pdf":
+        return b"%PDF-1.4\n"
     buffer = io.BytesIO()
     Image.new("RGB", (1, 1), "white").save(buffer, format=kind)
     return buffer.getvalue()
 
 
-#: Whole files, and what PDF files begin with.
-BLANK = {"png": white_pixel("PNG"), "pdf": b"%PDF-1.4\n", "webp": white_pixel("WEBP")}
-
-
-def leave_blank(_figure: Figure, file: Any, **options: Any) -> None:
-    content = BLANK[options["format"]]
-    if isinstance(file, io.BytesIO):
-        file.write(content)
-    else:
-        Path(file).write_bytes(content)
-
-
-def draw_quickly(figure: Figure, file: Any, **options: Any) -> None:
-    """Write a PDF's header only: drawing it takes longer than drawing the PNG."""
-    if options.get("format") == "pdf":
-        Path(file).write_bytes(BLANK["pdf"])
-    else:
-        DRAW(figure, file, **options | {"dpi": 50})
+def draw_quickly(style: Style, canvas: Any, kind: str) -> bytes:
+    """A PDF's header only: drawing it takes longer than drawing the PNG."""
+    canvas.set_dpi(50)
+    return blank(style, canvas, kind) if kind == "pdf" else DRAW(style, canvas, kind)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -51,7 +39,5 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
     thorough, drawn = item.config.option.thorough, item.get_closest_marker("drawn")
     with pytest.MonkeyPatch.context() as patch:
         if item.path.is_relative_to(HERE) and not (thorough and drawn):
-            draws = thorough or drawn
-            patch.setattr(Figure, "savefig", draw_quickly if draws else leave_blank)
-            patch.setattr(style, "find_places", style.find_places if draws else lambda _canvas, _dpi: None)
+            patch.setattr(Style, "content", draw_quickly if thorough or drawn else blank)
         return (yield)

@@ -8,7 +8,6 @@ among them, and the kept tables stay as they are.
 from __future__ import annotations
 
 import argparse
-import io
 import json
 import math
 import os
@@ -23,8 +22,6 @@ from typing import Any
 
 import polars as pl
 import pytest
-from matplotlib.figure import Figure
-from PIL import Image
 
 from tests.kit.archives import unpacked
 from tests.kit.golden_stores import differences
@@ -32,7 +29,7 @@ from tests.kit.paths import GOLDEN, ROOT
 from vla_attention.__main__ import main as vla_attention
 from vla_attention.analyze.published.parse_results import build_parser as parser_of_results
 from vla_attention.analyze.published.parse_results import main as parse_attention_ratio_results
-from vla_attention.analyze.render import style
+from vla_attention.analyze.render.style import Style
 from vla_attention.capture.commands.arguments import build_evaluate_parser, build_parser
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.published.evaluate import arguments_from_environment
@@ -149,16 +146,9 @@ def _asked(program: Callable[[list[str]], int], words: list[str], folder: Path) 
     shutil.rmtree(folder / "results", ignore_errors=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        patch.setattr(Figure, "savefig", _leave_blank)
-        patch.setattr(style, "find_places", lambda _canvas, _dpi: None)
+        patch.setattr(Style, "content", lambda *_: b"")
         assert program(words) == 0
     return dict(_read(folder / "results"))
-
-
-def _leave_blank(_figure: Figure, file: Any, **options: Any) -> None:
-    blank = io.BytesIO()
-    Image.new("RGB", (1, 1)).save(blank, format="PNG")
-    Path(file).write_bytes(blank.getvalue())
 
 
 def _read(folder: Path) -> Iterator[tuple[str, pl.DataFrame]]:

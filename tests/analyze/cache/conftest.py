@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from vla_attention.analyze.cache import fingerprints
+from vla_attention.analyze.cache import remembered
 
 
 @pytest.fixture
 def cache(tmp_path, monkeypatch) -> Path:
     folder = tmp_path / "cache"
     monkeypatch.setenv("VLA_CACHE", str(folder))
-    monkeypatch.setattr(fingerprints, "SETTLED_SECONDS", 0.0)
+    monkeypatch.setattr(remembered, "SETTLED_SECONDS", 0.0)
     return folder

@@ -19,8 +19,8 @@ import vla_attention as va
 from tests.kit.attacks import attacks, files_of, first, two
 from tests.kit.stores import StoreSpec, write_store
 from tests.kit.thorough import thorough_except
-from vla_attention.analyze.cache import fingerprints, remembered
-from vla_attention.analyze.cache.housekeeping import kept_files
+from vla_attention.analyze.cache import remembered
+from vla_attention.analyze.cache.kept_files import kept_files
 from vla_attention.analyze.core import measure
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.measures.question import ask
@@ -172,7 +172,7 @@ def test_no_attack_is_answered_from_the_cache(cache, stores, uncached, name):
     for path in stores:
         for question in (SPANS, WORDS):
             tables(path, **question)
-    kept = sum(one.size for one in kept_files(cache))
+    kept = sum(size for _, size, _ in kept_files(cache))
     assert kept > 0
     attacks(list(ARRAYS))[name](*stores)
     for question in (SPANS, WORDS):
@@ -221,14 +221,14 @@ def test_an_episode_that_was_captured_again_has_its_new_numbers(cache, stores, m
 def test_a_cache_that_cannot_be_written_changes_nothing(stores, tmp_path, monkeypatch, uncached):
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setenv("VLA_CACHE", str(tmp_path / "file" / "cache"))
-    monkeypatch.setattr(fingerprints, "SETTLED_SECONDS", 0.0)
+    monkeypatch.setattr(remembered, "SETTLED_SECONDS", 0.0)
     assert same(tables(stores[0], **SPANS), uncached(stores[0], **SPANS))
 
 
 def test_damaged_files_are_measured_again(cache, stores, measured, uncached):
     expected = uncached(stores[0], **SPANS)
     tables(stores[0], **SPANS)
-    path = kept_files(cache)[0].path
+    path = kept_files(cache)[0][2]
     whole = path.read_bytes()
     numbers = whole.index(b"\n") + 1
     for position in (0, numbers, len(whole) // 2, len(whole) - 40, len(whole) - 1):
@@ -241,8 +241,8 @@ def test_damaged_files_are_measured_again(cache, stores, measured, uncached):
 
 CODE = """
 import sys
-from vla_attention.analyze.cache import fingerprints
-fingerprints.SETTLED_SECONDS = 0.0
+from vla_attention.analyze.cache import remembered
+remembered.SETTLED_SECONDS = 0.0
 import vla_attention as va
 run = va.open(sys.argv[1])
 print("ready", flush=True)

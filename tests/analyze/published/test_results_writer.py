@@ -17,7 +17,7 @@ from tests.kit.made_up_steps import (
 )
 from vla_attention.analyze.published import results_writer
 from vla_attention.analyze.published.results_writer import write_results
-from vla_attention.analyze.render.output_files import replacing
+from vla_attention.analyze.render.files import replacing
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.schemas.jsonable import from_json
 from vla_attention.schemas.results import (
@@ -36,7 +36,8 @@ def replans_of(steps, grouping=GROUPING):
 
 
 def documents_of(replans, grouping) -> list[dict]:
-    return list(results_writer.documents_of(replans.measured, grouping, DENOISE_STEPS))
+    positions = range(len(replans.measured))
+    return list(results_writer.documents_of(replans.measured, positions, grouping, DENOISE_STEPS))
 
 
 def write(path, documents) -> None:

@@ -139,7 +139,7 @@ def smuggled(episode: Path) -> None:
         (flipped, "joint/rows"),
         (linked_file, "is a link, and no copy follows links"),
         (linked_folder, "its joint is a link, and no copy follows links"),
-        (smuggled, "its seal lists payload.sh, which belongs to no array"),
+        (smuggled, "files that belong to no array: payload.sh"),
         (lambda episode: (episode / "state/zarr.json").unlink(), "has lost its state/zarr.json"),
         (lambda episode: (episode / "seal/zarr.json").unlink(), "it has lost its seal"),
     ],

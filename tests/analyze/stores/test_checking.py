@@ -6,8 +6,7 @@ import pytest
 
 from tests.kit.stores import write_store
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.stores.checking import faults_of_each
-from vla_attention.analyze.stores.parallel import workers
+from vla_attention.analyze.stores.parallel import episode_reports, workers
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 
@@ -24,14 +23,14 @@ def test_workers_find_the_faults_that_verify_store_finds(damaged, capsys):
     expected = verify_store(store)
     assert {fault.where for fault in expected} == {"task001_episode000"}
     pairs = [(store, episode) for episode in store.episodes]
-    assert [fault for found in faults_of_each(pairs) for fault in found] == expected
+    assert [fault for report in episode_reports(pairs) for fault in report.faults] == expected
     with workers(2):
-        assert [fault for found in faults_of_each(pairs) for fault in found] == expected
+        assert [fault for report in episode_reports(pairs) for fault in report.faults] == expected
 
 
 def test_what_was_read_of_an_episode_is_not_kept(damaged):
     store = open_store(damaged)
-    assert len(list(faults_of_each((store, episode) for episode in store.episodes))) == 4
+    assert len(list(episode_reports((store, episode) for episode in store.episodes))) == 4
     assert all("seal" not in vars(episode) for episode in store.episodes)
 
 
