@@ -34,7 +34,7 @@ class Empty(StoredEpisode):
 def without_replans(store: Store, position: int) -> Store:
     """The opened store, one of whose episodes says that it holds no replan. The writer makes no such episode."""
     given = store.episodes[position]
-    empty = Empty(given.folder, given.name, given.run, given.version)
+    empty = Empty(given.folder, given.name, given.run)
     return replace(store, episodes=(*store.episodes[:position], empty, *store.episodes[position + 1 :]))
 
 

@@ -23,14 +23,14 @@ def test_workers_find_the_faults_that_verify_store_finds(damaged, capsys):
     expected = verify_store(store)
     assert {fault.where for fault in expected} == {"task001_episode000"}
     pairs = [(store, episode) for episode in store.episodes]
-    assert [fault for report in episode_reports(pairs) for fault in report.faults] == expected
+    assert [fault for report in episode_reports(pairs, "values") for fault in report.faults] == expected
     with workers(2):
-        assert [fault for report in episode_reports(pairs) for fault in report.faults] == expected
+        assert [fault for report in episode_reports(pairs, "values") for fault in report.faults] == expected
 
 
 def test_what_was_read_of_an_episode_is_not_kept(damaged):
     store = open_store(damaged)
-    assert len(list(episode_reports((store, episode) for episode in store.episodes))) == 4
+    assert len(list(episode_reports(((store, episode) for episode in store.episodes), "values"))) == 4
     assert all("seal" not in vars(episode) for episode in store.episodes)
 
 
