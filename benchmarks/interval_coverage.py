@@ -39,11 +39,11 @@ from numpy.typing import NDArray
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import vla_attention as va
-from vla_attention.analyze.statistics.family_errors import family_error
 from vla_attention.analyze.statistics.intervals import (
     POSITIVE,
     EpisodeStatistic,
     estimates,
+    family_error,
     geometric_mean_over_episodes,
     mean_over_episodes,
 )

@@ -40,7 +40,7 @@ from vla_attention.analyze.commands.language import SHOWN_AT, listens
 from vla_attention.analyze.core.action_changes import ActionSpread
 from vla_attention.analyze.core.behaviour import with_choices
 from vla_attention.analyze.core.recorded_effects import summary_of
-from vla_attention.analyze.statistics.episode_intervals import Sampling
+from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.layout import Role
 

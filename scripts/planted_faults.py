@@ -110,8 +110,8 @@ FAULTS = (
     ),
     Fault(
         "wrong degrees of freedom: families less one",
-        "analyze/statistics/family_errors.py",
-        "    degrees = np.where(np.abs(degrees - whole) < _ROUNDING, whole, degrees)",
+        "analyze/statistics/intervals.py",
+        "    degrees = np.where(np.abs(degrees - whole) < _WHOLE, whole, degrees)",
         "    degrees = np.where(whole > 0, (size > 0).sum(axis=-1) - 1.0, degrees)",
         ("tests/analyze/statistics",),
     ),

@@ -12,20 +12,24 @@ from vla_attention.analyze.commands.apart import kept_apart
 from vla_attention.analyze.commands.effects import word_effects
 from vla_attention.analyze.commands.holdings import holdings, overlaps_of
 from vla_attention.analyze.commands.language import listens
-from vla_attention.analyze.core.about import about, enough, notes, only, out_of
+from vla_attention.analyze.core.about import (
+    GROUP_COLUMNS,
+    NORM_COLUMNS,
+    RATIO_COLUMNS,
+    about,
+    enough,
+    inverse,
+    notes,
+    only,
+    out_of,
+    sides,
+    with_interval,
+)
 from vla_attention.analyze.core.axes import COLUMNS, check_axes
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.contributions import Norms, group_norms, side_norms
 from vla_attention.analyze.core.levels import Levels, levels_of, overall, task_cells, task_groups
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
-from vla_attention.analyze.core.words_of_numbers import (
-    GROUP_COLUMNS,
-    NORM_COLUMNS,
-    RATIO_COLUMNS,
-    inverse,
-    sides,
-    with_interval,
-)
 from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.sinks import SinkRule, search_sinks

@@ -7,13 +7,21 @@ from typing import Any
 
 import polars as pl
 
-from vla_attention.analyze.core.about import about, enough, notes, only, out_of
+from vla_attention.analyze.core.about import (
+    GROUP_COLUMNS,
+    RATIO_COLUMNS,
+    about,
+    enough,
+    notes,
+    only,
+    out_of,
+    sides,
+    with_interval,
+)
 from vla_attention.analyze.core.axes import columns_of, with_families
-from vla_attention.analyze.core.by_axes import groups_by, ratios_by
 from vla_attention.analyze.core.estimate import Scale, estimate
-from vla_attention.analyze.core.levels import Levels
+from vla_attention.analyze.core.levels import Levels, groups_by, ratios_by
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
-from vla_attention.analyze.core.words_of_numbers import GROUP_COLUMNS, RATIO_COLUMNS, sides, with_interval
 from vla_attention.analyze.measures.question import Question
 from vla_attention.schemas.errors import plural
 

@@ -9,26 +9,23 @@ import polars as pl
 
 from vla_attention.analyze.commands.compare_tables import ALL, figures_of, tables_of
 from vla_attention.analyze.commands.language import SHOWN_AT, listens, whatever
-from vla_attention.analyze.core.about import UNTRAINED, notes, solved
+from vla_attention.analyze.core.about import UNTRAINED, notes, solved, with_interval
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.compared import (
+    PAIR,
     Compared,
     RunValues,
     by_themselves,
     compared,
 )
-from vla_attention.analyze.core.differences import PAIR
-from vla_attention.analyze.core.moved import is_noise, moved, moved_episodes
+from vla_attention.analyze.core.reruns import held_by_one, is_noise, moved, moved_episodes
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
 from vla_attention.analyze.core.runs import Run, check_comparable, noted_differences
-from vla_attention.analyze.core.same_calls import held_by_one
-from vla_attention.analyze.core.words_of_numbers import with_interval
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.task_families import sampling_of
-from vla_attention.analyze.statistics.episode_intervals import Sampling
 from vla_attention.analyze.statistics.exact_tests import mcnemar
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
-from vla_attention.analyze.stores.run_notes import run_notes
+from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.safe_text import visible
 
@@ -64,7 +61,7 @@ def compare(runs: Sequence[Run], allow_mismatch: Collection[str] = ()) -> Result
             findings += _behaved(part, told[first.name], told[part.name])
         findings += [*_needs(part), _attention(part)]
     about = [f"{run.name}: {_outcome(run, first)}." for run in runs]
-    about += dict.fromkeys(line for run in runs for line in run_notes(run.question.episodes))
+    about += dict.fromkeys(line for run in runs for line in run.question.told)
     about += [UNTRAINED] if any(run.question.untrained for run in runs) else []
     beside = dict.fromkeys(line for run in runs for line in notes(run.question) if line not in about)
     of_pairs = [_pairing(part, "seed" in allow_mismatch) for part in parts]

@@ -19,7 +19,6 @@ from vla_attention.analyze.core.result import Column, Figure, Finding, Result, T
 from vla_attention.analyze.core.word_items import items_of
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.schemas.errors import BadArgument, listing, plural
 from vla_attention.schemas.safe_text import visible
 
@@ -73,7 +72,7 @@ def failures(question: Question, twins: Question | None = None) -> Result:
         [*_why(question, failed, outcomes.height, lost), *where, *_foretold(outcomes)],
         [*tables, _by_task(outcomes, bool(failed))],
         _strip(left),
-        [*question.skipped, *(run_notes(twins.episodes) if twins else ())],
+        [*question.skipped, *(twins.told if twins else ())],
     )
 
 

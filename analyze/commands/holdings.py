@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.core.about import about
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
-from vla_attention.analyze.measures.baselines import baseline_notes, uniform_keys, uniform_masses
-from vla_attention.analyze.measures.masses import uniform_ratio
-from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.measures.masses import uniform_keys, uniform_masses, uniform_ratio
+from vla_attention.analyze.measures.question import Question, baseline_notes
 from vla_attention.analyze.measures.selected import resolve_all
 from vla_attention.analyze.stores.contents import lines_of_store
 from vla_attention.schemas.errors import listing, plural

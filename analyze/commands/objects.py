@@ -10,7 +10,6 @@ import polars as pl
 from vla_attention.analyze.core.about import about, enough, notes
 from vla_attention.analyze.core.axes import COLUMNS, check_axes, columns_of, with_families
 from vla_attention.analyze.core.estimate import Scale, estimate
-from vla_attention.analyze.core.lazy_frames import frame_of_episodes
 from vla_attention.analyze.core.object_maps import enrichment_elsewhere, object_maps
 from vla_attention.analyze.core.object_shares import (
     CLASSES,
@@ -21,7 +20,7 @@ from vla_attention.analyze.core.object_shares import (
     with_coverage,
 )
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
-from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
+from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, frame_of_episodes
 from vla_attention.analyze.measures.question import Question
 from vla_attention.schemas.errors import plural
 

@@ -21,11 +21,11 @@ from vla_attention.analyze.core.camera_maps import (
     patch_table,
     scale_end,
     stored_picture,
+    upright,
 )
 from vla_attention.analyze.core.levels import levels_of
-from vla_attention.analyze.core.patch_pictures import upright
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
-from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, episode_id
+from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import check_replan, find_episode
 from vla_attention.analyze.render.video import check_video, write_film
@@ -152,7 +152,7 @@ def _frame(
     maps: EpisodeMaps, replans: Sequence[int], ratios: pl.DataFrame | None, groups: Grouping | None
 ) -> pl.DataFrame:
     """A row for each picture: where it stands in the figure, what is written about it, and its map."""
-    item, identity = maps.item, dict(zip(EPISODE_ID, episode_id(maps.item), strict=True))
+    item, identity = maps.item, dict(zip(EPISODE_ID, maps.item.key, strict=True))
     known = {} if ratios is None else dict(ratios.filter(**identity).select("replan", "ratio").iter_rows())
     taken = None if groups is None else resolve(groups, item.tokens).weights >= _OUTLINE_WEIGHT
     rows = []
@@ -236,7 +236,7 @@ def _figure(
 
 def _finding(question: Question, maps: EpisodeMaps, table: pl.DataFrame) -> Finding:
     """The patch with the highest lift of the first episode, and what is there."""
-    own = table.filter(**dict(zip(EPISODE_ID, episode_id(maps.item), strict=True)))
+    own = table.filter(**dict(zip(EPISODE_ID, maps.item.key, strict=True)))
     row = own.sort("lift").row(-1, named=True)
     on = "" if row["object"] is None else f", on the {row['object'].replace('_', ' ')}"
     said = (

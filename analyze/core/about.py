@@ -1,25 +1,53 @@
-"""What every result says of its run first, and what it notes beside its numbers."""
+"""What every result says of its run first, what it notes beside its numbers, columns and phrases that several share."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import polars as pl
 
+from vla_attention.analyze.core.result import Column
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.task_families import units_of, unknown_families
+from vla_attention.analyze.measures.task_families import unknown_families
 from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Units
-from vla_attention.analyze.stores.run_notes import run_notes
 from vla_attention.schemas.errors import listing, plural
+from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.stores.store_format import RootAttributes
 
 #: With fewer units than these, an interval about other tasks covers less where these are skewed.
 _FEW = 10
 #: What untrained weights mean for every number.
 UNTRAINED = "The weights are untrained (random): the numbers show that the pipeline works, and nothing about a policy."
+GROUP_COLUMNS = (
+    Column("group", "text"),
+    Column("fraction", "percent", "of the attention", "part of the attention to all groups"),
+    Column(
+        "lift", "factor", "times even", "attention per token, over what it would be if spread evenly over all tokens"
+    ),
+    Column("keys", "number", "tokens"),
+)
+RATIO_COLUMNS = (
+    Column(
+        "geometric_mean",
+        "factor",
+        "ratio",
+        "attention to one side over the other, geometric mean over layers, calls and tasks",
+    ),
+    Column("uniform_ratio", "number", "if even", "the ratio if attention were spread evenly over all tokens"),
+    Column("ratio_lift", "factor", "per token", "ratio / ratio if even"),
+)
+NORM_COLUMNS = (
+    Column("layer", "text"),
+    Column("visual_norm", "number", "pictures", "length of the vector that the keys add to the residual stream"),
+    Column("linguistic_norm", "number", "text"),
+    Column("geometric_mean", "factor", "ratio"),
+    Column("uniform_ratio", "number", "if even", "the ratio if attention were shared out evenly between the segments"),
+    Column("ratio_lift", "factor", "over even", "ratio / ratio if even"),
+)
 
 
 def about(question: Question) -> list[str]:
@@ -28,7 +56,7 @@ def about(question: Question) -> list[str]:
     suites = listing(dict.fromkeys(store.suite for store in question.stores), 4)
     outcomes = [item.episode.attributes.success for item in question.selected]
     line = f"{policy.name} on {suites}: {solved(outcomes, question.num_tasks)}."
-    return [line, *run_notes(question.episodes), *([UNTRAINED] if question.untrained else [])]
+    return [line, *question.told, *([UNTRAINED] if question.untrained else [])]
 
 
 def solved(outcomes: Iterable[bool | None], num_tasks: int) -> str:
@@ -49,11 +77,11 @@ def notes(question: Question) -> list[str]:
     recorded = question.stores[0].attributes.recording_of(question.site).layers
     every = len(set(question.selection.blocks)) == len(recorded)
     which = "mean over all layers" if every else f"layer{'s' * (len(labels) > 1)} {listing(labels, 40)}"
-    told, root = set(run_notes(question.episodes)), question.stores[0].attributes
+    root = question.stores[0].attributes
     others = [other.name for other in root.sites if other.name != question.site]
     return [
         f"Site '{question.site}', {which}. Intervals: {_held(question.units)}, about {question.units.words}.",
-        *(remark for remark in question.remarks if remark not in told),
+        *(remark for remark in question.remarks if remark not in question.told),
         *filter(None, [question.selection.note, without_a_side(root, question.site), unknown_families(
             question.sampling, question.selected)]),
         *([f"Of site '{question.site}' only; {listing(others)} are softmaxes of their own: choose by --site, and never "
@@ -70,7 +98,7 @@ def _held(units: Units) -> str:
 def only(question: Question, episodes: pl.DataFrame) -> Question:
     """The question about the episodes in a table, by `EPISODE_ID`; about all where the table is empty."""
     wanted = set(episodes.select(EPISODE_ID).iter_rows())
-    left = [item for item in question.selected if (*item.task, item.episode.attributes.episode_index) in wanted]
+    left = [item for item in question.selected if item.key in wanted]
     return replace(question, selected=tuple(left) or question.selected)
 
 
@@ -94,20 +122,36 @@ def without_a_side(root: RootAttributes, site: str) -> str:
     )
 
 
-def enough(question: Question, what: str = "the numbers") -> str:
+def enough(question: Question) -> str:
     """Whether the data suffice to say something about other episodes and tasks, as a sentence; empty where they do."""
     episodes, tasks = len(question.selected), question.num_tasks
     if episodes == 1:
         return "One episode shows nothing about others: there is no interval."
     if tasks == 1:
-        return f"One task of {episodes} episodes: {what} show nothing about other tasks."
+        return f"One task of {episodes} episodes: the numbers show nothing about other tasks."
     units = question.units
     if units.estimand.of_other_tasks:
         return ""
-    families = units_of(question.sampling, question.selected).num_families
+    families = question.sampling.units(question.tasks).num_families
     if families is None or families >= FEWEST_FAMILIES:
         return ""
     kinds = "one kind" if families == 1 else f"{families} kinds"
-    return (
-        f"The {tasks} tasks are of {kinds} (sentences of one template): {what} are about these tasks, not about others."
-    )
+    which = f"The {tasks} tasks are of {kinds} (sentences of one template)"
+    return f"{which}: the numbers are about these tasks, not about others."
+
+
+def sides(grouping: Grouping) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The groups on both sides of the ratio."""
+    assert grouping.ratio is not None
+    return grouping.ratio.numerator, grouping.ratio.denominator
+
+
+def inverse(value: float, low: float | None, high: float | None) -> list[float | None]:
+    """1 / value with its interval."""
+    return [1 / value, None if high is None else 1 / high, None if low is None else 1 / low]
+
+
+def with_interval(row: Mapping[str, Any], name: str) -> str:
+    """`2.89 [2.13, 3.93]`; the value alone without an interval."""
+    low, high = row[f"{name}_low"], row[f"{name}_high"]
+    return f"{row[name]:.3g}" + ("" if low is None else f" [{low:.3g}, {high:.3g}]")

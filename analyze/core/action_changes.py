@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.alignment import GRIPPER, episode_timing
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.statistics.intervals import estimates, ratio_of_means_over_episodes
 from vla_attention.analyze.statistics.units import Units
@@ -27,6 +26,9 @@ Array = NDArray[np.float64]
 #: What is measured of a pair of replans: over the executed steps, over the whole chunk, the angle in degrees between
 #: the first actions' translations, the share of executed steps whose gripper command has the other sign.
 CHANGES = ("effect", "effect_chunk", "angle", "gripper_flips")
+#: Position of the gripper command in an action. Every suite of the capture side drives robosuite's Panda gripper: a
+#: command above 0 closes it, one below 0 opens it, 0 leaves it as it is. While an episode waits, the command is -1.
+GRIPPER = -1
 #: The dimensions of an action that move the hand. Every suite of the capture side drives robosuite's Panda arm.
 TRANSLATION = slice(0, 3)
 #: A dimension with less spread than this part of the largest one is not driven by the policy. Division by its spread
@@ -109,10 +111,7 @@ def noise_of(pairs: Sequence[tuple[Array, Array]], spread: Array) -> Noise:
     # Several episodes that do not differ agree on the value; a single one says nothing of others.
     alike = (np.nan, np.nan) if len(pairs) < 2 else None
     intervals = [(one.interval(), one.value) for one in spreads]
-    ends = np.array(
-        [(interval.low, interval.high) if interval else alike or (value, value) for interval, value in intervals],
-        np.float64,
-    )
+    ends = np.array([interval or alike or (value, value) for interval, value in intervals], np.float64)
     values = np.array([[one.value for one in spreads], *ends.T], dtype=np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         change, low, high = np.where(spread > 0, np.sqrt(values) / spread, np.nan)
@@ -210,7 +209,7 @@ class BaseEpisode:
         """Read an episode's actions."""
         actions = actions_of(item.store, item.episode)
         env_step = item.episode.read("env_step").astype(np.int64)
-        starts, num_steps = episode_timing(item.store.attributes, item.episode, env_step)
+        starts, num_steps = item.timing(env_step)
         executed = np.full(len(starts), actions.shape[1])
         if stores_executed(item.store):
             known = item.store.attributes.protocol.replan_steps

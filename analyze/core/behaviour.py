@@ -19,27 +19,15 @@ from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import EpisodeAttributes
 
-_GOAL = pl.Struct({"goal": pl.String, "instruction": pl.String, "held": pl.Int64})
+_TEXTS = (
+    "suite", "instruction", "told", "told_goal", "own_goal", "family", "scene", "state", "touched", "did", "before",
+    "how",
+)  # fmt: skip
 SCHEMA: dict[str, Any] = {
-    "suite": pl.String,
-    "task_id": pl.Int64,
-    "episode_index": pl.Int64,
-    "instruction": pl.String,
-    "told": pl.String,
-    "told_goal": pl.String,
-    "own_goal": pl.String,
-    "family": pl.String,
-    "scene": pl.String,
-    "state": pl.String,
+    **dict.fromkeys(_TEXTS, pl.String),
+    **dict.fromkeys(("task_id", "episode_index", "num_steps", "touched_at", "did_at"), pl.Int64),
     "outcome": pl.Boolean,
-    "num_steps": pl.Int64,
-    "touched": pl.String,
-    "touched_at": pl.Int64,
-    "did": pl.String,
-    "did_at": pl.Int64,
-    "before": pl.String,
-    "how": pl.String,
-    "goals": pl.List(_GOAL),
+    "goals": pl.List(pl.Struct({"goal": pl.String, "instruction": pl.String, "held": pl.Int64})),
 }
 OTHER_GOAL, OTHER_TOUCH, NO_TOUCH = "reached another goal", "touched something else first", "touched nothing"
 UNFINISHED, TOLD_SO = "touched what the task names, did not finish", "did what it was told, not its task"
@@ -99,17 +87,11 @@ def row_of(
     # Who pushes what is named has touched it, and may have reached the goal of touching it.
     elsewhere = done is not None and not (named and done.first_held == touched_at)
     told_so = done is not None and aim is not None and key_of(done) == key_of(aim)
-    how = (
-        TOLD_SO
-        if told_so
-        else OTHER_GOAL
-        if elsewhere
-        else NO_TOUCH
-        if touched is None
-        else UNFINISHED
-        if named
-        else OTHER_TOUCH
-    )
+    reasons = (
+        (told_so, TOLD_SO), (elsewhere, OTHER_GOAL), (touched is None, NO_TOUCH), (named, UNFINISHED),
+        (True, OTHER_TOUCH),
+    )  # fmt: skip
+    how = next(reason for holds, reason in reasons if holds)
     return {
         "suite": suite,
         "task_id": attributes.task_id,
@@ -155,9 +137,8 @@ def _done(goals: Iterable[TaskGoal], aim: TaskGoal | None, family: str) -> tuple
     held = [goal for goal in goals if goal.first_held]
     whole = [*held, *([aim] if aim is not None else [])]
     held = [goal for goal in held if not any(is_part(key_of(goal), key_of(other)) for other in whole)]
-    alike = [goal for goal in held if _fits(goal.instruction, family)]
     held.sort(key=lambda goal: (goal.first_held or 0, key_of(goal)))
-    alike.sort(key=lambda goal: (goal.first_held or 0, key_of(goal)))
+    alike = [goal for goal in held if _fits(goal.instruction, family)]
     reached = None if aim is None else next((goal for goal in held if key_of(goal) == key_of(aim)), None)
     if reached is None:
         return next(iter([*alike, *held]), None), None

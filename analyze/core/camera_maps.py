@@ -1,21 +1,29 @@
-"""Attention on the pictures of one episode: mass and lift of every patch, replan by replan."""
+"""Attention on the pictures of one episode: how patches lie on a picture, and mass and lift of every patch by replan.
+
+The stored frame is what the model sees (turned, resized and cropped already, see `PolicyCameraView`), and a camera's
+patches tile all of it evenly, row by row from its top left corner. Frame and map are therefore laid over each other
+first, and only then turned to the way a person sees the scene.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.core.patch_pictures import upright
 from vla_attention.analyze.measures.frames import Axis, long_table
-from vla_attention.analyze.measures.patch_maps import PictureMap, map_note, mean_rows, mean_uniform, seen_cameras
+from vla_attention.analyze.measures.masses import uniform_keys
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, positions_by_task
+from vla_attention.analyze.stores.rows import layer_rows
+from vla_attention.schemas.cached_property import cached_property
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
-from vla_attention.schemas.layout import Role
+from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout
 from vla_attention.schemas.stores.store_format import PolicyCameraView
 
 Array = NDArray[np.float64]
@@ -23,6 +31,140 @@ Array = NDArray[np.float64]
 _TOP_QUANTILE = 0.995
 #: It ends at this many times the value of uniform attention, or above.
 _LEAST_TOP = 4.0
+#: Cells along a side of a map that adds several grids.
+_MOST_CELLS = 128
+#: Grey that stands for a picture that was not stored.
+NO_PICTURE = 205
+
+
+@dataclass(frozen=True)
+class PictureMap:
+    """How the patches of a camera lie on a map of its picture: `rows` x `columns` even cells.
+
+    The cells of one grid over the whole picture are its patches. Of several grids (tiles, a thumbnail, frames of other
+    times), or of one over a part, they are as small as the smallest patches, at most 128 along a side: each patch's
+    mass is spread evenly over its area, and masses of patches at one place are added, so that a map sums to the mass of
+    all patches.
+
+    Attributes:
+        grids: of the camera, in key order.
+        keys: of the patches of these grids, one grid after another, shape (patch,).
+    """
+
+    grids: tuple[PatchGrid, ...]
+    keys: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, layout: SiteLayout, camera: str) -> PictureMap:
+        """The map of a camera that has patches."""
+        return cls(layout.grids(camera), layout.patch_keys(camera))
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of cells."""
+        return self._cells([(grid.rows, grid.part[2]) for grid in self.grids], self.grids[0].image_height)
+
+    @property
+    def columns(self) -> int:
+        """Number of columns of cells."""
+        return self._cells([(grid.columns, grid.part[3]) for grid in self.grids], self.grids[0].image_width)
+
+    def _cells(self, sides: Sequence[tuple[int, float]], pixels: int) -> int:
+        """Cells along a side: (number of patches, part of the side) of each grid, and the picture's pixels."""
+        if self.cells_are_patches:
+            return sides[0][0]
+        return min(max(math.ceil(patches / length - 1e-6) for patches, length in sides), pixels, _MOST_CELLS)
+
+    @property
+    def cells_are_patches(self) -> bool:
+        """Whether the camera has one grid over its whole picture."""
+        return len(self.grids) == 1 and self.grids[0].covers_all
+
+    def spread(self, masses: NDArray[Any]) -> NDArray[Any]:
+        """Masses of patches (..., patch) as maps (..., row, column) of the same sum."""
+        if self.cells_are_patches:
+            return masses.reshape(*masses.shape[:-1], self.rows, self.columns)
+        total = np.zeros((*masses.shape[:-1], self.rows, self.columns), dtype=masses.dtype)
+        first = 0
+        for grid, (down, across) in zip(self.grids, self._shares, strict=True):
+            own = masses[..., first : first + grid.num_patches].reshape(*masses.shape[:-1], grid.rows, grid.columns)
+            total += (down.T @ own @ across).astype(masses.dtype)
+            first += grid.num_patches
+        return total
+
+    def finest(self, values: NDArray[Any]) -> NDArray[Any]:
+        """The values (..., patch) of the smallest patch at each cell's centre, (..., cell); 0 without a patch."""
+        below = np.concatenate([values, np.zeros_like(values[..., :1])], axis=-1)
+        smallest = np.full(self.rows * self.columns, -1)
+        for patch in self._at[::-1]:
+            smallest = np.where(patch.ravel() >= 0, patch.ravel(), smallest)
+        return below[..., smallest]
+
+    def highest(self, values: NDArray[Any]) -> NDArray[Any]:
+        """The highest of the values (..., patch) at each cell's centre, (..., row, column); 0 without a patch."""
+        below = np.concatenate([values, np.zeros_like(values[..., :1])], axis=-1)
+        return np.asarray(below[..., self._at].max(axis=-3))
+
+    @cached_property
+    def _shares(self) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+        return [grid.shares(self.rows, self.columns) for grid in self.grids]
+
+    @cached_property
+    def _at(self) -> NDArray[np.int64]:
+        """The patch of each grid at the centres of the cells (grid, row, column), smallest first; -1: none."""
+        found, first = [], 0
+        for grid in self.grids:
+            top, left, height, width = grid.part
+            row = np.floor(((np.arange(self.rows) + 0.5) / self.rows - top) * grid.rows / height).astype(int)
+            column = np.floor(((np.arange(self.columns) + 0.5) / self.columns - left) * grid.columns / width).astype(
+                int
+            )
+            inside = np.outer((row >= 0) & (row < grid.rows), (column >= 0) & (column < grid.columns))
+            patch = np.where(inside, first + row[:, None] * grid.columns + column, -1)
+            found.append((height * width / grid.num_patches, first, patch))
+            first += grid.num_patches
+        return np.stack([patch for _, _, patch in sorted(found, key=lambda one: one[:2])])
+
+
+def seen_cameras(item: SelectedEpisode) -> tuple[str, ...]:
+    """Cameras of the site whose patches are not all masked, in key order."""
+    layout, roles = item.tokens.layout, item.tokens.static_roles
+    return tuple(camera for camera in layout.pictured if (roles[:, layout.patch_keys(camera)] == Role.IMAGE).any())
+
+
+def upright(image: NDArray[Any], view: PolicyCameraView) -> NDArray[Any]:
+    """A stored picture or patch map (row, column, ...) as a person in the camera's place would see it.
+
+    Rows are reversed unless the stored picture is upright; columns are reversed if it is mirrored, so that left is left
+    as in the instruction. Turning twice gives the stored picture back.
+    """
+    return image[:: 1 if view.upright else -1, :: -1 if view.mirrored else 1]
+
+
+def enlarge(patch_map: NDArray[np.floating], height: int, width: int, smooth: bool = False) -> NDArray[np.float64]:
+    """A patch map (row, column) with a value for every pixel, (height, width): patches divide both sides evenly.
+
+    A pixel has the value of the patch in which its centre lies; with `smooth`, values are bilinear between patch
+    centres and constant beyond the outermost ones, which shows the map softer than it is known.
+    """
+    values = np.asarray(patch_map, dtype=np.float64)
+    if values.ndim != 2 or not values.size:
+        raise BadArgument(f"A patch map has two axes (row, column) and patches; got shape {values.shape}.")
+    rows, columns = _centres(height, values.shape[0]), _centres(width, values.shape[1])
+    if not smooth:
+        return np.asarray(values[np.floor(rows).astype(int)][:, np.floor(columns).astype(int)])
+    for axis, centres in ((0, rows), (1, columns)):
+        place = np.clip(centres - 0.5, 0.0, values.shape[axis] - 1.0)
+        below = np.floor(place).astype(int)
+        above = np.minimum(below + 1, values.shape[axis] - 1)
+        part = (place - below).reshape((-1, 1) if axis == 0 else (1, -1))
+        values = (1.0 - part) * values.take(below, axis) + part * values.take(above, axis)
+    return values
+
+
+def _centres(pixels: int, cells: int) -> NDArray[np.float64]:
+    """Where the pixels' centres lie, in units of a cell."""
+    return (np.arange(pixels) + 0.5) * cells / pixels
 
 
 @dataclass(frozen=True)
@@ -66,12 +208,12 @@ class EpisodeMaps:
 
     def has_frames(self, camera: str) -> bool:
         """Whether the camera's pictures were stored."""
-        return f"frames/{camera}" in self.item.episode.attributes.arrays
+        return self.item.episode.has(f"frames/{camera}")
 
 
 def stored_picture(item: SelectedEpisode, camera: str, replan: int) -> NDArray[np.uint8] | None:
     """The picture that the policy got, as a person sees the scene, (row, column, 3); None where none was stored."""
-    if f"frames/{camera}" not in item.episode.attributes.arrays:
+    if not item.episode.has(f"frames/{camera}"):
         return None
     picture: NDArray[np.uint8] = item.episode.read(f"frames/{camera}", replan)
     return upright(picture, view_of(item, camera))
@@ -105,11 +247,14 @@ def camera_names(question: Question, wanted: Sequence[str] | None = None) -> tup
 
 def episode_maps(question: Question, item: SelectedEpisode, cameras: Sequence[str]) -> EpisodeMaps:
     """Read one episode's attention, mean over the selected layers, denoise steps and heads."""
-    tokens = item.tokens
-    mean = mean_rows(item, question.selection, question.site)
+    tokens, selection = item.tokens, question.selection
+    rows = layer_rows(item.store.attributes, item.episode, selection, question.site, per_head=True)
+    parts = [part.rows.mean(axis=1, dtype=np.float64) for part in rows if part.layer in selection.once]
+    mean = sum(parts, np.zeros(())) / len(parts)  # (replan, key)
     image = mean * (tokens.static_roles == int(Role.IMAGE))
+    uniform = uniform_keys(item, selection).mean(axis=(2, 3))
+    uniform = (uniform[:, list(selection.once)] if uniform.shape[1] > 1 else uniform).mean(axis=1)
     # As much mass as the valid keys have, shared out as uniform attention does.
-    uniform = mean_uniform(item, question.selection)
     uniform = uniform * ((mean * item.valid).sum(axis=1) / (uniform * item.valid).sum(axis=1))[:, None]
     whole = image.sum(axis=1)
     maps = {}
@@ -150,20 +295,31 @@ def patch_table(maps: EpisodeMaps, replans: Sequence[int]) -> pl.DataFrame:
     axis: Axis = {"replan": chosen, "env_step": maps.env_step[chosen]}
     frames = []
     for camera, one in maps.cameras.items():
-        place = np.moveaxis(np.indices(one.mass.shape[1:]), 0, -1)  # (row, column, 2)
-        shown, turned = np.empty_like(place), upright(place, one.view)
-        shown[turned[..., 0], turned[..., 1]] = place
-        names = {
-            "row": place[..., 0],
-            "column": place[..., 1],
-            "shown_row": shown[..., 0],
-            "shown_column": shown[..., 1],
-        }
-        cells: Axis = {name: numbers.ravel() for name, numbers in names.items()}
+        row, column = np.indices(one.mass.shape[1:]).reshape(2, -1)
+        shown_row = row if one.view.upright else row.max() - row
+        shown_column = column.max() - column if one.view.mirrored else column
+        cells = {"row": row, "column": column, "shown_row": shown_row, "shown_column": shown_column}
         values = {"mass": one.mass, "share": one.share, "lift": one.lift}
         columns = {name: array[chosen].reshape(1, len(chosen), -1) for name, array in values.items()}
         frames.append(long_table(maps.item, [{"camera": (camera,)}, axis, cells], columns))
     return pl.concat(frames)
+
+
+def map_note(layout: SiteLayout, camera: str, outside: float | None) -> str:
+    """What a camera's map adds up and leaves out, in a sentence; empty where its keys are the patches of one grid.
+
+    outside: part of the camera's attention on keys that lie nowhere in the picture, 0 to 1; None: not known.
+    """
+    spans = layout.camera_spans(camera)
+    placed = [span.name for span in spans if span.grid is not None]
+    others = [span.name for span in spans if span.grid is None]
+    notes = []
+    if len(placed) > 1:
+        notes.append(f"adds the attention on {listing(placed)}")
+    if others:
+        share = "" if outside is None else f", with {100 * outside:.1f}% of the camera's attention"
+        notes.append(f"leaves out the keys of {listing(others)}, which lie nowhere in the picture{share}")
+    return f"The map of {camera} {' and '.join(notes)}." if notes else ""
 
 
 def orientation_notes(episodes: Sequence[EpisodeMaps]) -> list[str]:

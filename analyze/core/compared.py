@@ -1,25 +1,24 @@
-"""The numbers of one run beside those of the first one, paired where that is possible."""
+"""The numbers of one run beside those of the first one: within pairs, or where none pairs of independent episodes.
+
+Two episodes are a pair when suite, task, initial state (by its digest) and seed are equal: the same scene, the same
+noise, other weights. A rerun repeats the calls of its base, and pairs by episode. Differences within pairs do not
+contain differences between scenes. Every difference is the other run's value minus the first one's.
+
+A table of values has one row per (episode, item): `EPISODE_ID`, the columns of the item, `value`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import numpy as np
 import polars as pl
 
 from vla_attention.analyze.core.action_changes import units_of_recorded
-from vla_attention.analyze.core.courses import PICTURES
-from vla_attention.analyze.core.differences import (
-    alone,
-    differences,
-    differences_unpaired,
-    paired,
-    pairing,
-    pairs_of,
-    ratios_of_shared_replans,
-    values_of_groups,
-)
+from vla_attention.analyze.core.courses import strip
+from vla_attention.analyze.core.estimate import Scale, estimate, with_q
 from vla_attention.analyze.core.levels import SIDES, Levels, levels_of, task_cells, task_groups
 from vla_attention.analyze.core.measure import measure, table_of
 from vla_attention.analyze.core.object_shares import (
@@ -30,12 +29,14 @@ from vla_attention.analyze.core.object_shares import (
     with_coverage,
 )
 from vla_attention.analyze.core.recorded_effects import recorded_effects
-from vla_attention.analyze.core.runs import Run
+from vla_attention.analyze.core.runs import Run, RunsDiffer
 from vla_attention.analyze.core.word_items import items_of
-from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG
+from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, float_values
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.statistics.episode_intervals import Sampling
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.analyze.statistics.two_samples import mean_difference
+from vla_attention.analyze.statistics.units import Sampling
+from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.stores.store_format import episode_name
 
 #: What is compared -> the columns that name an item of it, and inside of which looks are counted.
 KINDS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -45,6 +46,9 @@ KINDS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "objects": (("kind", "item"), ("kind",)),
     "effects": (("item_kind", "item", "reader"), ("reader",)),
 }
+#: Two episodes with equal values here are a pair; `occurrence` counts the episodes of a run with the same first state.
+PAIR = ("suite", "task_id", "initial_state_digest", "seed", "occurrence")
+_TASK = ["suite", "task_id", "instruction"]
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,7 @@ class RunValues:
 
     Attributes:
         run: the run.
-        episodes: what pairs them, see `differences.pairing`.
+        episodes: what pairs them, see `pairing`.
         levels: the groups, heads kept apart.
     """
 
@@ -68,7 +72,7 @@ class RunValues:
 
     @cached_property
     def values(self) -> Mapping[str, pl.DataFrame]:
-        """By kind of `KINDS`, a table of values (see `differences`).
+        """By kind of `KINDS`, a table of values (see the module).
 
         Those of words and objects are log2 of their attention over what they would get if it were spread evenly.
         """
@@ -99,8 +103,8 @@ class Compared:
 
     Attributes:
         first, other: what was measured of both.
-        pairs: of their episodes, see `differences.pairs_of`; without any, means of independent episodes are compared.
-        rows: by kind, see `differences.differences`.
+        pairs: of their episodes, see `pairs_of`; without any, means of independent episodes are compared.
+        rows: by kind, see `differences`.
         values: by kind, both values of every pair.
     """
 
@@ -117,13 +121,15 @@ class Compared:
 
     def alone(self) -> pl.DataFrame:
         """The episodes without a partner: run, compared_with, `EPISODE_ID`."""
-        sides = {"first": (self.first, self.other), "other": (self.other, self.first)}
-        return pl.concat(
-            alone(one.episodes, self.pairs, side).select(
-                pl.lit(one.run.name).alias("run"), pl.lit(against.run.name).alias("compared_with"), *EPISODE_ID
-            )
-            for side, (one, against) in sides.items()
-        )
+        found = []
+        for side, one, against in (("first", self.first, self.other), ("other", self.other, self.first)):
+            paired = self.pairs.select("suite", "task_id", episode_index=f"episode_{side}")
+            rest = one.episodes.join(paired, on=EPISODE_ID, how="anti", maintain_order="left")
+            found.append(rest.select(run=pl.lit(one.run.name), compared_with=pl.lit(against.run.name), **_SAME_NAMES))
+        return pl.concat(found)
+
+
+_SAME_NAMES = {name: pl.col(name) for name in EPISODE_ID}
 
 
 def compared(first: RunValues, other: RunValues, sampling: Sampling) -> Compared:
@@ -152,12 +158,12 @@ def compared(first: RunValues, other: RunValues, sampling: Sampling) -> Compared
     for kind, (item, looks) in KINDS.items():
         if not all(kind in side for side in sides):
             continue
+        of_kind = sides[0][kind], sides[1][kind]
         if pairs.height:
-            values[kind] = paired(pairs, sides[0][kind], sides[1][kind], item)
+            values[kind] = paired(pairs, *of_kind, item)
             rows[kind] = differences(values[kind], item, sampling, looks)
         else:
-            episodes = first.episodes, other.episodes
-            rows[kind] = differences_unpaired(sides[0][kind], sides[1][kind], episodes, item, sampling, looks)
+            rows[kind] = differences_unpaired(of_kind, (first.episodes, other.episodes), item, sampling, looks)
     return Compared(first, other, pairs, rows, values)
 
 
@@ -199,25 +205,21 @@ def strip_of_pair(
     """A pair of episodes, one that ended otherwise if there is one, and three moments of both.
 
     Returns:
-        The two episodes; and one row per picture: row (0: the first run, 1: the other), column, above, replan, camera;
-        none where the stores have no pictures.
+        The two episodes; and their `courses.strip`, the first run's above.
     """
     keys, pairs = ["suite", "task_id"], part.pairs
     for side, told in (("first", told_first), ("other", told_other)):
         did = told.select(*keys, pl.col("episode_index").alias(f"episode_{side}"), pl.col("did").alias(f"did_{side}"))
         pairs = pairs.join(did, on=[*keys, f"episode_{side}"], how="left", maintain_order="left")
     pair = pairs.sort(pl.col("did_first").eq_missing(pl.col("did_other")), maintain_order=True).row(0, named=True)
-    items, rows = [], []
-    for row, (side, of) in enumerate((("first", part.first), ("other", part.other))):
-        key = (pair["suite"], pair["task_id"], pair[f"episode_{side}"])
-        named = {(*item.task, item.episode.attributes.episode_index): item for item in of.run.question.selected}
-        items.append(item := named[key])
+    items, shown = [], []
+    for side, of in (("first", part.first), ("other", part.other)):
+        named = {item.key: item for item in of.run.question.selected}
+        items.append(item := named[pair["suite"], pair["task_id"], pair[f"episode_{side}"]])
         last, steps = item.episode.attributes.num_replans - 1, item.episode.attributes.env_step
-        cameras = [camera.name for camera in item.store.attributes.policy.cameras]
-        camera = next((name for name in cameras if item.episode.has(f"frames/{name}")), None)
-        for column, replan in enumerate(sorted({0, last // 2, last}) if camera else []):
-            rows.append((row, column, f"{of.run.name}, step {steps[replan] - steps[0]}", replan, camera))
-    return (items[0], items[1]), pl.DataFrame(rows, schema=PICTURES, orient="row")
+        moments = sorted({0, last // 2, last})
+        shown.append([(replan, f"{of.run.name}, step {steps[replan] - steps[0]}") for replan in moments])
+    return (items[0], items[1]), strip(items, shown)
 
 
 def side_by_side(part: Compared, told: Mapping[str, pl.DataFrame]) -> pl.DataFrame | None:
@@ -251,3 +253,180 @@ def by_themselves(base: RunValues, rest: Sequence[RunValues], sampling: Sampling
         cells.append(tasks.with_columns(success_rate=pl.lit(None, pl.Float64)) if repeats else tasks)
         groups.append(task_groups(one.levels.episodes_groups(), sampling).select(name, pl.all()))
     return pl.concat(cells, how="diagonal"), pl.concat(groups, how="diagonal")
+
+
+def pairing(run: Run, ignore_seed: bool) -> pl.DataFrame:
+    """`EPISODE_ID`, instruction and `PAIR` of each selected episode; of other seeds too where they may differ."""
+    rows = [
+        (*item.key, about.instruction, about.initial_state, 0 if ignore_seed else item.store.attributes.protocol.seed)
+        for item in run.question.selected
+        for about in [item.episode.attributes]
+    ]
+    schema = {
+        "suite": pl.String, "task_id": pl.Int64, "episode_index": pl.Int64, "instruction": pl.String,
+        "initial_state_digest": pl.String, "seed": pl.Int64,
+    }  # fmt: skip
+    frame = pl.DataFrame(rows, schema=schema, orient="row")
+    return frame.with_columns(occurrence=pl.col("episode_index").rank("ordinal").over(PAIR[:-1]).cast(pl.Int64))
+
+
+def pairs_of(first: pl.DataFrame, other: pl.DataFrame, rerun: bool) -> pl.DataFrame:
+    """The pairs of two runs, from `pairing` of each.
+
+    Returns:
+        `PAIR`, instruction, episode_first, episode_other.
+    """
+    mine = first.rename({"episode_index": "episode_first"})
+    theirs = other.rename({"episode_index": "episode_other"}).drop("instruction")
+    keys = list(PAIR)
+    if rerun:
+        theirs = theirs.drop("occurrence").with_columns(episode_first="episode_other")
+        keys[-1] = "episode_first"
+    return mine.join(theirs, on=keys, how="inner").sort("suite", "task_id", "episode_first")
+
+
+def paired(pairs: pl.DataFrame, first: pl.DataFrame, other: pl.DataFrame, item: Sequence[str]) -> pl.DataFrame:
+    """The values of both episodes of every pair, and their difference: the pair, the item, first, other, difference."""
+    joined = pairs
+    for side, values in (("first", first), ("other", other)):
+        keys = ["suite", "task_id", f"episode_{side}", *(item if side == "other" else ())]
+        of_side = values.rename({"episode_index": f"episode_{side}", "value": side}).select(*keys[:3], *item, side)
+        joined = joined.join(of_side, on=keys, how="inner", nulls_equal=True, maintain_order="left_right")
+    return joined.with_columns(difference=pl.col("other") - pl.col("first"))
+
+
+def differences(
+    joined: pl.DataFrame, item: Sequence[str], sampling: Sampling, looks: Sequence[str] = ()
+) -> pl.DataFrame:
+    """Mean differences of pairs (`paired`) for every item, by task, by suite where there are several, and over all.
+
+    looks: columns of `item`; one look for each value of the others is counted in `difference_q` over all tasks, and one
+    for each task in those of tasks (Benjamini-Hochberg).
+
+    Returns:
+        One row per (scope, item): scope "task", "suite" or "all"; suite, task_id, instruction; paired; num_tasks,
+        num_families, intervals; num_first, num_other, the episodes; mean_first, mean_other, and `difference` with
+        `difference_low`, `difference_high` and `difference_q`, of none.
+    """
+    known = joined.filter(pl.col("difference").is_finite())
+    values: dict[str, Scale] = dict.fromkeys(("first", "other", "difference"), "plain")
+
+    def rows_of(by: list[str], of: Sequence[str]) -> pl.DataFrame:
+        rows = estimate(known, [*by, *item], values, sampling, {"difference": 0.0}, of)
+        numbers = {"num_first": "num_episodes", "num_other": "num_episodes", "mean_first": "first"}
+        return rows.with_columns(**numbers, mean_other="other", paired=pl.lit(True))
+
+    return _by_scope(joined, item, looks, rows_of)
+
+
+def differences_unpaired(
+    values: tuple[pl.DataFrame, pl.DataFrame],
+    episodes: tuple[pl.DataFrame, pl.DataFrame],
+    item: Sequence[str],
+    sampling: Sampling,
+    looks: Sequence[str] = (),
+) -> pl.DataFrame:
+    """As `differences`, of means of independent episodes; `episodes`: both runs' `pairing`.
+
+    A task that both runs have moves both means, and its difference has less noise than that of two different tasks.
+    """
+    both = pl.concat(
+        table.join(of.select(*EPISODE_ID, "instruction"), on=EPISODE_ID).with_columns(_other=pl.lit(number == 1))
+        for number, (table, of) in enumerate(zip(values, episodes, strict=True))
+    )
+
+    def rows_of(by: list[str], of: Sequence[str]) -> pl.DataFrame:
+        rows = []
+        for part in both.partition_by([*by, *item], maintain_order=True):
+            is_other, units = part["_other"].to_numpy(), sampling.units(part)
+            if is_other.all() or not is_other.any():
+                continue  # a task of one run only
+            one = mean_difference(float_values(part["value"]), is_other, units)
+            low, high = one.difference.interval() or (None, None)
+            rows.append(
+                {**part.select(*by, *item).row(0, named=True), "num_tasks": units.num_tasks, **units.about}
+                | {"intervals": one.estimand.value, "num_first": one.num_second, "num_other": one.num_first}
+                | {"mean_first": one.mean_second, "mean_other": one.mean_first, "difference": one.difference.value}
+                | {"difference_low": low, "difference_high": high, "difference_p": one.difference.p_value(0.0)}
+            )
+        frame = pl.DataFrame(rows, infer_schema_length=None)
+        return with_q(frame, "difference", of).with_columns(paired=pl.lit(False)) if rows else frame
+
+    return _by_scope(both, item, looks, rows_of)
+
+
+def _by_scope(
+    values: pl.DataFrame,
+    item: Sequence[str],
+    looks: Sequence[str],
+    rows_of: Callable[[list[str], Sequence[str]], pl.DataFrame],
+) -> pl.DataFrame:
+    """Rows of every task, of every suite where there are several, and over all, from the columns that tell them apart.
+
+    rows_of: gives the rows, from these columns and from those inside of which looks are counted.
+    """
+    several = values["suite"].n_unique() > 1
+    scopes = [("task", _TASK), *([("suite", ["suite"])] if several else []), ("all", [])]
+    found = [(scope, rows_of(by, item if scope == "task" else [*by, *looks])) for scope, by in scopes]
+    named = [rows.with_columns(scope=pl.lit(scope)) for scope, rows in found if rows.width]
+    rows = pl.concat(named, how="diagonal_relaxed")
+    missing = [name for name in _TASK if name not in rows.columns]
+    rows = rows.with_columns(pl.lit(None, values.schema[name]).alias(name) for name in missing)
+    if values.height and not several:
+        rows = rows.with_columns(suite=pl.lit(values["suite"][0]))
+    front = ["scope", *_TASK, *item, "paired", "num_tasks", "num_families", "intervals", "num_first", "num_other"]
+    return rows.select(*front, "mean_first", "mean_other", pl.col(r"^difference.*$"))
+
+
+def values_of_groups(levels: Levels, log2_ratio: pl.DataFrame | None = None) -> pl.DataFrame:
+    """One row per (episode, layer, quantity): log2_ratio, then GROUP_fraction of every group, then success.
+
+    Two runs may name a block by different numbers (7 and 25): `layer` is the block's number as text, or "layers_avg".
+
+    Args:
+        levels: the measured groups.
+        log2_ratio: `EPISODE_ID`, layer and value, if the ratio is not that of all replans.
+    """
+    cells, place = levels.episodes(), [*EPISODE_ID, "layer", "block"]
+    parts = []
+    if levels.grouping.ratio is not None:
+        ratios = cells.select(*place, value=pl.col("log_ratio_mean") / np.log(2.0))
+        if log2_ratio is not None:
+            ratios = ratios.drop("value").join(log2_ratio, on=place[:-1], how="left", maintain_order="left")
+        parts.append(ratios.with_columns(quantity=pl.lit("log2_ratio")))
+    groups = levels.episodes_groups()
+    with_mass = groups.group_by("group").agg(pl.col("mass").max()).filter(pl.col("mass") > 0)["group"]
+    groups = groups.filter(pl.col("group").is_in(with_mass.implode()))
+    parts.append(groups.select(*place, value="fraction", quantity=pl.format("{}_fraction", "group")))
+    parts.append(cells.select(*place, value=pl.col("success").cast(pl.Float64), quantity=pl.lit("success")))
+    of_block = pl.when(pl.col("layer") == LAYERS_AVG).then("layer").otherwise(pl.col("block").cast(pl.String))
+    values = pl.concat([part.select(*place, "quantity", "value") for part in parts]).with_columns(layer=of_block)
+    return values.unique([*EPISODE_ID, "layer", "quantity"], keep="first", maintain_order=True)
+
+
+def ratios_of_shared_replans(first: Levels, other: Levels, name: str) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """log2 of the ratio of a run and of its rerun, means over the replans in which both have a finite one.
+
+    Returns:
+        For each run `EPISODE_ID`, layer, value.
+
+    Raises:
+        RunsDiffer: an episode has other replans in the rerun, which is called `name`.
+    """
+    key = [*EPISODE_ID, "replan", "env_step", "layer"]
+    tables = [levels.replans().select(*key, pl.col("log2_ratio").alias("value")).collect() for levels in (first, other)]
+    shared = tables[0].join(tables[1].select(EPISODE_ID).unique(), on=EPISODE_ID, how="semi")
+    theirs = tables[1].join(shared.select(EPISODE_ID).unique(), on=EPISODE_ID, how="semi")
+    unlike = pl.concat([one.join(two, on=key, how="anti") for one, two in ((shared, theirs), (theirs, shared))])
+    if unlike.height:
+        episodes = unlike.select("task_id", "episode_index").unique().sort("task_id", "episode_index")
+        names = [episode_name(task, episode) for task, episode in episodes.iter_rows()]
+        raise RunsDiffer(
+            f"{listing(names, 6)} of the rerun {name} has other replans than in its base; make the rerun again."
+        )
+    finite = [one.filter(pl.col("value").is_finite()) for one in (shared, theirs)]
+    both = finite[0].join(finite[1].select(key), on=key, how="semi").select(key)
+    return tuple(  # type: ignore[return-value]
+        one.join(both, on=key, how="semi").group_by(*EPISODE_ID, "layer", maintain_order=True).agg(pl.mean("value"))
+        for one in finite
+    )

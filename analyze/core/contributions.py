@@ -22,44 +22,37 @@ much of one direction they are. Unlike masses, both may be given for sides at di
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.estimate import Scale, estimate
-from vla_attention.analyze.core.lazy_frames import frame_of_episodes
-from vla_attention.analyze.measures.baselines import uniform_keys, uniform_masses
-from vla_attention.analyze.measures.frames import (
-    EPISODE_ID,
-    LAYERS_AVG,
-    denoise_axis,
-    layer_axis,
-    long_table,
-    replan_axis,
-)
-from vla_attention.analyze.measures.masses import ratio
-from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
+from vla_attention.analyze.measures.frames import LAYERS_AVG, Axis, frame_of_episodes, long_table
+from vla_attention.analyze.measures.masses import finite_mean, ratio, uniform_keys, uniform_masses
+from vla_attention.analyze.measures.not_in_memory import OnDisk
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_episode
-from vla_attention.analyze.statistics.episode_intervals import Sampling
-from vla_attention.analyze.stores.parallel import each_episode, map_episodes
+from vla_attention.analyze.statistics.units import Sampling
+from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import ResolvedGrouping
 from vla_attention.schemas.segments import Segment, segment_members, weights_on_segments
-from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.store_format import RootAttributes
 
 Array = NDArray[np.float64]
 #: Roles of the keys on each side of the ratio: the images that the policy sees now, and the text.
 VISUAL_ROLES = ("image",)
 LINGUISTIC_ROLES = ("bos", "template", "instruction", "text")
-_GEOMETRIC = {"geometric_mean": "contribution_ratio", "uniform_ratio": "uniform_ratio", "ratio_lift": "ratio_lift"}
+_SIDES = ("visual_norm", "linguistic_norm")
+_RATIOS = ("contribution_ratio", "uniform_ratio", "ratio_lift")
+#: An episode, and the arrays of its norms.
+_Episode: TypeAlias = tuple[SelectedEpisode, Mapping[str, NDArray[Any]]]
 
 
 @dataclass(frozen=True)
@@ -67,12 +60,14 @@ class Norms:
     """Norms of every episode, and the tables that are made of them.
 
     Attributes:
-        measured: of each episode its tokens and arrays, whose axes `axes` labels.
+        measured: of each episode the columns of its cells (replan, layer, denoise), of groups `norm` (replan, layer,
+            denoise, group), and labels of the axes: env_step, layer and block.
+        selection: the denoise steps.
         above, below: the columns of the ratio's sides; empty without a ratio.
         groups: the groups whose norms there are.
     """
 
-    measured: Sequence[tuple[SelectedEpisode, Mapping[str, NDArray[Any]]]]
+    measured: Sequence[_Episode]
     selection: Selection
     above: str = ""
     below: str = ""
@@ -82,31 +77,72 @@ class Norms:
         """suite, task_id, episode_index, replan, env_step, layer, block, denoise_step; norms of both sides,
         contribution_ratio (infinite or null where the denominator is 0), uniform_ratio and ratio_lift.
         """
-        return frame_of_episodes(self.measured, self._cells)
+        labels = ("layer", "block", "norm", "env_step")
+        return frame_of_episodes(
+            self.measured,
+            lambda one: self._table(one, {name: array for name, array in one[1].items() if name not in labels}),
+        )
 
     def norms(self) -> pl.LazyFrame:
         """The same names, group, norm; of every group that is made of whole segments in all episodes."""
-        return frame_of_episodes(self.measured, self._norms)
+        groups = {"group": list(self.groups)}
+        return frame_of_episodes(self.measured, lambda one: self._table(one, {"norm": one[1]["norm"]}, groups))
+
+    def _table(self, one: _Episode, values: Mapping[str, Array], *further: Axis) -> pl.DataFrame:
+        item, arrays = one
+        steps = arrays["env_step"]
+        axes: list[Axis] = [
+            {"replan": range(len(steps)), "env_step": steps},
+            {name: arrays[name] for name in ("layer", "block")},
+            {"denoise_step": self.selection.denoise_steps},
+        ]
+        return long_table(item, [*axes, *further], values)
 
     def ratios(self, sampling: Sampling) -> pl.DataFrame:
-        """The ratio in every layer and over all of them, see `ratios_by_layer`."""
-        then = partial(_means_of_episodes, above=self.above, below=self.below)
-        return ratios_by_layer(frame_of_episodes(self.measured, self._cells, then).collect(), self.above, self.below,
-                               sampling)  # fmt: skip
+        """Norms and their ratio of every layer and over all of them ("layers_avg"), with intervals.
 
-    def _cells(self, one: tuple[SelectedEpisode, Mapping[str, NDArray[Any]]]) -> pl.DataFrame:
+        Returns:
+            layer, layer_number (null for the average); means of `above` and `below`, geometric mean uniform_ratio; and
+            with `_low` and `_high`
+                geometric_mean    exp of the mean log ratio
+                ratio_lift        geometric mean of ratio / uniform ratio
+                ratio_mean        mean of the episodes' mean ratios of norms
+                ratio_of_means    mean `above` / mean `below`
+            Ratios that are infinite or undefined are in no mean but `ratio_of_means`.
+        """
+        episodes = frame_of_episodes(self.measured, self._means).collect()
+        values: dict[str, Scale] = dict.fromkeys((self.above, self.below, "ratio_mean"), "positive")
+        values |= dict.fromkeys(("geometric_mean", "uniform_ratio", "ratio_lift"), "geometric")
+        rows = estimate(episodes, ["layer"], values, sampling, quotients={"ratio_of_means": (self.above, self.below)})
+        bounded = ("ratio_mean", "ratio_of_means", "geometric_mean", "ratio_lift")
+        ends = [f"{name}{end}" for name in bounded for end in ("", "_low", "_high")]
+        number = pl.col("layer").cast(pl.Int64, strict=False).alias("layer_number")
+        return rows.select("layer", number, self.above, self.below, "uniform_ratio", *ends)
+
+    def _means(self, one: _Episode) -> pl.DataFrame:
+        """Means over replans and denoise steps, a row for each layer and "layers_avg"; a block counts once there."""
         item, arrays = one
-        values = {name: array for name, array in arrays.items() if name not in ("layer", "block", "norm", "env_step")}
-        return long_table(item, self._axes(one), values)
+        sides = (self.above, self.below)
+        layers = {name: arrays[name] for name in (*sides, *_RATIOS)}
+        once = np.sort(np.unique(arrays["block"], return_index=True)[1])
+        whole = {name: array[:, once] for name, array in layers.items()}
+        if f"{self.above}_of_uniform" in arrays:
+            # The sides are in different blocks: the ratio over all of them is, at every replan and denoise step, of the
+            # means of each side's norm over its blocks.
+            norms = [[finite_mean(arrays[f"{side}{end}"][:, once], 1)[:, None] for end in ("", "_of_uniform")]
+                     for side in sides]  # fmt: skip
+            whole |= ratio_columns(*norms)
 
-    def _norms(self, one: tuple[SelectedEpisode, Mapping[str, NDArray[Any]]]) -> pl.DataFrame:
-        return long_table(one[0], [*self._axes(one), {"group": list(self.groups)}], {"norm": one[1]["norm"]})
+        def over(name: str, log: bool = False) -> Array:
+            with np.errstate(divide="ignore"):
+                of_layers, of_all = (np.log(part[name]) if log else part[name] for part in (layers, whole))
+            means = np.append(finite_mean(of_layers, (0, 2)), finite_mean(of_all, (0, 1, 2)))
+            return np.exp(means) if log else means
 
-    def _axes(self, one: tuple[SelectedEpisode, Mapping[str, NDArray[Any]]]) -> list[Any]:
-        _, arrays = one
-        layer = {name: arrays[name] for name in ("layer", "block")}
-        steps = arrays["env_step"]
-        return [{"replan": range(len(steps)), "env_step": steps}, layer, denoise_axis(self.selection)]
+        values = {name: over(name) for name in sides} | {"ratio_mean": over("contribution_ratio")}
+        logs = zip(("geometric_mean", "uniform_ratio", "ratio_lift"), _RATIOS, strict=True)
+        values |= {name: over(column, log=True) for name, column in logs}
+        return long_table(item, [{"layer": [*map(str, arrays["layer"]), LAYERS_AVG]}], values)
 
 
 def selected_gram(item: SelectedEpisode, site: str, selection: Selection) -> NDArray[np.float32]:
@@ -162,7 +198,7 @@ def uniform_weights(item: SelectedEpisode, site: str, selection: Selection) -> A
     return np.concatenate([weights, np.full((*weights.shape[:-1], 1), np.nan)], axis=-1)
 
 
-def ratio_columns(above: tuple[Array, Array], below: tuple[Array, Array]) -> dict[str, Array]:
+def ratio_columns(above: Sequence[Array], below: Sequence[Array]) -> dict[str, Array]:
     """`contribution_ratio`, `uniform_ratio`, `ratio_lift`; each side is its norm and its norm of uniform attention."""
     value, uniform = ratio(above[0], below[0]), ratio(above[1], below[1])
     return {"contribution_ratio": value, "uniform_ratio": uniform, "ratio_lift": ratio(value, uniform)}
@@ -179,10 +215,10 @@ def side_norms(question: Question) -> Norms | None:
     if not all(item.store.attributes.recording.contributions for item in selected):
         return None
     each = partial(_sides_of_episode, selection=selection, layers=question.settings.layers)
-    norms = OnDisk(each_episode(each, selected))
-    if not all(norms[i] for i in range(len(norms))):
+    norms: OnDisk[_Episode] = OnDisk(each_episode(each, _fresh(selected)), lambda i, arrays: (selected[i], arrays))
+    if not all(arrays for _, arrays in norms):
         return None
-    return Norms(_with_items(selected, norms), selection, "visual_norm", "linguistic_norm")
+    return Norms(norms, selection, *_SIDES)
 
 
 def group_norms(question: Question) -> Norms | None:
@@ -190,83 +226,66 @@ def group_norms(question: Question) -> Norms | None:
     selected, selection, grouping = question.selected, question.selection, question.grouping
     if not all(store.attributes.recording.contributions for store in question.stores):
         return None
-    chosen = map_episodes(partial(_segments_of_groups, site=question.site, grouping=grouping), selected)
     # A group that cannot be measured in one episode would be a mean over the others only.
-    names = tuple(name for name in grouping.names if all(name in parts for parts in chosen))
+    measurable = set.intersection(*(set(_whole_groups(item, question.site, grouping)) for item in _fresh(selected)))
+    names = tuple(name for name in grouping.names if name in measurable)
     if not names:
         return None
-    each = partial(_groups_of_episode, selection=selection, site=question.site, grouping=grouping)
-    measurable = [{name: parts[name] for name in names} for parts in chosen]
-    norms = OnDisk(each_episode(each, zip(selected, measurable, strict=True)))
-    sides = ("numerator_norm", "denominator_norm") if "numerator_norm" in norms[0] else ("", "")
-    return Norms(_with_items(selected, norms), selection, *sides, groups=names)
+    each = partial(_groups_of_episode, selection=selection, site=question.site, grouping=grouping, names=names)
+    norms: OnDisk[_Episode] = OnDisk(each_episode(each, _fresh(selected)), lambda i, arrays: (selected[i], arrays))
+    sides = ("numerator_norm", "denominator_norm") if "numerator_norm" in norms[0][1] else ("", "")
+    return Norms(norms, selection, *sides, groups=names)
 
 
-def _with_items(selected: Sequence[SelectedEpisode], norms: OnDisk[Any]) -> Sequence[tuple[SelectedEpisode, Any]]:
-    return MadeWhenAsked(lambda i: (selected[i], norms[i]), range(len(selected)))
+def _fresh(selected: Sequence[SelectedEpisode]) -> Iterator[SelectedEpisode]:
+    return (item.fresh() for item in selected)
 
 
-def _sides_of_episode(
-    item: SelectedEpisode, selection: Selection, layers: Sequence[int] | None
-) -> dict[str, NDArray[Any]]:
+def _sides_of_episode(item: SelectedEpisode, selection: Selection, layers: Sequence[int] | None) -> dict[str, Any]:
     """The columns of one episode's norms (replan, layer, denoise), and the axes' labels; empty without a side."""
-    root, episode = item.store.attributes, item.episode
-    sides = [_parts_of_side(root, episode, roles) for roles in (VISUAL_ROLES, LINGUISTIC_ROLES)]
-    if len({root.recording_of(side[0]).layers for side in sides if side}) > 1:
-        return _of_different_blocks(item, selection, layers, [side for side in sides if side])
-    sites = {side[0] for side in sides if side}
-    grams = {site: selected_gram(item, site, selection) for site in sites}
-    uniform = {site: uniform_weights(item, site, selection) for site in sites}
-    norms = [
-        (joint_norm(grams[side[0]], side[1]), joint_norm(grams[side[0]], side[1], uniform[side[0]]))
-        for side in sides
-        if side is not None
-    ]
-    if len(norms) < len(sides):
-        return {}
-    visual, linguistic = norms
-    return {**_labels(item, selection), "visual_norm": visual[0], "linguistic_norm": linguistic[0],
-            **ratio_columns(visual, linguistic)}  # fmt: skip
-
-
-def _labels(item: SelectedEpisode, selection: Selection) -> dict[str, NDArray[Any]]:
-    labels = {name: np.array(values) for name, values in layer_axis(selection).items()}
-    return labels | {"env_step": np.asarray(replan_axis(item)["env_step"])}
-
-
-def _of_different_blocks(
-    item: SelectedEpisode,
-    selection: Selection,
-    layers: Sequence[int] | None,
-    sides: Sequence[tuple[str, NDArray[np.bool_]]],
-) -> dict[str, NDArray[Any]]:
-    """The same where the sides are at sites in different blocks; empty where no chosen block has one of the sides."""
     root = item.store.attributes
-    blocks_of = {
-        site: tuple(b for b in root.recording_of(site).layers if layers is None or b in layers) for site, _ in sides
-    }
-    if len(sides) < 2 or not all(blocks_of.values()):
+    sides = [side for roles in (VISUAL_ROLES, LINGUISTIC_ROLES) if (side := _parts_of_side(item, roles)) is not None]
+    if len(sides) < 2:
         return {}
-    union = sorted({block for blocks in blocks_of.values() for block in blocks})
-    shape = (item.tokens.num_replans, len(union), len(selection.denoise))
-    values: dict[str, NDArray[Any]] = _labels(item, selection) | {"layer": np.array(union), "block": np.array(union)}
-    for name, (site, parts) in zip(("visual_norm", "linguistic_norm"), sides, strict=True):
-        recorded = root.recording_of(site).layers
-        own = replace(selection, layers=tuple(recorded.index(block) for block in blocks_of[site]))
-        gram, uniform = selected_gram(item, site, own), uniform_weights(item, site, own)
-        at = [union.index(block) for block in blocks_of[site]]
-        for column, norm in ((name, joint_norm(gram, parts)), (f"{name}_of_uniform", joint_norm(gram, parts, uniform))):
-            values[column] = np.full(shape, np.nan)
-            values[column][:, at] = norm
-    return values | dict.fromkeys(("contribution_ratio", "uniform_ratio", "ratio_lift"), np.full(shape, np.nan))
+    labels = {"layer": selection.layer_labels, "block": selection.blocks}
+    chosen, places = [selection] * 2, [list(range(len(selection.layers)))] * 2
+    recorded = [root.recording_of(site).layers for site, _ in sides]
+    if recorded[0] != recorded[1]:
+        blocks = [[block for block in one if layers is None or block in layers] for one in recorded]
+        union = tuple(sorted({*blocks[0], *blocks[1]}))
+        labels, places = {"layer": union, "block": union}, [[union.index(block) for block in own] for own in blocks]
+        chosen = [
+            replace(selection, layers=tuple(one.index(block) for block in own))
+            for one, own in zip(recorded, blocks, strict=True)
+        ]
+        if not all(blocks):
+            return {}
+    sites = {site: own for (site, _), own in zip(sides, chosen, strict=True)}
+    read = {site: (selected_gram(item, site, own), uniform_weights(item, site, own)) for site, own in sites.items()}
+    values: dict[str, Any] = {}
+    for name, (site, parts), at in zip(_SIDES, sides, places, strict=True):
+        gram, uniform = read[site]
+        for end, weights in (("", None), ("_of_uniform", uniform)):
+            norm = joint_norm(gram, parts, weights)
+            values[name + end] = np.full((len(norm), len(labels["block"]), norm.shape[2]), np.nan)
+            values[name + end][:, at] = norm
+    ratios = ratio_columns(*([values[name], values[f"{name}_of_uniform"]] for name in _SIDES))
+    if recorded[0] != recorded[1]:
+        values |= {name: np.full_like(array, np.nan) for name, array in ratios.items()}
+    else:
+        values = {name: values[name] for name in _SIDES} | ratios
+    return _labels(item, labels) | values
 
 
-def _parts_of_side(
-    root: RootAttributes, episode: StoredEpisode, roles: Sequence[str]
-) -> tuple[str, NDArray[np.bool_]] | None:
+def _labels(item: SelectedEpisode, layers: Mapping[str, Sequence[int]]) -> dict[str, NDArray[Any]]:
+    labels = {name: np.array(values) for name, values in layers.items()}
+    return labels | {"env_step": item.episode.read("env_step").astype(np.int64)}
+
+
+def _parts_of_side(item: SelectedEpisode, roles: Sequence[str]) -> tuple[str, NDArray[np.bool_]] | None:
     """The first site that has segments with these roles, and which parts they are, (part,)."""
-    for site in root.sites:
-        segments: tuple[Segment, ...] = episode.attributes.segments[site.name]
+    for site in item.store.attributes.sites:
+        segments: tuple[Segment, ...] = item.episode.attributes.segments[site.name]
         # The last part is the whole update of the block, and belongs to neither side.
         parts = np.array([*(segment.role in roles for segment in segments), False])
         if parts.any():
@@ -294,98 +313,23 @@ def whole_segments(item: SelectedEpisode, resolved: ResolvedGrouping, site: str)
     return parts
 
 
-def _segments_of_groups(item: SelectedEpisode, site: str, grouping: Grouping) -> dict[str, NDArray[np.bool_]]:
+def _whole_groups(item: SelectedEpisode, site: str, grouping: Grouping) -> dict[str, NDArray[np.bool_]]:
     return whole_segments(item, resolve_episode(grouping, item), site)
 
 
 def _groups_of_episode(
-    pair: tuple[SelectedEpisode, Mapping[str, NDArray[np.bool_]]], selection: Selection, site: str, grouping: Grouping
+    item: SelectedEpisode, selection: Selection, site: str, grouping: Grouping, names: Sequence[str]
 ) -> dict[str, NDArray[Any]]:
     """`norm` (replan, layer, denoise, group), the measures of both sides (replan, layer, denoise), the axes' labels."""
-    item, parts = pair
-    gram = selected_gram(item, site, selection)
-    norm = np.stack([joint_norm(gram, taken) for taken in parts.values()], axis=-1)
-    found = {**_labels(item, selection), "norm": norm}
-    if grouping.ratio is not None and {*grouping.ratio.numerator, *grouping.ratio.denominator} <= parts.keys():
+    parts, gram = _whole_groups(item, site, grouping), selected_gram(item, site, selection)
+    norm = np.stack([joint_norm(gram, parts[name]) for name in names], axis=-1)
+    found = _labels(item, {"layer": selection.layer_labels, "block": selection.blocks}) | {"norm": norm}
+    if grouping.ratio is not None and {*grouping.ratio.numerator, *grouping.ratio.denominator} <= {*names}:
         uniform = uniform_weights(item, site, selection)
         above, below = (
-            (joint_norm(gram, taken), joint_norm(gram, taken, uniform))
+            [joint_norm(gram, taken), joint_norm(gram, taken, uniform)]
             for side in (grouping.ratio.numerator, grouping.ratio.denominator)
             for taken in [np.any([parts[name] for name in side], axis=0)]
         )
         found |= {"numerator_norm": above[0], "denominator_norm": below[0], **ratio_columns(above, below)}
     return found
-
-
-def _by_layer(rows: pl.DataFrame, measures: Sequence[pl.Expr], by: tuple[str, ...] = ()) -> pl.DataFrame:
-    """Means over replans and denoise steps, one row per (episode, layer or "layers_avg", `by`); `layer` is a string.
-
-    A block that was named by two layer numbers counts once in "layers_avg".
-    """
-    once = rows.select("layer", "block").unique(maintain_order=True).unique("block", keep="first")["layer"]
-    layers = rows.group_by(*EPISODE_ID, "layer", *by, maintain_order=True).agg(*measures)
-    average = rows.filter(pl.col("layer").is_in(once.implode())).group_by(*EPISODE_ID, *by, maintain_order=True)
-    whole = average.agg(*measures).with_columns(pl.lit(LAYERS_AVG).alias("layer")).select(layers.columns)
-    return pl.concat([layers.with_columns(pl.col("layer").cast(pl.String)), whole])
-
-
-def _finite(name: str) -> pl.Expr:
-    return pl.col(name).filter(pl.col(name).is_finite())
-
-
-def _geometric_mean(name: str) -> pl.Expr:
-    log = pl.col(name).log()
-    return log.filter(log.is_finite()).mean().exp()
-
-
-def _means_of_episodes(rows: pl.DataFrame, above: str, below: str) -> pl.DataFrame:
-    """Per (episode, layer): mean norms, and the means of their ratio that `ratios_by_layer` lists."""
-    ratios = [
-        _finite("contribution_ratio").mean().alias("ratio_mean"),
-        *(_geometric_mean(column).alias(name) for name, column in _GEOMETRIC.items()),
-    ]
-    found = _by_layer(rows, [pl.col(above, below).mean(), *ratios])
-    if f"{above}_of_uniform" not in rows.columns:
-        return found
-    # The sides are in different blocks: the ratio over all of them is, at every replan and denoise step, of the means
-    # of each side's norm over its blocks.
-    cell = [*EPISODE_ID, "replan", "denoise_step"]
-    once = rows.unique([*cell, "block"], keep="first", maintain_order=True)
-    steps = once.group_by(cell, maintain_order=True).agg(
-        pl.col(above, below, f"{above}_of_uniform", f"{below}_of_uniform").mean()
-    )
-    steps = steps.with_columns(
-        (pl.col(above) / pl.col(below)).alias("contribution_ratio"),
-        (pl.col(f"{above}_of_uniform") / pl.col(f"{below}_of_uniform")).alias("uniform_ratio"),
-    ).with_columns((pl.col("contribution_ratio") / pl.col("uniform_ratio")).alias("ratio_lift"))
-    over = steps.group_by(*EPISODE_ID, maintain_order=True).agg(*ratios)
-    average = pl.col("layer") == LAYERS_AVG
-    whole = found.filter(average).select(*EPISODE_ID, "layer", above, below)
-    whole = whole.join(over, on=EPISODE_ID, how="left", maintain_order="left")
-    return pl.concat([found.filter(~average), whole.select(found.columns)])
-
-
-def ratios_by_layer(episodes: pl.DataFrame, above: str, below: str, sampling: Sampling) -> pl.DataFrame:
-    """Norms and their ratio of every layer and over all of them ("layers_avg"), with intervals.
-
-    Args:
-        episodes: per (episode, layer) the means of `_means_of_episodes`.
-        above, below: the columns of the norms.
-        sampling: what the intervals are about, and which tasks are related.
-
-    Returns:
-        layer, layer_number (null for the average); means of `above` and `below`, geometric mean uniform_ratio; and with
-        `_low` and `_high`
-            geometric_mean    exp of the mean log ratio
-            ratio_lift        geometric mean of ratio / uniform ratio
-            ratio_mean        mean of the episodes' mean ratios of norms
-            ratio_of_means    mean `above` / mean `below`
-        Ratios that are infinite or undefined are in no mean but `ratio_of_means`.
-    """
-    values: dict[str, Scale] = dict.fromkeys((above, below, "ratio_mean"), "positive")
-    values |= dict.fromkeys(_GEOMETRIC, "geometric")
-    rows = estimate(episodes, ["layer"], values, sampling, quotients={"ratio_of_means": (above, below)})
-    number = pl.col("layer").cast(pl.Int64, strict=False).alias("layer_number")
-    bounded = ("ratio_mean", "ratio_of_means", "geometric_mean", "ratio_lift")
-    ends = [f"{name}{end}" for name in bounded for end in ("", "_low", "_high")]
-    return rows.select("layer", number, above, below, "uniform_ratio", *ends)

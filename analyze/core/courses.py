@@ -1,4 +1,10 @@
-"""Where hands and things were, step by step, and where failed episodes left solved ones that began like them."""
+"""Where hands and things were, step by step, and where failed episodes left solved ones that began like them.
+
+A path is (moment, quantity) in metres: where the hand is as seen from every named object, and these objects as seen
+from one another, so that it is the same wherever on the table they lie. Episodes differ in pace: a moment is held
+against the nearest one of another path at most `SLACK` steps before or after it. A path that has ended stays where it
+ended.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +15,17 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.alignment import episode_timing
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.statistics.leaving import Array, band, by_replan, distance, leaves_at, path_of
 from vla_attention.schemas.episode_steps import HAND, POSES
 
+Array = NDArray[np.float64]
+
+#: Steps by which another episode may be ahead or behind.
+SLACK = 10
+#: Episodes nearer than 1 cm are together, however alike the others are.
+TOGETHER = 0.01
+#: An episode that is elsewhere in fewer replans than these, at its end, has not left.
+FEWEST = 3
 #: Solved episodes of the task whose initial states are nearest.
 _TWINS = 3
 #: Replans of a strip, from the one at which an episode leaves.
@@ -27,7 +39,7 @@ class Course:
     Attributes:
         item: the episode.
         starts: (replan,) steps executed before each replan.
-        path: (moment, quantity), see `statistics.leaving`, of the things that the task names; of all if it names none.
+        path: (moment, quantity), of the things that the task names; of all if it names none.
         start: where all bodies are at the beginning, (body, 3) in metres.
     """
 
@@ -65,7 +77,7 @@ def course_of(item: SelectedEpisode) -> Course | None:
     if steps is None:
         return None
     poses = item.episode.read(POSES).astype(np.float64)[..., :3]
-    starts, _ = episode_timing(item.store.attributes, item.episode, item.episode.read("env_step").astype(np.int64))
+    starts, _ = item.timing(item.episode.read("env_step").astype(np.int64))
     named = {thing.name for thing in item.episode.attributes.objects if thing.of_interest}
     things = [i for i, name in enumerate(steps.bodies) if name != HAND]
     things = [i for i in things if steps.bodies[i] in named] or things
@@ -115,28 +127,72 @@ def _apart(course: Course, others: Sequence[Course]) -> Array:
 
 
 def strip_of(one: Leaving) -> pl.DataFrame:
-    """Where the pictures around the replan lie at which an episode leaves; none where the store has no pictures.
+    """The `strip` of the failed episode, and below it of its twin, around the replan at which the first leaves."""
+    items, last = (one.item, one.twin), one.item.episode.attributes.num_replans - 1
+    moments = [replan for shift in _SHOWN if 0 <= (replan := (one.replan or 0) + shift) <= last]
+    shown = []
+    for who, item in zip(("failed", "solved"), items, strict=True):
+        end = item.episode.attributes.num_replans - 1
+        marks = {one.replan: ", leaves"} if item is one.item else {}
+        labels = {at: f"{who}, step {int(one.starts[at])}{marks.get(at, '')}" for at in moments}
+        shown.append([(at, text) if at <= end else (end, f"{who}, at its end") for at, text in labels.items()])
+    return strip(items, shown)
+
+
+def strip(items: Sequence[SelectedEpisode], shown: Sequence[Sequence[tuple[int, str]]]) -> pl.DataFrame:
+    """Where stored pictures of episodes lie, below each other; of an episode without pictures none.
+
+    shown: of each episode its replans, and what stands above their pictures.
 
     Returns:
-        One row per picture: row (0: the failed episode, 1: its twin), column, above, replan, camera.
+        One row per picture: row, column, above, replan, camera.
     """
-    last, rows = one.item.episode.attributes.num_replans - 1, []
-    shown = [replan for shift in _SHOWN if 0 <= (replan := (one.replan or 0) + shift) <= last]
-    for row, (who, item) in enumerate((("failed", one.item), ("solved", one.twin))):
+    rows: list[tuple[int, int, str, int, str]] = []
+    for row, (item, moments) in enumerate(zip(items, shown, strict=True)):
         cameras = [camera.name for camera in item.store.attributes.policy.cameras]
-        camera = next((name for name in cameras if f"frames/{name}" in item.episode.attributes.arrays), None)
-        for column, replan in enumerate(shown if camera else []):
-            mark = ", leaves" if (row, replan) == (0, one.replan) else ""
-            own = min(replan, item.episode.attributes.num_replans - 1)
-            label = f"{who}, step {int(one.starts[replan])}{mark}" if own == replan else f"{who}, at its end"
-            rows.append((row, column, label, own, camera))
-    return pl.DataFrame(rows, schema=PICTURES, orient="row")
+        camera = next((name for name in cameras if item.episode.has(f"frames/{name}")), None)
+        rows += [(row, column, above, at, camera) for column, (at, above) in enumerate(moments) if camera is not None]
+    schema = {"row": pl.Int64, "column": pl.Int64, "above": pl.String, "replan": pl.Int64, "camera": pl.String}
+    return pl.DataFrame(rows, schema=schema, orient="row")
 
 
-#: Columns of a strip of stored pictures.
-PICTURES = {
-    **dict.fromkeys(("row", "column"), pl.Int64),
-    "above": pl.String,
-    "replan": pl.Int64,
-    "camera": pl.String,
-}
+def path_of(hand: Array, things: Sequence[Array]) -> Array:
+    """The path (moment, quantity) of the hand and of things, each (moment, 3)."""
+    seen = [hand - thing for thing in things] or [hand]
+    seen += [other - thing for i, thing in enumerate(things) for other in things[i + 1 :]]
+    return np.concatenate(seen, axis=1)
+
+
+def distance(path: Array, other: Array) -> Array:
+    """How far a path is from another one at each of its moments (moment,): root mean square over positions, metres."""
+    at = np.arange(len(path))[:, None] + np.arange(-SLACK, SLACK + 1)
+    apart = ((path[:, None] - other[at.clip(0, len(other) - 1)]) ** 2).sum(axis=2).min(axis=1)
+    root: Array = np.sqrt(apart / (path.shape[1] / 3))
+    return root
+
+
+def by_replan(moments: Array, starts: NDArray[np.int64]) -> Array:
+    """Means (replan,) of values (moment,) over the moments behind the steps that each replan executed."""
+    ends = np.append(starts[1:], len(moments) - 1)
+    return np.array([moments[begin + 1 : end + 1].mean() for begin, end in zip(starts, ends, strict=True)])
+
+
+def band(distances: Sequence[Array], length: int) -> Array:
+    """How far apart episodes are that do the same, (replan,): the largest of theirs at each replan and beside it.
+
+    distances: (replan,) each, from one such episode to its own nearest.
+    """
+    held = np.stack([one[np.arange(length).clip(0, len(one) - 1)] for one in distances])
+    largest = np.pad(held.max(axis=0), 1, mode="edge")
+    beside: Array = np.maximum(np.max([largest[:-2], largest[1:-1], largest[2:]], axis=0), TOGETHER)
+    return beside
+
+
+def leaves_at(apart: Array, within: Array) -> int | None:
+    """The replan from which on an episode is farther apart than `within`, each (replan,), to its end; None: never.
+
+    Being outside in fewer than `FEWEST` last replans is no leaving.
+    """
+    inside = np.flatnonzero(apart <= within)
+    first = int(inside[-1]) + 1 if len(inside) else 0
+    return first if first + min(FEWEST, len(apart)) <= len(apart) else None

@@ -3,18 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
+import numpy as np
 import polars as pl
 
-from vla_attention.analyze.statistics.episode_intervals import Sampling, means_with_intervals
-from vla_attention.analyze.statistics.intervals import NO_LIMITS, POSITIVE, SHARE
+from vla_attention.analyze.measures.frames import float_values
+from vla_attention.analyze.statistics.intervals import (
+    NO_LIMITS,
+    POSITIVE,
+    SHARE,
+    EpisodeStatistic,
+    Estimate,
+    estimates,
+    geometric_mean_over_episodes,
+    mean_over_episodes,
+    ratio_of_means_over_episodes,
+)
 from vla_attention.analyze.statistics.many_looks import adjusted_p_values
+from vla_attention.analyze.statistics.units import Sampling, Units
 
-#: positive: masses, lifts, ratios; the interval is symmetric on the log scale. share: 0..1, log odds. plain: as it is.
-#: geometric: a column of ratios, of which the mean of logarithms is taken.
-Scale: TypeAlias = Literal["positive", "share", "plain", "geometric"]
-_LIMITS = {"positive": POSITIVE, "share": SHARE, "plain": NO_LIMITS}
+#: positive: masses, lifts, ratios; the interval is symmetric on the log scale. share: 0..1, log odds. correlation:
+#: -1..1, in the same way. plain: as it is. geometric: a column of ratios, of which the mean of logarithms is taken.
+Scale: TypeAlias = Literal["positive", "share", "correlation", "plain", "geometric"]
+_LIMITS = {"positive": POSITIVE, "share": SHARE, "correlation": (-1.0, 1.0), "plain": NO_LIMITS}
 
 
 def estimate(
@@ -26,33 +38,81 @@ def estimate(
     family: Collection[str] = (),
     quotients: Mapping[str, tuple[str, str]] | None = None,
 ) -> pl.DataFrame:
-    """Mean of each value for every item of `by`, with its interval.
+    """Mean of each value for every item of `by`, over tasks of the tasks' means, with its interval (see `intervals`).
+
+    The mean and the interval of an item use the episodes that have it. Values that are null or not finite are left out
+    of their mean.
 
     Args:
         table: one row per (episode, item), with `suite` and `task_id`.
         by: the columns that name an item.
         values: columns to average, each with its scale.
         sampling: what the intervals are about, and which tasks are related.
-        nulls: for some values, what they would be if nothing were there.
+        nulls: for some values or quotients, what they would be if nothing were there.
         family: of `by`, the columns inside of whose values the looks are counted; all rows are one look's unless given.
-        quotients: further columns, each the mean of one column / the mean of another.
+        quotients: further columns, each the mean of one column / the mean of another over the episodes that have both.
 
     Returns:
         One row per item in order of first appearance: `by`, num_episodes, num_tasks, num_families, intervals; per value
         V, V_low, V_high (null where there is none), and of `nulls` V_q, the p of this null adjusted for the number of
         rows (Benjamini-Hochberg).
     """
-    nulls = nulls or {}
-    limits = {name: _LIMITS[scale] for name, scale in values.items() if scale != "geometric"}
-    geometric = {name: f"_log_{name}" for name, scale in values.items() if scale == "geometric"}
-    logs = table.with_columns(pl.col(name).log().alias(log) for name, log in geometric.items())
-    found = means_with_intervals(
-        logs, by, limits, sampling, nulls=nulls, quotients=quotients, geometric=geometric
-    )  # fmt: skip
-    found = found.drop(f"{name}_episodes" for name in (*values, *(quotients or {})))
+    nulls, quotients = nulls or {}, quotients or {}
+    needed = dict.fromkeys([*values, *(name for pair in quotients.values() for name in pair)])
+    logs = {name: table[name].log() if values.get(name) == "geometric" else table[name] for name in needed}
+    columns = {name: float_values(column) for name, column in logs.items()}
+    whole = sampling.units(table)
+    items = table.select(by).with_row_index("_row").group_by(by, maintain_order=True).agg("_row")
+    # Items whose episodes are of the same tasks, one by one, are computed together: there can be thousands.
+    alike: dict[bytes, list[int]] = {}
+    members = [rows.to_numpy().astype(np.intp) for rows in items["_row"]]
+    for i, rows in enumerate(members):
+        alike.setdefault(whole.tasks[rows].tobytes(), []).append(i)
+    found: list[dict[str, Any]] = [{} for _ in members]
+    for numbers in alike.values():
+        at = np.stack([members[i] for i in numbers])  # (item, episode)
+        given = whole.of_tasks(whole.tasks[at[0]])
+        statistics = {
+            name: geometric_mean_over_episodes(columns[name][at])
+            if scale == "geometric"
+            else mean_over_episodes(columns[name][at], _LIMITS[scale])
+            for name, scale in values.items()
+        } | {
+            name: ratio_of_means_over_episodes(columns[above][at], columns[below][at])
+            for name, (above, below) in quotients.items()
+        }
+        each = iter(estimates(list(statistics.values()), given.decided()))
+        for i in numbers:
+            found[i] |= {"num_episodes": at.shape[1], "num_tasks": given.num_tasks, **given.about}
+        for name, statistic in statistics.items():
+            for place, i in enumerate(numbers):
+                one = _of_what_is_left(statistic, place, given, next(each))
+                found[i][name] = one.value
+                found[i][f"{name}_low"], found[i][f"{name}_high"] = one.interval() or (None, None)
+                if name in nulls:
+                    found[i][f"{name}_p"] = one.p_value(nulls[name])
+    schema: dict[str, Any] = {"num_episodes": pl.Int64, "num_tasks": pl.Int64, "num_families": pl.Int64,
+                              "intervals": pl.String}  # fmt: skip
+    for name in (*values, *quotients):
+        ends = (name, f"{name}_low", f"{name}_high", *([f"{name}_p"] if name in nulls else []))
+        schema |= dict.fromkeys(ends, pl.Float64)
+    rows = pl.concat([items.drop("_row"), pl.DataFrame(found, schema=schema)], how="horizontal")
     for name in nulls:
-        found = with_q(found, name, family)
-    return found
+        rows = with_q(rows, name, family)
+    return rows
+
+
+def _of_what_is_left(statistic: EpisodeStatistic, place: int, given: Units, one: Estimate) -> Estimate:
+    """The estimate about these tasks, where episodes that have a value are of fewer families than all; else `one`."""
+    used = statistic.used[place]
+    left = given if used.all() or not used.any() else given.part(used)
+    if left is given or left.decided().estimand == given.decided().estimand:
+        return one
+    part = EpisodeStatistic(
+        statistic.numerator[place, used], statistic.denominator[place, used], used[used], statistic.exponentiate,
+        statistic.limits,
+    )  # fmt: skip
+    return estimates([part], left.decided())[0]
 
 
 def with_q(table: pl.DataFrame, name: str, family: Collection[str] = ()) -> pl.DataFrame:

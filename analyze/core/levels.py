@@ -15,7 +15,7 @@ ratios, which the published scripts take. Ratios that are not finite are never d
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -24,12 +24,13 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.core.axes import OF_ROWS, weighted, with_time
 from vla_attention.analyze.core.estimate import estimate
 from vla_attention.analyze.core.measure import Items, Measured, measure, table_of
 from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, check_not_empty, resolve_episode
-from vla_attention.analyze.statistics.episode_intervals import Sampling
+from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import check_names
 
@@ -75,15 +76,11 @@ class Levels:
                 denoise_time=pl.col("denoise_step").replace_strict(named, return_dtype=pl.Float64),
             ).drop("layer_number")
 
-        return table_of(self.measured, self._of_steps, MORE, then)
-
-    @property
-    def _of_steps(self) -> tuple[str, ...]:
-        return ("replan", "layer", "denoise", *(("head",) if self.heads else ()))
+        return table_of(self.measured, OF_ROWS if self.heads else OF_ROWS[:3], MORE, then)
 
     def steps_groups(self) -> pl.LazyFrame:
         """`groups` of every step; `layer` is a number."""
-        single = self.groups(*self._of_steps).filter(pl.col("layer") != LAYERS_AVG)
+        single = self.groups(*(OF_ROWS if self.heads else OF_ROWS[:3])).filter(pl.col("layer") != LAYERS_AVG)
         return single.with_columns(layer="layer_number").drop("layer_number")
 
     def replans(self) -> pl.LazyFrame:
@@ -134,13 +131,14 @@ def levels_of(question: Question, heads: bool = False) -> Levels:
 def items_of(item: SelectedEpisode, grouping: Grouping) -> Items:
     """The groups, then with a ratio the sums of the groups on each side; a share is of the groups' summed mass."""
     weights = resolve_episode(grouping, item).weights
-    kinds, names, parts = ["group"] * len(grouping.names), list(grouping.names), [weights]
+    names, parts = [("group", name) for name in grouping.names], [weights]
     if grouping.ratio is not None:
         for kind, side in zip(SIDES, (grouping.ratio.numerator, grouping.ratio.denominator), strict=True):
-            kinds.append(kind)
-            names.append(kind)
+            names.append((kind, kind))
             parts.append(weights[..., [grouping.names.index(name) for name in side]].sum(axis=-1, keepdims=True))
-    labels = {"kind": pl.Series(kinds, dtype=pl.String), "group": pl.Series(names, dtype=pl.String)}
+    labels = {
+        column: pl.Series([name[i] for name in names], dtype=pl.String) for i, column in enumerate(("kind", "group"))
+    }
     # A group without a key at a replan has mass 0 there: fractions of all groups add up to 1.
     return Items(labels, np.concatenate(parts, axis=-1), len(grouping.names), absent="zero")
 
@@ -161,18 +159,15 @@ def cells_of(rows: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
         return cells.drop(items, strict=False)
     below = rows.filter(pl.col("kind") == SIDES[1])
     above_mass, below_mass = cells["mass"], below["mass"]
-    return (
-        cells.drop(items, strict=False)
-        .with_columns(
-            numerator_mass=above_mass,
-            denominator_mass=below_mass,
-            numerator_fraction=cells["share"],
-            denominator_fraction=below["share"],
-            ratio=(above_mass / below_mass).fill_nan(None),
-            uniform_ratio=(cells["uniform"] / below["uniform"]).fill_nan(None),
-        )
-        .with_columns(*_relative())
+    sides = cells.drop(items, strict=False).with_columns(
+        numerator_mass=above_mass,
+        denominator_mass=below_mass,
+        numerator_fraction=cells["share"],
+        denominator_fraction=below["share"],
+        ratio=(above_mass / below_mass).fill_nan(None),
+        uniform_ratio=(cells["uniform"] / below["uniform"]).fill_nan(None),
     )
+    return sides.with_columns(*_relative())
 
 
 def _relative() -> list[pl.Expr]:
@@ -183,6 +178,18 @@ def _relative() -> list[pl.Expr]:
 
 def _finite(name: str) -> pl.Expr:
     return pl.col(name).filter(pl.col(name).is_finite())
+
+
+def _num_without(name: str) -> pl.Expr:
+    """Number of values that are not finite."""
+    return (~pl.col(name).is_finite().fill_null(False)).sum().cast(pl.Int64)
+
+
+def _spread() -> list[pl.Expr]:
+    """ratio_std, ratio_median, ratio_min and ratio_max of the finite values of ratio_mean."""
+    of = _finite("ratio_mean")
+    numbers = {"std": of.std(ddof=0), "median": of.median(), "min": of.min(), "max": of.max()}
+    return [number.alias(f"ratio_{name}") for name, number in numbers.items()]
 
 
 def _geometric(name: str) -> pl.Expr:
@@ -196,9 +203,7 @@ def replan_cells(rows: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
     if grouping.ratio is None:
         return cells
     known = pl.col("ratio").is_finite().fill_null(False)
-    cells = cells.with_columns(
-        ratio_mean="ratio", nonfinite_layers=(~known).cast(pl.Int64)
-    )  # fmt: skip
+    cells = cells.with_columns(ratio_mean="ratio", nonfinite_layers=(~known).cast(pl.Int64))
     layers = cells.filter(pl.col("layer") != LAYERS_AVG)
     # A block that two layer numbers name counts once.
     once = layers.unique([*EPISODE_ID, "replan", "block"], keep="first", maintain_order=True)
@@ -208,7 +213,7 @@ def replan_cells(rows: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
     average = once.group_by(*EPISODE_ID, "replan", maintain_order=True).agg(
         _geometric("ratio").alias("ratio"),
         _finite("ratio").mean().alias("ratio_mean"),
-        (~known).sum().cast(pl.Int64).alias("nonfinite_layers"),
+        _num_without("ratio").alias("nonfinite_layers"),
         pl.when(same)
         .then(pl.col("uniform_ratio").first())
         .otherwise(counted.filter(counted.is_finite() & (counted > 0)).log().mean().exp())
@@ -221,6 +226,58 @@ def replan_cells(rows: pl.DataFrame, grouping: Grouping) -> pl.DataFrame:
     )
     joined = pl.concat([layers, whole.with_columns(*_relative()).select(layers.columns)])
     return joined.sort(*EPISODE_ID, "replan", "layer_number", nulls_last=True, maintain_order=True)
+
+
+def ratios_by(levels: Levels, by: Collection[str]) -> pl.DataFrame:
+    """The ratio of every episode and cell of the axes; the grouping has one.
+
+    Returns:
+        `EPISODE_KEYS`, the columns of the axes; ratio, uniform_ratio and ratio_lift (geometric means over replans and,
+        unless they are kept, over layers, of ratios with a finite logarithm), numerator_fraction, denominator_fraction,
+        numerator_mass, denominator_mass (means), num_nonfinite (ratios without a finite logarithm).
+    """
+
+    def then(rows: pl.DataFrame) -> pl.DataFrame:
+        cells = cells_of(rows, levels.grouping).filter(pl.col("layer") != LAYERS_AVG)
+        if "layer" not in by:  # a block that two layer numbers name counts once
+            cell = [*EPISODE_ID, "replan", "block", "denoise_step", "head"]
+            cells = cells.unique(cell, keep="first", maintain_order=True)
+        cells = with_time(cells, levels.measured) if "time" in by else cells.with_columns(weight=1.0)
+        logs = {name: pl.col(name).log() for name in ("ratio", "uniform_ratio", "ratio_lift")}
+        plain = ("numerator_fraction", "denominator_fraction", "numerator_mass", "denominator_mass")
+        return cells.group_by(*EPISODE_KEYS, *_columns_of(by), maintain_order=True).agg(
+            *(weighted(log, pl.col("weight")).exp().alias(name) for name, log in logs.items()),
+            *(weighted(pl.col(name), pl.col("weight")).alias(name) for name in plain),
+            (~logs["ratio"].is_finite().fill_null(False)).sum().cast(pl.Int64).alias("num_nonfinite"),
+        )
+
+    inner = {"replan", "layer", *(axis for axis in OF_ROWS if axis in by)}
+    return table_of(levels.measured, inner, MORE, then).collect()
+
+
+def groups_by(levels: Levels, by: Collection[str]) -> pl.DataFrame:
+    """Keys, mass, fraction and lift of every group in every episode and cell of the axes, means over replans."""
+
+    def then(rows: pl.DataFrame) -> pl.DataFrame:
+        rows = _of_groups(rows)
+        if "layer" in by:
+            rows = rows.filter(pl.col("layer") != LAYERS_AVG)
+        if "time" not in by:
+            return rows
+        rows = with_time(rows, levels.measured)
+        return rows.group_by(*EPISODE_KEYS, *_columns_of(by), "group", maintain_order=True).agg(
+            weighted(pl.col(name), pl.col("weight")).alias(name) for name in ("keys", "mass", "fraction", "lift")
+        )
+
+    inner = {*(axis for axis in OF_ROWS if axis in by), *(("replan",) if "time" in by else ())}
+    return table_of(levels.measured, inner, then=then).collect()
+
+
+def _columns_of(by: Collection[str]) -> list[str]:
+    """The columns of `means` for axes that are kept."""
+    columns = {"replan": ("replan", "env_step"), "layer": LAYER, "denoise": ("denoise_step",), "head": ("head",)}
+    names = [name for axis in OF_ROWS if axis in by for name in columns[axis]]
+    return [*names, "phase"] if "time" in by else names
 
 
 def over_replans(replans: pl.DataFrame) -> pl.DataFrame:
@@ -243,19 +300,15 @@ def over_replans(replans: pl.DataFrame) -> pl.DataFrame:
     grouped = replans.group_by(*EPISODE_KEYS, *LAYER, maintain_order=True)
     if "ratio" not in replans.columns:
         return grouped.agg(plain)
-    spread = _finite("ratio_mean")
     found = grouped.agg(
         *plain,
         pl.col("numerator_mass", "denominator_mass").mean(),
-        spread.mean().alias("ratio_mean"),
-        spread.std(ddof=0).alias("ratio_std"),
-        spread.median().alias("ratio_median"),
-        spread.min().alias("ratio_min"),
-        spread.max().alias("ratio_max"),
+        _finite("ratio_mean").mean(),
+        *_spread(),
         (pl.col("numerator_mass").mean() / pl.col("denominator_mass").mean()).fill_nan(None).alias("ratio_of_means"),
         (_finite("log2_ratio").mean() * np.log(2.0)).alias("log_ratio_mean"),
-        (~pl.col("ratio_mean").is_finite().fill_null(False)).sum().cast(pl.Int64).alias("num_nonfinite"),
-        (~pl.col("log2_ratio").is_finite().fill_null(False)).sum().cast(pl.Int64).alias("geometric_left_out"),
+        _num_without("ratio_mean").alias("num_nonfinite"),
+        _num_without("log2_ratio").alias("geometric_left_out"),
         pl.col("nonfinite_layers").sum(),
         _geometric("uniform_ratio").alias("uniform_ratio"),
         _geometric("ratio_lift").alias("ratio_lift"),
@@ -285,13 +338,9 @@ def task_cells(episodes: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
     counts = [pl.col("num_replans").sum()]
     if has_ratio:
         has_log = pl.col("log_ratio_mean").is_finite().fill_null(False)
-        spread = _finite("ratio_mean")
         counts += [
-            spread.std(ddof=0).alias("ratio_std"),
-            spread.median().alias("ratio_median"),
-            spread.min().alias("ratio_min"),
-            spread.max().alias("ratio_max"),
-            (~pl.col("ratio_mean").is_finite().fill_null(False)).sum().cast(pl.Int64).alias("episodes_without_ratio"),
+            *_spread(),
+            _num_without("ratio_mean").alias("episodes_without_ratio"),
             has_log.sum().cast(pl.Int64).alias("episodes_with_ratio"),
             pl.struct("suite", "task_id").filter(has_log).n_unique().cast(pl.Int64).alias("tasks_with_ratio"),
             pl.col("num_nonfinite", "geometric_left_out", "nonfinite_layers").sum(),
@@ -305,7 +354,7 @@ def task_cells(episodes: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
             rows = rows.with_columns(uniform_ratio=pl.when(has_log | none).then("_uniform"))
         part = estimate(rows, by, _VALUES if has_ratio else _PLAIN, sampling, quotients=_QUOTIENTS if has_ratio else {})
         part = part.join(rows.group_by(by).agg(counts), on=by, how="left", nulls_equal=True, maintain_order="left")
-        found.append(_scoped(part, scope))
+        found.append(part.with_columns(scope=pl.lit(scope)))
     bounds = [f"{name}_{end}" for name in _UNBOUNDED for end in ("low", "high")]
     return (
         pl.concat(found, how="diagonal").drop(bounds, strict=False).select(*_TASK, *LAYER, pl.exclude(*_TASK, *LAYER))
@@ -334,18 +383,15 @@ def task_groups(groups: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
     found = []
     values: dict[str, Any] = dict.fromkeys(("mass", "keys", "density", "lift"), "plain") | {"fraction": "share"}
     for scope, names in _scopes(groups):
-        found.append(_scoped(estimate(groups, [*names, *LAYER, "group"], values, sampling), scope))
-    kept = ["mass", "keys", "density", "lift", "fraction", "fraction_low", "fraction_high"]
+        rows = estimate(groups, [*names, *LAYER, "group"], values, sampling)
+        found.append(rows.with_columns(scope=pl.lit(scope)))
+    kept = [*values, "fraction_low", "fraction_high"]
     return pl.concat(found, how="diagonal").select(*_TASK, *LAYER, "group", *kept)
 
 
 def _scopes(rows: pl.DataFrame) -> list[tuple[str, list[str]]]:
     several = rows["suite"].n_unique() > 1
     return [("task", ["suite", "task_id", "instruction"]), ("all", ["suite"]), *([("combined", [])] if several else [])]
-
-
-def _scoped(rows: pl.DataFrame, scope: str) -> pl.DataFrame:
-    return rows.with_columns(scope=pl.lit(scope))
 
 
 def overall(tasks: pl.DataFrame) -> pl.DataFrame:

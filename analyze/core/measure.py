@@ -8,7 +8,7 @@ heads (and for "layers_avg" over layers), unless these axes are kept.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, TypeAlias
@@ -17,24 +17,21 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.core.lazy_frames import frame_of_episodes
-from vla_attention.analyze.measures.baselines import uniform_keys, uniform_masses
 from vla_attention.analyze.measures.frames import (
     EPISODE_KEYS,
-    LayerAxis,
+    frame_of_episodes,
     head_axis,
+    layer_axis,
     long_table,
 )
-from vla_attention.analyze.measures.kept import measured_once
-from vla_attention.analyze.measures.masses import finite_mean, masses
-from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
+from vla_attention.analyze.measures.masses import finite_mean, masses, uniform_keys, uniform_masses
+from vla_attention.analyze.measures.not_in_memory import OnDisk, measured_once
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.groupings.resolve import counted_keys
-from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.segments import segment_members, weights_on_segments
 
 Array: TypeAlias = NDArray[np.float64]
@@ -119,27 +116,18 @@ def measure(
         check: called before anything is measured with the most keys of the items at a replan, (1, item) per episode.
     """
     chosen, selection = question.selected, replace(question.selection, per_head="head" in keep)
-    with progress_bar(len(chosen), "episodes") as advance:
-        described = list(each_episode(partial(_described, items_of=items_of), chosen))
-        check([one.keys for one in described])
+    fresh = (item.fresh() for item in chosen)
+    described: OnDisk[_Described] = OnDisk(each_episode(partial(_described, items_of=items_of), fresh))
+    check([one.keys for one in described])
+    each = partial(_measured, items_of=items_of, selection=selection, site=question.site, denoise="denoise" in keep)
+    arguments, digests = {"denoise": "denoise" in keep}, [one.digest for one in described]
+    arrays = measured_once("items", chosen, selection, question.site, each, arguments, digests)
 
-        def scan(positions: Sequence[int]) -> Iterator[dict[str, NDArray[Any]]]:
-            each = partial(
-                _measured, items_of=items_of, selection=selection, site=question.site, denoise="denoise" in keep
-            )
-            return each_episode(each, [chosen[i] for i in positions], advance)
+    def made(i: int, content: dict[str, NDArray[Any]]) -> Measured:
+        about = described[i]
+        return Measured(chosen[i], selection, about.labels, about.absent, **content)
 
-        digests = [one.digest for one in described]
-        arrays = measured_once(
-            "items", chosen, selection, question.site, scan, {"denoise": "denoise" in keep},
-            digests, advance,
-        )  # fmt: skip
-        kept = OnDisk(arrays)
-
-    def made(i: int) -> Measured:
-        return Measured(chosen[i], selection, described[i].labels, described[i].absent, **kept[i])
-
-    return MadeWhenAsked(made, range(len(chosen)))
+    return OnDisk(arrays, made)
 
 
 @dataclass(frozen=True)
@@ -185,6 +173,9 @@ def _measured(
             mass[:, part.layer, part.denoise if denoise else 0] += found if denoise else found / steps
     uniform = uniform_masses(uniform_keys(item, selection), weights)
     uniform = uniform if denoise else uniform.mean(axis=2, keepdims=True)
+    # As they were before storage rounded the rows.
+    row_sum = _selected_cells(item.episode.read(f"{site}/row_sum"), selection).mean(axis=-1)
+    row_sum = (row_sum if selection.per_head else row_sum.mean(axis=-1, keepdims=True)).astype(np.float64)
     arrays = {
         "mass": mass[..., :-2],
         "whole": mass[..., : items.whole].sum(axis=-1) if isinstance(items.whole, int) else mass[..., -2],
@@ -192,20 +183,13 @@ def _measured(
         "keys": counted_keys(weights, item.tokens.existing)[:, :-2],
         "uniform": uniform[..., :-2],
         "uniform_valid": uniform[..., -1],
-        "row_sum": _row_sums(item, selection, site)
-        if denoise
-        else _row_sums(item, selection, site).mean(2, keepdims=True),
+        "row_sum": row_sum if denoise else row_sum.mean(axis=2, keepdims=True),
         "num_valid": item.num_valid,
         "env_step": item.episode.read("env_step").astype(np.int64),
         "denoise_time": item.episode.read("denoise_time")[list(selection.denoise)].astype(np.float64),
     }
     # In C order, as they come from the cache and from other processes: numpy's sums depend on the order in memory.
     return {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-
-
-def _row_sums(item: SelectedEpisode, selection: Selection, site: str) -> NDArray[np.float64]:
-    """Stored sums of the rows (replan, layer, denoise, head or 1), as they were before storage rounded the rows."""
-    return _reduce(_selected_cells(item.episode.read(f"{site}/row_sum"), selection), selection).astype(np.float64)
 
 
 def _segment_weights(item: SelectedEpisode, weights: NDArray[np.float32], site: str) -> NDArray[np.float32] | None:
@@ -221,12 +205,6 @@ def _segment_weights(item: SelectedEpisode, weights: NDArray[np.float32], site: 
 def _selected_cells(values: NDArray[np.float32], selection: Selection) -> NDArray[np.float32]:
     """The selected layers, denoise steps and heads of an array whose axes begin with (replan, layer, denoise, head)."""
     return values[:, list(selection.layers)][:, :, list(selection.denoise)][:, :, :, list(selection.heads)]
-
-
-def _reduce(values: NDArray[np.float32], selection: Selection, axis: int = -1) -> NDArray[np.float32]:
-    """Average over queries (the given axis) and, unless heads are kept apart, over heads (the axis before it)."""
-    values = values.mean(axis=axis)
-    return values if selection.per_head else values.mean(axis=axis, keepdims=True)
 
 
 def means(measured: Measured, by: Collection[str] = (), more: Collection[str] = ()) -> pl.DataFrame:
@@ -246,17 +224,18 @@ def means(measured: Measured, by: Collection[str] = (), more: Collection[str] = 
             share  mass / mass of `Items.whole`
         Null where a number does not exist.
     """
-    one, layers = measured, LayerAxis.of(measured.selection)
-    for axis, name, labels in ((2, "denoise", one.selection.denoise), (3, "head", one.selection.heads)):
+    one, selection = measured, measured.selection
+    for axis, name, labels in ((2, "denoise", selection.denoise), (3, "head", selection.heads)):
         if name in by and one.mass.shape[axis] < len(labels):
             raise ValueError(f"the axis '{name}' was not kept when the items were measured")
     averaged = tuple(axis for axis, name in ((2, "denoise"), (3, "head")) if name not in by)
 
     def of_layers(values: Array) -> Array:
         values = values.mean(axis=averaged, keepdims=True)
-        if values.shape[1] == 1 and layers.num_layers > 1:  # the same in all layers
+        if values.shape[1] == 1 and len(selection.layers) > 1:  # the same in all layers
             return values
-        return layers.with_average(values) if "layer" in by else values[:, layers.once].mean(axis=1, keepdims=True)
+        average: Array = values[:, list(selection.once)].mean(axis=1, keepdims=True)
+        return np.concatenate([values, average], axis=1) if "layer" in by else average
 
     mass, uniform = of_layers(one.mass), of_layers(one.uniform)
     whole, valid, row_sum, of_valid = (
@@ -289,10 +268,10 @@ def means(measured: Measured, by: Collection[str] = (), more: Collection[str] = 
         for name, array in spread.items():
             values[f"{name}_std"] = np.sqrt(finite_mean((array - values[name]) ** 2))
     place = slice(None) if "layer" in by else slice(-1, None)
-    axes.append({name: list(labels)[place] for name, labels in layers.columns.items()})
-    steps = one.selection.denoise_steps if "denoise" in by else [None]
+    axes.append({name: list(labels)[place] for name, labels in layer_axis(selection).items()})
+    steps = selection.denoise_steps if "denoise" in by else [None]
     axes.append({"denoise_step": pl.Series(steps, dtype=pl.Int64)})
-    axes.append(head_axis(replace(one.selection, per_head="head" in by)))
+    axes.append(head_axis(replace(selection, per_head="head" in by)))
     return long_table(one.item, [*axes, one.labels], values, EPISODE_KEYS)
 
 

@@ -21,6 +21,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.core.camera_maps import PictureMap
 from vla_attention.analyze.core.object_shares import ALL_CAMERAS, ITEM, cameras_of, covered, names_of
 from vla_attention.analyze.core.pointing_and_iou import (
     centre_of_mass,
@@ -36,10 +37,9 @@ from vla_attention.analyze.core.pointing_and_iou import (
     shifted_iou,
     shifted_masks,
 )
-from vla_attention.analyze.measures.frames import EPISODE_KEYS, Axis, LayerAxis, head_axis, long_table
+from vla_attention.analyze.measures.frames import EPISODE_KEYS, Axis, head_axis, layer_axis, long_table, with_average
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.not_in_memory import OnDisk
-from vla_attention.analyze.measures.patch_maps import PictureMap
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, positions_by_task
 from vla_attention.analyze.stores.parallel import each_episode
@@ -102,7 +102,7 @@ def object_maps(question: Question, heads: bool, layers: bool, iou: bool) -> Seq
     selection = replace(question.selection, per_head=heads)
     read = partial(_of_episode, selection=selection, site=question.site, layers=layers, iou=iou)
     with progress_bar(len(question.selected), "episodes") as advance:
-        return OnDisk(each_episode(read, question.selected, advance))
+        return OnDisk(each_episode(read, (item.fresh() for item in question.selected), advance))
 
 
 def enrichment_elsewhere(question: Question, found: Sequence[ObjectMaps]) -> pl.DataFrame:
@@ -203,20 +203,20 @@ def _of_episode(item: SelectedEpisode, selection: Selection, site: str, layers: 
     for part in layer_rows(item.store.attributes, item.episode, selection, site):
         for camera, view in views.items():
             maps[camera][:, part.layer, part.denoise] = part.rows[..., view.picture.keys]
-    axis = LayerAxis.of(selection)
+    of_layers = layer_axis(selection)
     items: Axis = {label: [name[i] for name in names] for i, label in enumerate(ITEM[1:])}
     heads_axis = head_axis(selection)
     pointing, overlaps = [], []
     for camera, view in views.items() if iou else ():
         scores = _compared(maps[camera], view)
-        averaged = {name: axis.with_average(array, 0, finite_mean)[None] for name, array in scores.items()}
+        averaged = {name: with_average(array, selection, 0, finite_mean)[None] for name, array in scores.items()}
         of_regions = {name: averaged.pop(name) for name in ("iou", "iou_chance")}
-        axes: list[Axis] = [{"camera": (camera,)}, axis.columns, heads_axis]
+        axes: list[Axis] = [{"camera": (camera,)}, of_layers, heads_axis]
         pointing.append(long_table(item, [*axes, items], {**_of_masks(view), **averaged}, EPISODE_KEYS))
         thresholds: Axis = {"threshold": [f"p{percentile:g}" for percentile in PERCENTILES]}
         overlaps.append(long_table(item, [*axes, thresholds, items], of_regions, EPISODE_KEYS))
     place = slice(None, -1) if layers else slice(-1, None)
-    means = [axis.with_average(array.mean(axis=2, dtype=np.float64))[:, place] for array in maps.values()]
+    means = [with_average(array.mean(axis=2, dtype=np.float64), selection)[:, place] for array in maps.values()]
     of_camera = [array.sum(axis=-1, keepdims=True) for array in means]
     with np.errstate(invalid="ignore", divide="ignore"):
         whole = [
@@ -229,7 +229,7 @@ def _of_episode(item: SelectedEpisode, selection: Selection, site: str, layers: 
         np.concatenate(whole, axis=-1).astype(np.float32),
         np.concatenate([view.area.mean(axis=0) for view in views.values()]),
         {camera: len(view.picture.keys) for camera, view in views.items()},
-        ({name: list(labels)[place] for name, labels in axis.columns.items()}, heads_axis, items),
+        ({name: list(labels)[place] for name, labels in of_layers.items()}, heads_axis, items),
     )
 
 

@@ -9,11 +9,10 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.core.axes import OF_ROWS
-from vla_attention.analyze.core.by_axes import weighted, with_time
+from vla_attention.analyze.core.axes import OF_ROWS, weighted, with_time
+from vla_attention.analyze.core.camera_maps import seen_cameras
 from vla_attention.analyze.core.measure import Items, Measured, measure, table_of
 from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG
-from vla_attention.analyze.measures.patch_maps import seen_cameras
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.schemas.errors import BadArgument

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.core.action_changes import (
     CHANGES,
+    GRIPPER,
     ActionSpread,
     BaseEpisode,
     changes_noise_alone,
@@ -25,18 +26,15 @@ from vla_attention.analyze.core.action_changes import (
     root_mean_square_change,
     units_of_recorded,
 )
-from vla_attention.analyze.core.axes import with_families
-from vla_attention.analyze.core.by_axes import weighted
+from vla_attention.analyze.core.axes import weighted, with_families
 from vla_attention.analyze.core.contributions import joint_norm, selected_gram, whole_segments
 from vla_attention.analyze.core.estimate import Scale, estimate
-from vla_attention.analyze.core.lazy_frames import frame_of_episodes
 from vla_attention.analyze.core.measure import Items, Measured, means, measure
-from vla_attention.analyze.measures.alignment import GRIPPER
-from vla_attention.analyze.measures.frames import EPISODE_ID, episode_columns
-from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
+from vla_attention.analyze.measures.frames import EPISODE_ID, episode_columns, frame_of_episodes
+from vla_attention.analyze.measures.not_in_memory import OnDisk
 from vla_attention.analyze.measures.question import Question, select_again
 from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, resolve_episode, vocabulary_of
-from vla_attention.analyze.statistics.episode_intervals import Sampling
+from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.effects import CHANGE
@@ -169,20 +167,20 @@ def recorded_effects(
     places = _places(replace(question, selected=tuple(having))) if attention else []
     measured = [measure(at, partial(_items, selectors=selectors), "effects") for at, selectors in places]
     each = partial(_arrays, spread=spread, places=[(at.site, at.selection, selectors) for at, selectors in places])
-    kept = OnDisk(each_episode(each, zip(having, *(at.selected for at, _ in places), strict=True)))
 
-    def made(i: int) -> _Episode:
-        return having[i], kept[i], [at_site[i] for at_site in measured]
+    def made(i: int, arrays: Mapping[str, Any]) -> _Episode:
+        return having[i], arrays, [at_site[i] for at_site in measured]
 
+    episodes = OnDisk(each_episode(each, zip(having, *(at.selected for at, _ in places), strict=True)), made)
+    drift = _drift(episodes)
     elsewhere = [
         f"Attention to {plural(len(selectors), 'item')} is of site '{at.site}', where the keys are."
         for at, selectors in places
         if at.site != question.site
     ]
-    episodes = MadeWhenAsked(made, range(len(having)))
-    found = RecordedEffects(question, spread, episodes, (*_drift(having, kept), *elsewhere))
+    found = RecordedEffects(question, spread, episodes, (*drift, *elsewhere))
     if found.rows().head(1).collect().is_empty():
-        said = _drift(having, kept) or ("None was measured in a selected replan.",)
+        said = drift or ("None was measured in a selected replan.",)
         raise BadArgument(_NOT_SHOWN.format(question.stores[0].path, " ".join(said)))
     return found
 
@@ -331,8 +329,7 @@ def _norms(item: SelectedEpisode, site: str, selection: Selection, selectors: Se
     """Norms of the items' contributions, (replan, selector), means over layers and denoise steps; NaN where none is."""
     norm = np.full((item.episode.attributes.num_replans, len(selectors)), np.nan)
     if item.store.attributes.recording.contributions:
-        blocks = [i for i in range(len(selection.blocks)) if selection.is_first_of_block(i)]
-        gram = selected_gram(item, site, selection)[:, blocks]
+        gram = selected_gram(item, site, selection)[:, list(selection.once)]
         parts = whole_segments(item, resolve_episode(_grouping(selectors), item), site)
         for i in range(len(selectors)):
             if f"item{i}" in parts:
@@ -347,9 +344,7 @@ def _rows(one: _Episode) -> pl.DataFrame:
     assert effects is not None
     named = [{"condition": visible(given.name), **described(given)} for given in effects.conditions]
     conditions = pl.DataFrame(named, schema=dict.fromkeys(NAMES, pl.String))[arrays["condition"]]
-    keys = {
-        name: column.new_from_index(0, len(conditions)) for name, column in episode_columns([item], _EPISODE).items()
-    }
+    keys = episode_columns(item, _EPISODE, len(conditions))
     place = {name: arrays[name] for name in ("replan", "env_step", "begin", "end")}
     values = {name: arrays["changes"][:, i] for i, name in enumerate(CHANGES)} | {"gripper_effect": arrays["gripper"]}
     rows = pl.DataFrame({**keys, **place, **conditions.to_dict(), **values}).filter(pl.col("kind") != "nothing")
@@ -389,10 +384,10 @@ def _means(rows: pl.DataFrame, cells: Sequence[str]) -> pl.DataFrame:
     )
 
 
-def _drift(having: Sequence[SelectedEpisode], kept: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+def _drift(episodes: Sequence[_Episode]) -> tuple[str, ...]:
     """How far calls without a change are from those that the robot executed, if rounding does not explain it."""
     most, where = 0.0, ""
-    for item, arrays in zip(having, kept, strict=True):
+    for item, arrays, _ in episodes:
         effects = item.episode.attributes.effects
         assert effects is not None
         nothing = [i for i, given in enumerate(effects.conditions) if given.is_none]

@@ -7,7 +7,7 @@ torch and the like, which hardly affect them. A rerun repeats the policy calls o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from typing import Any
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.schemas.errors import BadArgument, UnknownName, UserError, did_you_mean, listing
+from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.store_url import StorePlace, store_place
@@ -88,7 +89,14 @@ def parse_runs(texts: Sequence[str]) -> list[RunArgument]:
     runs = [run if run.name else RunArgument(_name_among(run.paths[0], unnamed), run.paths) for run in runs]
     if len(runs) < 2:
         raise BadArgument("A comparison needs two runs or more; look at one with vla-attention analyze.")
-    _refuse_twice(runs)
+    places = [path.resolve() for run in runs for path in run.paths]
+    for path in (path for run in runs for path in run.paths):
+        if places.count(path.resolve()) > 1:
+            raise BadArgument(f"The store {path} is given twice; a run compared with itself differs in nothing.")
+    names = [run.name for run in runs]
+    for name in names:
+        if names.count(name) > 1:
+            raise BadArgument(f"Two runs are named '{name}'; name them apart with NAME=STORE.")
     return runs
 
 
@@ -103,20 +111,6 @@ def _name_among(path: StorePlace, others: Sequence[StorePlace]) -> str:
     while any(end(path, depth) == end(other, depth) for other in rivals) and depth < len(path.resolve().parts):
         depth += 1
     return end(path, depth)
-
-
-def _refuse_twice(runs: Sequence[RunArgument]) -> None:
-    seen: dict[StorePlace, str] = {}
-    for run in runs:
-        for path in run.paths:
-            where = path.resolve()
-            if where in seen:
-                raise BadArgument(f"The store {path} is given twice; a run compared with itself differs in nothing.")
-            seen[where] = run.name
-    names = [run.name for run in runs]
-    for name in names:
-        if names.count(name) > 1:
-            raise BadArgument(f"Two runs are named '{name}'; name them apart with NAME=STORE.")
 
 
 def open_runs(arguments: Sequence[RunArgument], settings: AnalysisSettings, allowed: Sequence[str] = ()) -> list[Run]:
@@ -148,40 +142,52 @@ _SIMULATOR = ("mujoco", "robosuite", "hf-libero", "assets")
 #: Entries that are measured anew in every episode; they say nothing about how runs were captured.
 _MEASURED = ("largest P·V error", "replan blocks without attention", "difference to own setting")
 #: Entries of the policy's configuration that belong to the weights.
-_NAMES_OF_WEIGHTS = ("configuration", "config_name", "statistics")
+_NAMES_OF_WEIGHTS = ("configuration", "config_name", "statistics", "config")
 
-#: Field -> (its value in a run, why it matters), in the order of messages.
-_FIELDS: dict[str, tuple[Callable[[Run], Any], str]] = {
-    "family": (lambda run: run.stores[0].attributes.policy.family, "policies of other families attend over other keys"),
-    "suite": (lambda run: run.suites, "other suites have other tasks"),
-    "seed": (lambda run: _protocol(run, "seed"), "it seeds environment and noise"),
-    "protocol": (lambda run: _protocol(run, "name"), "resets are seeded in other ways"),
-    "image_size": (lambda run: _protocol(run, "image_size"), "the simulator drew other pictures"),
-    "wait_steps": (lambda run: _protocol(run, "wait_steps"), "episodes begin elsewhere"),
-    "replan_steps": (lambda run: _protocol(run, "replan_steps"), "replans are taken at other moments"),
-    "max_steps": (lambda run: _protocol(run, "max_steps"), "failed episodes have other lengths"),
-    "layers": (lambda run: run.question.selection.blocks, "averages over other layers"),
-    "denoise_steps": (lambda run: run.question.selection.denoise_steps, "averages over other denoise steps"),
-    "heads": (lambda run: run.question.selection.head_numbers, "averages over other heads"),
-    "queries": (
-        lambda run: tuple(
-            getattr(run.stores[0].attributes.recording_of(run.question.site), name)
-            for name in ("queries", "num_action_queries", "num_pools")
-        ),
-        "averages over other queries",
-    ),
-    "depth": (
-        lambda run: tuple(
-            getattr(run.stores[0].attributes.policy, name) for name in ("num_layers", "num_heads", "num_denoise_steps")
-        ),
-        "equal numbers stand for other layers, heads and denoise steps",
-    ),
-    "layout": (lambda run: _layout(run), "other keys, and with them another uniform baseline"),
-    "cameras": (lambda run: run.stores[0].attributes.policy.cameras, "the policies are shown other pictures"),
-    "processing": (lambda run: _processing(run), "observations and prompts are prepared in other ways"),
-    "simulator": (lambda run: _versions(run, _SIMULATOR), "other versions of the simulator"),
+#: Field -> why it matters, in the order of messages.
+FIELDS = {
+    "family": "policies of other families attend over other keys",
+    "suite": "other suites have other tasks",
+    "seed": "it seeds environment and noise",
+    "protocol": "resets are seeded in other ways",
+    "image_size": "the simulator drew other pictures",
+    "wait_steps": "episodes begin elsewhere",
+    "replan_steps": "replans are taken at other moments",
+    "max_steps": "failed episodes have other lengths",
+    "layers": "averages over other layers",
+    "denoise_steps": "averages over other denoise steps",
+    "heads": "averages over other heads",
+    "queries": "averages over other queries",
+    "depth": "equal numbers stand for other layers, heads and denoise steps",
+    "layout": "other keys, and with them another uniform baseline",
+    "cameras": "the policies are shown other pictures",
+    "processing": "observations and prompts are prepared in other ways",
+    "simulator": "other versions of the simulator",
 }
-FIELDS = tuple(_FIELDS)
+
+
+def _fields(run: Run) -> dict[str, Any]:
+    """The values of `FIELDS` in a run: texts, numbers, tuples of them, or mappings."""
+    root, question = run.stores[0].attributes, run.question
+    policy, recording, provenance = root.policy, root.recording_of(question.site), _provenance(run)
+    of_stores = {
+        name: tuple(sorted({getattr(store.attributes.protocol, name) for store in run.stores}))
+        for name in ("seed", "name", "image_size", "wait_steps", "replan_steps", "max_steps")
+    }
+    return of_stores | {
+        "family": policy.family,
+        "suite": run.suites,
+        "protocol": of_stores["name"],
+        "layers": question.selection.blocks,
+        "denoise_steps": question.selection.denoise_steps,
+        "heads": question.selection.head_numbers,
+        "queries": (recording.queries, recording.num_action_queries, recording.num_pools),
+        "depth": (policy.num_layers, policy.num_heads, policy.num_denoise_steps),
+        "layout": _layout(root.site(question.site)),
+        "cameras": policy.cameras,
+        "processing": {name: value for name, value in policy.config.items() if name not in _NAMES_OF_WEIGHTS},
+        "simulator": {name: value for name, value in provenance.items() if name in _SIMULATOR},
+    }
 
 
 def check_fields(allowed: Sequence[str]) -> None:
@@ -212,9 +218,10 @@ def check_comparable(runs: Sequence[Run], allowed: Sequence[str]) -> list[str]:
                 "choose a site that both have with --site."
             )
     waived = {*allowed, *(("max_steps",) if "suite" in allowed and len({run.suites for run in runs}) > 1 else ())}
-    notes = []
+    notes, of_first = [], _fields(first)
     for run in runs[1:]:
-        differing = {name: _difference(name, first, run) for name in FIELDS}
+        of_run = _fields(run)
+        differing = {name: _difference(of_first[name], of_run[name]) for name in FIELDS}
         differences = {name: text for name, text in differing.items() if text}
         refused = [name for name in differences if name not in waived]
         if refused:
@@ -222,9 +229,12 @@ def check_comparable(runs: Sequence[Run], allowed: Sequence[str]) -> list[str]:
             # Allowing another suite allows its other number of steps.
             to_allow = [name for name in refused if name != "max_steps" or "suite" not in refused]
             flags = " ".join(f"--allow-mismatch {name}" for name in to_allow)
+            choices = {"layers": "--layers", "denoise_steps": "--denoise", "heads": "--heads"}
+            chosen = [choices[name] for name in refused if name in choices]
+            usable = f", choose what both recorded with {listing(chosen)}" if chosen else ""
             raise RunsDiffer(
                 f"Runs {first.name} and {run.name} differ in more than their weights ({named}): "
-                f"{_FIELDS[refused[0]][1]}; capture them alike{_selection_hint(refused)}, or compare all the same with "
+                f"{FIELDS[refused[0]]}; capture them alike{usable}, or compare all the same with "
                 f"{flags}."
             )
         notes += [
@@ -250,35 +260,26 @@ def _refuse_families(stores: Sequence[tuple[str, Store]], allowed: bool) -> None
     """Refuse mixed families, unless allowed and with a site of the same name in both."""
     name, first = stores[0]
     for other_name, other in stores[1:]:
-        if first.attributes.policy.family == other.attributes.policy.family:
-            continue
+        family, other_family = first.attributes.policy.family, other.attributes.policy.family
         sites, other_sites = ([site.name for site in store.attributes.sites] for store in (first, other))
-        families = f"{first.attributes.policy.family} and {other.attributes.policy.family}"
-        what = f"Runs {name} and {other_name} mix policies, {families}"
-        if not set(sites) & set(other_sites):
+        what = f"Runs {name} and {other_name} mix policies, {family} and {other_family}"
+        if family != other_family and not set(sites) & set(other_sites):
             raise MixedPolicies(
                 f"{what}, which have no site in common ({listing(sites)}; {listing(other_sites)}): their softmaxes are "
                 "over different keys, and their masses cannot be compared; ask each with vla-attention analyze."
             )
-        if not allowed:
+        if family != other_family and not allowed:
             raise MixedPolicies(
                 f"{what}, which attend over different keys with different uniform baselines; if lifts and ratios at a "
                 "site of the same name are to be compared all the same, give --allow-mismatch family."
             )
 
 
-def _selection_hint(refused: Sequence[str]) -> str:
-    flags = {"layers": "--layers", "denoise_steps": "--denoise", "heads": "--heads"}
-    usable = [flags[name] for name in refused if name in flags]
-    return f", choose what both recorded with {listing(usable)}" if usable else ""
-
-
-def _difference(field: str, first: Run, other: Run) -> str:
-    """How two runs differ in a field, or an empty string."""
-    mine, theirs = (_FIELDS[field][0](run) for run in (first, other))
+def _difference(mine: Any, theirs: Any) -> str:
+    """How two values of a field differ, or an empty string."""
     if mine == theirs:
         return ""
-    if isinstance(mine, Mapping) and isinstance(theirs, Mapping):
+    if isinstance(mine, Mapping):
         names = [name for name in {**mine, **theirs} if mine.get(name) != theirs.get(name)]
         return listing([f"{name} {_shown(mine.get(name))} and {_shown(theirs.get(name))}" for name in names], 4)
     return f"{_shown(mine)} and {_shown(theirs)}"
@@ -292,30 +293,14 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 40 else text[:39] + "…"
 
 
-def _protocol(run: Run, name: str) -> tuple[int, ...]:
-    return tuple(sorted({getattr(store.attributes.protocol, name) for store in run.stores}))
-
-
-def _layout(run: Run) -> dict[str, str]:
-    """Span of the run's site -> its keys, camera and grid, as text."""
-    site = next(site for site in run.stores[0].attributes.sites if site.name == run.question.site)
+def _layout(site: SiteLayout) -> dict[str, str]:
+    """Span of a site -> its keys, camera and grid, as text."""
     spans = {}
     for span in site.spans:
         grid = f" of {span.grid.describe()}" if span.grid else ""
         camera = f" of camera {span.camera}" if span.camera not in (None, span.name) else ""
         spans[span.name] = f"keys {span.start}-{span.stop - 1}{camera}{grid}{', growing' if span.growing else ''}"
     return spans
-
-
-def _processing(run: Run) -> dict[str, Any]:
-    """The policy's configuration but for sizes of the model and names of the weights."""
-    config = run.stores[0].attributes.policy.config
-    return {name: value for name, value in config.items() if name not in (*_NAMES_OF_WEIGHTS, "config")}
-
-
-def _versions(run: Run, names: Sequence[str]) -> dict[str, str]:
-    provenance = _provenance(run)
-    return {name: provenance[name] for name in names if name in provenance}
 
 
 def _provenance(run: Run) -> dict[str, str]:

@@ -30,10 +30,12 @@ def items_of(item: SelectedEpisode) -> Items:
     "scale". A share is of the mass of all language; state digits and patches have none.
     """
     tokens = item.tokens
-    prompts, num_keys = max(1, len(tokens.prompts)), tokens.layout.num_keys
+    num_keys, roles = tokens.layout.num_keys, tokens.static_roles
     members: dict[tuple[str, str, int | None, str | None], int] = {}
     cells: list[tuple[int, int, int]] = []
-    for number, words in enumerate(tokens.words):
+    # Most prompts differ in the state's digits alone, and have the same words.
+    lines = {line: number for number, line in enumerate(dict.fromkeys(tokens.words))}
+    for words, number in lines.items():
         for place, word in enumerate(words):
             text, of_class = word.text.casefold(), word_class(word.text)
             for name in (
@@ -43,14 +45,17 @@ def items_of(item: SelectedEpisode) -> Items:
             ):
                 item_number = members.setdefault(name, len(members))
                 cells += [(number, key, item_number) for key in word.keys]
-    roles = tokens.static_roles
     named = [role for role in SCALE if (roles == role).any()]
-    of_prompt = np.zeros(1, np.intp) if prompts == 1 else np.asarray(tokens.prompt_index)
-    weights = np.zeros((max(len(of_prompt), len(roles)), num_keys, len(members) + len(named)), np.float32)
+    at = (
+        np.zeros(1, np.intp)
+        if len(lines) < 2
+        else np.array([lines[words] for words in tokens.words])[tokens.prompt_index]
+    )
+    weights = np.zeros((max(len(at), len(roles)), num_keys, len(members) + len(named)), np.float32)
     if cells:
-        of_words = np.zeros((prompts, num_keys, len(members)), np.float32)
+        of_words = np.zeros((len(lines), num_keys, len(members)), np.float32)
         of_words[tuple(np.array(cells).T)] = 1.0
-        weights[..., : len(members)] = of_words[of_prompt]
+        weights[..., : len(members)] = of_words[at]
     for i, role in enumerate(named, len(members)):
         weights[..., i] = roles == role
     names = [*members, *(("scale", SCALE[role], None, None) for role in named)]

@@ -6,13 +6,13 @@ is null in a table; infinite ratios stay infinite.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
+from polars.io.plugins import register_io_source
 
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.stores.selection import Selection
@@ -20,8 +20,12 @@ from vla_attention.schemas.safe_text import visible
 
 #: The columns that name an episode.
 EPISODE_ID = ("suite", "task_id", "episode_index")
+_EPISODE_TYPES = {
+    "suite": pl.String, "task_id": pl.Int64, "instruction": pl.String, "episode_index": pl.Int64,
+    "success": pl.Boolean, "num_steps": pl.Int64,
+}  # fmt: skip
 #: The columns that describe an episode; the last ones follow from its name.
-EPISODE_KEYS = ("suite", "task_id", "instruction", "episode_index", "success", "num_steps")
+EPISODE_KEYS = tuple(_EPISODE_TYPES)
 #: The layer that stands for the mean over all layers.
 LAYERS_AVG = "layers_avg"
 
@@ -29,6 +33,8 @@ LAYERS_AVG = "layers_avg"
 Measured = TypeVar("Measured")
 #: One axis: the columns that label it, each with a value per position.
 Axis = Mapping[str, Sequence[Any] | NDArray[Any] | pl.Series]
+#: Rows of so many are handed on at once: whatever polars is asked takes a millisecond, of an episode as of a dozen.
+_ROWS_AT_ONCE = 20_000
 
 
 def long_table(
@@ -51,7 +57,7 @@ def long_table(
     """
     shape = tuple(len(next(iter(axis.values()))) for axis in axes)
     height = int(np.prod(shape))
-    columns: dict[str, pl.Series] = {name: _constant(name, item, height) for name in keys}
+    columns = episode_columns(item, keys, height)
     for i, axis in enumerate(axes):
         inner = int(np.prod(shape[i + 1 :]))
         position = np.tile(np.repeat(np.arange(shape[i]), inner), height // max(1, shape[i] * inner))
@@ -63,42 +69,32 @@ def long_table(
     return pl.DataFrame(columns).with_columns(pl.col(measured).fill_nan(None))
 
 
-def _constant(name: str, item: SelectedEpisode, height: int) -> pl.Series:
-    value = item.store.suite if name == "suite" else getattr(item.episode.attributes, name)
-    if name == "success":
-        return pl.Series(name, [value], dtype=pl.Boolean).new_from_index(0, height)  # null where it is not known
+def episode_columns(item: SelectedEpisode, keys: Sequence[str], height: int) -> dict[str, pl.Series]:
+    """The columns that describe an episode, of `EPISODE_KEYS`, each with its value in so many rows."""
+    values = {name: item.store.suite if name == "suite" else getattr(item.episode.attributes, name) for name in keys}
     # Instructions are any text, and tables are printed and drawn.
-    return _labels(name, [visible(value) if isinstance(value, str) else value]).new_from_index(0, height)
-
-
-def episode_columns(items: Sequence[SelectedEpisode], keys: Sequence[str]) -> dict[str, pl.Series]:
-    """The columns that describe episodes, of `EPISODE_KEYS`, with one value for each episode."""
-    return {name: pl.concat([_constant(name, item, 1) for item in items]) for name in keys}
+    shown = {name: visible(value) if isinstance(value, str) else value for name, value in values.items()}
+    return {
+        name: pl.Series(name, [value], dtype=_EPISODE_TYPES[name]).new_from_index(0, height)
+        for name, value in shown.items()
+    }
 
 
 def _labels(name: str, labels: Sequence[Any] | NDArray[Any] | pl.Series) -> pl.Series:
     if isinstance(labels, pl.Series):  # a Series keeps its type where all labels are null
         return labels
-    given = labels.tolist() if isinstance(labels, np.ndarray) else list(labels)
-    known = next((label for label in given if label is not None), 0)
-    kinds = {bool: pl.Boolean, int: pl.Int64, float: pl.Float64, str: pl.String}
-    return pl.Series(name, given, dtype=kinds[type(known)])
+    series = pl.Series(name, labels.tolist() if isinstance(labels, np.ndarray) else list(labels))
+    return series.cast(pl.Int64) if series.dtype == pl.Null else series
 
 
-def layer_name(layer: str, average: str = "all layers", noun: str = "layer") -> str:
+def layer_name(layer: str, average: str) -> str:
     """A layer's label in tables as text: `layer 5`, or `average` for the mean over the selected ones."""
-    return average if layer == LAYERS_AVG else f"{noun} {layer}"
+    return average if layer == LAYERS_AVG else f"layer {layer}"
 
 
 def float_values(column: pl.Series) -> NDArray[np.float64]:
     """A column of numbers as an array; NaN for null."""
     return column.cast(pl.Float64).fill_null(float("nan")).to_numpy()
-
-
-def episode_id(item: SelectedEpisode) -> tuple[str, int, int]:
-    """The values of `EPISODE_ID`."""
-    attributes = item.episode.attributes
-    return item.store.suite, attributes.task_id, attributes.episode_index
 
 
 def replan_axis(item: SelectedEpisode) -> Axis:
@@ -108,13 +104,12 @@ def replan_axis(item: SelectedEpisode) -> Axis:
 
 
 def layer_axis(selection: Selection) -> Axis:
-    """Labels `layer` (the number that the user typed) and `block` (the transformer block)."""
-    return {"layer": selection.layer_labels, "block": selection.blocks}
-
-
-def denoise_axis(selection: Selection) -> Axis:
-    """Label `denoise_step`."""
-    return {"denoise_step": selection.denoise_steps}
+    """Labels `layer`, `layer_number` (as the user numbers it, as text and as number) and `block`, then "layers_avg"."""
+    return {
+        "layer": [*map(str, selection.layer_labels), LAYERS_AVG],
+        "layer_number": [*selection.layer_labels, None],
+        "block": [*selection.blocks, None],
+    }
 
 
 def head_axis(selection: Selection) -> Axis:
@@ -122,50 +117,46 @@ def head_axis(selection: Selection) -> Axis:
     return {"head": selection.head_numbers if selection.per_head else (None,)}
 
 
-@dataclass(frozen=True)
-class LayerAxis:
-    """The selected layers and, after them, `layers_avg`.
+def with_average(
+    values: NDArray[np.float64],
+    selection: Selection,
+    axis: int = 1,
+    mean: Callable[[NDArray[np.float64], int], NDArray[np.float64]] = np.mean,
+) -> NDArray[np.float64]:
+    """Append the mean over the layers along `axis`; `mean(values, axis)` says how, for instance `finite_mean`."""
+    average = mean(np.take(values, selection.once, axis=axis), axis)
+    return np.concatenate([values, np.expand_dims(average, axis)], axis=axis)
 
-    Attributes:
-        labels: the layers as the user numbers them, as text, then "layers_avg".
-        numbers: the same as numbers; None for the average.
-        blocks: transformer blocks; None for the average.
-        once: positions of the layers that the average is over. A block that was named by two layer numbers counts once.
+
+def frame_of_episodes(
+    measured: Sequence[Measured],
+    make: Callable[[Measured], pl.DataFrame],
+    then: Callable[[pl.DataFrame], pl.DataFrame] = lambda rows: rows,
+) -> pl.LazyFrame:
+    """The rows that `make` gives of each member, in order; the same columns of each. They are made at each collect.
+
+    `then` makes other rows of those of some whole episodes. Neither reads a store: polars would wrap the error of a
+    damaged one into its own.
     """
+    schema = then(make(measured[0])).schema
 
-    labels: tuple[str, ...]
-    numbers: tuple[int | None, ...]
-    blocks: tuple[int | None, ...]
-    once: tuple[int, ...]
+    def batches() -> Iterator[pl.DataFrame]:
+        batch: list[pl.DataFrame] = []
+        for number, one in enumerate(measured, start=1):
+            batch.append(make(one))
+            if number == len(measured) or sum(table.height for table in batch) >= _ROWS_AT_ONCE:
+                yield then(pl.concat(batch))
+                batch = []
 
-    @classmethod
-    def of(cls, selection: Selection, average_one: bool = True) -> LayerAxis:
-        """The layers of a selection. `average_one`: append the average also where there is a single layer."""
-        labels = tuple(str(label) for label in selection.layer_labels)
-        numbers, blocks = tuple(selection.layer_labels), tuple(selection.blocks)
-        once = tuple(i for i in range(len(blocks)) if selection.is_first_of_block(i))
-        if len(labels) == 1 and not average_one:
-            return cls(labels, numbers, blocks, once)
-        return cls((*labels, LAYERS_AVG), (*numbers, None), (*blocks, None), once)
+    def source(
+        columns: list[str] | None, predicate: pl.Expr | None, most: int | None, _batch: int | None
+    ) -> Iterator[pl.DataFrame]:
+        left = most
+        for part in batches():
+            rows = part if predicate is None else part.filter(predicate)
+            rows = rows if columns is None else rows.select(columns)
+            yield rows if left is None else rows.head(left)
+            if left is not None and (left := left - rows.height) <= 0:
+                return
 
-    @property
-    def num_layers(self) -> int:
-        """Number of layers, without the average."""
-        return sum(number is not None for number in self.numbers)
-
-    @property
-    def columns(self) -> Axis:
-        """Labels `layer`, `layer_number` and `block`."""
-        return {"layer": self.labels, "layer_number": self.numbers, "block": self.blocks}
-
-    def with_average(
-        self,
-        values: NDArray[np.float64],
-        axis: int = 1,
-        mean: Callable[[NDArray[np.float64], int], NDArray[np.float64]] = np.mean,
-    ) -> NDArray[np.float64]:
-        """Append the mean over the layers along `axis`; `mean(values, axis)` says how, for instance `finite_mean`."""
-        if len(self.labels) == values.shape[axis]:
-            return values
-        average = mean(np.take(values, self.once, axis=axis), axis)
-        return np.concatenate([values, np.expand_dims(average, axis)], axis=axis)
+    return register_io_source(source, schema=schema, validate_schema=False)

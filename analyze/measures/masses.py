@@ -1,17 +1,22 @@
-"""From rows and weights to masses and what follows from them. Pure arithmetic on arrays."""
+"""From rows and weights to masses, and what uniform attention gives. Arithmetic on arrays, and the stored baseline."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.groupings.grouping import Grouping
+from vla_attention.schemas.groupings.key_counts import uniform_of_version_1
+
+Array = NDArray[np.float64]
 
 
-def masses(rows: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float64]:
+def masses(rows: NDArray[np.float32], weights: NDArray[np.float32]) -> Array:
     """Mass of each group: the sum over keys of probability x weight.
+
+    One product per replan, or a single one for weights that never change; float32 sums err by about 3e-7.
 
     Args:
         rows: (replan, ..., key), or segment masses (replan, ..., segment).
@@ -20,102 +25,72 @@ def masses(rows: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[n
     Returns:
         (replan, ..., group).
     """
-    return weighted_sums(rows, weights).astype(np.float64)
-
-
-def weighted_sums(values: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Sums over keys of values (replan, ..., key) x weights (replan or 1, key, group), shape (replan, ..., group).
-
-    One product per replan, or a single one for weights that never change; float32 sums err by about 3e-7.
-    """
-    flat = values.reshape(values.shape[0], -1, values.shape[-1])
+    flat = rows.reshape(rows.shape[0], -1, rows.shape[-1])
     product = flat.reshape(-1, flat.shape[-1]) @ weights[0] if len(weights) == 1 else np.matmul(flat, weights)
-    sums: NDArray[np.float32] = product.reshape(*values.shape[:-1], weights.shape[2])
-    return sums
+    return np.asarray(product.reshape(*rows.shape[:-1], weights.shape[2]), dtype=np.float64)
 
 
-@dataclass(frozen=True)
-class GroupMeasures:
-    """The measures of every group, each of shape (replan, ..., group).
-
-    A field is a column of every table of groups; over replans, episodes and tasks its finite values are averaged.
-    """
-
-    mass: NDArray[np.float64]
-    fraction: NDArray[np.float64]
-    keys: NDArray[np.float64]
-    density: NDArray[np.float64]
-    lift: NDArray[np.float64]
-
-    def columns(self) -> dict[str, NDArray[np.float64]]:
-        """The measures by the names of their columns."""
-        return {name: getattr(self, name) for name in GROUP_MEASURES}
-
-
-#: The columns of groups, in the order of the tables.
-GROUP_MEASURES = tuple(field.name for field in fields(GroupMeasures))
-
-
-def group_measures(
-    mass: NDArray[np.float64],
-    valid_mass: NDArray[np.float64],
-    num_keys: NDArray[np.float64],
-    uniform_mass: NDArray[np.float64],
-    uniform_valid: NDArray[np.float64],
-) -> GroupMeasures:
-    """Fractions, densities and lifts of masses.
-
-    fraction = mass / sum of the masses of all groups; density = mass / number of keys;
-    lift = (mass / the mass that uniform attention gives) / (the same of all valid keys), so that attention that is
-    uniform at each query gives 1 (`schemas/groupings/key_counts.py`). Keys of a null sink (Cosmos's padded text) are
-    not valid: their mass is not in the mass of all valid keys.
-
-    Args:
-        mass: (replan, ..., group).
-        valid_mass: (replan, ...), sum over all valid keys.
-        num_keys: (replan or 1, group), fractional where objects cover parts of patches.
-        uniform_mass: what uniform attention gives the groups; as `mass`, or with axes of length 1.
-        uniform_valid: what it gives all valid keys; as `valid_mass`, or with axes of length 1.
+def uniform_keys(item: SelectedEpisode, selection: Selection) -> Array:
+    """What uniform attention gives every key, see `schemas/groupings/key_counts.py`: stored from version 2 on.
 
     Returns:
-        Measures; density of a group without keys, lift of a group of which no query sees a key, and every fraction of a
-        row without any mass, is NaN.
+        (replan, layer, denoise, head, key) of the selection, mean over the stored queries and, unless heads are kept
+        apart, over heads; an axis along which nothing changes may have length 1.
     """
-    keys = num_keys.reshape(num_keys.shape[0], *(1,) * (mass.ndim - 2), num_keys.shape[1])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        fraction = mass / mass.sum(axis=-1, keepdims=True)
-        density = np.where(keys > 0, mass / keys, np.nan)
-        lift = np.where(uniform_mass > 0, mass / uniform_mass, np.nan) / (valid_mass / uniform_valid)[..., None]
-    return GroupMeasures(mass, fraction, keys, density, lift)
+    tokens, episode = item.tokens, item.episode
+    name = f"{tokens.layout.name}/uniform"
+    if item.store.attributes.store_version == 1:
+        roles = tokens.static_roles
+        return uniform_of_version_1(tokens.layout, roles, item.valid, tokens.num_queries)[:, None, None, None]
+    _, layers, denoise, heads, _, _ = episode.shape_of(name)
+    places = [
+        (layer, step)
+        for layer in (selection.layers if layers > 1 else (0,))
+        for step in (selection.denoise if denoise > 1 else (0,))
+    ]
+    parts = []
+    for values in episode.read_layers(name, places):  # (replan or 1, head or 1, query or 1, key)
+        episode.refuse_missing(name, values)
+        of_heads = values[:, list(selection.heads)] if heads > 1 else values
+        parts.append(of_heads.mean(axis=(2,) if selection.per_head else (1, 2), dtype=np.float64))
+    stacked = np.stack(parts, axis=1)
+    replans, _, *rest = stacked.shape
+    rest = rest if selection.per_head else [1, *rest]
+    return stacked.reshape(replans, len(selection.layers) if layers > 1 else 1, -1, *rest)
 
 
-def ratio(numerator: NDArray[np.float64], denominator: NDArray[np.float64]) -> NDArray[np.float64]:
+def uniform_masses(uniform: Array, weights: NDArray[np.float32]) -> Array:
+    """What uniform attention gives groups: (replan or 1, layer, denoise, head, group).
+
+    Args:
+        uniform: of every key, see `uniform_keys`.
+        weights: (replan or 1, key, group), in 0..1.
+    """
+    if weights.strides[0] == 0:  # the same at all replans, see `stack_over_keys`
+        weights = weights[:1]
+    replans, *cells, keys = uniform.shape
+    found: Array = np.matmul(uniform.reshape(replans, -1, keys), weights.astype(np.float64))
+    return found.reshape(len(found), *cells, weights.shape[2])
+
+
+def uniform_ratio(uniform_mass: Array, grouping: Grouping) -> Array:
+    """The ratio that uniform attention gives (...), from what it gives the groups (..., group); as in `ratio`."""
+    assert grouping.ratio is not None
+    sides = (grouping.ratio.numerator, grouping.ratio.denominator)
+    above, below = (uniform_mass[..., [grouping.names.index(name) for name in side]].sum(axis=-1) for side in sides)
+    return ratio(above, below)
+
+
+def ratio(numerator: Array, denominator: Array) -> Array:
     """numerator / denominator: infinite where only the denominator is 0, NaN (undefined) where both are."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return numerator / denominator
 
 
-def sides(values: NDArray[np.float64], grouping: Grouping) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sums of values (..., group) over the groups of the ratio's numerator and of its denominator, (...) each."""
-    assert grouping.ratio is not None
-    top, bottom = (
-        [grouping.names.index(name) for name in side] for side in (grouping.ratio.numerator, grouping.ratio.denominator)
-    )
-    return values[..., top].sum(axis=-1), values[..., bottom].sum(axis=-1)
-
-
-def uniform_ratio(uniform_mass: NDArray[np.float64], grouping: Grouping) -> NDArray[np.float64]:
-    """The ratio that uniform attention gives (...), from what it gives the groups (..., group), see `group_measures`.
-
-    Infinite or NaN as in `ratio`.
-    """
-    return ratio(*sides(uniform_mass, grouping))
-
-
-def finite_mean(values: NDArray[np.float64], axis: int | tuple[int, ...] = 0) -> NDArray[np.float64]:
+def finite_mean(values: Array, axis: int | tuple[int, ...] = 0) -> Array:
     """Mean over the finite values along one axis or several; NaN where there is none."""
     finite = np.isfinite(values)
     count = finite.sum(axis=axis)
     with np.errstate(invalid="ignore"):
-        mean: NDArray[np.float64] = np.where(finite, values, 0.0).sum(axis=axis) / np.where(count > 0, count, np.nan)
+        mean: Array = np.where(finite, values, 0.0).sum(axis=axis) / np.where(count > 0, count, np.nan)
     return mean

@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from vla_attention.analyze.measures.baselines import baseline_notes, contribution_notes
-from vla_attention.analyze.measures.question_settings import AnalysisSettings
-from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens, vocabulary_of
-from vla_attention.analyze.measures.task_families import sampling_of, units_of
-from vla_attention.analyze.statistics.episode_intervals import Sampling
-from vla_attention.analyze.statistics.units import Units
-from vla_attention.analyze.stores.parallel import episode_reports, read_ahead
-from vla_attention.analyze.stores.run_notes import run_notes
+import polars as pl
+
+from vla_attention.analyze.measures.question_settings import AnalysisSettings, union_of
+from vla_attention.analyze.measures.selected import SelectedEpisode, load_tokens
+from vla_attention.analyze.measures.task_families import sampling_of
+from vla_attention.analyze.statistics.units import Sampling, Units
+from vla_attention.analyze.stores.parallel import episode_reports
+from vla_attention.analyze.stores.run_notes import RunNotes
 from vla_attention.analyze.stores.selection import (
     Selection,
     check_combinable,
@@ -27,10 +27,10 @@ from vla_attention.analyze.stores.selection import (
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.groupings.builtin_groupings import find_grouping
 from vla_attention.schemas.groupings.grouping import Grouping, parse_group_argument, parse_ratio_argument, with_groups
-from vla_attention.schemas.groupings.vocabulary import Vocabulary
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Names, Vocabulary
 from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
-from vla_attention.schemas.stores.store_format import RootAttributes, StoreError
+from vla_attention.schemas.stores.store_format import CALLERS_MODULES, RootAttributes, StoreError
 
 DEFAULT_GROUPING = "default"
 
@@ -51,6 +51,7 @@ class Question:
         skipped: a line for all that was left out: what the stores say of foreign and unlisted files among their
             episodes, and every episode that is damaged or empty (`skip_corrupt`).
         notes: further lines for every result, for instance which denoise steps it is of or which keys were taken out.
+        told: what every answer says of runs that were changed or told something else (`RunNotes`).
     """
 
     stores: tuple[Store, ...]
@@ -63,6 +64,7 @@ class Question:
     sampling: Sampling
     skipped: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    told: tuple[str, ...] = ()
 
     @property
     def episodes(self) -> list[tuple[Store, StoredEpisode]]:
@@ -72,21 +74,17 @@ class Question:
     @property
     def remarks(self) -> tuple[str, ...]:
         """The lines that every result with numbers has: what was left out, what the baselines are of, and the notes."""
-        return (*self._remarks_on_numbers, *self.notes)
+        return (*self.skipped, *self.told, *baseline_notes(self.stores), *self.notes)
 
     @property
-    def _remarks_on_numbers(self) -> tuple[str, ...]:
-        return (
-            *self.skipped,
-            *run_notes(self.episodes),
-            *baseline_notes(self.stores),
-            *contribution_notes(self.stores),
-        )
+    def tasks(self) -> pl.DataFrame:
+        """The task of each episode: suite, task_id."""
+        return pl.DataFrame([item.task for item in self.selected], schema=["suite", "task_id"], orient="row")
 
     @property
     def units(self) -> Units:
         """The units of intervals over all selected episodes."""
-        return units_of(self.sampling, self.selected).decided()
+        return self.sampling.units(self.tasks).decided()
 
     @property
     def num_tasks(self) -> int:
@@ -104,8 +102,31 @@ class Question:
         return any(store.attributes.policy.untrained for store in self.stores)
 
 
-#: Site and tasks -> the episodes with their tokens, and their vocabulary.
-KnownEpisodes = dict[tuple[str, tuple[int | str, ...] | None], tuple[tuple[SelectedEpisode, ...], Vocabulary]]
+def baseline_notes(stores: Sequence[Store]) -> tuple[str, ...]:
+    """Lines about stores of version 1 whose baseline may be that of too many keys, or contributions not what keys add.
+
+    In policies that `vla-capture` builds all queries of a replan see the same keys, but for a growing span, which is
+    counted; in other policies of torch nobody noted who sees what.
+    """
+    old = [
+        (store.path.name, root.recording.contributions)
+        for store in stores
+        if (root := store.attributes).store_version == 1 and root.policy.checkpoint_format == CALLERS_MODULES
+    ]
+    names, contributions = [name for name, _ in old], [name for name, has in old if has]
+    lines = (
+        (names, "Baselines of {} (version 1) are of the keys that any query of any layer sees; where queries or layers "
+         "see different keys, lifts are off. A new recording has baselines by query and layer."),
+        (contributions, "Contributions of {} (version 1) end at the output projection; where the policy has a gate or "
+         "a norm behind it, they are off. A new recording follows them to the residual stream."),
+    )  # fmt: skip
+    return tuple(line.format(listing(which)) for which, line in lines if which)
+
+
+#: Site and tasks -> the episodes with their tokens, their vocabulary, and the notes on their runs.
+KnownEpisodes = dict[
+    tuple[str, tuple[int | str, ...] | None], tuple[tuple[SelectedEpisode, ...], Vocabulary, tuple[str, ...]]
+]
 
 
 def ask(stores: Sequence[Store], settings: AnalysisSettings, known: KnownEpisodes | None = None) -> Question:
@@ -126,31 +147,26 @@ def ask(stores: Sequence[Store], settings: AnalysisSettings, known: KnownEpisode
     selection = select(root, settings.layers, settings.denoise, settings.heads, settings.per_head, site)
     skipped = [note for store in stores for note in store.notes]
     if known is not None and not settings.skip_corrupt and (site, settings.tasks) in known:
-        selected, vocabulary = known[site, settings.tasks]
+        selected, vocabulary, told = known[site, settings.tasks]
     else:
         chosen = [(store, episode) for store in stores for episode in select_episodes(store, settings.tasks)]
         if settings.skip_corrupt:
             chosen, faulty = _without_faulty(chosen)
             skipped += faulty
-        _refuse_empty(chosen)
-        selected = tuple(load_tokens(chosen, site))
-        vocabulary = vocabulary_of(selected)
+        names, notes_of_runs = Names(), RunNotes()
+
+        def look(store: Store, episode: StoredEpisode, tokens: EpisodeTokens) -> None:
+            names.add(tokens)
+            notes_of_runs.add(store, episode.attributes)
+
+        selected = tuple(load_tokens(chosen, site, look))
+        vocabulary, told = names.vocabulary(), notes_of_runs.lines
         if known is not None and not settings.skip_corrupt:
-            known[site, settings.tasks] = selected, vocabulary
+            known[site, settings.tasks] = selected, vocabulary, told
     grouping = choose_grouping(settings, vocabulary)
-    notes = _denoise_notes(root, selection, grouping)
-    sampling = sampling_of(settings.intervals, selected)
+    sampling, notes = sampling_of(settings.intervals, selected), _denoise_notes(root, selection, grouping)
     return Question(
-        stores=tuple(stores),
-        settings=settings,
-        selection=selection,
-        site=site,
-        selected=selected,
-        grouping=grouping,
-        vocabulary=vocabulary,
-        sampling=sampling,
-        skipped=tuple(skipped),
-        notes=notes,
+        tuple(stores), settings, selection, site, selected, grouping, vocabulary, sampling, tuple(skipped), notes, told
     )
 
 
@@ -174,17 +190,13 @@ def choose_grouping(settings: AnalysisSettings, vocabulary: Vocabulary) -> Group
         default = find_grouping(DEFAULT_GROUPING, vocabulary).groups
         wanted = dict.fromkeys((*ratio.numerator, *ratio.denominator))
         known = {name for name, _ in own}
-        own += [(name, _union(default[name])) for name in wanted if name in default and name not in known]
+        own += [(name, union_of(default[name])) for name in wanted if name in default and name not in known]
     base = None
     if settings.grouping is not None or not settings.groups:
         base = find_grouping(settings.grouping or DEFAULT_GROUPING, vocabulary)
     grouping = with_groups(base, own) if own else base
     assert grouping is not None
     return grouping if ratio is None else replace(grouping, ratio=ratio)
-
-
-def _union(selectors: Sequence[str]) -> str:
-    return " | ".join(f"({selector})" for selector in selectors)
 
 
 def _denoise_notes(root: RootAttributes, selection: Selection, grouping: Grouping) -> tuple[str, ...]:
@@ -224,17 +236,3 @@ def _without_faulty(
             f"None of the {len(chosen)} selected episodes can be used; the first: {skipped[0]}. Capture them again."
         )
     return kept, skipped
-
-
-def _refuse_empty(chosen: Sequence[tuple[Store, StoredEpisode]]) -> None:
-    opened = read_ahead(episode for _, episode in chosen)
-    empty = [
-        f"{episode.name} of {store.path}"
-        for (store, _), episode in zip(chosen, opened, strict=True)
-        if not episode.attributes.num_replans
-    ]
-    if empty:
-        raise StoreError(
-            f"{listing(empty)} hold{'s' if len(empty) == 1 else ''} no replan, so there is no attention to measure; "
-            "leave such episodes out with --skip-corrupt."
-        )

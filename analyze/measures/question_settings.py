@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, TypedDict
@@ -83,28 +83,19 @@ def settings_from_keywords(**keywords: Any) -> AnalysisSettings:
     return AnalysisSettings(**values)
 
 
-def check_name(what: str, given: str, known: Collection[str]) -> None:
-    """Raise `BadArgument` unless the name exists."""
-    if given not in known:
-        raise BadArgument(f"Unknown {what} '{given}'.{did_you_mean(given, known)} Existing: {listing(known)}.")
+def _several(value: Any) -> list[Any]:
+    return [value] if isinstance(value, (int, str)) else list(value)
 
 
 def _whole_numbers(value: int | Sequence[int]) -> tuple[int, ...]:
-    items = [value] if isinstance(value, (int, str)) else list(value)
     try:
-        return tuple(int(item) for item in items)
+        return tuple(int(item) for item in _several(value))
     except (TypeError, ValueError):
         raise BadArgument(f"Cannot use {value!r} as numbers; expected a whole number or several.") from None
 
 
 def _tasks(value: int | str | Sequence[int | str]) -> tuple[int | str, ...]:
-    items: Sequence[int | str] = [value] if isinstance(value, (int, str)) else list(value)
-    return tuple(item if isinstance(item, str) else _whole_numbers(item)[0] for item in items)
-
-
-def _steps(value: int | str | Sequence[int | str]) -> tuple[str, ...]:
-    items: Sequence[int | str] = [value] if isinstance(value, (int, str)) else list(value)
-    return tuple(str(item) for item in items)
+    return tuple(item if isinstance(item, str) else _whole_numbers(item)[0] for item in _several(value))
 
 
 def _groups(value: Mapping[str, str | Sequence[str]] | Sequence[str]) -> tuple[str, ...]:
@@ -112,10 +103,11 @@ def _groups(value: Mapping[str, str | Sequence[str]] | Sequence[str]) -> tuple[s
         return (value,)
     if not isinstance(value, Mapping):
         return tuple(value)
-    return tuple(f"{name}={_union(selectors)}" for name, selectors in value.items())
+    return tuple(f"{name}={union_of(selectors)}" for name, selectors in value.items())
 
 
-def _union(selectors: str | Sequence[str]) -> str:
+def union_of(selectors: str | Sequence[str]) -> str:
+    """Selectors as one."""
     return selectors if isinstance(selectors, str) else " | ".join(f"({selector})" for selector in selectors)
 
 
@@ -134,5 +126,5 @@ _CONVERT: dict[str, Any] = {
     "layers": _whole_numbers,
     "heads": _whole_numbers,
     "tasks": _tasks,
-    "denoise": _steps,
+    "denoise": lambda value: tuple(map(str, _several(value))),
 }

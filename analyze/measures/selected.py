@@ -1,18 +1,23 @@
-"""Selected episodes: an episode with its store and its tokens, and a grouping resolved on every one of them."""
+"""Selected episodes: an episode with its store, tokens and timing, and a grouping resolved on every one of them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.analyze.stores.contents import read_one_by_one
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import EmptyGroup, ResolvedGrouping, check_names, counted_keys, resolve
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary, collect_vocabulary
+from vla_attention.schemas.layout import Prompt
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
+from vla_attention.schemas.stores.store_format import RootAttributes, StoreError
 
 
 @dataclass(frozen=True)
@@ -28,10 +33,35 @@ class SelectedEpisode:
     tokens: EpisodeTokens
     without: tuple[int, ...] = ()
 
+    @classmethod
+    def brief(cls, store: Store, episode: StoredEpisode, tokens: EpisodeTokens) -> SelectedEpisode:
+        """An episode that was read, without what it keeps of that: of thousands it would fill the memory.
+
+        Prompts, which change with the robot's state and are most of it, are read again when they are asked for.
+        """
+        kept, attributes = replace(episode), copy(episode.attributes)
+        number, site = len(attributes.prompts), tokens.layout.name
+        object.__setattr__(attributes, "prompts", _Prompts(replace(episode), number) if number else ())
+        vars(kept)["attributes"] = attributes
+        prompts = _Prompts(replace(episode), number, store.attributes, site) if tokens.prompts else ()
+        return cls(store, kept, replace(tokens, prompts=prompts)).fresh()
+
+    def fresh(self) -> SelectedEpisode:
+        """The same, with nothing that was read of it since it was selected."""
+        episode = replace(self.episode)
+        vars(episode)["attributes"] = self.episode.attributes
+        coverage = episode.coverage(self.store.attributes, self.tokens.layout.name)
+        return replace(self, episode=episode, tokens=replace(self.tokens, coverage=coverage))
+
     @property
     def task(self) -> tuple[str, int]:
         """Its suite and the number of its task."""
         return self.store.suite, self.episode.attributes.task_id
+
+    @property
+    def key(self) -> tuple[str, int, int]:
+        """Its suite, the number of its task, and its own: the values of `frames.EPISODE_ID`."""
+        return (*self.task, self.episode.attributes.episode_index)
 
     @property
     def valid(self) -> NDArray[np.bool_]:
@@ -46,6 +76,54 @@ class SelectedEpisode:
         number: NDArray[np.int64] = self.valid.sum(axis=1)
         return number
 
+    def timing(self, env_step: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
+        """Policy steps (replan,) executed before each replan, and those of the whole episode.
+
+        In a loop that is not ours (`Protocol.of_other_loop`) nothing is known of waiting steps: the first replan is the
+        beginning, and where the number of steps is not known (0) or not beyond the last replan, this one lasts as long
+        as the median one.
+
+        Args:
+            env_step: environment step of each replan, (replan,).
+
+        Raises:
+            StoreError: the steps do not increase from 0, or the episode ended before its last replan.
+        """
+        num_steps, protocol = self.episode.attributes.num_steps, self.store.attributes.protocol
+        if protocol.of_other_loop:
+            starts = env_step - env_step[0]
+            if num_steps > starts[-1]:
+                return starts, num_steps
+            lasts = int(np.median(np.diff(starts))) if len(starts) > 1 else max(1, protocol.replan_steps)
+            return starts, int(starts[-1]) + lasts
+        starts = env_step - protocol.wait_steps
+        if len(starts) == 0 or starts[0] != 0 or (np.diff(starts) <= 0).any() or starts[-1] >= num_steps:
+            raise StoreError(
+                f"The replans of {self.episode.name} do not fit into its {num_steps} steps after "
+                f"{protocol.wait_steps} steps of waiting; check the store with vla-attention store verify."
+            )
+        return starts, num_steps
+
+
+@dataclass(frozen=True)
+class _Prompts(Sequence[Prompt]):
+    """The prompts of an episode, as the keys of a site if one is given: read whenever one is asked for."""
+
+    episode: StoredEpisode
+    number: int
+    root: RootAttributes | None = None
+    site: str = ""
+
+    def __len__(self) -> int:
+        return self.number
+
+    def __iter__(self) -> Iterator[Prompt]:
+        episode = replace(self.episode)
+        return iter(episode.attributes.prompts if self.root is None else episode.prompts(self.root, self.site))
+
+    def __getitem__(self, index: Any) -> Any:
+        return tuple(self)[index]
+
 
 def positions_by_task(selected: Sequence[SelectedEpisode]) -> dict[tuple[str, int], list[int]]:
     """Positions of each task's episodes, tasks in order of appearance."""
@@ -55,9 +133,33 @@ def positions_by_task(selected: Sequence[SelectedEpisode]) -> dict[tuple[str, in
     return positions
 
 
-def load_tokens(chosen: Sequence[tuple[Store, StoredEpisode]], site: str) -> list[SelectedEpisode]:
-    """Read the tokens of every episode; reads no rows."""
-    return [SelectedEpisode(store, episode, episode.tokens(store.attributes, site)) for store, episode in chosen]
+def load_tokens(
+    chosen: Sequence[tuple[Store, StoredEpisode]],
+    site: str,
+    look: Callable[[Store, StoredEpisode, EpisodeTokens], object] = lambda _store, _episode, _tokens: None,
+) -> list[SelectedEpisode]:
+    """Read the tokens of every episode; reads no rows.
+
+    look: called with each episode while it is read whole.
+
+    Raises:
+        StoreError: an episode holds no replan.
+    """
+    found, empty = [], []
+    opened = read_one_by_one(episode for _, episode in chosen)
+    for (store, _), episode in zip(chosen, opened, strict=True):
+        if not episode.attributes.num_replans:
+            empty.append(f"{episode.name} of {store.path}")
+            continue
+        tokens = episode.tokens(store.attributes, site)
+        look(store, episode, tokens)
+        found.append(SelectedEpisode.brief(store, episode, tokens))
+    if empty:
+        raise StoreError(
+            f"{listing(empty)} hold{'s' if len(empty) == 1 else ''} no replan, so there is no attention to measure; "
+            "leave such episodes out with --skip-corrupt."
+        )
+    return found
 
 
 def find_episode(selected: Sequence[SelectedEpisode], task: int | None, episode: int | None) -> SelectedEpisode:
@@ -94,29 +196,32 @@ def vocabulary_of(selected: Sequence[SelectedEpisode]) -> Vocabulary:
 
 
 def resolve_all(
-    grouping: Grouping, selected: Sequence[SelectedEpisode], vocabulary: Vocabulary | None = None
+    grouping: Grouping, selected: Sequence[SelectedEpisode], vocabulary: Vocabulary
 ) -> list[ResolvedGrouping]:
     """Resolve a grouping on every episode, with the checks that need all of them.
-
-    `vocabulary`: that of the episodes; collected from them unless it is given.
 
     Raises:
         SelectorError: a name exists in no selected episode.
         OverlappingGroups: groups share keys and the grouping does not allow it.
         EmptyGroup: a group has no key in any selected episode.
     """
-    check_names(grouping, vocabulary or vocabulary_of(selected), selected[0].tokens.layout)
-    resolved = [resolve(grouping, item.tokens) for item in selected]
+    check_names(grouping, vocabulary, selected[0].tokens.layout)
+    resolved = [resolve_episode(grouping, item) for item in selected]
     check_not_empty(grouping, [item.num_keys for item in resolved])
-    return [
-        _without(weights, item) if item.without else weights for item, weights in zip(selected, resolved, strict=True)
-    ]
+    return resolved
 
 
 def resolve_episode(grouping: Grouping, item: SelectedEpisode) -> ResolvedGrouping:
-    """The grouping on one episode, without the checks that need all of them."""
+    """The grouping on one episode, without the checks that need all of them.
+
+    Keys that were taken out of the episode are in no group, not valid and not counted.
+    """
     resolved = resolve(grouping, item.tokens)
-    return _without(resolved, item) if item.without else resolved
+    if not item.without:
+        return resolved
+    weights = resolved.weights.copy()
+    weights[:, list(item.without)] = 0.0
+    return ResolvedGrouping(resolved.names, weights, counted_keys(weights, item.tokens.existing), item.num_valid)
 
 
 def check_not_empty(grouping: Grouping, num_keys: Sequence[NDArray[np.float64]]) -> None:
@@ -128,15 +233,3 @@ def check_not_empty(grouping: Grouping, num_keys: Sequence[NDArray[np.float64]])
                 f"Group '{name}' ({selectors}) has no key in any of the {len(num_keys)} selected episodes; change its "
                 f'selector, or add allow_empty = ["{name}"] to the grouping.'
             )
-
-
-def _without(resolved: ResolvedGrouping, item: SelectedEpisode) -> ResolvedGrouping:
-    """The grouping without the keys that were taken out of the episode: in no group, not valid, not counted."""
-    weights = resolved.weights.copy()
-    weights[:, list(item.without)] = 0.0
-    return ResolvedGrouping(
-        names=resolved.names,
-        weights=weights,
-        num_keys=counted_keys(weights, item.tokens.existing),
-        num_valid=item.num_valid,
-    )

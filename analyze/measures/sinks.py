@@ -21,13 +21,25 @@ takes out keys that are sinks in at least the share `heads` of the selected laye
 Keys of the policy's own actions are none: the action queries compute these keys with each other, and the keys are on no
 side of a ratio of pictures and words.
 
+A sink that adds nothing takes attention without effect, and a mass that counts it misleads. One that adds as much per
+unit of mass as other keys do is read. Contributions tell, where they were recorded:
+
+    value ratio = (|c_k| / m_k) / (|c_rest| / m_rest)
+
+the length of what the key adds per unit of its mass, over the same of all other valid keys together, from norms and
+masses averaged over the task's replans, denoise steps and the blocks in which the key is a sink of a head.
+Contributions are stored for segments (a span's keys of one role) and for all heads together, so that only a sink that
+is a segment of its own, such as bos, has a value ratio: for one patch of a camera or one word of an instruction it
+cannot be told. The other keys' vectors may cancel each other, which makes their length small and the value ratio large:
+"small" is said on the safe side.
+
 Sinks are found per task, because the text depends on the instruction and the scene on the task. The rule cannot tell a
 sink from a key that deserves attention in most rows: look at the listed keys before you use a corrected number.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -36,24 +48,19 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.measures.baselines import uniform_keys
-from vla_attention.analyze.measures.kept import measured_once
-from vla_attention.analyze.measures.not_in_memory import MadeWhenAsked, OnDisk
+from vla_attention.analyze.core.contributions import has_all_heads, joint_norm, segment_masses, selected_gram
+from vla_attention.analyze.measures.masses import uniform_keys
+from vla_attention.analyze.measures.not_in_memory import OnDisk, measured_once
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, positions_by_task
-from vla_attention.analyze.measures.sink_kinds import value_ratios
-from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import BadArgument, listing, plural, unknown_name
 from vla_attention.schemas.groupings.resolve import describe_key
-from vla_attention.schemas.layout import Role
-from vla_attention.schemas.progress_bar import progress_bar
+from vla_attention.schemas.layout import INVALID_ROLES, Role
+from vla_attention.schemas.segments import segment_members
 
-DEFAULT_FACTOR = 10.0
-DEFAULT_SHARE = 0.5
-DEFAULT_MASS = 0.3
-DEFAULT_HEADS = 0.25
+Array = NDArray[Any]
 #: A value that exceeds a limit by less than this share of it may exceed it by rounding only.
 _ROUNDING = 5e-6
 
@@ -65,10 +72,10 @@ class SinkRule:
     Raises `BadArgument` for a factor below 1, or a share outside (0, 1].
     """
 
-    factor: float = DEFAULT_FACTOR
-    share: float = DEFAULT_SHARE
-    mass: float = DEFAULT_MASS
-    heads: float = DEFAULT_HEADS
+    factor: float = 10.0
+    share: float = 0.5
+    mass: float = 0.3
+    heads: float = 0.25
 
     def __post_init__(self) -> None:
         """Check the numbers."""
@@ -103,50 +110,21 @@ class SinkRule:
 
 
 @dataclass(frozen=True)
-class KeyShares:
-    """How much each key of an episode takes in each head; `layer` counts blocks once.
+class SinkSearch:
+    """Which keys are sinks of which heads.
 
     Attributes:
-        above: share of the rows in which the key takes more than the factor, shape (layer, head, key) float32.
-        held: mean over rows of the key's share in the mass of the valid keys, shape (layer, head, key) float32.
-        uniform: mean over rows of what uniform attention gives the key of that mass, shape (layer or 1, head or 1, key)
-            float32: 1 / the number of valid keys where every query sees the same.
+        keys: one row per (task, key that is valid in one of its episodes): suite, task_id, num_episodes; key, span,
+            role (the commonest over the replans at which the key is valid), patch_row, patch_column (null unless the
+            key is a patch), description (in words); num_valid (mean number of valid keys); share_of_rows (in which it
+            takes more than the factor), mean_mass (share of the valid keys' mass), times_uniform (mean_mass / what
+            uniform attention gives the key; null for one that no query sees), largest_mass (mean mass in the head where
+            it is largest), sink_heads (heads of layers in which it is a sink), heads_by_mass (in which it is one by
+            mass), num_heads (all heads of the selected layers), widespread (sink_heads / num_heads is at least the
+            rule's `heads`), value_ratio (null where it cannot be told).
+        heads: one row per (task, key, layer, head) where the key is a sink: suite, task_id, key, layer, block, head,
+            share_of_rows, mean_mass, by_mass.
     """
-
-    above: NDArray[np.float32]
-    held: NDArray[np.float32]
-    uniform: NDArray[np.float32]
-
-    @classmethod
-    def empty(cls, item: SelectedEpisode, selection: Selection, uniform: UniformShares) -> KeyShares:
-        """Zeros, to which `add` adds, and what uniform attention gives."""
-        shape = (len(layers_once(selection)), len(selection.heads), item.tokens.layout.num_keys)
-        return cls(np.zeros(shape, np.float32), np.zeros(shape, np.float32), uniform.means(selection))
-
-    def add(
-        self,
-        layer: int,
-        rows: NDArray[np.float32],
-        valid: NDArray[np.bool_],
-        limit: NDArray[np.float64],
-        selection: Selection,
-        keys: NDArray[np.int64] | slice = slice(None),
-    ) -> None:
-        """Count the rows (replan, head, key) of a layer (position in the selection) at one of its denoise steps.
-
-        A block that was named by two layer numbers counts once. `limit`: see `key_sums`. `keys`: which keys the rows
-        are of.
-        """
-        if selection.is_first_of_block(layer):
-            above, held = key_sums(rows, valid, limit)
-            count, at = rows.shape[0] * len(selection.denoise), layers_once(selection).index(layer)
-            self.above[at][:, keys] += (above / count).astype(np.float32)
-            self.held[at][:, keys] += (held / count).astype(np.float32)
-
-
-@dataclass(frozen=True)
-class SinkSearch:
-    """Which keys are sinks of which heads; see `search_of`."""
 
     keys: pl.DataFrame
     heads: pl.DataFrame
@@ -157,48 +135,52 @@ class SinkSearch:
         found = self.keys.filter(pl.col("sink_heads") > 0)
         return found.sort("suite", "task_id", "mean_mass", "key", descending=[False, False, True, False])
 
-    @property
-    def num_valid(self) -> float:
-        """Mean number of valid keys, of the task with most."""
-        return float(max(self.keys["num_valid"].to_list()))
+
+def search_sinks(question: Question, rule: SinkRule | None = None) -> SinkSearch:
+    """Look for sinks in every task, episodes of a task weighing the same; reads all selected rows once."""
+    rule = rule or SinkRule()
+    selected, selection, site = question.selected, question.selection, question.site
+    measure = partial(_key_shares, selection=selection, site=site, rule=rule)
+    arrays = measured_once("shares", selected, selection, site, measure, {"factor": rule.factor})
+    shares: OnDisk[dict[str, Array]] = OnDisk(arrays)
+    found = [
+        _of_task([selected[i] for i in positions], [shares[i] for i in positions], selection, rule)
+        for _, positions in sorted(positions_by_task(selected).items())
+    ]
+    keys, heads = (pl.concat(tables) for tables in zip(*found, strict=True))
+    on = ["suite", "task_id", "key"]
+    return SinkSearch(keys.join(_value_ratios(question, heads), on=on, how="left", maintain_order="left"), heads)
 
 
-def layers_once(selection: Selection) -> list[int]:
-    """Positions of the selected layers, without those that name a block again."""
-    return [i for i in range(len(selection.layers)) if selection.is_first_of_block(i)]
+def _key_shares(item: SelectedEpisode, selection: Selection, site: str, rule: SinkRule) -> dict[str, Array]:
+    """How much each key of an episode takes in each head; blocks count once.
 
-
-@dataclass(frozen=True)
-class UniformShares:
-    """What uniform attention gives every key of an episode, as a share of what it gives all valid keys.
-
-    Attributes:
-        shares: (replan or 1, layer or 1, denoise or 1, head or 1, key); 0 for a key that no query sees.
+    Returns:
+        above: share of the rows in which the key takes more than the factor, (layer, head, key) float32.
+        held: mean over rows of the key's share in the mass of the valid keys, (layer, head, key) float32.
+        uniform: mean over rows of what uniform attention gives the key of that mass, (layer or 1, head or 1, key)
+            float32: 1 / the number of valid keys where every query sees the same.
     """
-
-    shares: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, item: SelectedEpisode, selection: Selection) -> UniformShares:
-        """Those of an episode; heads are kept apart."""
-        uniform, valid = uniform_keys(item, replace(selection, per_head=True)), item.valid[:, None, None, None]
-        of_valid = (uniform * valid).sum(axis=-1, keepdims=True)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            shares = np.where(of_valid > 0, uniform / of_valid, 0.0)
-        # A key that is valid at some replans only takes nothing at the others, and its mean counts them.
-        return cls(np.where(valid, shares, 1.0 / np.maximum(item.num_valid, 1)[:, None, None, None, None]))
-
-    def at(self, layer: int, denoise: int) -> NDArray[np.float64]:
-        """Shares (replan or 1, head or 1, key) at positions of the selection; one for all keys where they are alike."""
-        _, layers, steps, _, _ = self.shares.shape
-        here = self.shares[:, layer if layers > 1 else 0, denoise if steps > 1 else 0]
-        highest = here.max(axis=-1, keepdims=True)
-        return highest if ((here == 0) | (here >= highest * (1.0 - _ROUNDING))).all() else here
-
-    def means(self, selection: Selection) -> NDArray[np.float32]:
-        """`KeyShares.uniform`."""
-        means: NDArray[np.float32] = self.shares.mean(axis=(0, 2)).astype(np.float32)
-        return means[layers_once(selection)] if len(means) > 1 else means
+    uniform, valid = uniform_keys(item, replace(selection, per_head=True)), item.valid[:, None, None, None]
+    of_valid = (uniform * valid).sum(axis=-1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = np.where(of_valid > 0, uniform / of_valid, 0.0)
+    # A key that is valid at some replans only takes nothing at the others, and its mean counts them.
+    shares = np.where(valid, shares, 1.0 / np.maximum(item.num_valid, 1)[:, None, None, None, None])
+    above, held = np.zeros((2, len(selection.once), len(selection.heads), item.tokens.layout.num_keys), np.float32)
+    for part in layer_rows(item.store.attributes, item.episode, selection, site, per_head=True):
+        if part.layer in selection.once:
+            at, count = selection.once.index(part.layer), len(part.rows) * len(selection.denoise)
+            _, layers, steps, _, _ = shares.shape
+            here = shares[:, part.layer if layers > 1 else 0, part.denoise if steps > 1 else 0]
+            highest = here.max(axis=-1, keepdims=True)
+            # One for all keys where they are alike.
+            here = highest if ((here == 0) | (here >= highest * (1.0 - _ROUNDING))).all() else here
+            in_rows, summed = key_sums(part.rows, item.valid, rule.factor * here)
+            above[at] += (in_rows / count).astype(np.float32)
+            held[at] += (summed / count).astype(np.float32)
+    means = shares.mean(axis=(0, 2)).astype(np.float32)
+    return {"above": above, "held": held, "uniform": means[list(selection.once)] if len(means) > 1 else means}
 
 
 def key_sums(
@@ -225,114 +207,54 @@ def key_sums(
     return above, held.astype(np.float64)
 
 
-def episode_key_shares(item: SelectedEpisode, selection: Selection, site: str, rule: SinkRule) -> KeyShares:
-    """Read an episode's rows once."""
-    valid, uniform = item.valid, UniformShares.of(item, selection)
-    shares = KeyShares.empty(item, selection, uniform)
-    for part in layer_rows(item.store.attributes, item.episode, selection, site, per_head=True):
-        limit = rule.factor * uniform.at(part.layer, part.denoise)
-        shares.add(part.layer, part.rows, valid, limit, selection)
-    return shares
-
-
-def search_of(question: Question, shares: Sequence[KeyShares], rule: SinkRule) -> SinkSearch:
-    """Both tables of a search, episodes of a task weighing the same.
-
-    Returns:
-        keys: one row per (task, key that is valid in one of its episodes): suite, task_id, num_episodes; key, span,
-            role (the commonest over the replans at which the key is valid), patch_row, patch_column (null unless the
-            key is a patch), description (in words); num_valid (mean number of valid keys); share_of_rows (in which it
-            takes more than the factor), mean_mass (share of the valid keys' mass), times_uniform (mean_mass / what
-            uniform attention gives the key; null for one that no query sees), largest_mass (mean mass in the head where
-            it is largest), sink_heads (heads of layers in which it is a sink), heads_by_mass (in which it is one by
-            mass), num_heads (all heads of the selected layers), widespread (sink_heads / num_heads is at least the
-            rule's `heads`), value_ratio (see `sink_kinds`; null where it cannot be told).
-        heads: one row per (task, key, layer, head) where the key is a sink: suite, task_id, key, layer, block, head,
-            share_of_rows, mean_mass, by_mass.
-    """
-    selection = question.selection
-    once = layers_once(selection)
-    frames, heads = [], []
-    for (suite, task), positions in sorted(positions_by_task(question.selected).items()):
-        items = [question.selected[i] for i in positions]
-        above, held, uniform = np.zeros((3, *shares[positions[0]].held.shape))
-        for i in positions:
-            of_episode = shares[i]
-            above += of_episode.above
-            held += of_episode.held
-            uniform += of_episode.uniform
-        above /= len(items)
-        held /= len(items)
-        uniform /= len(items)
-        valid = [item.valid for item in items]
-        num_valid = float(np.mean([item.num_valid.mean() for item in items]))
-        keys = np.flatnonzero(np.any([part.any(axis=0) for part in valid], axis=0))
-        described = pl.DataFrame([_describe(int(key), items, valid) for key in keys], schema=_DESCRIPTION, orient="row")
-        counted = np.zeros(held.shape[2], dtype=bool)
-        counted[keys] = (described["role"] != Role.ACTION.label).to_numpy()
-        # Twice the uniform share: where a row has two or three valid keys, even attention exceeds the limit of mass.
-        by_mass = counted & (held > np.maximum(rule.mass, 2.0 * uniform))
-        # A share is a mean of quotients: rounding must not put one half below 0.5.
-        is_sink = by_mass | (counted & (above >= rule.share - _ROUNDING))
-        count = is_sink.sum(axis=(0, 1))
-        num_heads = above.shape[0] * above.shape[1]
-        labels = [pl.lit(suite).alias("suite"), pl.lit(task, dtype=pl.Int64).alias("task_id")]
-        mean_mass = held.mean(axis=(0, 1))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            times_uniform = mean_mass / uniform.mean(axis=(0, 1))
-        frames.append(
-            described.select(
-                *labels,
-                pl.lit(len(items), dtype=pl.Int64).alias("num_episodes"),
-                pl.all(),
-                pl.lit(num_valid).alias("num_valid"),
-                pl.Series("share_of_rows", above.mean(axis=(0, 1))[keys]),
-                pl.Series("mean_mass", mean_mass[keys]),
-                pl.Series("times_uniform", times_uniform[keys]).fill_nan(None),
-                pl.Series("largest_mass", held.max(axis=(0, 1))[keys]),
-                pl.Series("sink_heads", count[keys]),
-                pl.Series("heads_by_mass", by_mass.sum(axis=(0, 1))[keys]),
-                pl.lit(num_heads, dtype=pl.Int64).alias("num_heads"),
-                pl.Series("widespread", (count[keys] > 0) & (count[keys] >= rule.heads * num_heads - 1e-9)),
-            )
-        )
-        layer, head, key = np.nonzero(is_sink)
-        table = pl.DataFrame(
-            {
-                "key": key,
-                "layer": np.array([selection.layer_labels[i] for i in once])[layer],
-                "block": np.array([selection.blocks[i] for i in once])[layer],
-                "head": np.array(selection.head_numbers)[head],
-                "share_of_rows": above[layer, head, key],
-                "mean_mass": held[layer, head, key],
-                "by_mass": by_mass[layer, head, key],
-            }
-        )
-        heads.append(table.sort("key", "layer", "head").select(*labels, pl.all()))
-    of_heads = pl.concat(heads)
-    kinds = value_ratios(question, of_heads)
-    on = ["suite", "task_id", "key"]
-    return SinkSearch(pl.concat(frames).join(kinds, on=on, how="left", maintain_order="left"), of_heads)
-
-
-def search_sinks(question: Question, rule: SinkRule | None = None) -> SinkSearch:
-    """Look for sinks in every task; reads all selected rows once."""
-    rule = rule or SinkRule()
-    selected, selection, site = question.selected, question.selection, question.site
-    with progress_bar(len(selected), "episodes searched for sinks") as advance:
-
-        def measure(positions: Sequence[int]) -> Iterator[dict[str, NDArray[Any]]]:
-            scan = partial(_share_arrays, selection=selection, site=site, rule=rule)
-            return each_episode(scan, [selected[i] for i in positions], advance)
-
-        arguments = {"factor": rule.factor}
-        arrays = measured_once("shares", selected, selection, site, measure, arguments, progress=advance)
-        kept = OnDisk(arrays)
-    return search_of(question, MadeWhenAsked(lambda i: KeyShares(**kept[i]), range(len(kept))), rule)
-
-
-def _share_arrays(item: SelectedEpisode, selection: Selection, site: str, rule: SinkRule) -> dict[str, NDArray[Any]]:
-    return vars(episode_key_shares(item, selection, site, rule))
+def _of_task(
+    items: Sequence[SelectedEpisode], shares: Sequence[Mapping[str, Array]], selection: Selection, rule: SinkRule
+) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """The rows of both tables of a search of one task, without value_ratio."""
+    above, held, uniform = (np.mean([np.asarray(one[name], np.float64) for one in shares], axis=0)
+                            for name in ("above", "held", "uniform"))  # fmt: skip
+    valid = [item.valid for item in items]
+    keys = np.flatnonzero(np.any([part.any(axis=0) for part in valid], axis=0))
+    described = pl.DataFrame([_describe(int(key), items, valid) for key in keys], schema=_DESCRIPTION, orient="row")
+    counted = np.zeros(held.shape[2], dtype=bool)
+    counted[keys] = (described["role"] != Role.ACTION.label).to_numpy()
+    # Twice the uniform share: where a row has two or three valid keys, even attention exceeds the limit of mass.
+    by_mass = counted & (held > np.maximum(rule.mass, 2.0 * uniform))
+    # A share is a mean of quotients: rounding must not put one half below 0.5.
+    is_sink = by_mass | (counted & (above >= rule.share - _ROUNDING))
+    count, num_heads, mean_mass = is_sink.sum(axis=(0, 1))[keys], above[..., 0].size, held.mean(axis=(0, 1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        times_uniform = mean_mass / uniform.mean(axis=(0, 1))
+    suite, task = items[0].task
+    labels = {"suite": pl.lit(suite), "task_id": pl.lit(task, dtype=pl.Int64)}
+    of_keys = described.select(
+        **labels,
+        num_episodes=pl.lit(len(items), dtype=pl.Int64),
+        **{name: pl.col(name) for name in _DESCRIPTION},
+        num_valid=pl.lit(float(np.mean([item.num_valid.mean() for item in items]))),
+        share_of_rows=pl.Series(above.mean(axis=(0, 1))[keys]),
+        mean_mass=pl.Series(mean_mass[keys]),
+        times_uniform=pl.Series(times_uniform[keys]).fill_nan(None),
+        largest_mass=pl.Series(held.max(axis=(0, 1))[keys]),
+        sink_heads=pl.Series(count),
+        heads_by_mass=pl.Series(by_mass.sum(axis=(0, 1))[keys]),
+        num_heads=pl.lit(num_heads, dtype=pl.Int64),
+        widespread=pl.Series((count > 0) & (count >= rule.heads * num_heads - 1e-9)),
+    )
+    key, at, head = np.nonzero(is_sink.transpose(2, 0, 1))
+    layer = np.array(selection.once)[at]
+    of_heads = pl.DataFrame(
+        {
+            "key": key,
+            "layer": np.array(selection.layer_labels)[layer],
+            "block": np.array(selection.blocks)[layer],
+            "head": np.array(selection.head_numbers)[head],
+            "share_of_rows": above[at, head, key],
+            "mean_mass": held[at, head, key],
+            "by_mass": by_mass[at, head, key],
+        }
+    )
+    return of_keys, of_heads.sort("key", "layer", "head").select(**labels, **{n: pl.col(n) for n in of_heads.columns})
 
 
 def without_sinks(question: Question, sinks: pl.DataFrame, rule: SinkRule) -> Question:
@@ -363,53 +285,34 @@ def without_sinks(question: Question, sinks: pl.DataFrame, rule: SinkRule) -> Qu
     return replace(question, selected=selected, grouping=grouping, notes=notes)
 
 
-def merged_sinks(sinks: pl.DataFrame) -> pl.DataFrame:
-    """Sinks over tasks, one row per (key, description): num_tasks, and over those tasks means of the numbers.
-
-    `heads_share` and `heads_by_mass_share` are shares of the layers' heads; `widespread` holds when it does in a task.
-    """
-    numbers = ("share_of_rows", "mean_mass", "times_uniform", "value_ratio")
-    merged = sinks.group_by("key", "span", "role", "description", maintain_order=True).agg(
-        pl.struct("suite", "task_id").n_unique().cast(pl.Int64).alias("num_tasks"),
-        *(pl.col(name).mean() for name in numbers),
-        pl.col("largest_mass").max(),
-        (pl.col("sink_heads") / pl.col("num_heads")).mean().alias("heads_share"),
-        (pl.col("heads_by_mass") / pl.col("num_heads")).mean().alias("heads_by_mass_share"),
-        pl.col("widespread").any(),
-    )
-    return merged.sort("num_tasks", "mean_mass", "key", descending=[True, True, False])
-
-
-def cannot_fire(num_valid: float, rule: SinkRule) -> str:
-    """Why the rule's first part finds nothing among so few valid keys, as a sentence; empty where it can."""
-    if num_valid > rule.factor:
-        return ""
-    return (
-        f"With {num_valid:.3g} valid keys none can take more than {rule.factor:g} x its uniform share, which is all of "
-        "the row: keys are judged by their mass alone; a smaller factor (--without-sinks factor=2) judges by multiples "
-        "too."
-    )
-
-
 def describe_sinks(sinks: pl.DataFrame, num_tasks: int, rule: SinkRule, num_valid: float) -> str:
     """The keys that were taken out, as sentences for a summary; `num_valid`: most valid keys of a task."""
     out = sinks.filter("widespread")
     left = sinks.height - out.height
-    also = ""
+    of_rule, also = f"{rule}, in at least {rule.heads:.0%} of the layers' heads", ""
     if left:
         also = (
             f" Sinks of fewer heads stay in: {plural(left, 'key')}, counted in every task by itself (a rule "
             "with a smaller `heads` takes them out too)."
         )
-    of_rule = f"{rule}, in at least {rule.heads:.0%} of the layers' heads"
-    also += f" {cannot_fire(num_valid, rule)}".rstrip()
+    if num_valid <= rule.factor:
+        also += (
+            f" With {num_valid:.3g} valid keys none can take more than {rule.factor:g} x its uniform share, which is "
+            "all of the row: keys are judged by their mass alone; a smaller factor (--without-sinks factor=2) judges "
+            "by multiples too."
+        )
     if out.is_empty():
         return f"Without sinks: no key takes {of_rule}, so nothing was taken out.{also}"
+    merged = out.group_by("key", "span", "role", "description", maintain_order=True).agg(
+        pl.struct("suite", "task_id").n_unique().alias("num_tasks"),
+        pl.col("mean_mass").mean(),
+        (pl.col("sink_heads") / pl.col("num_heads")).mean().alias("heads_share"),
+    )
     of = f"of {num_tasks} tasks" if num_tasks > 1 else "of the one task"
     named = [
         f"{row['description']} ({row['role']}; in {row['num_tasks']} {of}, in {row['heads_share']:.0%} of the heads, "
         f"{row['mean_mass']:.1%} of the mass)"
-        for row in merged_sinks(out).iter_rows(named=True)
+        for row in merged.sort("num_tasks", "mean_mass", "key", descending=[True, True, False]).iter_rows(named=True)
     ]
     return (
         f"Without sinks: {listing(named, 6)} {'is' if len(named) == 1 else 'are'} out of every group and of the valid "
@@ -444,3 +347,62 @@ def _describe(
         return key, span.name, role, None, None, describe_key(key, tokens)
     row, column = divmod(key - span.start, span.grid.columns)
     return key, span.name, role, row, column, f"{describe_key(key, tokens)}, patch ({row}, {column})"
+
+
+def _value_ratios(question: Question, heads: pl.DataFrame) -> pl.DataFrame:
+    """One row per sink that is a segment of its own: suite, task_id, key, value_ratio.
+
+    `heads` names the blocks in which a key is a sink: suite, task_id, key, block. Empty without contributions, and
+    where not all heads were recorded.
+    """
+    ratios = []
+    recorded = (store.attributes for store in question.stores)
+    if all(root.recording.contributions and has_all_heads(root, question.site) for root in recorded):
+        sinks = heads.group_by("suite", "task_id", "key", maintain_order=True).agg(pl.col("block").unique())
+        for suite, task, key, blocks in sinks.iter_rows():
+            found = _value_ratio(question, suite, task, key, blocks)
+            if found is not None:
+                ratios.append((suite, task, key, found))
+    schema = {"suite": pl.String, "task_id": pl.Int64, "key": pl.Int64, "value_ratio": pl.Float64}
+    return pl.DataFrame(ratios, schema=schema, orient="row")
+
+
+def _value_ratio(question: Question, suite: str, task: int, key: int, blocks: list[int]) -> float | None:
+    """None where the key shares its segment at a replan, or is valid at none."""
+    sums = np.zeros(4)
+    for item in question.selected:
+        if item.task == (suite, task):
+            found = _lengths_and_masses(item, question, key, blocks)
+            if found is None:
+                return None
+            sums += found
+    length, mass, of_rest, mass_of_rest = sums
+    if not (mass > 0 and mass_of_rest > 0 and of_rest > 0):
+        return None
+    return float((length / mass) / (of_rest / mass_of_rest))
+
+
+def _lengths_and_masses(
+    item: SelectedEpisode, question: Question, key: int, blocks: list[int]
+) -> NDArray[np.float64] | None:
+    """Mean norm and mass of the key's segment, and of all other valid ones, over replans at which the key is valid."""
+    selection, site, tokens = question.selection, question.site, item.tokens
+    segments = item.episode.attributes.segments[site]
+    members = segment_members(tokens.layout, tokens.static_roles, segments)
+    valid = ~np.isin(tokens.static_roles, INVALID_ROLES)
+    own = members[:, key]  # (replan or 1, segment)
+    at = np.broadcast_to(valid[:, key], (tokens.num_replans,))
+    taken = (own & valid[:, [key]]).any(axis=0)
+    if not at.any():
+        return np.zeros(4)
+    # One segment, of one key, at every replan at which the key is valid.
+    if taken.sum() != 1 or (members.sum(axis=1)[:, taken][valid[:, key]] != 1).any():
+        return None
+    rest = (members & valid[:, :, None]).any(axis=(0, 1)) & ~taken
+    layers = [i for i, block in enumerate(selection.blocks) if block in blocks and i in selection.once]
+    gram = selected_gram(item, site, selection)[at][:, layers]
+    mass = segment_masses(item, site, selection)[at][:, layers]
+    numbers = []
+    for part in (taken, rest):
+        numbers += [joint_norm(gram, np.append(part, False)).mean(), mass[..., part].sum(axis=-1).mean()]
+    return np.array(numbers)

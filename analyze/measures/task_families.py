@@ -3,13 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-
-import numpy as np
 
 from vla_attention.analyze.measures.selected import SelectedEpisode
-from vla_attention.analyze.statistics.episode_intervals import Sampling, TaskName
-from vla_attention.analyze.statistics.units import Estimand, Units
+from vla_attention.analyze.statistics.units import Estimand, Sampling
 from vla_attention.schemas.errors import UserError, listing
 from vla_attention.schemas.safe_text import visible
 
@@ -26,7 +22,7 @@ def sampling_of(estimand: Estimand, selected: Iterable[SelectedEpisode]) -> Samp
     Raises:
         MixedFamilies: episodes of a task know different ones, and intervals are by families.
     """
-    families: dict[TaskName, str] = {}
+    families: dict[tuple[str, int], str] = {}
     for item in selected:
         family, task = item.episode.attributes.task_family, item.task
         known = families.setdefault(task, family) if family else ""
@@ -37,14 +33,6 @@ def sampling_of(estimand: Estimand, selected: Iterable[SelectedEpisode]) -> Samp
                 "Record them again with one, or choose --intervals these-tasks."
             )
     return Sampling(estimand, families)
-
-
-def units_of(sampling: Sampling, selected: Sequence[SelectedEpisode]) -> Units:
-    """The units of episodes, not decided (`Units.decided`)."""
-    tasks = [item.task for item in selected]
-    number = {task: i for i, task in enumerate(dict.fromkeys(tasks))}
-    families = [sampling.families.get(task, "") for task in tasks]
-    return Units.of(np.array([number[task] for task in tasks]), sampling.estimand, families)
 
 
 def unknown_families(sampling: Sampling, selected: Sequence[SelectedEpisode]) -> str:
@@ -58,30 +46,19 @@ def unknown_families(sampling: Sampling, selected: Sequence[SelectedEpisode]) ->
 
 def related_instructions(instructions: Sequence[str]) -> str:
     """That tasks with these instructions, of which no family is known, seem related; empty where they do not."""
-    alike = alike_instructions(instructions)
-    if alike is None:
+    number, examples = alike_instructions(instructions)
+    if not number:
         return ""
+    quoted = listing([f"'{text}'" for text in examples], 4)
     return (
-        f"Of {len(instructions)} tasks no family is known, and {alike.number} of their instructions differ in at most "
-        f"one word from another one ({_quoted(alike.examples)}). Such tasks are related: intervals that count them as "
-        "independent are too narrow."
+        f"Of {len(instructions)} tasks no family is known, and {number} of their instructions differ in at most one "
+        f"word from another one ({quoted}). Such tasks are related: intervals that count them as independent are too "
+        "narrow."
     )
 
 
-def _quoted(texts: Iterable[str]) -> str:
-    return listing([f"'{text}'" for text in texts], 4)
-
-
-@dataclass(frozen=True)
-class AlikeInstructions:
-    """`number` instructions differ in at most one word from another one; `examples` are the first two."""
-
-    number: int
-    examples: tuple[str, ...]
-
-
-def alike_instructions(instructions: Sequence[str]) -> AlikeInstructions | None:
-    """The instructions that differ in at most one word from another one; None where none does.
+def alike_instructions(instructions: Sequence[str]) -> tuple[int, tuple[str, ...]]:
+    """How many instructions differ in at most one word from another one, and the first two that do.
 
     Words are compared without case. Equal instructions differ in none.
     """
@@ -92,8 +69,5 @@ def alike_instructions(instructions: Sequence[str]) -> AlikeInstructions | None:
         for i in range(len(words)):
             places.setdefault((str(i), *words[:i], *words[i + 1 :]), []).append(number)
     groups = [group for group in places.values() if len(group) > 1]
-    if not groups:
-        return None
-    first = min(groups)
-    examples = dict.fromkeys(instructions[number] for number in first[:2])
-    return AlikeInstructions(len({number for group in groups for number in group}), tuple(examples))
+    examples = dict.fromkeys(instructions[number] for number in min(groups, default=[])[:2])
+    return len({number for group in groups for number in group}), tuple(examples)

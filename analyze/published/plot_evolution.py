@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from vla_attention.analyze.core.levels import MORE, Levels, replan_cells
-from vla_attention.analyze.core.measure import Measured, means
+from vla_attention.analyze.core.measure import means
 from vla_attention.analyze.measures.frames import LAYERS_AVG, float_values, layer_name
 from vla_attention.analyze.render.figures import lines, stacked
 from vla_attention.analyze.render.numbers import format_number
@@ -36,22 +36,22 @@ def evolution_files(levels: Levels) -> dict[str, Callable[[Path], None]]:
     They are called `task{id}_{slug}_ep{k}_layer{N}_ratio_evolution.png`, or `..._layers_avg_...`, in the folder
     `episodes`, with a folder for each suite where there are several.
     """
-    several = len({one.item.store.suite for one in levels.measured}) > 1
+    several = len({item.store.suite for item in levels.question.selected}) > 1
     layers = dict.fromkeys([*map(str, levels.question.selection.layer_labels), LAYERS_AVG])
     files: dict[str, Callable[[Path], None]] = {}
-    for one in levels.measured:
-        about = one.item.episode.attributes
-        folder = f"episodes/{file_part(one.item.store.suite)}" if several else "episodes"
+    for i, item in enumerate(levels.question.selected):
+        about = item.episode.attributes
+        folder = f"episodes/{file_part(item.store.suite)}" if several else "episodes"
         slug = re.sub(r"[^a-z0-9]+", "_", about.instruction.lower()).strip("_")[:_SLUG_LENGTH].rstrip("_") or "task"
         for layer in layers:
             of_layer = layer if layer == LAYERS_AVG else f"layer{layer}"
             stem = f"task{about.task_id}_{slug}_ep{about.episode_index}_{of_layer}_ratio_evolution"
-            files[f"{folder}/{stem}.png"] = partial(_write, one=one, grouping=levels.grouping, layer=layer)
+            files[f"{folder}/{stem}.png"] = partial(_write, levels=levels, number=i, layer=layer)
     return files
 
 
-def _write(path: Path, one: Measured, grouping: Grouping, layer: str) -> None:
-    rows = means(one, ("replan", "layer"), MORE)
+def _write(path: Path, levels: Levels, number: int, layer: str) -> None:
+    rows, grouping = means(levels.measured[number], ("replan", "layer"), MORE), levels.grouping
     cells = replan_cells(rows, grouping).filter(layer=layer).sort("replan")
     groups = rows.filter(kind="group", layer=layer).rename({"share": "fraction"}).sort("replan")
     with Style().settings():

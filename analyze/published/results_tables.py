@@ -15,7 +15,7 @@ import polars as pl
 from vla_attention.analyze.core.levels import LAYER, over_replans, task_cells, task_groups
 from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS, LAYERS_AVG
 from vla_attention.analyze.published.results_reader import RATIO, ResultsFile, ResultsKind
-from vla_attention.analyze.statistics.episode_intervals import Sampling
+from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 
 #: The group of what is left: 1 minus the known fractions.

@@ -34,17 +34,21 @@ def results_files(levels: Levels) -> dict[str, Callable[[Path], None]]:
     proxy = frame_proxy(question.stores[0].attributes, question.selected[0].tokens.layout, grouping)
 
     def write(path: Path, suite: str) -> None:
-        of_suite = [one for one in levels.measured if one.item.store.suite == suite]
-        write_results(path, documents_of(of_suite, grouping, question.selection.denoise_steps, proxy))
+        positions = [i for i, item in enumerate(question.selected) if item.store.suite == suite]
+        write_results(path, documents_of(levels.measured, positions, grouping, question.selection.denoise_steps, proxy))
 
     suites = dict.fromkeys(item.store.suite for item in question.selected)
     return {results_file_name(suite): partial(write, suite=suite) for suite in suites}
 
 
 def documents_of(
-    measured: Sequence[Measured], grouping: Grouping, denoise_steps: Sequence[int], proxy: FrameProxy | None = None
+    measured: Sequence[Measured],
+    positions: Sequence[int],
+    grouping: Grouping,
+    denoise_steps: Sequence[int],
+    proxy: FrameProxy | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """The JSON document of each episode of a suite, by task and number.
+    """The JSON document of each episode of a suite (its positions), by task and number; one is in memory at a time.
 
     visual is the sum of the ratio's numerator groups, linguistic that of its denominator groups; the fraction of either
     is its mass / sum of all groups' masses. `denoise_steps` are those that the masses are means over. With a `proxy`
@@ -60,8 +64,11 @@ def documents_of(
             "results file; expected a [ratio] with numerator and denominator groups (or --ratio A,B/C)."
         )
     first = len(grouping.names)  # behind the groups, both sides of the ratio
-    sides_keys = [one.keys[:, first : first + 2] for one in measured]
-    whole = [name for i, name in enumerate(_KEYS) if all((keys[:, i] % 1 == 0).all() for keys in sides_keys)]
+    order, whole = [], set(_KEYS)
+    for i in positions:
+        one = measured[i]
+        order.append((one.item.key, i))
+        whole -= {name for k, name in enumerate(_KEYS) if (one.keys[:, first + k] % 1).any()}
     sides = [*_SIDES, _ACTION] if _ACTION in grouping.names and proxy is None else list(_SIDES)
     kinds = [f"{side}_{kind}" for side in sides for kind in ("mass", "fraction")]
     ratio = pl.col(_RATIO)
@@ -70,12 +77,11 @@ def documents_of(
         num_nonfinite=ratio.null_count(),
     )  # fmt: skip
     others = [pl.struct(mean=pl.col(kind).mean(), std=pl.col(kind).std(ddof=0)).alias(kind) for kind in kinds]
-    about = [one.item.episode.attributes for one in measured]
-    for i in sorted(range(len(measured)), key=lambda i: (about[i].task_id, about[i].episode_index)):
+    for _, i in sorted(order):
         rows = _with_sides(means(measured[i], ("replan", "layer"), (*MORE, "whole")), grouping, proxy)
         identity = rows.row(0, named=True)
         rows = rows.sort("replan", maintain_order=True).select("layer", "step", _RATIO, *kinds, "total_mass", *_KEYS)
-        rows = rows.with_columns(pl.col(whole).cast(pl.Int64))
+        rows = rows.with_columns(pl.col([*whole]).cast(pl.Int64))
         summaries = rows.group_by("layer").agg(spread.alias(_RATIO), *others, num_steps=pl.len())
         of_layers = {row.pop("layer"): row for row in summaries.to_dicts()}
         layers = rows.partition_by("layer", as_dict=True, maintain_order=True, include_key=False)

@@ -26,7 +26,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.core.patch_pictures import NO_PICTURE, enlarge
+from vla_attention.analyze.core.camera_maps import NO_PICTURE, enlarge
 from vla_attention.analyze.core.result import Figure
 from vla_attention.analyze.render.style import Style, wrapped
 

@@ -8,7 +8,7 @@ An interval is about one of these (`Estimand`):
 
     tasks like these   the mean over a population of tasks of which the store's tasks are a sample. Tasks of one family
                        are related, so the units are the families, and from four of them on there is an interval: the
-                       error is cluster-robust (`family_errors`). Episodes vary inside the tasks' means already. To
+                       error is cluster-robust (`family_shares`). Episodes vary inside the tasks' means already. To
                        count them once more, as a bootstrap of tasks and then of episodes does, makes the interval too
                        wide (Field & Welsh 2007, "Bootstrapping clustered data", Journal of the Royal Statistical
                        Society B 69).
@@ -23,6 +23,22 @@ With one task both are the same: t over its episodes. A quotient of two means is
 these units is the infinitesimal jackknife (Efron & Tibshirani 1993, "An introduction to the bootstrap", chapter 11).
 The interval is symmetric on a scale on which the quantity has no limits: the logarithm for masses and ratios, the
 log odds for fractions. `benchmarks/interval_coverage.py` measures the coverage.
+
+The error by families. The estimate is the mean over tasks, and every task weighs the same; only its error is by
+families. With T tasks, deviations e_t from the mean and families g of n_g tasks,
+
+    variance = sum over g of (sum of the e_t in g)^2 / (T (T - n_g)).
+
+This is the bias-reduced linearisation of a mean ("CR2": Bell & McCaffrey 2002, "Bias reduction in standard errors for
+linear regression with multi-stage samples", Survey Methodology 28): residuals of a family are multiplied by
+(I - H_gg)^(-1/2), which for a mean is 1 / sqrt(1 - n_g / T) of their sum. It is unbiased where tasks are independent
+and spread alike. The degrees of freedom are Satterthwaite's under the same working model: with p_gh the matrix of the
+quadratic form, (sum p_gg)^2 / sum p_gh^2 (Bell & McCaffrey 2002; Pustejovsky & Tipton 2018, "Small-sample methods for
+cluster-robust variance estimation and hypothesis testing in fixed effects models", Journal of Business & Economic
+Statistics 36). They depend on the sizes of the families alone, and are few where one family has most of the tasks.
+
+With families of one task each, this is s^2 / T with T - 1 degrees of freedom; with G families of equal size, the t
+interval over the means of families with G - 1.
 """
 
 from __future__ import annotations
@@ -30,11 +46,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vla_attention.analyze.statistics.family_errors import family_error
 from vla_attention.analyze.statistics.student import student_quantile, two_sided_p
 from vla_attention.analyze.statistics.units import Estimand as Estimand
 from vla_attention.analyze.statistics.units import Units
@@ -49,10 +65,11 @@ SHARE = (0.0, 1.0)
 _FEW, _SMALL_STRATUM = 5, 0.85
 #: A spread below this share of the values is rounding. Values without spread have no interval.
 ROUNDING = 1e-12
+#: Degrees of freedom this close to a whole number are that number.
+_WHOLE = 1e-9
 
 
-@dataclass(frozen=True)
-class Interval:
+class Interval(NamedTuple):
     """Both ends of an interval."""
 
     low: float
@@ -195,6 +212,47 @@ def estimates(statistics: Sequence[EpisodeStatistic], units: Units) -> list[Esti
     return [_estimate(*one) for one in each]
 
 
+def family_shares(
+    deviations: NDArray[np.float64], there: NDArray[np.bool_], families: NDArray[np.intp], fewest: int = 2
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """What each family adds to the error of a mean over tasks: its square is a part of the variance.
+
+    Args:
+        deviations: from the mean, (..., task).
+        there: which tasks the mean is over, (..., task).
+        families: number of each task's family, (task,).
+        fewest: with fewer families in the mean there is no error.
+
+    Returns:
+        Shares (..., family), 0 where a family has no task in the mean, and the degrees of freedom (...); NaN where
+        there is no error.
+    """
+    member = (families[:, None] == np.arange(families.max(initial=-1) + 1)).astype(np.float64)  # (task, family)
+    sums, size = np.where(there, deviations, 0.0) @ member, there.astype(np.float64) @ member
+    total = size.sum(axis=-1, keepdims=True)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shares = np.where(size > 0, sums / np.sqrt(total * (total - size)), 0.0)
+        # p_gg = n_g / T^2 and p_gh^2 = a_g a_h / T^2, with a_g = n_g^2 / (T (T - n_g)).
+        a = size**2 / (total * (total - size))
+        off_diagonal = a.sum(axis=-1) ** 2 - (a**2).sum(axis=-1)
+        degrees = 1.0 / ((size**2).sum(axis=-1) / total[..., 0] ** 2 + off_diagonal)
+    enough = (size > 0).sum(axis=-1) >= max(fewest, 2)
+    whole = np.round(degrees)
+    degrees = np.where(np.abs(degrees - whole) < _WHOLE, whole, degrees)
+    return np.where(enough[..., None], shares, np.nan), np.where(enough, degrees, np.nan)
+
+
+def family_error(
+    deviations: NDArray[np.float64], there: NDArray[np.bool_], families: NDArray[np.intp], fewest: int = 2
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Variance of a mean over tasks and its degrees of freedom, (...) each; the arguments are those of
+    `family_shares`.
+    """
+    shares, degrees = family_shares(deviations, there, families, fewest)
+    variance: NDArray[np.float64] = (shares**2).sum(axis=-1)
+    return variance, degrees
+
+
 def strata_error(
     squares: NDArray[np.float64], size: NDArray[np.float64], num_tasks: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -268,14 +326,3 @@ def _from_scale(place: float, limits: tuple[float, float]) -> float:
 
 def _exp(value: float) -> float:
     return math.exp(value) if value < 709.0 else math.inf
-
-
-def named_interval(name: str, value: float | None, interval: Interval | None) -> dict[str, float | None]:
-    """Columns `name`, `name_low`, `name_high` of a table row; None without an interval."""
-    low, high = ends(interval)
-    return {name: value, f"{name}_low": low, f"{name}_high": high}
-
-
-def ends(interval: Interval | None) -> tuple[float | None, float | None]:
-    """Both ends of an interval; None twice without one."""
-    return (None, None) if interval is None else (interval.low, interval.high)

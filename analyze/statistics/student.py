@@ -1,6 +1,6 @@
 """Student's t distribution: quantiles and tails. Pure functions.
 
-Degrees of freedom need not be whole: those of few families of tasks (`family_errors`) are not, and 1.9 are far from 1.
+Degrees of freedom need not be whole: those of few families of tasks (`intervals`) are not, and 1.9 are far from 1.
 """
 
 from __future__ import annotations

@@ -12,8 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vla_attention.analyze.statistics.family_errors import family_shares
-from vla_attention.analyze.statistics.intervals import ROUNDING, UNKNOWN, Estimate, strata_error, welch_degrees
+from vla_attention.analyze.statistics.intervals import (
+    ROUNDING,
+    UNKNOWN,
+    Estimate,
+    family_shares,
+    strata_error,
+    welch_degrees,
+)
 from vla_attention.analyze.statistics.units import Estimand, Units
 
 
@@ -36,88 +42,59 @@ class MeanDifference:
     estimand: Estimand
 
 
-def mean_difference(values: ArrayLike, is_first: ArrayLike, units: Units, decide: bool = False) -> MeanDifference:
+def mean_difference(values: ArrayLike, is_first: ArrayLike, units: Units) -> MeanDifference:
     """Compare the episodes for which `is_first` is true with the others.
+
+    The units are families of tasks, tasks, or the episodes of every (class, task). About these tasks, where a class has
+    too few families for other tasks.
 
     Args:
         values: (episode,) one value per episode; values that are not finite are left out.
         is_first: (episode,) bool.
         units: the episodes' tasks and families, and what the interval is about.
-        decide: about these tasks, where a class has too few families for other tasks; else it then has no error.
     """
     sample, chosen = np.asarray(values, dtype=np.float64), np.asarray(is_first, dtype=bool)
     finite = np.isfinite(sample)
-    x = np.where(finite, sample, 0.0)
-    first, second = finite & chosen, finite & ~chosen
-    cells = _TaskCells.of(x, first, units), _TaskCells.of(x, second, units)
-    units = units.decided(first, second) if decide else units
-    known = all(cell.num_tasks for cell in cells)
-    mean_first, mean_second = (cell.mean if cell.num_tasks else None for cell in cells)
-    difference = _difference(cells, units) if known else UNKNOWN
-    return MeanDifference(int(first.sum()), int(second.sum()), mean_first, mean_second, difference, units.estimand)
+    classes = finite & chosen, finite & ~chosen
+    units = units.decided(*classes)
+    member = (units.tasks[:, None] == np.arange(units.num_tasks)).astype(np.float64)  # (episode, task)
+    used, x = np.stack(classes).astype(np.float64), np.where(finite, sample, 0.0)
+    size = used @ member  # (class, task)
+    means = np.divide((used * x) @ member, size, out=np.zeros_like(size), where=size > 0)
+    squares = (used * (x - means[:, units.tasks]) ** 2) @ member
+    numbers = (size > 0).sum(axis=1)
+    both = [float(own.sum() / number) if number else None for own, number in zip(means, numbers, strict=True)]
+    difference = UNKNOWN
+    if None not in both:
+        value = float(means[0].sum() / numbers[0] - means[1].sum() / numbers[1])
+        # One task of several shows nothing about others: no error.
+        if units.estimand.of_other_tasks and (size > 0).any(axis=0).sum() > 1:
+            variance, degrees = _between_clusters(means, size > 0, units)
+        else:
+            squared_error, freedom = strata_error(squares.ravel(), size.ravel(), np.repeat(numbers, size.shape[1]))
+            variance, degrees = float(squared_error), math.floor(freedom) if np.isfinite(freedom) else 0
+        # The variance is not a number with too few clusters, and where a stratum has a single episode.
+        known = variance > (ROUNDING * np.abs(means).max()) ** 2 and degrees >= 1
+        difference = Estimate(value, math.sqrt(variance), degrees) if known else Estimate(value)
+    of_class = used.sum(axis=1).astype(int).tolist()
+    return MeanDifference(of_class[0], of_class[1], both[0], both[1], difference, units.estimand)
 
 
-@dataclass(frozen=True)
-class _TaskCells:
-    """The episodes of one class by task: number, mean and sum of squared deviations, each (task,); 0 where none."""
-
-    size: NDArray[np.float64]
-    means: NDArray[np.float64]
-    squares: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, x: NDArray[np.float64], member: NDArray[np.bool_], units: Units) -> _TaskCells:
-        count, task_of = len(units.clusters), units.tasks
-        size = np.bincount(task_of[member], minlength=count).astype(np.float64)
-        total: NDArray[np.float64] = np.bincount(task_of[member], x[member], minlength=count).astype(np.float64)
-        means = np.divide(total, size, out=np.zeros(count), where=size > 0)
-        deviations = (x[member] - means[task_of[member]]) ** 2
-        return cls(size, means, np.bincount(task_of[member], deviations, minlength=count).astype(np.float64))
-
-    @property
-    def num_tasks(self) -> int:
-        return int((self.size > 0).sum())
-
-    @property
-    def mean(self) -> float:
-        return float(self.means.sum() / self.num_tasks)
-
-
-def _difference(sides: tuple[_TaskCells, _TaskCells], units: Units) -> Estimate:
-    """Difference of the means of two classes.
-
-    The units are families of tasks, tasks, or the episodes of every (class, task). Where there are several tasks, and
-    other tasks are what the interval is about, one task shows nothing about them: no error.
-    """
-    value = sides[0].mean - sides[1].mean
-    several = bool(((sides[0].size > 0) | (sides[1].size > 0)).sum() > 1)
-    if several and units.estimand.of_other_tasks:
-        variance, degrees = _between_clusters(sides, units)
-    else:
-        squares, sizes = (np.concatenate([getattr(side, name) for side in sides]) for name in ("squares", "size"))
-        divisors = np.repeat([float(side.num_tasks) for side in sides], [len(side.size) for side in sides])
-        squared_error, freedom = strata_error(squares, sizes, divisors)
-        variance, degrees = float(squared_error), math.floor(freedom) if np.isfinite(freedom) else 0
-    largest = max(float(np.abs(side.means).max()) for side in sides)
-    # The variance is not a number with too few clusters, and where a stratum has a single episode.
-    if not variance > (ROUNDING * largest) ** 2 or degrees < 1:
-        return Estimate(value)
-    return Estimate(value, math.sqrt(variance), degrees)
-
-
-def _between_clusters(sides: tuple[_TaskCells, _TaskCells], units: Units) -> tuple[float, float]:
+def _between_clusters(means: NDArray[np.float64], there: NDArray[np.bool_], units: Units) -> tuple[float, float]:
     """Variance of the difference and its degrees of freedom, with families of tasks, or tasks, as the units.
 
     This is the bias-reduced linearisation of the regression on both classes: its residuals are those of the means.
+
+    Args:
+        means: (class, task).
+        there: which tasks each class has, (class, task).
+        units: the tasks' families.
     """
-    clusters = units.clusters
-    parts = [family_shares(side.means - side.mean, side.size > 0, clusters, units.fewest_clusters) for side in sides]
-    (first, first_degrees), (second, second_degrees) = parts
+    deviations = means - means.sum(axis=1, keepdims=True) / there.sum(axis=1, keepdims=True)
+    shares, degrees = family_shares(deviations, there, units.clusters, units.fewest_clusters)
     # A cluster in both classes moves both means: its deviations are subtracted before they are squared.
-    variance = float(((first - second) ** 2).sum())
-    shared = set(clusters[sides[0].size > 0]) & set(clusters[sides[1].size > 0])
-    if shared or not math.isfinite(variance):
-        return variance, float(np.minimum(first_degrees, second_degrees))
-    of_side = np.array([(share**2).sum() for share in (first, second)])
-    degrees = float(welch_degrees(of_side, np.array([first_degrees, second_degrees])))
-    return variance, degrees if units.families is not None else float(np.floor(degrees))
+    variance = float(((shares[0] - shares[1]) ** 2).sum())
+    if set(units.clusters[there[0]]) & set(units.clusters[there[1]]) or not math.isfinite(variance):
+        return variance, float(degrees.min())
+    welch = float(welch_degrees((shares**2).sum(axis=1), degrees))
+    return variance, welch if units.families is not None else float(np.floor(welch))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
+import polars as pl
 from numpy.typing import ArrayLike, NDArray
 
 #: Tasks of fewer families show nothing about tasks like these: an interval with two degrees of freedom is as long as
@@ -75,10 +78,6 @@ class Units:
         known = families is not None and bool((families >= 0).any())
         return replace(self, tasks=numbers, families=families if known else None)
 
-    def repeated(self, times: int) -> Units:
-        """The units of the same episodes several times, one after the other."""
-        return replace(self, tasks=np.tile(self.tasks, times))
-
     @property
     def num_tasks(self) -> int:
         """Number of tasks of these episodes."""
@@ -97,11 +96,13 @@ class Units:
         parts = [self.part(chosen) for chosen in classes] or [self]
         if all(part.has_enough_families for part in parts):
             return self
-        return self.about_these_tasks()
-
-    def about_these_tasks(self) -> Units:
-        """The same episodes, with an interval about their own tasks."""
         return replace(self, estimand=Estimand.THESE_TASKS, families=None)
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """Columns of a row: of how many families its tasks are (None: none known), and what its intervals are about."""
+        estimand = self.decided().estimand if self.num_tasks > 1 else Estimand.THESE_TASKS
+        return {"num_families": self.num_families, "intervals": estimand.value}
 
     @property
     def words(self) -> str:
@@ -123,3 +124,25 @@ class Units:
     def fewest_clusters(self) -> int:
         """With fewer of them there is no interval about other tasks."""
         return 2 if self.families is None else FEWEST_FAMILIES
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """What intervals over several tasks are about, and which tasks are related.
+
+    Attributes:
+        estimand: what was asked for.
+        families: by suite and number those of the tasks that have a known one; tasks of one family may be of different
+            suites.
+    """
+
+    estimand: Estimand = Estimand.TASKS_LIKE_THESE
+    families: Mapping[tuple[str, int], str] = field(default_factory=dict)
+
+    def units(self, table: pl.DataFrame) -> Units:
+        """The units of the rows of a table with `suite` and `task_id`, not decided (`Units.decided`)."""
+        # Task ids repeat between suites, so a task is a pair of both.
+        numbers = table.select(pl.struct("suite", "task_id").rank("dense")).to_series().to_numpy()
+        names = table.select("suite", "task_id").unique().sort("suite", "task_id").rows()
+        units = Units.of(np.arange(len(names)), self.estimand, [self.families.get(name, "") for name in names])
+        return units.of_tasks(numbers.astype(np.intp) - 1)

@@ -12,20 +12,55 @@ from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import EpisodeAttributes
 
-Episodes = Iterable[tuple[Store, StoredEpisode]]
+
+class RunNotes:
+    """Collects, of episodes one after the other, what is said of runs that were changed or told something else."""
+
+    def __init__(self) -> None:
+        self._stores: dict[str, Store] = {}
+        self._told: dict[str, list[str]] = {}
+        self._lost: dict[str, list[str]] = {}
+
+    def add(self, store: Store, attributes: EpisodeAttributes) -> None:
+        """Look at an episode."""
+        self._stores[str(store.path)] = store
+        given, instruction = told_instruction(store, attributes), attributes.instruction
+        if not same_words(given, instruction):
+            said = f"'{visible(given)}' where the task is '{visible(instruction)}'"
+            self._told.setdefault(store.path.name, []).append(said)
+        if end := _never_read(attributes.prompts):
+            self._lost.setdefault(store.path.name, []).append(end)
+
+    @property
+    def of_prompts(self) -> tuple[str, ...]:
+        """A line on each store whose policy was told another sentence than its task's, and where prompts were cut."""
+        others = [
+            f"The prompt is not the task's instruction in {plural(len(pairs), 'episode')} of {name}: the policy was "
+            f"told {listing(dict.fromkeys(pairs), 2)}."
+            for name, pairs in self._told.items()
+        ]
+        cut = [
+            f"Prompts were cut in {name}: in {plural(len(ends), 'episode')} the policy never read the end of its "
+            f"prompt ({listing([f'{end!r}' for end in dict.fromkeys(ends)], 3)})."
+            for name, ends in self._lost.items()
+        ]
+        return (*others, *cut)
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """A line on each store whose run was changed, and `of_prompts`; empty without any."""
+        # Of a run that differs in its prompt alone, the lines on prompts say more.
+        told, every = self.of_prompts, self._stores.values()
+        more = [store for store in every if not replace(store.attributes.interventions, prompt=None).is_none]
+        return (*change_notes(more if told else every), *told)
 
 
-def run_notes(episodes: Episodes) -> tuple[str, ...]:
-    """A line on each store whose run was changed, and what `prompt_notes` says of it; empty without any."""
-    episodes = list(episodes)
-    told = prompt_notes(episodes)
-    # Of a run that differs in its prompt alone, these lines say more.
-    stores = {
-        str(store.path): store
-        for store, _ in episodes
-        if not told or not replace(store.attributes.interventions, prompt=None).is_none
-    }
-    return (*change_notes(stores.values()), *told)
+def prompt_notes(episodes: Iterable[tuple[Store, StoredEpisode]]) -> tuple[str, ...]:
+    """`RunNotes.of_prompts` of episodes."""
+    notes = RunNotes()
+    for store, episode in episodes:
+        notes.add(store, episode.attributes)
+    return notes.of_prompts
 
 
 def change_notes(stores: Iterable[Store]) -> tuple[str, ...]:
@@ -35,31 +70,6 @@ def change_notes(stores: Iterable[Store]) -> tuple[str, ...]:
         for store in stores
         if not store.attributes.interventions.is_none
     )
-
-
-def prompt_notes(episodes: Episodes) -> tuple[str, ...]:
-    """A line on each store whose policy was told another sentence than its task's, and where prompts were cut."""
-    told: dict[str, list[str]] = {}
-    lost: dict[str, list[str]] = {}
-    for store, episode in episodes:
-        given, instruction = told_instruction(store, episode.attributes), episode.attributes.instruction
-        if not same_words(given, instruction):
-            told.setdefault(store.path.name, []).append(
-                f"'{visible(given)}' where the task is '{visible(instruction)}'"
-            )
-        if end := _never_read(episode.attributes.prompts):
-            lost.setdefault(store.path.name, []).append(end)
-    others = [
-        f"The prompt is not the task's instruction in {plural(len(pairs), 'episode')} of {name}: the policy was told "
-        f"{listing(dict.fromkeys(pairs), 2)}."
-        for name, pairs in told.items()
-    ]
-    cut = [
-        f"Prompts were cut in {name}: in {plural(len(ends), 'episode')} the policy never read the end of its prompt "
-        f"({listing([f'{end!r}' for end in dict.fromkeys(ends)], 3)})."
-        for name, ends in lost.items()
-    ]
-    return (*others, *cut)
 
 
 def told_instruction(store: Store, attributes: EpisodeAttributes) -> str:

@@ -32,9 +32,10 @@ class Selection:
     per_head: bool
     note: str | None = None
 
-    def is_first_of_block(self, layer: int) -> bool:
-        """Whether the layer at this position is the first that names its block. Sums and means count a block once."""
-        return self.blocks.index(self.blocks[layer]) == layer
+    @property
+    def once(self) -> tuple[int, ...]:
+        """Positions of the layers, without those that name a block again: sums and means count a block once."""
+        return tuple(i for i, block in enumerate(self.blocks) if self.blocks.index(block) == i)
 
 
 def select(

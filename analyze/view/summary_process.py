@@ -17,9 +17,9 @@ from typing import Any
 
 import polars as pl
 
+from vla_attention.analyze.core.about import sides
 from vla_attention.analyze.core.action_changes import units_of_recorded
 from vla_attention.analyze.core.levels import levels_of
-from vla_attention.analyze.core.words_of_numbers import sides
 from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings

@@ -23,7 +23,6 @@ from vla_attention.analyze.core.action_changes import (
     root_mean_square_change,
     with_noise,
 )
-from vla_attention.analyze.measures.alignment import replan_starts
 from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
 from vla_attention.capture.interventions.changed_inputs import changed_inputs
 from vla_attention.capture.interventions.resolution import TooFewKeys, interventions_for
@@ -114,12 +113,7 @@ def changed_episodes(
             _write(path, digest, actions)
             say(f"{folder}: {number} of {len(store.episodes)} episodes, {time.monotonic() - begun:.0f} s")
         attributes = episode.attributes
-        starts = replan_starts(
-            episode.read("env_step").astype(np.int64),
-            store.attributes.protocol.wait_steps,
-            attributes.num_steps,
-            episode.name,
-        )
+        starts = episode.read("env_step").astype(np.int64) - store.attributes.protocol.wait_steps
         base = episode.read("actions").astype(np.float64)
         executed = np.minimum(np.diff(np.append(starts, attributes.num_steps)), base.shape[1])
         found.append(

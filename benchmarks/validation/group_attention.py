@@ -71,7 +71,7 @@ def group_attention(
     unless given.
 
     A group is read at the question's site, or where it has no keys there and the user chose no site, at the next one
-    that has. `lift` is that of `masses.group_measures`, `norm` that of the group's contribution where the group is
+    that has. `lift` is that of `core.measure.means`, `norm` that of the group's contribution where the group is
     made of whole segments and contributions were recorded.
     """
     names = [site.name for site in question.stores[0].attributes.sites]
@@ -170,7 +170,7 @@ def _of_group(
 ) -> Array:
     """`MEASURES` of one group (replan, measure). Masses are averaged over layers, denoise steps and heads first."""
     selection, place = measured.selection, group.place
-    layers = [i for i in _places(selection.blocks, place.layers) if selection.is_first_of_block(i)]
+    layers = [i for i in _places(selection.blocks, place.layers) if i in selection.once]
     denoise = _places(selection.denoise_steps, place.denoise_steps)
     # Heads are apart only where a group asks for some of them.
     apart = selection.per_head
@@ -208,7 +208,7 @@ def _norm(
     None where the intervention was at some heads only, or at nothing that is selected.
     """
     selection, place = measured.selection, group.place
-    layers = [i for i in _places(selection.blocks, place.layers) if selection.is_first_of_block(i)]
+    layers = [i for i in _places(selection.blocks, place.layers) if i in selection.once]
     denoise = _places(selection.denoise_steps, place.denoise_steps)
     if place.heads is not None or not (layers and denoise):
         return None

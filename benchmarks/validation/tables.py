@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.statistics.episode_intervals import Sampling, means_with_intervals
-from vla_attention.analyze.statistics.intervals import NO_LIMITS
+from vla_attention.analyze.core.estimate import estimate
+from vla_attention.analyze.statistics.units import Sampling
 
 #: Scale on which a number is averaged and compared, and the way back.
 SCALES = {"log": (np.log, np.exp), "plain": (lambda x: x, lambda x: x)}
@@ -28,7 +28,7 @@ def means(table: pl.DataFrame, by: Sequence[str], value: str = "value", scale: s
     chosen = table.with_columns(pl.Series(value, transformed)).filter(pl.Series(there))
     if not chosen.height:
         return []
-    found = means_with_intervals(chosen, by, {value: NO_LIMITS}, Sampling())
+    found = estimate(chosen, by, {value: "plain"}, Sampling())
     rows = []
     for row in found.iter_rows(named=True):
         numbers = {

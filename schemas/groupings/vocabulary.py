@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -61,7 +61,7 @@ class EpisodeTokens:
 
     layout: SiteLayout
     key_role: NDArray[np.uint8]
-    prompts: tuple[Prompt, ...] = ()
+    prompts: Sequence[Prompt] = ()
     prompt_index: NDArray[np.integer] | None = None
     objects: tuple[SceneObject, ...] = ()
     coverage: Mapping[str, NDArray[np.float32]] | None = None

@@ -24,7 +24,7 @@ from tests.kit.strategies import episode_tokens
 from tests.kit.tokens import OBJECTS, small_prompt, tokens_of
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.objects import objects
-from vla_attention.analyze.measures.patch_maps import PictureMap
+from vla_attention.analyze.core.camera_maps import PictureMap
 from vla_attention.capture.effects.arguments import EffectSettings
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_picture, patch_pixels
 from vla_attention.capture.torch_policies.policy_layout import RecordedSite

@@ -15,7 +15,7 @@ from vla_attention.analyze.core.levels import SIDES, Levels, task_cells, task_gr
 from vla_attention.analyze.core.measure import Measured
 from vla_attention.analyze.measures.frames import EPISODE_ID, EPISODE_KEYS
 from vla_attention.analyze.published.results_writer import documents_of, write_results
-from vla_attention.analyze.statistics.episode_intervals import Sampling
+from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.groupings.grouping import Grouping, Ratio
 from vla_attention.schemas.results import FrameProxy, results_file_name
@@ -213,7 +213,7 @@ def write_results_of_suites(
     for suite in dict.fromkeys(one.item.store.suite for one in made.measured):
         paths.append(folder / results_file_name(suite))
         of_suite = [one for one in made.measured if one.item.store.suite == suite]
-        write_results(paths[-1], documents_of(of_suite, grouping, denoise_steps, proxy))
+        write_results(paths[-1], documents_of(of_suite, range(len(of_suite)), grouping, denoise_steps, proxy))
     return paths
 
 
@@ -253,7 +253,8 @@ def _measured(part: pl.DataFrame, grouping: Grouping) -> Measured:
     episode = SimpleNamespace(
         attributes=SimpleNamespace(**{name: first[name] for name in EPISODE_KEYS}), read=lambda name: arrays[name]
     )
-    item: Any = SimpleNamespace(store=SimpleNamespace(suite=first["suite"]), episode=episode)
+    key = tuple(first[name] for name in EPISODE_ID)
+    item: Any = SimpleNamespace(store=SimpleNamespace(suite=first["suite"]), episode=episode, key=key)
 
     def of(names: Sequence[str], table: pl.DataFrame = part) -> Any:
         return table.select(pl.col(names).cast(pl.Float64)).to_numpy()

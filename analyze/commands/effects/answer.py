@@ -21,14 +21,12 @@ from vla_attention.analyze.commands.effects.items import (
     figures_of_items,
     with_untested,
 )
-from vla_attention.analyze.core.about import about, enough, notes
-from vla_attention.analyze.core.action_changes import ActionSpread
+from vla_attention.analyze.core.about import about, enough, notes, with_interval
+from vla_attention.analyze.core.action_changes import GRIPPER, ActionSpread
 from vla_attention.analyze.core.axes import check_axes, columns_of
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.recorded_effects import PICTURES, TEXT, RecordedEffects, recorded_effects, summary_of
 from vla_attention.analyze.core.result import Figure, Finding, Result, Table
-from vla_attention.analyze.core.words_of_numbers import with_interval
-from vla_attention.analyze.measures.alignment import GRIPPER
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
 from vla_attention.schemas.errors import BadArgument, listing, plural

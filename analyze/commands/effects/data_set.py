@@ -13,16 +13,14 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.analyze.core.about import enough
+from vla_attention.analyze.core.about import enough, with_interval
 from vla_attention.analyze.core.action_changes import ActionSpread, action_spread
-from vla_attention.analyze.core.estimate import Scale, estimate, with_q
+from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.core.result import Column, Figure, Finding, Table
-from vla_attention.analyze.core.words_of_numbers import with_interval
 from vla_attention.analyze.measures.frames import EPISODE_ID, LAYERS_AVG, long_table, replan_axis
 from vla_attention.analyze.measures.masses import finite_mean
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.statistics.episode_intervals import means_with_intervals
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
@@ -156,11 +154,9 @@ def _correlations(question: Question, rows: pl.DataFrame) -> pl.DataFrame:
             found.append((*key, measure, rank_correlation(*pair)))
     names = joined.select(*EPISODE_ID, "quantity", "of").schema
     schema: Any = {**names, "measure": pl.String, "correlation": pl.Float64}
-    table = means_with_intervals(
-        pl.DataFrame(found, schema=schema, orient="row"), ["quantity", "of", "measure"], {"correlation": (-1.0, 1.0)},
-        question.sampling, nulls={"correlation": 0.0},
-    )  # fmt: skip
-    return with_q(table.drop("correlation_episodes"), "correlation")
+    table = pl.DataFrame(found, schema=schema, orient="row")
+    by = ["quantity", "of", "measure"]
+    return estimate(table, by, {"correlation": "correlation"}, question.sampling, {"correlation": 0.0})
 
 
 def _finding(

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import polars as pl
 
+from vla_attention.analyze.core.about import with_interval
 from vla_attention.analyze.core.estimate import Scale, estimate
 from vla_attention.analyze.core.result import Column, Figure, Finding
-from vla_attention.analyze.core.words_of_numbers import with_interval
 from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.statistics.many_looks import NAMED_AT

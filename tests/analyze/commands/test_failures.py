@@ -18,9 +18,9 @@ from tests.kit.stores import StoreSpec, rerun_source, small_steps, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.commands.failures import failures
 from vla_attention.analyze.core.behaviour import NO_TOUCH, OTHER_GOAL, OTHER_TOUCH, TOLD_SO, UNFINISHED
-from vla_attention.analyze.core.patch_pictures import upright
+from vla_attention.analyze.core.camera_maps import upright
+from vla_attention.analyze.core.courses import FEWEST, TOGETHER, band, by_replan, distance, leaves_at, path_of
 from vla_attention.analyze.render.figures import draw
-from vla_attention.analyze.statistics.leaving import TOGETHER, band, by_replan, distance, leaves_at, path_of
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.reader import open_store
 
@@ -185,8 +185,9 @@ def test_pace_and_place_do_not_count(shift, seed):
 @given(st.lists(st.floats(0, 1), min_size=1, max_size=20), st.floats(0.01, 0.9))
 def test_from_there_on_it_is_outside(values, height):
     found, within = np.array(values), np.full(len(values), height)
-    at = leaves_at(found, within, fewest=1)
-    assert values[-1] <= height if at is None else (found[at:] > height).all() and (at == 0 or values[at - 1] <= height)
+    at, outside = leaves_at(found, within), [value > height for value in values][::-1]
+    last = outside.index(False) if False in outside else len(outside)
+    assert at == (len(values) - last if last >= min(FEWEST, len(values)) else None)
 
 
 def test_the_last_replans_alone_are_no_leaving():

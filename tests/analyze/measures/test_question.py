@@ -13,8 +13,8 @@ from tests.kit.questions import question_about
 from tests.kit.stores import write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.analyze import analyze
-from vla_attention.schemas.stores.reader import Store, open_store
-from vla_attention.schemas.stores.store_format import StoreError
+from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
+from vla_attention.schemas.stores.store_format import EpisodeAttributes, StoreError
 
 
 def damage_rows(store: Path, episode: str) -> None:
@@ -25,11 +25,17 @@ def damage_rows(store: Path, episode: str) -> None:
     file.write_bytes(bytes(content))
 
 
+class Empty(StoredEpisode):
+    @property
+    def attributes(self) -> EpisodeAttributes:
+        return replace(StoredEpisode.attributes.func(self), num_replans=0)
+
+
 def without_replans(store: Store, position: int) -> Store:
     """The opened store, one of whose episodes says that it holds no replan. The writer makes no such episode."""
-    episode = store.episodes[position]
-    episode.__dict__["attributes"] = replace(episode.attributes, num_replans=0)
-    return store
+    given = store.episodes[position]
+    empty = Empty(given.folder, given.name, given.run, given.version)
+    return replace(store, episodes=(*store.episodes[:position], empty, *store.episodes[position + 1 :]))
 
 
 def test_a_damaged_episode_ends_the_analysis_with_its_name_and_a_way_out(tmp_path, capsys):

@@ -18,7 +18,6 @@ from tests.kit.stores import StoreSpec, every_key_seen, write_store
 from tests.kit.strategies import episode_tokens, groupings
 from tests.kit.tokens import small_layout
 from vla_attention.analyze.core.levels import levels_of
-from vla_attention.analyze.measures.sink_kinds import may_be_empty
 from vla_attention.analyze.measures.sinks import (
     SinkRule,
     describe_sinks,
@@ -112,23 +111,6 @@ def test_keys_of_the_policys_own_actions_are_no_sinks():
     # So they stay where everything is computed without sinks.
     without = without_sinks(question, search.sinks, SinkRule())
     assert not {key for item in without.selected for key in item.without} & set(actions["key"])
-
-
-@pytest.mark.parametrize(
-    ("role", "values", "empty"),
-    [
-        ("bos", None, True),
-        ("template", None, True),
-        ("instruction", None, False),
-        ("image", None, False),
-        ("state", None, False),
-        ("bos", 1.2, False),
-        ("bos", 0.1, True),
-        ("instruction", 0.1, True),
-    ],
-)
-def test_only_keys_without_content_or_with_small_values_may_be_empty(role, values, empty):
-    assert may_be_empty(role, values) == empty
 
 
 def test_a_block_that_is_named_twice_does_not_count_twice(tmp_path):

@@ -36,7 +36,8 @@ def replans_of(steps, grouping=GROUPING):
 
 
 def documents_of(replans, grouping) -> list[dict]:
-    return list(results_writer.documents_of(replans.measured, grouping, DENOISE_STEPS))
+    positions = range(len(replans.measured))
+    return list(results_writer.documents_of(replans.measured, positions, grouping, DENOISE_STEPS))
 
 
 def write(path, documents) -> None:

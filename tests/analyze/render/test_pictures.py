@@ -6,7 +6,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from vla_attention.analyze.core.patch_pictures import upright
+from vla_attention.analyze.core.camera_maps import upright
 from vla_attention.analyze.core.result import Figure
 from vla_attention.analyze.render.figures import draw
 from vla_attention.analyze.render.pictures import lit, strength

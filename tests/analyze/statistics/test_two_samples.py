@@ -20,7 +20,7 @@ def both(first, second):
 @pytest.mark.parametrize("estimand", Estimand)
 def test_the_difference_in_one_task_agrees_with_scipy(estimand):
     values, is_first = both(FIRST, SECOND)
-    found = mean_difference(values, is_first, Units.of(np.zeros(len(values)), estimand), decide=True)
+    found = mean_difference(values, is_first, Units.of(np.zeros(len(values)), estimand))
     assert (found.num_first, found.num_second) == (12, 9)
     assert found.difference.value == pytest.approx(FIRST.mean() - SECOND.mean())
     welch = stats.ttest_ind(FIRST, SECOND, equal_var=False)
@@ -35,7 +35,7 @@ def test_over_common_tasks_it_is_the_paired_t_test_over_task_means():
     is_first = np.tile([True, True, True, True, False, False], 8)
     values = generator.normal(0, 2.0, 8)[tasks] + 0.3 * is_first + generator.normal(0, 0.4, 48)
     gaps = [values[(tasks == t) & is_first].mean() - values[(tasks == t) & ~is_first].mean() for t in range(8)]
-    estimate = mean_difference(values, is_first, Units.of(tasks), decide=True).difference
+    estimate = mean_difference(values, is_first, Units.of(tasks)).difference
     assert estimate.p_value(0.0) == pytest.approx(stats.ttest_1samp(gaps, 0.0).pvalue)
     interval = estimate.interval()
     expected = stats.t.interval(0.95, 7, np.mean(gaps), stats.sem(gaps))
@@ -47,7 +47,7 @@ def test_of_different_tasks_it_is_the_t_test_between_their_means():
     tasks = np.repeat(np.arange(12), 4)
     values = generator.normal(0, 1.0, 12)[tasks] + generator.normal(0, 0.4, 48)
     means = np.array([values[tasks == task].mean() for task in range(12)])
-    found = mean_difference(values, tasks < 5, Units.of(tasks), decide=True)
+    found = mean_difference(values, tasks < 5, Units.of(tasks))
     welch = stats.ttest_ind(means[:5], means[5:], equal_var=False)
     assert found.difference.value == pytest.approx(means[:5].mean() - means[5:].mean())
     assert found.difference.error == pytest.approx(found.difference.value / welch.statistic)
@@ -75,7 +75,7 @@ def test_two_beside_twenty_seldom_exclude_zero():
 
 @pytest.mark.parametrize("size", [0, 1, 5, 6])
 def test_a_class_of_none_has_no_difference_and_one_of_one_no_interval(size):
-    found = mean_difference(np.arange(6.0), np.arange(6) < size, Units.of(np.zeros(6)), decide=True)
+    found = mean_difference(np.arange(6.0), np.arange(6) < size, Units.of(np.zeros(6)))
     assert (found.difference.value is None) == (size in (0, 6))
     assert found.difference.interval() is None
     assert found.mean_first == (None if size == 0 else pytest.approx(np.arange(size).mean()))

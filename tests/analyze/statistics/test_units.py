@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from vla_attention.analyze.statistics.episode_intervals import Sampling, about_row, means_with_intervals
-from vla_attention.analyze.statistics.intervals import POSITIVE
-from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Estimand, Units
+from vla_attention.analyze.core.estimate import estimate
+from vla_attention.analyze.statistics.units import FEWEST_FAMILIES, Estimand, Sampling, Units
 
 LIKE, THESE = Estimand.TASKS_LIKE_THESE, Estimand.THESE_TASKS
 TASKS = [7, 7, 3, 5, 9, 9]
@@ -65,14 +64,14 @@ def test_a_row_says_of_how_many_families_it_is_and_what_its_intervals_are_about(
         | {("a", task, "somewhere"): [1.0, 2.0 + task] for task in (0, 4, 1)}
         | {("a", 3, "once"): [1.0, 2.0], ("b", 0, "elsewhere"): [1.0], ("c", 1, "elsewhere"): [2.0]}
     )
-    found = means_with_intervals(given, ["thing"], {"value": POSITIVE}, Sampling(LIKE, families))
+    found = estimate(given, ["thing"], {"value": "positive"}, Sampling(LIKE, families))
     assert found.select("thing", "num_tasks", "num_families", "intervals").rows() == [
         ("everywhere", 8, 4, "tasks-like-these"),
         ("somewhere", 3, 2, "these-tasks"),
         ("once", 1, 1, "these-tasks"),
         ("elsewhere", 2, 2, "these-tasks"),
     ]
-    these = means_with_intervals(given, ["thing"], {"value": POSITIVE}, Sampling(THESE))
+    these = estimate(given, ["thing"], {"value": "positive"}, Sampling(THESE))
     assert found.filter(thing="somewhere")["value_low"].item() == these.filter(thing="somewhere")["value_low"].item()
 
 
@@ -82,4 +81,4 @@ def test_families_are_those_of_suites_together():
         pl.DataFrame({"suite": ["a", "b", "b"], "task_id": [0, 0, 1]})
     )
     assert (units.num_tasks, units.num_families) == (3, 2)
-    assert about_row(units) == {"num_families": 2, "intervals": "these-tasks"}
+    assert units.about == {"num_families": 2, "intervals": "these-tasks"}

@@ -22,9 +22,8 @@ from numpy.typing import NDArray
 from tests.analyze.view.grouping_episodes import NUM_EPISODES, made_up_episode
 from vla_attention.analyze.core.levels import MORE, items_of, replan_cells
 from vla_attention.analyze.core.measure import Measured, means
-from vla_attention.analyze.measures.baselines import uniform_masses
 from vla_attention.analyze.measures.frames import EPISODE_KEYS, float_values
-from vla_attention.analyze.measures.masses import masses
+from vla_attention.analyze.measures.masses import masses, uniform_masses
 from vla_attention.analyze.measures.selected import SelectedEpisode, resolve_all
 from vla_attention.analyze.stores.selection import Selection
 from vla_attention.schemas.errors import UserError

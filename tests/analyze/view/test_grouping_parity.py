@@ -15,7 +15,7 @@ from tests.analyze.view.grouping_cases import grouping_cases
 from tests.analyze.view.viewer_in_node import needs_node, run_in_node
 from tests.end_to_end.test_cameras_of_several_spans import KINDS, spans_of
 from tests.kit.tokens import small_prompt, tokens_of
-from vla_attention.analyze.measures.patch_maps import PictureMap
+from vla_attention.analyze.core.camera_maps import PictureMap
 from vla_attention.schemas.groupings.grouping import Grouping
 from vla_attention.schemas.groupings.resolve import resolve
 from vla_attention.schemas.jsonable import to_json

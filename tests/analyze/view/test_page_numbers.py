@@ -21,8 +21,15 @@ from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answe
 from tests.end_to_end.test_cameras_of_several_spans import write_spans_store
 from tests.kit.golden_stores import FOLDER
 from tests.kit.http_ranges import serve
-from vla_attention.analyze.core.camera_maps import camera_names, episode_maps, scale_end, stored_picture
-from vla_attention.analyze.core.patch_pictures import NO_PICTURE, enlarge, upright
+from vla_attention.analyze.core.camera_maps import (
+    NO_PICTURE,
+    camera_names,
+    enlarge,
+    episode_maps,
+    scale_end,
+    stored_picture,
+    upright,
+)
 from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.question_settings import settings_from_keywords
 from vla_attention.analyze.stores.rows import layer_rows

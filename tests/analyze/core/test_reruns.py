@@ -12,7 +12,7 @@ import pytest
 
 from tests.kit.reruns import BASE, PLANTED, base_actions, changed_actions, knockout, write_with
 from tests.kit.stores import rerun_source, write_store
-from vla_attention.analyze.core.same_calls import check_same_calls
+from vla_attention.analyze.core.reruns import check_same_calls
 from vla_attention.schemas.interventions import ImageChange, Interventions, NoiseChange, PromptChange
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import StoreError

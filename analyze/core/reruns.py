@@ -1,4 +1,4 @@
-"""Whether a rerun and its base are of the same policy calls: what each was given, but for what the condition changes.
+"""Reruns beside their base: whether they are of the same policy calls, and how far the actions moved.
 
 A base that was recorded again with the same settings has the digest of the one that was rerun. So the digest of the run
 is not enough: everything that both stores hold of a call is compared before two replans are a pair.
@@ -7,11 +7,27 @@ is not enough: everything that both stores hold of a call is compared before two
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.core.action_changes import (
+    CHANGES,
+    BaseEpisode,
+    action_spread,
+    actions_of,
+    changes_noise_alone,
+    changes_of,
+    noise_of,
+    with_noise,
+)
+from vla_attention.analyze.core.estimate import Scale, estimate
+from vla_attention.analyze.core.runs import Run
+from vla_attention.analyze.measures.frames import EPISODE_ID
+from vla_attention.analyze.measures.masses import finite_mean
+from vla_attention.analyze.statistics.units import Sampling
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.episode_shapes import misfits
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
@@ -20,30 +36,22 @@ from vla_attention.schemas.stores.store_format import CorruptEpisode, StoreError
 #: (replan,) in which replans something differs.
 _Differs = NDArray[np.bool_]
 _PICTURES = ("frames", "camera_frames")
+_SCALES: dict[str, Scale] = {
+    "effect": "positive", "effect_chunk": "positive", "angle": "positive", "gripper_flips": "share",
+    "noise": "positive", "minus_noise": "plain",
+}  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Changed:
-    """What a condition changes in the inputs of its base: this may differ, and nothing else.
+def _changed(base: Store, rerun: Store) -> set[str]:
+    """The inputs that the rerun changes beyond its base, by name: these may differ, and nothing else.
 
     What the base's own run had changed is in what its calls were given; a rerun of it has the same.
     """
-
-    prompt: bool
-    noise: bool
-    cameras: frozenset[str]
-
-    @classmethod
-    def between(cls, base: Store, rerun: Store) -> Changed:
-        """What the rerun changes beyond its base."""
-        mine, theirs = base.attributes.interventions, rerun.attributes.interventions
-        cameras = frozenset(change.camera for change in theirs.images if change not in mine.images)
-        return cls(theirs.prompt != mine.prompt, theirs.noise != mine.noise, cameras)
-
-    def is_free(self, name: str) -> bool:
-        """Whether an array or a list of numbers of that name may differ."""
-        group, _, camera = name.partition("/")
-        return (name == "noise_seed" and self.noise) or (group in _PICTURES and camera in self.cameras)
+    mine, theirs = base.attributes.interventions, rerun.attributes.interventions
+    names = {f"{group}/{change.camera}" for change in theirs.images if change not in mine.images for group in _PICTURES}
+    if theirs.prompt != mine.prompt:
+        names.add("prompt")
+    return names | {"noise_seed"} if theirs.noise != mine.noise else names
 
 
 def check_same_calls(base: Store, episode: StoredEpisode, rerun: Store, own: StoredEpisode) -> None:
@@ -75,7 +83,7 @@ def check_same_calls(base: Store, episode: StoredEpisode, rerun: Store, own: Sto
             f"{base.path} of '{mine.task_name}' ('{visible(mine.instruction)}'): these are not the same episodes; make "
             "the rerun again."
         )
-    differing = dict(_differing_inputs(episode, own, Changed.between(base, rerun)))
+    differing = dict(_differing_inputs(episode, own, _changed(base, rerun)))
     if differing:
         replan = min(int(np.argmax(differs)) for differs in differing.values())
         what = [name for name, differs in differing.items() if differs[replan]]
@@ -94,16 +102,13 @@ def check_same_calls(base: Store, episode: StoredEpisode, rerun: Store, own: Sto
 def held_by_one(bases: Sequence[Store], reruns: Sequence[Store]) -> list[str]:
     """The inputs that only one of a run and its rerun holds, and which are therefore not compared."""
     known = {(store.suite, episode.name): (store, episode) for store in bases for episode in store.episodes}
-    pairs = [(known.get((store.suite, one.name)), (store, one)) for store in reruns for one in store.episodes]
-    found = [name for base, own in pairs if base is not None for name in _held_by_one(*base, *own)]
+    found = []
+    for store in reruns:
+        for own in store.episodes:
+            base, episode = known.get((store.suite, own.name), (None, own))
+            for name in sorted({*_inputs(episode), *_inputs(own)} - _changed(base, store)) if base else ():
+                found += [_called(name, "s")] if episode.has(name) != own.has(name) else []
     return list(dict.fromkeys(found))
-
-
-def _held_by_one(base: Store, episode: StoredEpisode, rerun: Store, own: StoredEpisode) -> list[str]:
-    free, names = Changed.between(base, rerun), {*_inputs(episode), *_inputs(own)}
-    return [
-        _called(name, "s") for name in sorted(names) if episode.has(name) != own.has(name) and not free.is_free(name)
-    ]
 
 
 def _inputs(episode: StoredEpisode) -> list[str]:
@@ -112,20 +117,20 @@ def _inputs(episode: StoredEpisode) -> list[str]:
     return [name for name in ("noise_seed", "state") if episode.has(name)] + pictures
 
 
-def _differing_inputs(base: StoredEpisode, own: StoredEpisode, free: Changed) -> Iterator[tuple[str, _Differs]]:
+def _differing_inputs(base: StoredEpisode, own: StoredEpisode, free: set[str]) -> Iterator[tuple[str, _Differs]]:
     """What of the calls' inputs differs although nothing changed it, and in which replans."""
     mine, theirs = base.attributes, own.attributes
     known: dict[str, tuple[Sequence[object], Sequence[object]]] = {"environment step": (mine.env_step, theirs.env_step)}
-    if mine.noise_seed and theirs.noise_seed and not free.noise:
+    if mine.noise_seed and theirs.noise_seed and "noise_seed" not in free:
         known["noise seed"] = (mine.noise_seed, theirs.noise_seed)
-    if not free.prompt:
+    if "prompt" not in free:
         known["prompt"] = (_prompts(base), _prompts(own))
     for name, (first, other) in known.items():
         differs = np.array([one != two for one, two in zip(first, other, strict=True)], dtype=bool)
         if differs.any():
             yield f"another {name}", differs
     for name in _inputs(base):
-        if name == "noise_seed" or not own.has(name) or free.is_free(name):
+        if name == "noise_seed" or not own.has(name) or name in free:
             continue
         of_array = _array_differs(base, name, own, name)
         if of_array is not None:
@@ -134,8 +139,8 @@ def _differing_inputs(base: StoredEpisode, own: StoredEpisode, free: Changed) ->
 
 def _prompts(episode: StoredEpisode) -> list[str]:
     """The text of each replan's prompt."""
-    attributes = episode.attributes
-    return [attributes.prompts[index].text for index in attributes.prompt_index]
+    texts = [prompt.text for prompt in episode.attributes.prompts]
+    return [texts[index] for index in episode.attributes.prompt_index]
 
 
 def _called(name: str, plural: str = "") -> str:
@@ -155,3 +160,64 @@ def _array_differs(first: StoredEpisode, name: str, other: StoredEpisode, others
         return np.ones(len(one), dtype=bool)
     differs: _Differs = (one != two).reshape(len(one), -1).any(axis=1)
     return differs if differs.any() else None
+
+
+def is_noise(run: Run) -> bool:
+    """Whether another noise seed is all that a rerun changed."""
+    return all(changes_noise_alone(store.attributes.interventions) for store in run.stores)
+
+
+def moved_episodes(base: Run, reruns: Sequence[Run]) -> pl.DataFrame:
+    """How far the actions moved, means over the replans of each episode.
+
+    Units are the standard deviations of the base's actions over all of its episodes and steps, so that they do not
+    change with --tasks. A dimension that another noise seed changes by more than its spread is not compared.
+
+    Returns:
+        One row per (rerun, episode of both): run, `EPISODE_ID`, num_replans, `CHANGES`; noise, the effect of another
+        noise seed in the same episode (several: their mean), and minus_noise, the effect minus that; null where no
+        rerun changes the noise alone, and for those that do.
+
+    Raises:
+        BadArgument: the base holds no actions, they are all the same, or a rerun has none of its episodes.
+        StoreError: a rerun is of other policy calls, see `check_same_calls`.
+    """
+    members = {(*item.task, item.episode.name): BaseEpisode.of(item) for item in base.question.selected}
+    spread = action_spread([actions_of(store, one) for store in base.stores for one in store.episodes])
+    if not spread.used.any():
+        raise BadArgument(f"The actions of {base.name} are the same in every replan and step: a change has no unit.")
+    pairs = []
+    for run in reruns:
+        for store in run.stores:
+            for episode in store.episodes:
+                key = (store.suite, episode.attributes.task_id, episode.name)
+                if (member := members.get(key)) is not None:
+                    check_same_calls(member.item.store, member.item.episode, store, episode)
+                    pairs.append((run, member, actions_of(store, episode)))
+    for run in reruns:
+        if not any(one is run for one, _, _ in pairs):
+            raise BadArgument(f"The rerun {run.name} holds none of the selected episodes of {base.name}.")
+    noise = [(member.actions, others) for run, member, others in pairs if is_noise(run)]
+    spread = with_noise(spread, noise_of(noise, spread.spread)) if noise else spread
+    rows = [
+        (
+            run.name,
+            is_noise(run),
+            *member.item.key,
+            len(others),
+            *finite_mean(changes_of(member, others, spread)).tolist(),
+        )
+        for run, member, others in pairs
+    ]
+    names = ["run", "is_noise", *EPISODE_ID, "num_replans", *CHANGES]
+    table = pl.DataFrame(rows, schema=names, orient="row").with_columns(pl.col(CHANGES).fill_nan(None))
+    floor = table.filter("is_noise").group_by(EPISODE_ID).agg(noise=pl.mean("effect"))
+    table = table.join(floor, on=EPISODE_ID, how="left", maintain_order="left")
+    table = table.with_columns(noise=pl.when(~pl.col("is_noise")).then("noise")).drop("is_noise")
+    return table.with_columns(minus_noise=pl.col("effect") - pl.col("noise"))
+
+
+def moved(episodes: pl.DataFrame, sampling: Sampling) -> pl.DataFrame:
+    """Means of `moved_episodes` for every rerun with intervals; over_noise: mean effect / mean noise; minus_noise_q."""
+    quotients = {"over_noise": ("effect", "noise")}
+    return estimate(episodes, ["run"], _SCALES, sampling, {"minus_noise": 0.0}, quotients=quotients)

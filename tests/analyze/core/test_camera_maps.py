@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from vla_attention.analyze.core.patch_pictures import enlarge
+from vla_attention.analyze.core.camera_maps import enlarge
 from vla_attention.capture.environments.coverage import patch_coverage
 from vla_attention.capture.policies.cosmos.preprocess import crop_and_enlarge, visible_area
 
