@@ -22,6 +22,7 @@ from vla_attention.analyze.core.runs import (
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.render.terminal import screen
 from vla_attention.schemas.layout import Role
+from vla_attention.schemas.stores.reader import StoredEpisode
 
 TASKS, EPISODES = (0, 1, 2, 5), 4
 
@@ -172,6 +173,12 @@ CHANGES = {
 }
 
 
+class OfAnotherJob(StoredEpisode):
+    @property
+    def attributes(self):
+        return replace(StoredEpisode.attributes.func(self), provenance={"mujoco": "1.2"})
+
+
 @pytest.fixture
 def changed(stores, monkeypatch):
     """Two runs, the attributes of the second one changed."""
@@ -184,10 +191,10 @@ def changed(stores, monkeypatch):
             if path != stores["higher"]:
                 return store
             root = change(store.attributes)
+            episodes = store.episodes
             if root.provenance != store.attributes.provenance:  # as episodes of another job have it
-                for episode in store.episodes:
-                    episode.__dict__["attributes"] = replace(episode.attributes, provenance=root.provenance)
-            return replace(store, attributes=root)
+                episodes = tuple(OfAnotherJob(**vars(episode)) for episode in episodes)
+            return replace(store, attributes=root, episodes=episodes)
 
         with monkeypatch.context() as patch:
             patch.setattr(runs_module, "open_store", changed_store)
