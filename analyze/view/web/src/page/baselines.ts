@@ -1,4 +1,4 @@
-/** What uniform attention gives: stored from version 2 on, made from roles before. analyze/measures/masses.py. */
+/** What uniform attention gives: stored from version 2 on, made from roles before. analyze/measures/baselines.py. */
 import { storedPlaces, type UniformKeys } from "../grouping/key_counts";
 import type { EpisodeTokens } from "../grouping/tokens";
 import { uniformMasses } from "../measures/masses";
