@@ -78,10 +78,12 @@ class Norms:
         contribution_ratio (infinite or null where the denominator is 0), uniform_ratio and ratio_lift.
         """
         labels = ("layer", "block", "norms", "env_step")
-        return frame_of_episodes(
-            self.measured,
-            lambda one: self._table(one, {name: array for name, array in one[1].items() if name not in labels}),
-        )
+
+        def rows_of(one: _Episode) -> pl.DataFrame:
+            values = {name: array for name, array in one[1].items() if name not in labels and self.above}
+            return self._table(one, values)
+
+        return frame_of_episodes(self.measured, rows_of)
 
     def norms(self) -> pl.LazyFrame:
         """The same names, group, norm; of every group that is made of whole segments in all episodes."""
