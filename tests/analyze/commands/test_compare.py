@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 from tests.kit.paths import ROOT
+from tests.kit.questions import with_attributes
 from tests.kit.stores import StoreSpec, rerun_source, write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.compare import compare
@@ -22,7 +23,6 @@ from vla_attention.analyze.core.runs import (
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.render.terminal import screen
 from vla_attention.schemas.layout import Role
-from vla_attention.schemas.stores.reader import StoredEpisode
 
 TASKS, EPISODES = (0, 1, 2, 5), 4
 
@@ -173,12 +173,6 @@ CHANGES = {
 }
 
 
-class OfAnotherJob(StoredEpisode):
-    @property
-    def attributes(self):
-        return replace(StoredEpisode.attributes.func(self), provenance={"mujoco": "1.2"})
-
-
 @pytest.fixture
 def changed(stores, monkeypatch):
     """Two runs, the attributes of the second one changed."""
@@ -191,10 +185,10 @@ def changed(stores, monkeypatch):
             if path != stores["higher"]:
                 return store
             root = change(store.attributes)
-            episodes = store.episodes
             if root.provenance != store.attributes.provenance:  # as episodes of another job have it
-                episodes = tuple(OfAnotherJob(**vars(episode)) for episode in episodes)
-            return replace(store, attributes=root, episodes=episodes)
+                episodes = [with_attributes(episode, provenance=root.provenance) for episode in store.episodes]
+                store = replace(store, episodes=tuple(episodes))
+            return replace(store, attributes=root)
 
         with monkeypatch.context() as patch:
             patch.setattr(runs_module, "open_store", changed_store)
