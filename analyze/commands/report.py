@@ -48,8 +48,13 @@ def report(question: Question, num_episodes: int = 2, num_replans: int = 8) -> l
         tables = [table for table in result.tables if table.name not in later]
         kept = [line for line in result.about if line not in said] if shown else result.about
         notes = [note for note in result.notes if note not in told]
-        findings = [finding for finding in result.findings if finding.sentence not in told]
-        told |= {*result.notes, *(finding.sentence for finding in result.findings)}
+        answers = {one.asks: one.sentence for other in rest for one in other.findings}  # in other words, of more items
+        findings = [
+            replace(finding, limit="" if finding.limit in told else finding.limit)
+            for finding in result.findings
+            if finding.sentence not in told and answers.get(finding.asks, finding.sentence) == finding.sentence
+        ]
+        told |= {*result.notes, *(text for finding in result.findings for text in (finding.sentence, finding.limit))}
         shown.append(replace(result, about=kept, findings=findings, tables=tables, figures=figures, notes=notes))
     return shown
 

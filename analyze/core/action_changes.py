@@ -109,13 +109,11 @@ def noise_of(pairs: Sequence[tuple[Array, Array]], spread: Array) -> Noise:
     # The episodes are those of which the units are, whatever their tasks.
     spreads = estimates([statistic], Units.of(np.zeros(len(pairs))))
     # Several episodes that do not differ agree on the value; a single one says nothing of others.
-    alike = (np.nan, np.nan) if len(pairs) < 2 else None
-    intervals = [(one.interval(), one.value) for one in spreads]
-    ends = np.array([interval or alike or (value, value) for interval, value in intervals], np.float64)
-    values = np.array([[one.value for one in spreads], *ends.T], dtype=np.float64)
+    values = np.array(
+        [(one.value, *(one.interval() or [one.value if len(pairs) > 1 else np.nan] * 2)) for one in spreads], np.float64
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
-        change, low, high = np.where(spread > 0, np.sqrt(values) / spread, np.nan)
-    return Noise(change, low, high)
+        return Noise(*np.where(spread > 0, np.sqrt(values.T) / spread, np.nan))
 
 
 def units_of_recorded(*stores: Store, skip_corrupt: bool = False) -> ActionSpread:
@@ -187,8 +185,7 @@ class BaseEpisode:
         actions: (replan, step, dimension).
         env_step: (replan,).
         starts: (replan,) policy steps before each replan.
-        executed: (replan,) how many steps of each chunk were executed; all of them where that is not known
-            (`stores_executed`).
+        executed: (replan,) how many steps of each chunk were executed; all of them where that is not known.
         num_steps: policy steps of the episode.
     """
 
@@ -199,11 +196,6 @@ class BaseEpisode:
     executed: NDArray[np.int64]
     num_steps: int
 
-    @property
-    def name(self) -> str:
-        """The name of the episode's group."""
-        return self.item.episode.name
-
     @classmethod
     def of(cls, item: SelectedEpisode) -> BaseEpisode:
         """Read an episode's actions."""
@@ -211,26 +203,18 @@ class BaseEpisode:
         env_step = item.episode.read("env_step").astype(np.int64)
         starts, num_steps = item.timing(env_step)
         executed = np.full(len(starts), actions.shape[1])
-        if stores_executed(item.store):
-            known = item.store.attributes.protocol.replan_steps
+        protocol = item.store.attributes.protocol
+        # Of the caller's own loop it is not known where it gave no number, and a replayed data set executes none: there
+        # `replan_steps` is the number of frames from one policy call to the next.
+        if protocol.name != "dataset" and protocol.replan_steps > 0:
             until_next = np.diff(np.append(starts, num_steps))
-            executed = np.minimum(executed, np.minimum(until_next, known))
+            executed = np.minimum(executed, np.minimum(until_next, protocol.replan_steps))
         return cls(item, actions, env_step, starts, executed, num_steps)
 
     def at(self, replans: NDArray[np.int64]) -> BaseEpisode:
         """The same at some replans, which may repeat."""
         parts = {name: getattr(self, name)[replans] for name in ("actions", "env_step", "starts", "executed")}
         return replace(self, **parts)
-
-
-def stores_executed(store: Store) -> bool:
-    """Whether a store says how many steps of each chunk were executed.
-
-    Of the caller's own loop that is not known where it gave no number, and a replayed data set executes none: there
-    `replan_steps` is the number of frames from one policy call to the next.
-    """
-    protocol = store.attributes.protocol
-    return protocol.name != "dataset" and protocol.replan_steps > 0
 
 
 def changes_of(base: BaseEpisode, actions: Array, spread: ActionSpread) -> Array:

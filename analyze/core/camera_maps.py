@@ -356,9 +356,5 @@ def choose_episodes(selected: Sequence[SelectedEpisode], count: int) -> list[Sel
         picked.append((fitting or tasks[place])[0])
     # With fewer tasks than wanted episodes: further episodes of the same tasks, in turn.
     rest = [item for depth in range(max(map(len, tasks))) for group in tasks for item in group[depth : depth + 1]]
-    for item in rest:
-        if len(picked) >= count:
-            break
-        if all(item is not other for other in picked):
-            picked.append(item)
-    return picked
+    further = [item for item in rest if all(item is not other for other in picked)]
+    return [*picked, *further[: max(0, count - len(picked))]]

@@ -52,7 +52,7 @@ LINGUISTIC_ROLES = ("bos", "template", "instruction", "text")
 _SIDES = ("visual_norm", "linguistic_norm")
 _RATIOS = ("contribution_ratio", "uniform_ratio", "ratio_lift")
 #: An episode, and the arrays of its norms.
-_Episode: TypeAlias = tuple[SelectedEpisode, Mapping[str, NDArray[Any]]]
+_Episode: TypeAlias = tuple[SelectedEpisode, Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ class Norms:
     """Norms of every episode, and the tables that are made of them.
 
     Attributes:
-        measured: of each episode the columns of its cells (replan, layer, denoise), of groups `norm` (replan, layer,
-            denoise, group), and labels of the axes: env_step, layer and block.
+        measured: of each episode the columns of its cells (replan, layer, denoise), `norms` of groups by name, and
+            labels of the axes: env_step, layer and block.
         selection: the denoise steps.
         above, below: the columns of the ratio's sides; empty without a ratio.
         groups: the groups whose norms there are.
@@ -77,16 +77,22 @@ class Norms:
         """suite, task_id, episode_index, replan, env_step, layer, block, denoise_step; norms of both sides,
         contribution_ratio (infinite or null where the denominator is 0), uniform_ratio and ratio_lift.
         """
-        labels = ("layer", "block", "norm", "env_step")
-        return frame_of_episodes(
-            self.measured,
-            lambda one: self._table(one, {name: array for name, array in one[1].items() if name not in labels}),
-        )
+        labels = ("layer", "block", "norms", "env_step")
+
+        def rows_of(one: _Episode) -> pl.DataFrame:
+            values = {name: array for name, array in one[1].items() if name not in labels and self.above}
+            return self._table(one, values)
+
+        return frame_of_episodes(self.measured, rows_of)
 
     def norms(self) -> pl.LazyFrame:
         """The same names, group, norm; of every group that is made of whole segments in all episodes."""
-        groups = {"group": list(self.groups)}
-        return frame_of_episodes(self.measured, lambda one: self._table(one, {"norm": one[1]["norm"]}, groups))
+
+        def rows_of(one: _Episode) -> pl.DataFrame:
+            norm = np.stack([one[1]["norms"][name] for name in self.groups], axis=-1)
+            return self._table(one, {"norm": norm}, {"group": self.groups})
+
+        return frame_of_episodes(self.measured, rows_of)
 
     def _table(self, one: _Episode, values: Mapping[str, Array], *further: Axis) -> pl.DataFrame:
         item, arrays = one
@@ -183,7 +189,8 @@ def uniform_weights(item: SelectedEpisode, site: str, selection: Selection) -> A
     recorded, because contributions are of all heads. The block's whole update, the last part, is in no side: NaN.
     """
     root = item.store.attributes
-    segments, tokens = item.episode.attributes.segments[site], item.episode.tokens(root, site)
+    tokens = item.tokens if item.tokens.layout.name == site else item.episode.tokens(root, site)
+    segments = item.episode.attributes.segments[site]
     members = segment_members(tokens.layout, tokens.static_roles, segments) & tokens.valid[:, :, None]
     # All stored heads and all keys, also where some were taken out: contributions are of all.
     whole = replace(selection, heads=tuple(range(len(root.recording_of(site).heads))), per_head=False)
@@ -226,15 +233,15 @@ def group_norms(question: Question) -> Norms | None:
     selected, selection, grouping = question.selected, question.selection, question.grouping
     if not all(store.attributes.recording.contributions for store in question.stores):
         return None
+    each = partial(_groups_of_episode, selection=selection, site=question.site, grouping=grouping)
+    norms: OnDisk[_Episode] = OnDisk(each_episode(each, _fresh(selected)), lambda i, arrays: (selected[i], arrays))
     # A group that cannot be measured in one episode would be a mean over the others only.
-    measurable = set.intersection(*(set(_whole_groups(item, question.site, grouping)) for item in _fresh(selected)))
-    names = tuple(name for name in grouping.names if name in measurable)
+    names = set.intersection(*(set(arrays["norms"]) for _, arrays in norms))
     if not names:
         return None
-    each = partial(_groups_of_episode, selection=selection, site=question.site, grouping=grouping, names=names)
-    norms: OnDisk[_Episode] = OnDisk(each_episode(each, _fresh(selected)), lambda i, arrays: (selected[i], arrays))
-    sides = ("numerator_norm", "denominator_norm") if "numerator_norm" in norms[0][1] else ("", "")
-    return Norms(norms, selection, *sides, groups=names)
+    has_sides = grouping.ratio is not None and {*grouping.ratio.numerator, *grouping.ratio.denominator} <= names
+    sides = ("numerator_norm", "denominator_norm") if has_sides else ("", "")
+    return Norms(norms, selection, *sides, groups=tuple(name for name in grouping.names if name in names))
 
 
 def _fresh(selected: Sequence[SelectedEpisode]) -> Iterator[SelectedEpisode]:
@@ -313,18 +320,12 @@ def whole_segments(item: SelectedEpisode, resolved: ResolvedGrouping, site: str)
     return parts
 
 
-def _whole_groups(item: SelectedEpisode, site: str, grouping: Grouping) -> dict[str, NDArray[np.bool_]]:
-    return whole_segments(item, resolve_episode(grouping, item), site)
-
-
-def _groups_of_episode(
-    item: SelectedEpisode, selection: Selection, site: str, grouping: Grouping, names: Sequence[str]
-) -> dict[str, NDArray[Any]]:
-    """`norm` (replan, layer, denoise, group), the measures of both sides (replan, layer, denoise), the axes' labels."""
-    parts, gram = _whole_groups(item, site, grouping), selected_gram(item, site, selection)
-    norm = np.stack([joint_norm(gram, parts[name]) for name in names], axis=-1)
-    found = _labels(item, {"layer": selection.layer_labels, "block": selection.blocks}) | {"norm": norm}
-    if grouping.ratio is not None and {*grouping.ratio.numerator, *grouping.ratio.denominator} <= {*names}:
+def _groups_of_episode(item: SelectedEpisode, selection: Selection, site: str, grouping: Grouping) -> dict[str, Any]:
+    """`norms` by group, the measures of both sides if it has them, (replan, layer, denoise) each; the axes' labels."""
+    parts, gram = whole_segments(item, resolve_episode(grouping, item), site), selected_gram(item, site, selection)
+    norms = {name: joint_norm(gram, part) for name, part in parts.items()}
+    found = _labels(item, {"layer": selection.layer_labels, "block": selection.blocks}) | {"norms": norms}
+    if grouping.ratio is not None and {*grouping.ratio.numerator, *grouping.ratio.denominator} <= parts.keys():
         uniform = uniform_weights(item, site, selection)
         above, below = (
             [joint_norm(gram, taken), joint_norm(gram, taken, uniform)]

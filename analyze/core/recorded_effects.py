@@ -171,7 +171,10 @@ def recorded_effects(
     def made(i: int, arrays: Mapping[str, Any]) -> _Episode:
         return having[i], arrays, [at_site[i] for at_site in measured]
 
-    episodes = OnDisk(each_episode(each, zip(having, *(at.selected for at, _ in places), strict=True)), made)
+    together = (
+        [item.fresh() for item in items] for items in zip(having, *(at.selected for at, _ in places), strict=True)
+    )
+    episodes = OnDisk(each_episode(each, together), made)
     drift = _drift(episodes)
     elsewhere = [
         f"Attention to {plural(len(selectors), 'item')} is of site '{at.site}', where the keys are."
@@ -197,19 +200,19 @@ def described(given: Interventions) -> dict[str, str | None]:
         kind = "nothing"
     elif changes_noise_alone(given):
         kind, item, item_kind = "noise", "another noise seed", "noise"
-    elif sum(changed) == 1 and len(given.keys) == 1:
+    elif sum(changed) > 1:
+        pass
+    elif len(given.keys) == 1:
         knockout = given.keys[0]
         kind = "random" if knockout.random_seed is not None else "only" if knockout.keep else "without"
         item, item_kind = _item_of(knockout.selector)
-        item = {"only": f"all but the {item.removeprefix('all ')}", "random": f"random keys, as many as {item}"}.get(
-            kind, item
-        )
-        selector, reader = visible(knockout.selector), _reader_of(knockout)
-    elif sum(changed) == 1 and given.prompt is not None:
+        others = {"only": f"all but the {item.removeprefix('all ')}", "random": f"random keys, as many as {item}"}
+        item, selector, reader = others.get(kind, item), visible(knockout.selector), _reader_of(knockout)
+    elif given.prompt is not None:
         kind, item_kind = "prompt", "exchange"
         if given.prompt.kind == "synonyms":
             item = visible(", ".join(f"'{word}' as '{other}'" for word, other in given.prompt.synonyms.items()))
-    elif sum(changed) == 1 and len(given.images) == 1:
+    elif len(given.images) == 1:
         kind, item_kind, image = "image", "exchange", given.images[0]
         how = {"blank": "grey", "mean": "as the task's mean"}.get(image.kind, image.kind)
         item = visible(f"{image.camera} {how}")
@@ -348,14 +351,12 @@ def _rows(one: _Episode) -> pl.DataFrame:
     place = {name: arrays[name] for name in ("replan", "env_step", "begin", "end")}
     values = {name: arrays["changes"][:, i] for i, name in enumerate(CHANGES)} | {"gripper_effect": arrays["gripper"]}
     rows = pl.DataFrame({**keys, **place, **conditions.to_dict(), **values}).filter(pl.col("kind") != "nothing")
-    if not measured:
-        return rows.with_columns(
-            pl.col(values.keys()).fill_nan(None), *(pl.lit(None, pl.Float64).alias(name) for name in _ATTENTION)
-        )
-    attention = pl.concat(
+    found = [
         means(at_site, ("replan",)).with_columns(norm=norm.ravel()).select("replan", "selector", *_ATTENTION)
         for at_site, norm in zip(measured, arrays["norms"], strict=True)
-    )
+    ]
+    schema = {"replan": pl.Int64, "selector": pl.String, **dict.fromkeys(_ATTENTION, pl.Float64)}
+    attention = pl.concat([pl.DataFrame(schema=schema), *found])
     joined = rows.join(attention, on=["replan", "selector"], how="left", maintain_order="left")
     return joined.with_columns(pl.col(*values, *_ATTENTION).fill_nan(None))
 

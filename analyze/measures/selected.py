@@ -18,6 +18,7 @@ from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
 from vla_attention.schemas.layout import Prompt
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import RootAttributes, StoreError
+from vla_attention.schemas.stores.store_url import StoreUrl
 
 
 @dataclass(frozen=True)
@@ -37,8 +38,11 @@ class SelectedEpisode:
     def brief(cls, store: Store, episode: StoredEpisode, tokens: EpisodeTokens) -> SelectedEpisode:
         """An episode that was read, without what it keeps of that: of thousands it would fill the memory.
 
-        Prompts, which change with the robot's state and are most of it, are read again when they are asked for.
+        Prompts, which change with the robot's state and are most of it, are read again when they are asked for. Of a
+        store that is elsewhere all is kept, since each reading is a request.
         """
+        if isinstance(episode.folder, StoreUrl):
+            return cls(store, episode, tokens)
         kept, attributes = replace(episode), copy(episode.attributes)
         number, site = len(attributes.prompts), tokens.layout.name
         object.__setattr__(attributes, "prompts", _Prompts(replace(episode), number) if number else ())
@@ -48,6 +52,8 @@ class SelectedEpisode:
 
     def fresh(self) -> SelectedEpisode:
         """The same, with nothing that was read of it since it was selected."""
+        if isinstance(self.episode.folder, StoreUrl):
+            return self
         episode = replace(self.episode)
         vars(episode)["attributes"] = self.episode.attributes
         coverage = episode.coverage(self.store.attributes, self.tokens.layout.name)

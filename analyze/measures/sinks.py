@@ -360,26 +360,16 @@ def _value_ratios(question: Question, heads: pl.DataFrame) -> pl.DataFrame:
     if all(root.recording.contributions and has_all_heads(root, question.site) for root in recorded):
         sinks = heads.group_by("suite", "task_id", "key", maintain_order=True).agg(pl.col("block").unique())
         for suite, task, key, blocks in sinks.iter_rows():
-            found = _value_ratio(question, suite, task, key, blocks)
-            if found is not None:
-                ratios.append((suite, task, key, found))
+            items = [item for item in question.selected if item.task == (suite, task)]
+            parts = [_lengths_and_masses(item, question, key, blocks) for item in items]
+            known = [part for part in parts if part is not None]
+            if len(known) < len(parts):
+                continue  # the key shares its segment at a replan
+            length, mass, of_rest, mass_of_rest = np.sum(known, axis=0)
+            if mass > 0 and mass_of_rest > 0 and of_rest > 0:
+                ratios.append((suite, task, key, (length / mass) / (of_rest / mass_of_rest)))
     schema = {"suite": pl.String, "task_id": pl.Int64, "key": pl.Int64, "value_ratio": pl.Float64}
     return pl.DataFrame(ratios, schema=schema, orient="row")
-
-
-def _value_ratio(question: Question, suite: str, task: int, key: int, blocks: list[int]) -> float | None:
-    """None where the key shares its segment at a replan, or is valid at none."""
-    sums = np.zeros(4)
-    for item in question.selected:
-        if item.task == (suite, task):
-            found = _lengths_and_masses(item, question, key, blocks)
-            if found is None:
-                return None
-            sums += found
-    length, mass, of_rest, mass_of_rest = sums
-    if not (mass > 0 and mass_of_rest > 0 and of_rest > 0):
-        return None
-    return float((length / mass) / (of_rest / mass_of_rest))
 
 
 def _lengths_and_masses(

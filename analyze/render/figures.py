@@ -26,7 +26,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.result import Figure
-from vla_attention.analyze.render.files import replacing, write_text
+from vla_attention.analyze.render.files import replacing
 from vla_attention.analyze.render.pictures import pictures
 from vla_attention.analyze.render.style import (
     BASELINE_COLOR,
@@ -70,27 +70,36 @@ def draw(figure: Figure, style: Style | None = None) -> Canvas:
     """The picture as a matplotlib figure."""
     style = style or Style()
     with style.settings():
-        return pictures(figure, style) if figure.kind == "pictures" else _plot(figure, style)
+        return _plot(figure, style)
+
+
+def content(figure: Figure, style: Style, kinds: Sequence[str]) -> tuple[list[bytes], float]:
+    """The picture as the bytes of a file of each kind, and its width in inches."""
+    with style.settings():  # once: ticks are made at drawing, and matplotlib's settings take long to change
+        canvas = _plot(figure, style)
+        return [style.content(canvas, kind) for kind in kinds], canvas.get_figwidth()
 
 
 def save(figure: Figure, folder: Path, style: Style | None = None, formats: Sequence[str] = ()) -> list[Path]:
     """Draw into a folder: NAME.png (and other formats), for a paper NAME_caption.md and .tex too; returns the paths."""
     style = style or Style()
-    canvas, paths = draw(figure, style), []
     # A paper's pictures are vectors; the PNG is to look at.
-    for kind in formats or (("png", "pdf") if style.paper else ("png",)):
-        paths.append(folder / f"{figure.name}.{kind}")
-        with replacing(paths[-1]) as temporary:
-            temporary.write_bytes(style.content(canvas, kind))
-    caption = f"{figure.title}. {figure.caption}".strip()
-    captions = {"md": caption, "tex": f"\\caption{{{caption.translate(_FOR_LATEX)}}}"} if style.paper else {}
-    for ending, text in captions.items():
-        paths.append(folder / f"{figure.name}_caption.{ending}")
-        write_text(paths[-1], f"{text}\n")
-    return paths
+    kinds = formats or (("png", "pdf") if style.paper else ("png",))
+    contents, _ = content(figure, style, kinds)
+    files = {f"{figure.name}.{kind}": one for kind, one in zip(kinds, contents, strict=True)}
+    if style.paper:
+        caption = f"{figure.title}. {figure.caption}".strip()
+        files[f"{figure.name}_caption.md"] = f"{caption}\n".encode()
+        files[f"{figure.name}_caption.tex"] = f"\\caption{{{caption.translate(_FOR_LATEX)}}}\n".encode()
+    for name, one in files.items():
+        with replacing(folder / name) as temporary:
+            temporary.write_bytes(one)
+    return [folder / name for name in files]
 
 
 def _plot(figure: Figure, style: Style) -> Canvas:
+    if figure.kind == "pictures":
+        return pictures(figure, style)
     o: Options = figure.options
     rows = figure.frame
     if figure.kind not in ("lines", "heat_map"):  # these show where a value is missing
@@ -128,7 +137,7 @@ def _framed(canvas: Canvas, figure: Figure, height: float, style: Style) -> None
     whole = top + height * (0.72 if style.paper else 1)
     canvas.set_figheight(whole)
     if not style.paper:
-        canvas.text(0.08 / width, 1 - 0.07 / whole, wrapped(figure.title, int(12.5 * width), 1), va="top", size=10)
+        canvas.text(0.08 / width, 1 - 0.07 / whole, wrapped(figure.title, int(13 * width), 1), va="top", size=10)
     if handles:
         canvas.legend(handles, labels, loc="upper left", bbox_to_anchor=(0.03 / width, 1 - title / whole),
                       ncols=columns, borderaxespad=0, handlelength=1.4, columnspacing=1.0, borderpad=0.1)  # fmt: skip

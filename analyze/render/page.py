@@ -9,7 +9,7 @@ from functools import cache, partial
 import jinja2
 
 from vla_attention.analyze.core.result import Figure, Result, Table
-from vla_attention.analyze.render.figures import draw
+from vla_attention.analyze.render.figures import content
 from vla_attention.analyze.render.numbers import cell
 from vla_attention.analyze.render.style import Style
 from vla_attention.schemas.safe_text import visible
@@ -66,7 +66,6 @@ def _picture(figure: Figure) -> tuple[str, bool]:
 
     Photographs are WebP, half the bytes of PNG.
     """
-    style, kind = Style(inches=_INCHES), "webp" if figure.kind == "pictures" else "png"
-    canvas = draw(figure, style)
-    content = base64.b64encode(style.content(canvas, kind)).decode()
-    return f"data:image/{kind};base64,{content}", canvas.get_figwidth() > _INCHES
+    kind = "webp" if figure.kind == "pictures" else "png"
+    (drawn,), inches = content(figure, Style(inches=_INCHES), (kind,))
+    return f"data:image/{kind};base64,{base64.b64encode(drawn).decode()}", inches > _INCHES

@@ -107,7 +107,7 @@ def pictures(figure: Figure, style: Style) -> Canvas:
     axes = canvas.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0), autoscale_on=False)
     axes.set_axis_off()
     if not style.paper:
-        axes.text(0.08, 0.07, wrapped(figure.title, int(12.5 * width), 1), va="top", size=10)
+        axes.text(0.08, 0.07, wrapped(figure.title, int(13 * width), 1), va="top", size=10)
     _draw_words(axes, words, float(o.get("words_high", 4.0)), top + _BAND / 2)
     levels = list(o.get("levels", ()))
     looks = [("black", points, f"{level:g} times even or more") for level, points in zip(levels, _LINES, strict=False)]

@@ -128,20 +128,19 @@ class Style:
         return canvas
 
     def content(self, canvas: Canvas, kind: str) -> bytes:
-        """A picture as the bytes of a file; it is drawn once."""
+        """A picture as the bytes of a file, within `settings`."""
         from PIL import Image
 
         file = BytesIO()
-        with self.settings():
-            if kind in ("png", "webp"):
-                pixels: Any = canvas.canvas
-                pixels.draw()
-                image = Image.fromarray(np.asarray(pixels.buffer_rgba())).convert("RGB")
-                options: Any = {"quality": 85, "method": 1} if kind == "webp" else {"dpi": (self.dpi, self.dpi)}
-                image.save(file, kind, **options)
-            else:
-                # Without a creation date the same data give the same file.
-                canvas.savefig(file, format=kind, metadata={"CreationDate": None} if kind == "pdf" else None)
+        if kind in ("png", "webp"):
+            pixels: Any = canvas.canvas
+            pixels.draw()
+            image = Image.fromarray(np.asarray(pixels.buffer_rgba())).convert("RGB")
+            options: Any = {"quality": 85, "method": 1} if kind == "webp" else {"dpi": (self.dpi, self.dpi)}
+            image.save(file, kind, **options)
+        else:
+            # Without a creation date the same data give the same file.
+            canvas.savefig(file, format=kind, metadata={"CreationDate": None} if kind == "pdf" else None)
         return file.getvalue()
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.schemas.groupings.grouping import Grouping
-from vla_attention.schemas.stores.reader import Store, open_store
+from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 
 
 def question_about(
@@ -27,3 +27,12 @@ def question_about(
         settings["grouping"] = grouping
     question = ask(opened, AnalysisSettings(**settings))
     return replace(question, grouping=grouping) if isinstance(grouping, Grouping) else question
+
+
+def with_attributes(episode: StoredEpisode, **changes: Any) -> StoredEpisode:
+    """An episode whose attributes say something else than its files."""
+
+    class Changed(StoredEpisode):
+        attributes = property(lambda self: replace(StoredEpisode.attributes.func(self), **changes))
+
+    return Changed(episode.folder, episode.name, episode.run, episode.version)

@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 from tests.kit.archives import example_store
+from tests.kit.questions import with_attributes
 from tests.kit.stores import StoreSpec, rerun_source, write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.compare import compare
@@ -185,8 +186,8 @@ def changed(stores, monkeypatch):
                 return store
             root = change(store.attributes)
             if root.provenance != store.attributes.provenance:  # as episodes of another job have it
-                for episode in store.episodes:
-                    episode.__dict__["attributes"] = replace(episode.attributes, provenance=root.provenance)
+                episodes = [with_attributes(episode, provenance=root.provenance) for episode in store.episodes]
+                store = replace(store, episodes=tuple(episodes))
             return replace(store, attributes=root)
 
         with monkeypatch.context() as patch:

@@ -9,12 +9,12 @@ import polars as pl
 import pytest
 
 from tests.kit.attacks import files_of
-from tests.kit.questions import question_about
+from tests.kit.questions import question_about, with_attributes
 from tests.kit.stores import write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.commands.analyze import analyze
-from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
-from vla_attention.schemas.stores.store_format import EpisodeAttributes, StoreError
+from vla_attention.schemas.stores.reader import Store, open_store
+from vla_attention.schemas.stores.store_format import StoreError
 
 
 def damage_rows(store: Path, episode: str) -> None:
@@ -25,16 +25,9 @@ def damage_rows(store: Path, episode: str) -> None:
     file.write_bytes(bytes(content))
 
 
-class Empty(StoredEpisode):
-    @property
-    def attributes(self) -> EpisodeAttributes:
-        return replace(StoredEpisode.attributes.func(self), num_replans=0)
-
-
 def without_replans(store: Store, position: int) -> Store:
     """The opened store, one of whose episodes says that it holds no replan. The writer makes no such episode."""
-    given = store.episodes[position]
-    empty = Empty(given.folder, given.name, given.run)
+    empty = with_attributes(store.episodes[position], num_replans=0)
     return replace(store, episodes=(*store.episodes[:position], empty, *store.episodes[position + 1 :]))
 
 

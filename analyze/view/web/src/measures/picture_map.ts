@@ -1,4 +1,4 @@
-/** How the patches of a camera lie on a map of its picture. The same as `PictureMap` of analyze/core/camera_maps.py. */
+/** How the patches of a camera lie on a map of its picture. The same as `PictureMap` of analyze/measures/patch_maps.py. */
 import { gridSpans, patchKeys } from "../grouping/tokens";
 import { coversAll, type GridDocument, type SiteDocument } from "../store/documents";
 

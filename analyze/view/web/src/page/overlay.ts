@@ -1,6 +1,6 @@
 /**
  * Attention laid over a picture: values of patches, their scale (as analyze/core/camera_maps.py), and pixels (as
- * analyze/core/camera_maps.py). Pure functions.
+ * analyze/show/patch_pictures.py). Pure functions.
  */
 import type { Cells, PictureMap } from "../measures/picture_map";
 import { keyRanks, overUniform } from "../measures/ranks";

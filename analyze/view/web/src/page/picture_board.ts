@@ -48,7 +48,7 @@ function massOf(row: Float64Array, spans: readonly SpanDocument[]): number {
   return keysOfSpans(spans).reduce((sum, key) => sum + row[key]!, 0);
 }
 
-/** What a camera's map adds up and leaves out; empty where its keys are the patches of one grid. `map_note` of camera_maps.py. */
+/** What a camera's map adds up and leaves out; empty where its keys are the patches of one grid. `map_note` of patch_maps.py. */
 export function mapNote({ row, site }: Pick<Shown, "row" | "site">, camera: string, share: number): string {
   const spans = cameraSpans(site.layout, camera);
   const [placed, others] = [spans.filter((span) => span.grid), spans.filter((span) => !span.grid)];

@@ -209,7 +209,7 @@ export class Episode {
     return this.#meansOf(this.#rows(this.site(site)), selection, replan, 1);
   }
 
-  /** The mean rows of the whole episode over a selection: `episode_maps` of analyze/core/camera_maps.py. */
+  /** The mean rows of the whole episode over a selection: `mean_rows` of analyze/measures/patch_maps.py. */
   async meanRows(site: string, selection: Selection): Promise<MeanRows> {
     const info = this.site(site);
     const values = await this.#meansOf(this.#rows(info), selection, 0, this.numReplans);
