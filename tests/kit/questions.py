@@ -35,4 +35,4 @@ def with_attributes(episode: StoredEpisode, **changes: Any) -> StoredEpisode:
     class Changed(StoredEpisode):
         attributes = property(lambda self: replace(StoredEpisode.attributes.func(self), **changes))
 
-    return Changed(episode.folder, episode.name, episode.run, episode.version)
+    return Changed(episode.folder, episode.name, episode.run)
