@@ -210,6 +210,21 @@ def test_tensorstore_reads_it(written):
         assert (array.read().result() == episode.read(name)).all(), name
 
 
+def test_other_readers_give_the_numbers_of_members_of_real_size(tmp_path):
+    """Some megabytes in one shard, with zarr, xarray and tensorstore, which know nothing of this project."""
+    spec = StoreSpec(tasks=(0,), episodes=1, replans=1400, frames=False, queries="all", mantissa_bits=23)
+    path = write_store(tmp_path / "a.zarr", spec=spec)
+    episode = open_store(path).episodes[0]
+    (file,) = (episode.folder / "joint/rows").glob("c.*")
+    assert file.stat().st_size > 4 << 20
+    rows = episode.read("joint/rows")
+    assert (zarr.open_group(path, mode="r")[f"episodes/{episode.name}/joint/rows"][...] == rows).all()
+    joint = xarray.open_zarr(path, group=f"episodes/{episode.name}/joint", consolidated=False)
+    assert (joint["rows"].to_numpy() == rows).all()
+    kept = {"driver": "zarr3", "kvstore": {"driver": "file", "path": str(file.parent)}}
+    assert (tensorstore.open(kept, read=True).result().read().result() == rows).all()
+
+
 DOCUMENT = Path(__file__).parents[3] / "docs" / "store.md"
 
 

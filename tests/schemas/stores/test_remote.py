@@ -90,6 +90,14 @@ def test_a_store_is_read_by_its_address(server, copied):
     assert verify_store(store) == []
 
 
+def test_one_request_opens_an_episode(server):
+    episode = open_store(f"{server.url}/a.zarr").episodes[0]
+    server.forget()
+    for name in episode.attributes.arrays:
+        assert episode.shape_of(name)
+    assert [path for path, _ in server.requests] == [f"a.zarr/episodes/{episode.name}/seal/zarr.json"]
+
+
 @pytest.mark.thorough
 def test_damaged_answers_are_never_a_number(server, copied):
     url = f"{server.url}/a.zarr"
