@@ -18,10 +18,10 @@ from vla_attention.schemas.jsonable import from_json, to_json
 from vla_attention.schemas.limits import DOCUMENT_BYTES
 from vla_attention.schemas.stores.array_metadata import chunks_of_a_shard
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder
-from vla_attention.schemas.stores.digest import bytes_digest, seal_digest
+from vla_attention.schemas.stores.digest import CHECKSUM_BYTES, bytes_digest, seal_digest
 from vla_attention.schemas.stores.root import group_attributes
 from vla_attention.schemas.stores.seal_content import EpisodeSeal, FileRecord
-from vla_attention.schemas.stores.shards import index_size
+from vla_attention.schemas.stores.shards import index_size, read_index
 from vla_attention.schemas.stores.store_format import SEAL_GROUP
 
 SEAL_FILE = f"{SEAL_GROUP}/zarr.json"
@@ -86,4 +86,10 @@ def _file_record(path: Path, chunks: int | None) -> FileRecord:
         if chunks is None:
             return record
         stored = os.pread(file.fileno(), index_size(chunks), max(0, size - index_size(chunks)))
-    return replace(record, index=bytes_digest(stored))
+        # Offset and length 0: a chunk that was not written.
+        ends = (int(offset + length) for offset, length in read_index(stored, size))
+        checksums = [
+            os.pread(file.fileno(), CHECKSUM_BYTES, end - CHECKSUM_BYTES) if end else bytes(CHECKSUM_BYTES)
+            for end in ends
+        ]
+    return replace(record, index=bytes_digest(stored), chunks=b"".join(checksums).hex())

@@ -5,6 +5,7 @@ It is part of the store format, as `store_format.py` is: nothing here changes wi
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,22 +14,29 @@ from vla_attention.schemas.limit_checks import check_at_most
 from vla_attention.schemas.limits import EPISODE_FILES
 from vla_attention.schemas.safe_text import check_inner_path
 
+_CHECKSUMS = re.compile(r"([0-9a-f]{8})*")
+
 
 @dataclass(frozen=True)
 class FileRecord:
     """Size in bytes and sha256 of a file of an episode.
 
-    index: of a shard, from which parts are read: the sha256 of the index at its end, with the index's checksum.
+    Of a shard, from which parts are read: `index` is the sha256 of the index at its end, with the index's checksum, and
+    `chunks` has the crc32c of every chunk, the 4 bytes at the chunk's end, in the index's order: 8 hexadecimal digits
+    each, `00000000` for a chunk that was not written. A file of another episode may have an index of the same bytes.
     """
 
     size: int
     sha256: str
     index: str = ""
+    chunks: str = ""
 
     def __post_init__(self) -> None:
-        """Check the size."""
+        """Check the size and the form of the checksums."""
         if self.size < 0:
             raise BadArgument(f"a file of {self.size} bytes")
+        if not _CHECKSUMS.fullmatch(self.chunks):
+            raise BadArgument("the checksums of the chunks of a file are not 8 hexadecimal digits each")
 
 
 @dataclass(frozen=True)

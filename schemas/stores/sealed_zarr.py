@@ -10,7 +10,7 @@ from zarr.core.buffer import Buffer, BufferPrototype
 
 from vla_attention.schemas.limits import WHOLE_FILE_BYTES
 from vla_attention.schemas.stores.array_metadata import ArrayMetadata
-from vla_attention.schemas.stores.digest import CHECKSUM_BYTES, crc32c
+from vla_attention.schemas.stores.digest import CHECKSUM_BYTES
 from vla_attention.schemas.stores.sealed_files import SealedFiles
 from vla_attention.schemas.stores.shards import SealedShard, check_blosc_frame
 from vla_attention.schemas.stores.store_format import CorruptEpisode
@@ -79,7 +79,7 @@ class SealedArrayStore(Store):
                 if shard.index[number].sum() == wanted.end:
                     frame = shard.chunk(number).tobytes()
                     self._check_frame(frame, shard.file)
-                    return frame + crc32c(frame).to_bytes(CHECKSUM_BYTES, "little")
+                    return frame + shard.checksums[CHECKSUM_BYTES * number : CHECKSUM_BYTES * (number + 1)]
         return None
 
     def _check_frame(self, frame: bytes, file: str) -> None:

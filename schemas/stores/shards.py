@@ -6,10 +6,10 @@ analysis of words reads thousands of chunks, and opens hundreds of episodes with
 `ShardedLayers` handles the layout of rows, and `SingleChunk` that of most other arrays, as `create_rows` and
 `write_whole` of `capture/store/codecs.py` write them. An array of any other layout is read with zarr-python.
 
-Nothing that a file says is believed: the index is compared with the episode's seal, each chunk with the checksum at
-its end, positions with the file's size, and the header of each compressed chunk with the size of the decoded one. A
-frame of Blosc that says it holds fewer bytes than the chunk would otherwise leave the rest of the buffer as it was:
-bytes of the process, which would pass for attention.
+Nothing that a file says is believed: the index and the checksum of each chunk are compared with the episode's seal, the
+chunk with its checksum, positions with the file's size, and the header of each compressed chunk with the size of the
+decoded one. A frame of Blosc that says it holds fewer bytes than the chunk would otherwise leave the rest of the buffer
+as it was: bytes of the process, which would pass for attention.
 """
 
 from __future__ import annotations
@@ -74,12 +74,14 @@ class SealedShard:
         file: the shard's path there.
         index_bytes: the index as it is stored, with its checksum.
         index: offset and length of each chunk, shape (chunk, 2); (0, 0): not written.
+        checksums: the last `CHECKSUM_BYTES` of each chunk, from the seal.
     """
 
     source: ByteSource
     file: str
     index_bytes: bytes
     index: NDArray[np.uint64]
+    checksums: bytes
 
     @classmethod
     def open(cls, source: ByteSource, file: str, record: FileRecord, chunks: int) -> SealedShard:
@@ -89,7 +91,11 @@ class SealedShard:
             CorruptEpisode: it is not the one in the seal.
             OSError: the file cannot be read.
         """
-        size = index_size(chunks)
+        size, checksums = index_size(chunks), bytes.fromhex(record.chunks)
+        if len(checksums) != CHECKSUM_BYTES * chunks:
+            raise CorruptEpisode(
+                f"its {file} has {chunks} chunks, and its seal lists {len(checksums) // CHECKSUM_BYTES}", file
+            )
         if record.size < size:
             raise CorruptEpisode(f"its {file} has {record.size} bytes in the seal, and an index of {size}", file)
         # One byte more: a file that has grown is not the one that was sealed.
@@ -99,7 +105,7 @@ class SealedShard:
         if bytes_digest(stored) != record.index:
             raise CorruptEpisode(f"its {file} does not agree with its seal: its index was changed", file)
         try:
-            return cls(source, file, stored, read_index(stored, record.size))
+            return cls(source, file, stored, read_index(stored, record.size), checksums)
         except CorruptEpisode as error:
             raise CorruptEpisode(f"its {file} cannot be read: {error}", file) from None
 
@@ -118,7 +124,8 @@ class SealedShard:
         half a megabyte takes longer than to read it from the system's cache.
 
         Raises:
-            CorruptEpisode: the chunk is missing, or its checksum is not that of its bytes.
+            CorruptEpisode: the chunk is missing, or its checksum is another one than in the seal or than that of its
+                bytes.
         """
         offset, length = (int(value) for value in self.index[number])
         if length <= CHECKSUM_BYTES:
@@ -138,7 +145,10 @@ class SealedShard:
         """What is wrong with the bytes of a chunk and its checksum, or None."""
         if len(stored) != self.index[number, 1]:
             return f"its {self.file} ends in chunk {number}"
-        if crc32c(stored[:-CHECKSUM_BYTES]) != int.from_bytes(stored[-CHECKSUM_BYTES:].tobytes(), "little"):
+        sealed = self.checksums[CHECKSUM_BYTES * number : CHECKSUM_BYTES * (number + 1)]
+        if stored[-CHECKSUM_BYTES:].tobytes() != sealed:
+            return f"chunk {number} of its {self.file} does not agree with its seal"
+        if crc32c(stored[:-CHECKSUM_BYTES]) != int.from_bytes(sealed, "little"):
             return f"the checksum of chunk {number} of its {self.file} does not fit"
         return None
 

@@ -213,14 +213,17 @@ def shards(content: bytes) -> None:
     size = index_size(count)
     if len(content) < size:
         content = bytes(size - len(content)) + content
-    chunks, stored = bytearray(content[:-size]), content[-size:-4]
+    chunks, stored, checksums = bytearray(content[:-size]), content[-size:-4], list[bytes]()
     for offset, length in struct.iter_unpack("<QQ", stored):
         end = offset + length
         if length >= 4 and end <= len(chunks):
             chunks[end - 4 : end] = crc32c(bytes(chunks[offset : end - 4])).to_bytes(4, "little")
+            checksums.append(bytes(chunks[end - 4 : end]))
+        else:
+            checksums.append(bytes(4))
     index = with_checksum(stored)
     content = bytes(chunks) + index
-    record = FileRecord(len(content), bytes_digest(content), bytes_digest(index))
+    record = FileRecord(len(content), bytes_digest(content), bytes_digest(index), b"".join(checksums).hex())
     shard = SealedShard.open(InMemory(content), "c.0", record, count)
     layers = ShardedLayers.of(metadata, lambda file: shard)
     assert layers is not None

@@ -153,6 +153,8 @@ EPISODE_CASES = [
     Case("seal: a terabyte", _instead("seal/zarr.json", _sparse), LOST + "1,000,000,000,000 bytes; expected at most"),
     Case("seal: 20,000 files", _seal(_many_files), SEAL + "The number of files is 20,"),
     Case("seal: a shard of 2^62 bytes", _record(size=2**62), "does not agree with its seal: it has another size"),
+    Case("seal: checksums that are none", _record(chunks="xy" * 16), SEAL + "8 hexadecimal digits"),
+    Case("seal: a million chunks", _record(chunks="0" * 8 * 10**6), "chunks, and its seal lists 1000000"),
     Case("seal: another index, verified", _record(index="0" * 64), "its index was changed", VERIFY, 1),
     Case("files: the episode is a link", _moved(""), "it is a link that leads out of the store"),
     Case("files: the episodes are a link", _moved_group, "its group 'episodes' is a link"),
