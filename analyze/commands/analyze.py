@@ -30,10 +30,10 @@ from vla_attention.analyze.core.behaviour import behaviour, with_choices
 from vla_attention.analyze.core.contributions import Norms, group_norms, side_norms
 from vla_attention.analyze.core.levels import Levels, levels_of, overall, task_cells, task_groups
 from vla_attention.analyze.core.result import Column, Figure, Finding, Result, Table
+from vla_attention.analyze.core.sinks import SinkRule, search_sinks
+from vla_attention.analyze.core.sinks import without_sinks as take_out
 from vla_attention.analyze.measures.frames import LAYERS_AVG
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.sinks import SinkRule, search_sinks
-from vla_attention.analyze.measures.sinks import without_sinks as take_out
 from vla_attention.analyze.published.plot_evolution import evolution_files
 from vla_attention.analyze.published.results_writer import results_files
 from vla_attention.schemas.errors import listing, plural

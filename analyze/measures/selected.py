@@ -26,7 +26,7 @@ class SelectedEpisode:
     """An episode together with its store and its tokens.
 
     `without`: keys that are taken out of every group and of the valid keys (sinks; see
-    `vla_attention.analyze.measures.sinks`).
+    `vla_attention.analyze.core.sinks`).
     """
 
     store: Store

@@ -16,8 +16,8 @@ from benchmarks.validation.changes import LINGUISTIC, VISUAL
 from benchmarks.validation.group_attention import MEASURES, GroupAttention, GroupOfKeys, Place, group_attention
 from benchmarks.validation.tables import means, spearman
 from vla_attention.analyze.core.action_changes import ActionSpread
+from vla_attention.analyze.core.sinks import SinkRule, search_sinks, without_sinks
 from vla_attention.analyze.measures.question import Question
-from vla_attention.analyze.measures.sinks import SinkRule, search_sinks, without_sinks
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 from vla_attention.schemas.groupings.words import split_words
 from vla_attention.schemas.interventions import Interventions, KeyKnockout

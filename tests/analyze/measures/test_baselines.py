@@ -19,8 +19,8 @@ from tests.kit.stores import StoreSpec, write_store
 from tests.kit.strategies import episode_tokens
 from tests.kit.uniform_cases import TABLE, tokens_of_case, write_case
 from vla_attention.analyze.core.camera_maps import camera_names, episode_maps
+from vla_attention.analyze.core.sinks import SinkRule, search_sinks
 from vla_attention.analyze.measures.masses import uniform_keys
-from vla_attention.analyze.measures.sinks import SinkRule, search_sinks
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens
 
 #: Stored in float32.

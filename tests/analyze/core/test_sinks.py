@@ -19,7 +19,7 @@ from tests.kit.stores import StoreSpec, every_key_seen, write_store
 from tests.kit.strategies import episode_tokens, groupings
 from tests.kit.tokens import small_layout
 from vla_attention.analyze.core.levels import levels_of
-from vla_attention.analyze.measures.sinks import (
+from vla_attention.analyze.core.sinks import (
     SinkRule,
     describe_sinks,
     key_sums,
