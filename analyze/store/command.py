@@ -40,7 +40,6 @@ Several stores have to be of one run configuration: what differs is named. No tw
 one store shares the files of the given ones (hard links), so that it takes no space; a damage of one is then a damage
 of both, and --copy makes files of its own. What comes from elsewhere is always copied.
 """
-_EXAMPLES_OF_VERIFY = EXAMPLES.replace("NAME", "vla-attention store")
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -60,7 +59,8 @@ def build_parser() -> argparse.ArgumentParser:
     copy.add_argument("--tar", action="store_true", help=tars)
     files = "of several stores: copy every file, instead of sharing it (hard links)"
     copy.add_argument("--copy", action="store_true", help=files)
-    what, examples = "read everything back and check it; --repair moves damaged episodes aside", _EXAMPLES_OF_VERIFY
+    what = "compare every file with what was sealed; --repair moves damaged episodes aside"
+    examples = EXAMPLES.replace("NAME", "vla-attention store")
     verify = acts.add_parser("verify", help=what, description=DESCRIPTION, epilog=examples, formatter_class=as_is)
     add_verify_arguments(verify)
     for act, answer in ((copy, _run_copy), (verify, _run_verify)):

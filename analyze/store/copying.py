@@ -91,10 +91,10 @@ def _tars(store: Path) -> dict[str, Path]:
 
 
 def _unpacked(episode: StoredEpisode, building: Path, only: str = "") -> StoredEpisode:
-    """An episode in a folder: unpacked where it is a tar file. only: the one file that is needed."""
+    """An episode in a folder, with nothing read: unpacked where it is a tar file. only: the one file that is needed."""
     tar = episode.folder
     if not isinstance(tar, Path) or tar.suffix != TAR_SUFFIX:
-        return episode
+        return replace(episode)
     into = building / "tar"
     shutil.rmtree(into, ignore_errors=True)
     try:
@@ -249,7 +249,7 @@ def copy_episode(
     folder: Path,
     without: tuple[str, ...],
     run: str,
-    linked: Callable[[str, Path], bool] = lambda _file, _place: False,
+    linked: Callable[[str, Path], bool] | None = None,
 ) -> tuple[int, int, int]:
     """Write the copy of one episode; returns the bytes that were copied, omitted and shared.
 
@@ -271,7 +271,7 @@ def copy_episode(
             continue
         place = folder / file
         place.parent.mkdir(parents=True, exist_ok=True)
-        if linked(file, place):
+        if linked is not None and linked(file, place):
             shared += record.size
             continue
         copied += episode.copy_file(file, place)

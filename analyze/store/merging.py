@@ -130,9 +130,9 @@ def _merge(stores: Sequence[Store], place: Path, progress: Callable[[int], objec
     for store in stores:
         for episode in store.episodes:
             fresh = replace(episode)  # what is read of it is not kept
-            how = (partial(_linked, fresh),) if link else ()
+            linked_here = partial(_linked, fresh) if link else None
             try:
-                sizes = copy_episode(store, fresh, place / EPISODES_GROUP / episode.name, (), store.run, *how)
+                sizes = copy_episode(store, fresh, place / EPISODES_GROUP / episode.name, (), store.run, linked_here)
             except CorruptEpisode as error:
                 raise CorruptEpisode(f"Cannot merge: {error} Repair the store first.") from None
             copied, linked = copied + sizes[0], linked + sizes[2]

@@ -49,6 +49,10 @@ def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[P
         CorruptEpisode: the episode's attributes or its seal cannot be read.
     """
     attributes, wrong = episode.attributes, set[str]()
+    # The files of arrays are compared with the seal when the arrays are read.
+    for file in episode.files.records:
+        if file.endswith("zarr.json"):
+            yield from metadata_problems(episode, file)
     for problem in form_problems(root, episode):
         wrong.add(problem.text.partition(" ")[0])
         yield problem
@@ -60,14 +64,10 @@ def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[P
 
 
 def form_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[Problem]:
-    """What of an episode's files, metadata and shapes is not as its run and its attributes say; reads no array."""
+    """Which files and shapes of an episode are not as its run and its attributes say; reads none of the files."""
     attributes = episode.attributes
     for file in files_of_no_array(root, attributes, episode.files.records):
         yield Problem(f"its seal lists {file}, which belongs to no array of an episode")
-    # The files of arrays are compared with the seal when the arrays are read.
-    for file in episode.files.records:
-        if file.endswith("zarr.json"):
-            yield from metadata_problems(episode, file)
     shapes = expected_shapes(root, attributes)
     numbers = {name: (len(given),) for name in NUMBERS if (given := getattr(attributes, name))}
     listed = {name: record.shape for name, record in attributes.arrays.items()} | numbers

@@ -29,6 +29,11 @@ class RemoteFailure(UserError, OSError):
     """A place elsewhere that cannot be read: the network, a server's refusal, or a missing package."""
 
 
+def is_web(place: StoreUrl) -> bool:
+    """Whether a plain web server has it, which need not list its folders."""
+    return place.protocol in ("http", "https")
+
+
 def source_of(place: StorePlace) -> ByteSource:
     """The files below a path or an address.
 
@@ -44,7 +49,7 @@ def source_of(place: StorePlace) -> ByteSource:
             "without; fsspec reads passwords from its own configuration (~/.config/fsspec)."
         )
     without = re.split("[?#]", place.url, maxsplit=1)[0]
-    if without != place.url and place.protocol in ("http", "https"):
+    if without != place.url and is_web(place):
         raise BadArgument(
             f"The address {without} was given with a query (a signed link), which is for one file; a store is a folder "
             "of files. Give an address that is read without one, or copy the store here."
@@ -150,8 +155,9 @@ def _file_system_of(url: str, _process: int, *_hub_variables: str | None) -> tup
             endpoint, headers = _hub()
             options = {"headers": headers, "timeout": _time_limits()}
             return fsspec.filesystem("https", client_kwargs=options), HubAddress.of(url).file_address(endpoint)
-        is_web = url.startswith(("http://", "https://"))
-        files, path = url_to_fs(url, **({"client_kwargs": {"timeout": _time_limits()}} if is_web else {}))
+        files, path = url_to_fs(
+            url, **({"client_kwargs": {"timeout": _time_limits()}} if is_web(StoreUrl(url)) else {})
+        )
     except ImportError as error:
         raise _missing(url, error) from None
     except ValueError as error:

@@ -16,7 +16,7 @@ from vla_attention.schemas.jsonable import MalformedDocument, from_json
 from vla_attention.schemas.limits import DOCUMENT_BYTES, ROOT_BYTES
 from vla_attention.schemas.regular_files import read_regular
 from vla_attention.schemas.stores.digest import run_digest
-from vla_attention.schemas.stores.remote_source import RemoteFailure, RemoteFolder, source_of
+from vla_attention.schemas.stores.remote_source import RemoteFailure, RemoteFolder, is_web, source_of
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
     FORMAT_NAME,
@@ -114,7 +114,7 @@ def list_episodes(path: StorePlace) -> tuple[list[StorePlace], list[str]]:
     """
     if isinstance(path, StoreUrl):
         try:
-            names = listed_names(path) or RemoteFolder(path.url).names(EPISODES_GROUP)
+            names = (listed_names(path) if is_web(path) else []) or RemoteFolder(path.url).names(EPISODES_GROUP)
         except (OSError, NotImplementedError) as error:
             raise StoreError(
                 f"The episodes of {path} cannot be listed ({str(error).rstrip('.')}), and it has no {NAMES_FILE}; "

@@ -79,7 +79,7 @@ class SealedArrayStore(Store):
                 if shard.index[number].sum() == wanted.end:
                     frame = shard.chunk(number).tobytes()
                     self._check_frame(frame, shard.file)
-                    return frame + shard.checksums[CHECKSUM_BYTES * number : CHECKSUM_BYTES * (number + 1)]
+                    return frame + shard.checksum(number)
         return None
 
     def _check_frame(self, frame: bytes, file: str) -> None:

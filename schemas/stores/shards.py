@@ -145,12 +145,15 @@ class SealedShard:
         """What is wrong with the bytes of a chunk and its checksum, or None."""
         if len(stored) != self.index[number, 1]:
             return f"its {self.file} ends in chunk {number}"
-        sealed = self.checksums[CHECKSUM_BYTES * number : CHECKSUM_BYTES * (number + 1)]
-        if stored[-CHECKSUM_BYTES:].tobytes() != sealed:
+        if stored[-CHECKSUM_BYTES:].tobytes() != self.checksum(number):
             return f"chunk {number} of its {self.file} does not agree with its seal"
-        if crc32c(stored[:-CHECKSUM_BYTES]) != int.from_bytes(sealed, "little"):
+        if crc32c(stored[:-CHECKSUM_BYTES]) != int.from_bytes(self.checksum(number), "little"):
             return f"the checksum of chunk {number} of its {self.file} does not fit"
         return None
+
+    def checksum(self, number: int) -> bytes:
+        """The checksum of one chunk, from the seal."""
+        return self.checksums[CHECKSUM_BYTES * number : CHECKSUM_BYTES * (number + 1)]
 
 
 def check_blosc_frame(frame: bytes | memoryview, decoded_bytes: int, typesize: int) -> None:

@@ -8,6 +8,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from vla_attention.schemas.command_line import format_bytes
@@ -82,7 +83,7 @@ def one_after_the_other(store: Store, depth: Depth) -> Iterator[EpisodeReport]:
     """Reports of the episodes, made in this thread."""
     from vla_attention.schemas.stores.verify import episode_report
 
-    return (episode_report(store, episode, depth) for episode in store.episodes)
+    return (episode_report(store, replace(episode), depth) for episode in store.episodes)  # what is read goes with it
 
 
 def run_verify(
