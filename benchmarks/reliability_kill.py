@@ -106,14 +106,14 @@ class Series:
 
         The moments are those of a share of the time that the first or the last episode took, however busy the machine.
         """
-        partial = self.store.with_name(self.store.name + ".partial")
+        writing = self.store / ".writing"
         began, committed, wanted = time.monotonic(), len(self._names()), random.randint(0, 2)
         took = 0.0
         while not forks.ended(process):
             now = len(self._names())
             if now > committed:
                 took, began, wanted, committed = time.monotonic() - began, time.monotonic(), wanted - 1, now
-            if wanted <= 0 and list(partial.glob("task*")):
+            if wanted <= 0 and list(writing.glob("task*-*")):
                 time.sleep(random.uniform(0, took or _PAUSE_S))
                 return not forks.ended(process)
             time.sleep(0.003)

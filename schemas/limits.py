@@ -26,16 +26,16 @@ WRITTEN_FILE_BYTES = 4_000_000
 #: Whole numbers in documents are below this: what 64 bits hold. Python itself refuses to read more than 4,300 digits.
 WHOLE_NUMBER = 2**63
 
-# What lies beside a store: claims on its episodes and records of the workers that fill it.
+# Locks on the episodes of a store, and logs of the workers that fill it.
 
-#: Bytes of a claim: names of a host and of a job, and some numbers, in 300 bytes.
-CLAIM_BYTES = 10_000
-#: Claims or records of a store: one for each process that fills it. Clusters allow arrays of some thousand tasks.
+#: Bytes of a lock: names of a host and of a job, and some numbers, in 300 bytes.
+LOCK_BYTES = 10_000
+#: Locks or logs of a store: one for each process that fills it. Clusters allow arrays of some thousand tasks.
 JOB_FILES = 100_000
-#: Bytes of a store's records together; a record has 80 for an episode that was written and up to 1,200 for one that was
+#: Bytes of a store's logs together; a log has 80 for an episode that was written and up to 1,200 for one that was
 #: dropped. They are in memory at once, which takes ten times as much.
-RECORDS_BYTES = 100_000_000
-#: Episodes that the records of a store plan. Each that is missing is counted by its number.
+LOGS_BYTES = 100_000_000
+#: Episodes that the logs of a store plan. Each that is missing is counted by its number.
 PLANNED_EPISODES = 1_000_000
 
 # Texts.

@@ -96,10 +96,10 @@ FAULTS = (
     ),
     Fault(
         "two writers: a living holder is replaced",
-        "schemas/stores/claims.py",
-        "if judged.silent_s < self.dead_after_s and not",
-        "if judged.silent_s < 0 and not",
-        ("tests/schemas/stores/test_claims.py", "tests/capture/rollout"),
+        "schemas/stores/locks.py",
+        "silent >= self.dead_after_s or",
+        "silent >= 0 or",
+        ("tests/schemas/stores/test_locks.py", "tests/capture/rollout"),
     ),
     Fault(
         "wrong weight of denoise steps: the last one alone",

@@ -23,7 +23,7 @@ from vla_attention.schemas.errors import BadArgument, UserError, listing, unknow
 from vla_attention.schemas.stores.digest import run_digest, with_digest
 from vla_attention.schemas.stores.durable_files import publish, publish_file
 from vla_attention.schemas.stores.episode_files import files_of_no_array, refuse_links
-from vla_attention.schemas.stores.partial_folders import partial_of, remove_dead_partials
+from vla_attention.schemas.stores.locks import WHOLE_STORE, store_locks
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
 from vla_attention.schemas.stores.root import (
@@ -157,8 +157,7 @@ def _copy(
     root = _root_document(store, without)
     run = run_digest(group_attributes(root))
     target.parent.mkdir(parents=True, exist_ok=True)
-    remove_dead_partials(target)
-    with partial_of(target, "copy") as building:
+    with store_locks(target).part(WHOLE_STORE) as building:
         _ensure_root(store, target, root, building)
         present = set(_tars(target)) if tar else {folder.name for folder in episode_folders(target)}
         if tar and not present and episode_folders(target):

@@ -19,7 +19,7 @@ from vla_attention.analyze.stores.parallel import episode_reports
 from vla_attention.schemas.errors import BadArgument, UserError, listing, plural, shortened
 from vla_attention.schemas.stores.digest import run_differences, with_digest
 from vla_attention.schemas.stores.durable_files import publish
-from vla_attention.schemas.stores.partial_folders import partial_of, remove_dead_partials
+from vla_attention.schemas.stores.locks import WHOLE_STORE, store_locks
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.remote_source import source_of
 from vla_attention.schemas.stores.root import group_attributes, group_document
@@ -68,8 +68,7 @@ def merge_stores(
     _check(stores, target)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        remove_dead_partials(target)
-        with partial_of(target, "merge") as building:
+        with store_locks(target).part(WHOLE_STORE) as building:
             place = building / target.name
             merged = _merge(stores, place, progress, link)
             write_names(place, building)

@@ -1,1 +1,1 @@
-"""Several processes that fill one store: their claims on episodes and their records, SIGTERM, SLURM, and the status."""
+"""Several processes that fill one store: their locks and logs, SIGTERM, SLURM, and the status."""

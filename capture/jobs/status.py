@@ -9,13 +9,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from vla_attention.capture.environments.suites import SUITES
-from vla_attention.capture.jobs.worker_records import REASON_CHARACTERS, WorkerRecord, planned_tasks, read_records
+from vla_attention.capture.jobs.worker_log import REASON_CHARACTERS, WorkerRecord, planned_tasks, read_logs
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, listing, plural, shortened
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.safe_text import visible
-from vla_attention.schemas.stores.claims import Holder, holders
 from vla_attention.schemas.stores.damaged_episodes import DamagedEpisode, look_at
+from vla_attention.schemas.stores.locks import Holder, episode_locks
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import is_episode_name, parse_episode_name
 from vla_attention.schemas.stores.store_url import local_path
@@ -26,7 +26,7 @@ class EpisodeStatus:
     """One committed episode that is whole, as far as was looked.
 
     at: time of the commit (ISO 8601, UTC).
-    by: the worker; empty if no record names it.
+    by: the worker; empty if no log names it.
     """
 
     task_id: int
@@ -58,7 +58,7 @@ class DroppedEpisode:
 class TaskStatus:
     """One task.
 
-    expected: number of episodes; None if neither the user nor a record gives it.
+    expected: number of episodes; None if neither the user nor a log gives it.
     committed, success, bytes: of the episodes that are not damaged. unknown: how many of them have no known outcome.
     missing: indices of the expected episodes that the store lacks.
     damaged: episodes that are in the store, but cannot be used.
@@ -81,7 +81,7 @@ class TaskStatus:
 
 @dataclass(frozen=True)
 class StoreStatus:
-    """A store. `writing`: the current claims on its episodes."""
+    """A store. `writing`: who is writing which of its episodes."""
 
     store: str
     suite: str
@@ -123,9 +123,9 @@ def store_status(path: Path, expected: int | None = None, verify: bool = False) 
         raise BadArgument(f"Cannot use --expected {expected}; expected at least 1.")
     store = open_store(path)
     root = store.attributes
-    records = read_records(path)
+    records = read_logs(path)
     plan = planned_tasks(records)
-    writers = {commit.episode: (commit.at, record.worker) for record in records for commit in record.committed}
+    writers = {episode: (at, record.worker) for record in records for episode, at in record.committed}
     episodes: dict[int, list[EpisodeStatus]] = {}
     damaged: dict[int, list[DamagedEpisode]] = {}
     instructions: dict[int, str] = {task.task_id: task.instruction for task in plan.values()}
@@ -177,7 +177,9 @@ def store_status(path: Path, expected: int | None = None, verify: bool = False) 
                 dropped=tuple(dropped.get(task_id, ())),
             )
         )
-    return StoreStatus(str(path), root.protocol.suite, root.policy.name, tuple(tasks), tuple(holders(path)))
+    return StoreStatus(
+        str(path), root.protocol.suite, root.policy.name, tuple(tasks), tuple(episode_locks(path).holders())
+    )
 
 
 def print_status(stores: Sequence[Path], expected: int | None, as_json: bool, check: bool, verify: bool = False) -> int:
@@ -209,7 +211,7 @@ def _dropped(records: Sequence[WorkerRecord], present: Set[str]) -> dict[int, li
 
 
 def _plain_time(at: str) -> str:
-    """A time of the records without its offset, which is that of UTC."""
+    """A time of the logs without its offset, which is that of UTC."""
     return at.removesuffix("+00:00").replace("T", " ")
 
 

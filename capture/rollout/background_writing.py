@@ -33,8 +33,8 @@ _LOOK_EVERY_S = 0.5
 class Committed:
     """The outcome of a commit: the episode's folder and its bytes, or an error of this episode alone.
 
-    `StoreExists`: another process was faster. `ReplanRefused`, which may come before a commit was asked for: numbers
-    that cannot be right. `CorruptEpisode`: what was read back is not what was written.
+    `StoreExists`: another process was faster, or has taken the episode. `ReplanRefused`: numbers that cannot be right.
+    `CorruptEpisode`: what was read back is not what was written. An error may come before a commit was asked for.
     """
 
     episode: EpisodeInBackground
@@ -79,13 +79,13 @@ class EpisodeInBackground:
     def _append(self, record: ReplanRecord) -> None:
         if self._dropped:
             return
-        if self._writer is None:
-            self._writer = self._open.enter_context(
-                self.store.episode(self.start, self.denoise_times, self.max_replans)
-            )
         try:
+            if self._writer is None:
+                self._writer = self._open.enter_context(
+                    self.store.episode(self.start, self.denoise_times, self.max_replans)
+                )
             self._writer.append(record)
-        except ReplanRefused as error:
+        except (StoreExists, ReplanRefused) as error:
             self._end(error)
 
     def _commit(self, success: bool, num_steps: int, steps: RecordedSteps | None) -> None:

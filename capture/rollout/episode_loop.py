@@ -1,4 +1,4 @@
-"""The loop over episodes: it claims, records and commits one after another. SIGTERM drops the unfinished one.
+"""The loop over episodes: it locks, records and commits one after another. SIGTERM drops the unfinished one.
 
 Where the policy calls of an episode come from is the source's: a simulator (`simulator_source.py`), the calls of a
 store (`rerun/`), the frames of a data set (`replay/`). A fault of one episode (`episode_faults.py`) drops that episode;
@@ -18,7 +18,7 @@ import torch
 
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Terminated, Termination
-from vla_attention.capture.jobs.worker_records import PlannedTask, RecordWriter
+from vla_attention.capture.jobs.worker_log import PlannedTask, WorkerLog
 from vla_attention.capture.rollout.episode_faults import EPISODE_FAULTS, Faults, MachineBroken
 from vla_attention.capture.rollout.progress import EpisodeProgress, Progress, Unit
 from vla_attention.capture.store.replan_records import EpisodeStart
@@ -26,9 +26,8 @@ from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.groupings.vocabulary import SceneObject
-from vla_attention.schemas.stores.claims import Claims, Holder
+from vla_attention.schemas.stores.locks import Holder, Locks
 from vla_attention.schemas.stores.store_format import StoreExists, episode_name
-from vla_attention.schemas.stores.worker import this_worker
 
 #: Seconds between two looks for an episode that another process is writing.
 _LOOK_EVERY_S = 5.0
@@ -122,7 +121,7 @@ def plan_of(jobs: Sequence[EpisodeJob]) -> tuple[PlannedTask, ...]:
 class EpisodeLoop(ABC):
     """Records the missing episodes of a store. Other processes may fill the same store at the same time.
 
-    plan: for the record of this worker. unit: what is counted of an episode. With steps, the line of every episode says
+    plan: for the log of this worker. unit: what is counted of an episode. With steps, the line of every episode says
     how it ended; where no environment runs, that was known before.
     """
 
@@ -130,17 +129,18 @@ class EpisodeLoop(ABC):
     plan: tuple[PlannedTask, ...]
     termination: Termination
     unit: Unit
-    record: RecordWriter = field(init=False)
+    log: WorkerLog = field(init=False)
     results: list[EpisodeResult] = field(default_factory=list, init=False)
     faults: Faults = field(default_factory=Faults, init=False)
-    claims: Claims = field(init=False)
+    locks: Locks = field(init=False)
     progress: Progress = field(init=False)
     #: The episodes in progress and their units, for the message after SIGTERM.
     positions: dict[str, int] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
-        """Begin the record of this worker."""
-        self.record = RecordWriter(self.store.path, this_worker(), self.plan, torch.get_num_threads())
+        """Begin the log of this worker."""
+        self.locks = self.store.locks
+        self.log = WorkerLog(self.store.path, self.locks.worker, self.plan, torch.get_num_threads())
 
     def record_all(self, missing: Sequence[EpisodeJob]) -> list[EpisodeResult]:
         """Record the missing episodes, and return those that this process committed.
@@ -153,18 +153,18 @@ class EpisodeLoop(ABC):
             MachineBroken: episode after episode met the same fault.
         """
         with ExitStack() as stack:
-            self.claims = stack.enter_context(Claims(self.store.path, self.record.worker))
+            stack.enter_context(self.locks)
             self.progress = Progress(len(missing), sum(job.size for job in missing), self.unit)
             stack.callback(self.progress.close)
             try:
                 with self.opened():
                     self._record_until_complete(missing)
             except BaseException as error:
-                self.record.end("stopped" if isinstance(error, (Terminated, KeyboardInterrupt)) else "failed")
+                self.log.end("stopped" if isinstance(error, (Terminated, KeyboardInterrupt)) else "failed")
                 if isinstance(error, Terminated):
                     self.progress.say(self._describe_stop(missing))
                 raise
-        self.record.end("failed" if self.faults.dropped else "finished")
+        self.log.end("failed" if self.faults.dropped else "finished")
         return self.results
 
     @abstractmethod
@@ -173,32 +173,32 @@ class EpisodeLoop(ABC):
 
     @abstractmethod
     def attempt_all(self, missing: Sequence[EpisodeJob]) -> list[tuple[EpisodeJob, Holder]]:
-        """Record every episode that nobody has; return those that other processes have claimed."""
+        """Record every episode that nobody has; return those that other processes are writing."""
 
     def _record_until_complete(self, missing: Sequence[EpisodeJob]) -> None:
         left = self.attempt_all(missing)
         announced: set[str] = set()
         while left:
-            new = [holder for _, holder in left if holder.episode not in announced]
+            new = [holder for _, holder in left if holder.name not in announced]
             if new:
                 described = listing([holder.describe() for holder in new], 4)
                 self.progress.say(f"Waiting for episodes that other processes are writing: {described}.")
-                announced.update(holder.episode for holder in new)
+                announced.update(holder.name for holder in new)
             time.sleep(_LOOK_EVERY_S)
             left = self.attempt_all([job for job, _ in left])
 
-    def claim(self, job: EpisodeJob) -> bool | Holder:
-        """Claim an episode: True if it is to be recorded, False if the store has it, else the holder of the claim."""
-        # Check before and after claiming: another process may commit the episode at any time before our claim.
+    def lock(self, job: EpisodeJob) -> bool | Holder:
+        """Lock an episode: True if it is to be recorded, False if the store has it, else the holder of the lock."""
+        # Check before and after locking: another process may commit the episode at any time before our lock.
         if self._has(job):
             self.progress.skip(job.name)
             return False
-        holder = self.claims.acquire(job.name)
+        holder = self.locks.acquire(job.name)
         if holder is not None:
             return holder
         if self._has(job):
             self.progress.skip(job.name)
-            self.claims.release(job.name)
+            self.locks.release(job.name)
             return False
         return True
 
@@ -209,7 +209,7 @@ class EpisodeLoop(ABC):
         """Note that this process has committed an episode."""
         self.positions.pop(result.folder.name, None)
         self.results.append(result)
-        self.record.add_commit(result.folder.name)
+        self.log.add_commit(result.folder.name)
         self.faults.note_recorded()
 
     def show_end(self, job: EpisodeJob, progress: EpisodeProgress, result: EpisodeResult, num_bytes: int) -> None:
@@ -231,22 +231,30 @@ class EpisodeLoop(ABC):
         try:
             again = self.faults.note(name, error)
         except MachineBroken:
-            self.record.add_drop(name, str(error))
+            self.log.add_drop(name, str(error))
             raise
         if again:
             progress.put_back()
         else:
             progress.drop()
-            self.record.add_drop(name, str(error))
+            self.log.add_drop(name, str(error))
         what_next = "The episode begins again." if again else "The episode is left out, and the run goes on."
         self.progress.say(f"{name}: {error} {what_next}")
         return again
 
-    def note_refused(self, name: str, progress: EpisodeProgress, error: StoreExists) -> None:
-        """Note that another process has committed an episode while this one recorded it."""
-        self.positions.pop(name, None)
-        progress.drop()
+    def note_refused(self, job: EpisodeJob, progress: EpisodeProgress, error: StoreExists) -> bool:
+        """Note that another process has committed or taken an episode while this one recorded it.
+
+        Returns whether it is to be looked at again: the other process has not committed it yet.
+        """
+        self.positions.pop(job.name, None)
         self.progress.say(f"{error} This process's copy was dropped.")
+        again = not self._has(job)
+        if again:
+            progress.put_back()
+        else:
+            progress.drop()
+        return again
 
     def _describe_stop(self, missing: Sequence[EpisodeJob]) -> str:
         committed = listing([result.folder.name for result in self.results], 40)
@@ -274,31 +282,32 @@ class OneByOneLoop(EpisodeLoop):
             self.source.close()
 
     def attempt_all(self, missing: Sequence[EpisodeJob]) -> list[tuple[EpisodeJob, Holder]]:
-        """Record every episode that nobody has; return those that other processes have claimed."""
+        """Record every episode that nobody has; return those that other processes are writing."""
         return [(job, holder) for job in missing if (holder := self._attempt(job)) is not None]
 
     def _attempt(self, job: EpisodeJob) -> Holder | None:
         """Record an episode unless the store has it, or drop it after a fault.
 
-        If another process has claimed it, return that claim's holder.
+        If another process is writing it, return who it is.
         """
         self.termination.check()
-        claimed = self.claim(job)
-        if isinstance(claimed, Holder):
-            return claimed
+        locked = self.lock(job)
+        if isinstance(locked, Holder):
+            return locked
         again = False
-        if claimed:
+        if locked:
             progress = self.progress.begin(job.title, job.size)
             try:
-                self._record_once(job, progress)
+                again = self._record_once(job, progress)
             except EPISODE_FAULTS as error:
                 again = self.note_fault(job.name, progress, error)
             finally:
-                self.claims.release(job.name)
+                self.locks.release(job.name)
         self.termination.check()
         return self._attempt(job) if again else None
 
-    def _record_once(self, job: EpisodeJob, progress: EpisodeProgress) -> None:
+    def _record_once(self, job: EpisodeJob, progress: EpisodeProgress) -> bool:
+        """Record an episode; returns whether another process took it and has not committed it."""
         if (line := self.source.begin(job)) is not None:
             self.progress.say(line)
 
@@ -311,8 +320,8 @@ class OneByOneLoop(EpisodeLoop):
             try:
                 result = self.source.record(job, report)
             except StoreExists as error:
-                self.note_refused(job.name, progress, error)
-                return
+                return self.note_refused(job, progress, error)
             self.note_commit(result)
         size = sum(file.stat().st_size for file in result.folder.rglob("*") if file.is_file())
         self.show_end(job, progress, result, size)
+        return False

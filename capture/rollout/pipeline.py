@@ -29,7 +29,7 @@ from vla_attention.capture.rollout.episode import (
     recorded_times,
     simulated_start,
 )
-from vla_attention.capture.rollout.episode_faults import EPISODE_FAULTS, SimulatorDied
+from vla_attention.capture.rollout.episode_faults import SimulatorDied
 from vla_attention.capture.rollout.episode_loop import EpisodeJob, EpisodeLoop, EpisodeResult
 from vla_attention.capture.rollout.policy_call import record_calls
 from vla_attention.capture.rollout.progress import EpisodeProgress
@@ -45,7 +45,7 @@ from vla_attention.capture.rollout.simulator_process import (
 )
 from vla_attention.capture.rollout.simulator_source import resets_line
 from vla_attention.schemas.errors import UserError
-from vla_attention.schemas.stores.claims import Holder
+from vla_attention.schemas.stores.locks import Holder
 from vla_attention.schemas.stores.store_format import StoreExists
 
 #: How often an episode is begun again after the end of its simulator.
@@ -138,7 +138,7 @@ class PipelinedLoop(EpisodeLoop):
             yield
 
     def attempt_all(self, missing: Sequence[EpisodeJob]) -> list[tuple[EpisodeJob, Holder]]:
-        """Record every episode that nobody has; return those that other processes have claimed."""
+        """Record every episode that nobody has; return those that other processes are writing."""
         self.termination.check()
         self._left = list(missing)
         elsewhere: list[tuple[EpisodeJob, Holder]] = []
@@ -163,8 +163,8 @@ class PipelinedLoop(EpisodeLoop):
                 self._idle.append((process, task_id))
                 return
             job = left.pop(place)
-            claimed = self.claim(job)
-            if claimed is True:
+            locked = self.lock(job)
+            if locked is True:
                 process = process or self._start_simulator()
                 simulator = Simulator(process, job, self.progress.begin(job.title, job.size))
                 self._running.append(simulator)
@@ -172,8 +172,8 @@ class PipelinedLoop(EpisodeLoop):
                 continue
             if process is not None:
                 self._idle.append((process, task_id))
-            if isinstance(claimed, Holder):
-                elsewhere.append((job, claimed))
+            if isinstance(locked, Holder):
+                elsewhere.append((job, locked))
 
     def _start_simulator(self) -> SimulatorProcess:
         try:
@@ -347,33 +347,34 @@ class PipelinedLoop(EpisodeLoop):
         self._after_fault(simulator.job, simulator.progress, error)
 
     def _after_fault(self, job: EpisodeJob, progress: EpisodeProgress, error: Exception) -> None:
-        self.claims.release(job.name)
-        if self.note_fault(job.name, progress, error):
+        self.locks.release(job.name)
+        if isinstance(error, StoreExists):
+            again = self.note_refused(job, progress, error)
+        else:
+            again = self.note_fault(job.name, progress, error)
+        if again:
             self._left.insert(0, job)
 
     def _note_commits(self, commits: Sequence[Committed]) -> None:
         for commit in commits:
-            if isinstance(commit.folder, EPISODE_FAULTS):
+            if isinstance(commit.folder, Exception):
                 self._fail_in_writing(commit.episode, commit.folder)
                 continue
             job, recording, progress = self._writing.pop(commit.episode)
-            if isinstance(commit.folder, StoreExists):
-                self.note_refused(job.name, progress, commit.folder)
-            else:
-                result = EpisodeResult(
-                    job.task.task_id,
-                    job.episode_index,
-                    recording.success,
-                    recording.step,
-                    recording.num_replans,
-                    commit.folder,
-                )
-                self.note_commit(result)
-                self.show_end(job, progress, result, commit.num_bytes)
-            self.claims.release(job.name)
+            result = EpisodeResult(
+                job.task.task_id,
+                job.episode_index,
+                recording.success,
+                recording.step,
+                recording.num_replans,
+                commit.folder,
+            )
+            self.note_commit(result)
+            self.show_end(job, progress, result, commit.num_bytes)
+            self.locks.release(job.name)
 
     def _fail_in_writing(self, writer: EpisodeInBackground, error: Exception) -> None:
-        """Drop an episode that the thread could not store; its simulator may be on the way to the next replan."""
+        """Drop an episode that the thread did not store; its simulator may be on the way to the next replan."""
         if writer in self._writing:
             job, _, progress = self._writing.pop(writer)
             self._after_fault(job, progress, error)
@@ -384,7 +385,7 @@ class PipelinedLoop(EpisodeLoop):
     def _note_last_commits(self) -> None:
         """Note the commits that were completed while the thread ended."""
         commits = self._thread.commits_before_end()
-        self._note_commits([commit for commit in commits if not isinstance(commit.folder, EPISODE_FAULTS)])
+        self._note_commits([commit for commit in commits if not isinstance(commit.folder, Exception)])
 
     def _end_simulators(self) -> None:
         for process in [*(simulator.process for simulator in self._running), *(process for process, _ in self._idle)]:

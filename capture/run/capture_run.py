@@ -16,11 +16,7 @@ from vla_attention.capture.interventions.prompts import check_synonyms
 from vla_attention.capture.interventions.resolution import check_not_compiled, interventions_for
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.jobs.termination import Termination
-from vla_attention.capture.jobs.worker_records import (
-    PlannedTask,
-    planned_tasks,
-    read_records,
-)
+from vla_attention.capture.jobs.worker_log import PlannedTask, planned_tasks, read_logs
 from vla_attention.capture.machine.provenance import POLICY_BATCH, describe_machine
 from vla_attention.capture.policies.families import family_of_kind
 from vla_attention.capture.policies.identity import announcement, downloads_of
@@ -172,7 +168,7 @@ def _record_missing(
         PlannedTask(task.task_id, task.name, task.instruction, settings.num_episodes)
         for _, task in sorted(expected.items())
     )
-    known = planned_tasks(read_records(store.path))
+    known = planned_tasks(read_logs(store.path))
     if not todo and all(task.task_id in known and known[task.task_id].wanted >= task.wanted for task in plan):
         return [], damaged_names, Faults()
     num_envs = min(settings.num_envs or default_num_envs(), len(todo))

@@ -1,4 +1,4 @@
-"""Writing one episode: it is written into a folder beside the store, sealed, read back, and renamed into place."""
+"""Writing one episode: it is written into a folder in `.writing`, sealed, read back, and renamed into place."""
 
 from __future__ import annotations
 
@@ -33,6 +33,7 @@ from vla_attention.schemas.stores.content_rules import (
 from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.durable_files import publish
 from vla_attention.schemas.stores.episode_checks import content_problems
+from vla_attention.schemas.stores.locks import Locks
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.root import read_run
 from vla_attention.schemas.stores.seal import seal_episode
@@ -75,6 +76,10 @@ class ReplanRefused(StoreError):
     """A replan whose numbers cannot be right; nothing of it is added to the episode."""
 
 
+class EpisodeTaken(StoreExists):
+    """Another process took an episode over, because this one seemed to have ended."""
+
+
 class EpisodeWriter:
     """Collects replans; has at most one block of rows in memory and writes whole shards only."""
 
@@ -86,6 +91,7 @@ class EpisodeWriter:
         start: EpisodeStart,
         denoise_times: NDArray[np.float64],
         max_replans: int,
+        locks: Locks,
         durable: bool,
     ) -> None:
         self.store = store
@@ -93,6 +99,7 @@ class EpisodeWriter:
         self.folder = folder
         self.start = start
         self.denoise_times = denoise_times
+        self.locks = locks
         self.durable = durable
         self.name = episode_name(start.task_id, start.episode_index)
         self.what = f"episode {self.name} of {store}"
@@ -111,13 +118,14 @@ class EpisodeWriter:
         Raises:
             ReplanRefused: the record does not fit the run or the replans before it, or breaks a rule of `verify`.
             StoreWriteFailed: the disk is full, or refuses in another way.
+            EpisodeTaken: as for `commit`.
         """
         for problem in self._problems(record):
             raise ReplanRefused(
                 f"Cannot store replan {len(self.records)} (environment step {record.env_step}) of {self.what}: "
                 f"{problem}."
             )
-        with naming_the_failure(self.what, self.store):
+        with self._as_its_holder():
             for name, site in self.sites.items():
                 site.append(record.rows[name], record.key_role[name])
         self.prompts.setdefault(record.prompt, len(self.prompts))
@@ -203,11 +211,13 @@ class EpisodeWriter:
 
         Raises:
             StoreExists: another writer has published the same episode meanwhile.
+            EpisodeTaken: this process stood still for so long that another one has taken the episode.
             RunMismatch: the store has been replaced by one of another run meanwhile.
             StoreWriteFailed: the disk is full, or refuses in another way.
         """
-        with naming_the_failure(self.what, self.store):
+        with self._as_its_holder():
             self._check_store()
+            self._check_lock()
             for site in self.sites.values():
                 self.digests |= site.finish()
             self._write_side_arrays()
@@ -240,6 +250,29 @@ class EpisodeWriter:
             steps=None if steps is None else steps.attributes,
         )
 
+    @contextmanager
+    def _as_its_holder(self) -> Iterator[None]:
+        """Name failures; those of a process whose files another one has removed are no failures of the disk."""
+        with naming_the_failure(self.what, self.store):
+            try:
+                yield
+            except (OSError, CorruptEpisode) as error:
+                if not isinstance(error, StoreExists) and self.store.exists():
+                    self._check_lock()
+                raise
+
+    def _check_lock(self) -> None:
+        if self.locks.holds(self.name):
+            return
+        self._refuse_committed()
+        raise EpisodeTaken(
+            f"Episode {self.name} of {self.store} was taken over by another process, because this one stood still."
+        )
+
+    def _refuse_committed(self) -> None:
+        if (self.store / EPISODES_GROUP / self.name).exists():
+            raise StoreExists(f"Episode {self.name} of {self.store} was committed by another process.")
+
     def _check_store(self) -> None:
         # Somebody may have removed the store, or replaced it by another run's, while this episode was rolled out.
         if not self.store.exists():
@@ -252,9 +285,8 @@ class EpisodeWriter:
         try:
             publish(self.folder, target, self.durable)
         except OSError:
-            if not target.exists():
-                raise
-            raise StoreExists(f"Episode {target.name} of {self.store} was committed by another process.") from None
+            self._refuse_committed()
+            raise
         return target
 
     def write(self, name: str, values: NDArray[np.generic], axes: tuple[str, ...]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
+import time
 from pathlib import Path
 
 import zarr
@@ -10,13 +10,7 @@ import zarr
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.stores.digest import run_differences, with_digest
 from vla_attention.schemas.stores.durable_files import publish
-from vla_attention.schemas.stores.partial_folders import (
-    make_partial,
-    partial_folder,
-    partial_of,
-    process_tag,
-    remove_if_empty,
-)
+from vla_attention.schemas.stores.locks import WHOLE_STORE, Held, store_locks
 from vla_attention.schemas.stores.root import read_root
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
@@ -25,6 +19,9 @@ from vla_attention.schemas.stores.store_format import (
     RunMismatch,
     StoreError,
 )
+
+#: Seconds between two looks whether another process has created the store.
+_LOOK_EVERY_S = 0.05
 
 
 def check_same_run(path: Path, existing: RootAttributes, wanted: RootAttributes) -> None:
@@ -51,24 +48,22 @@ def create_root(path: Path, attributes: RootAttributes, durable: bool) -> RootAt
 
     Another process may have created it first. `durable`: flush it to disk, see `RunStore`.
     """
-    try:
-        with partial_of(path, "root") as building:
-            root = zarr.create_group(building, zarr_format=3)
-            root.update_attributes(with_digest(to_json(attributes)))
-            root.create_group(EPISODES_GROUP)
-            publish(building, path, durable)
-    except OSError:
-        # If a store is there now, another process of the same array job was first.
-        if not path.exists():
-            raise
+    locks = store_locks(path)
+    while not path.exists():
+        try:
+            with locks.part(WHOLE_STORE) as building:
+                if not path.exists():
+                    root = zarr.create_group(building, zarr_format=3)
+                    root.update_attributes(with_digest(to_json(attributes)))
+                    root.create_group(EPISODES_GROUP)
+                    publish(building, path, durable)
+        except Held:  # by another process of the same array job
+            time.sleep(_LOOK_EVERY_S)
     return read_existing_root(path)
 
 
 def delete_store(path: Path) -> None:
     """Delete a store."""
     # Rename it first, so that a crash while deleting cannot leave half a store under the old name.
-    doomed = partial_folder(path) / f"deleted-{process_tag()}"
-    make_partial(doomed)
-    path.rename(doomed)
-    shutil.rmtree(doomed)
-    remove_if_empty(doomed.parent)
+    with store_locks(path).part(WHOLE_STORE) as folder:
+        path.rename(folder)

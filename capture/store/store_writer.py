@@ -1,34 +1,27 @@
 """A store opened for adding episodes.
 
-An episode is written into a folder beside the store, read back, flushed to disk and then renamed into place. A process
-that is killed at any moment leaves the store as it was.
+An episode is written into a folder in `.writing`, read back, flushed to disk and then renamed into place. A process
+that is killed at any moment leaves the episodes of the store as they were.
 """
 
 from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.capture.jobs.worker_log import log_folder
 from vla_attention.capture.store.episode_writer import EpisodeWriter, naming_the_failure
 from vla_attention.capture.store.replan_records import EpisodeStart
 from vla_attention.capture.store.store_root import check_same_run, create_root, delete_store, read_existing_root
 from vla_attention.schemas.errors import BadArgument, UserError, plural
-from vla_attention.schemas.stores.claims import holders, jobs_folder
 from vla_attention.schemas.stores.digest import run_differences
-from vla_attention.schemas.stores.partial_folders import (
-    make_partial,
-    partial_folder,
-    partials_in_use,
-    process_tag,
-    remove_dead_partials,
-    remove_if_empty,
-)
+from vla_attention.schemas.stores.locks import episode_locks, store_locks
 from vla_attention.schemas.stores.root import NAMES_FILE, episode_folders
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
@@ -38,7 +31,6 @@ from vla_attention.schemas.stores.store_format import (
     parse_episode_name,
 )
 from vla_attention.schemas.stores.store_place import check_place, why_refused
-from vla_attention.schemas.stores.worker import is_known_dead, this_worker
 
 WriteMode = Literal["new", "resume", "overwrite"]
 
@@ -54,6 +46,7 @@ class RunStore:
         self.path = path
         self.attributes = attributes
         self.durable = durable
+        self.locks = episode_locks(path)
 
     def committed(self) -> set[tuple[int, int]]:
         """(task id, episode index) of every complete episode."""
@@ -67,19 +60,19 @@ class RunStore:
     def episode(
         self, start: EpisodeStart, denoise_times: NDArray[np.float64], max_replans: int
     ) -> Iterator[EpisodeWriter]:
-        """Write one episode; leaving the block without `commit` drops it."""
+        """Write one episode, which is locked meanwhile; leaving the block without `commit` drops it.
+
+        Raises:
+            Held: another process is writing it.
+        """
         name = episode_name(start.task_id, start.episode_index)
-        folder = partial_folder(self.path) / f"{name}-{process_tag()}"
-        try:
+        with ExitStack() as stack:
             with naming_the_failure(f"episode {name} of {self.path}", self.path):
-                make_partial(folder)
+                folder = stack.enter_context(self.locks.part(name))
                 writer = EpisodeWriter(
-                    self.path, self.attributes, folder, start, denoise_times, max_replans, self.durable
+                    self.path, self.attributes, folder, start, denoise_times, max_replans, self.locks, self.durable
                 )
             yield writer
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
-            remove_if_empty(folder.parent)
 
 
 def open_run(path: Path, attributes: RootAttributes, mode: WriteMode, *, durable: bool = True) -> RunStore:
@@ -96,7 +89,8 @@ def open_run(path: Path, attributes: RootAttributes, mode: WriteMode, *, durable
         existing = read_existing_root(path) if path.exists() else create_root(path, attributes, durable)
         check_same_run(path, existing, attributes)
         (path / NAMES_FILE).unlink(missing_ok=True)  # of a copy: it would lack what is recorded now
-        remove_dead_partials(path)
+        for locks in (episode_locks(path), store_locks(path)):
+            locks.sweep()
     return RunStore(path, existing, durable)
 
 
@@ -107,7 +101,7 @@ def make_way(path: Path, mode: WriteMode) -> Path:
         StoreExists: a store with episodes is at `path`, and the mode is `new`.
     """
     check_place(path, "write a store at")
-    # Episodes are written beside the store itself; a link to it may be on another file system.
+    # A store is made, and deleted, beside itself; a link to it may be on another file system.
     path = path.resolve() if path.is_symlink() else path
     with _saying_where(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -116,8 +110,8 @@ def make_way(path: Path, mode: WriteMode) -> Path:
         if path.exists() and mode == "overwrite":
             read_existing_root(path)
             delete_store(path)
-        if mode == "overwrite":  # records and claims are of the deleted store
-            shutil.rmtree(jobs_folder(path), ignore_errors=True)
+        if mode == "overwrite":  # logs are of the deleted store
+            shutil.rmtree(log_folder(path), ignore_errors=True)
     return path
 
 
@@ -165,9 +159,8 @@ def remove_without_episodes(path: Path) -> None:
     """Delete a store that this process made and that has no episode, unless another process is recording one."""
     if not episode_folders(path) and not _is_being_recorded(path):
         delete_store(path)
-        shutil.rmtree(jobs_folder(path), ignore_errors=True)
+        shutil.rmtree(log_folder(path), ignore_errors=True)
 
 
 def _is_being_recorded(path: Path) -> bool:
-    here = this_worker()
-    return bool(partials_in_use(path)) or any(not is_known_dead(holder.worker, here) for holder in holders(path))
+    return any(not holder.is_dead for holder in episode_locks(path).holders())

@@ -19,7 +19,13 @@ def publish(folder: Path, target: Path, durable: bool) -> None:
             for file in files:
                 _flush(Path(parent) / file)
             _flush(Path(parent))
-    folder.rename(target)
+    number = folder.stat().st_ino
+    try:
+        folder.rename(target)
+    except OSError:
+        # A file server whose answer was lost is asked again, and reports a failure after the success.
+        if not target.is_dir() or target.stat().st_ino != number:
+            raise
     if durable:
         _flush(target.parent)
 

@@ -19,6 +19,7 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 
 from vla_attention.schemas.documents import decode_json
+from vla_attention.schemas.stores.locks import WRITING_FOLDER
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.root import NAMES_FILE
 from vla_attention.schemas.stores.seal import SEAL_FILE
@@ -108,7 +109,7 @@ def foreign_in_store(store: Store) -> tuple[str, ...]:
     """Paths beside the episodes of a store that are no part of it; nothing is known of a store at an address."""
     if isinstance(store.path, StoreUrl):
         return ()
-    known = {"zarr.json", EPISODES_DOCUMENT, NAMES_FILE}
+    known = {"zarr.json", EPISODES_DOCUMENT, NAMES_FILE, WRITING_FOLDER}
     known |= {f"{EPISODES_GROUP}/{name}" for name in _episode_names(store.path / EPISODES_GROUP)}
     beyond = _beyond(store.path, known, {".", EPISODES_GROUP})
     return _named(replace(one, path=f"{one.path} (a link)") if one.is_link else one for one in beyond)
@@ -125,7 +126,7 @@ def beyond_the_format(store: Store) -> tuple[str, ...]:
     """
     if isinstance(store.path, StoreUrl):
         return ()
-    known = {"zarr.json", EPISODES_GROUP, EPISODES_DOCUMENT, NAMES_FILE}
+    known = {"zarr.json", EPISODES_GROUP, EPISODES_DOCUMENT, NAMES_FILE, WRITING_FOLDER}
     beyond = list(foreign_in_store(store))
     beyond += [f"{path} (a link)" for path in known if os.path.islink(store.path / path)]
     unknown: CorruptEpisode | None = None

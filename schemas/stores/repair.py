@@ -1,28 +1,27 @@
 """`repair` of both command lines: damaged episodes are moved out of a store, so that --resume records them again.
 
 They go into `NAME.zarr.damaged/`, beside the store as all folders that readers must not see, and none of them is
-deleted. What killed processes of this machine left beside the store is removed.
+deleted. What processes left that have ended is removed.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import uuid
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from vla_attention.schemas.stores.claims import Claims, Holder, jobs_folder
 from vla_attention.schemas.stores.damaged_episodes import DamagedEpisode, look_at
 from vla_attention.schemas.stores.durable_files import publish_file
-from vla_attention.schemas.stores.partial_folders import no_link, process_tag, remove_if_empty
+from vla_attention.schemas.stores.locks import Holder, Locks, episode_locks, no_link
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.root import group_document, refuse_linked_group
 from vla_attention.schemas.stores.seal import read_seal
 from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, StoreError
 from vla_attention.schemas.stores.store_url import local_path
 from vla_attention.schemas.stores.verify import store_faults
-from vla_attention.schemas.stores.worker import this_worker
 
 #: Ending of the folder beside the store with the episodes that were moved aside. It may be deleted at any time.
 DAMAGED_SUFFIX = ".damaged"
@@ -34,7 +33,7 @@ class Finding:
     """A damaged episode, and what was done about it.
 
     moved_to: its folder beside the store; None if it is still in the store.
-    holder: the process that has claimed the episode, which is then left alone.
+    holder: the process that is writing the episode, which is then left alone.
     """
 
     damaged: DamagedEpisode
@@ -50,8 +49,8 @@ def damaged_folder(store: Path) -> Path:
 def repair_store(path: Path, verify: bool = False, dry_run: bool = False) -> list[Finding]:
     """Move every damaged episode of a store aside; other processes may read and fill the store meanwhile.
 
-    An episode is claimed before it is moved, and looked at again: a process that has recorded it anew in the meantime
-    does not lose it. An episode that another process has claimed stays.
+    An episode is locked before it is moved, and looked at again: a process that has recorded it anew in the meantime
+    does not lose it. An episode that another process is writing stays.
 
     Args:
         path: the store.
@@ -71,11 +70,8 @@ def repair_store(path: Path, verify: bool = False, dry_run: bool = False) -> lis
     damaged = [(episode, fault) for episode, fault in looks if fault is not None]
     if dry_run or not damaged:
         return [Finding(fault) for _, fault in damaged]
-    try:
-        with Claims(path, this_worker()) as claims:
-            return [finding for item, _ in damaged if (finding := _move(store, item, claims, verify)) is not None]
-    finally:
-        remove_if_empty(jobs_folder(path))
+    with episode_locks(path) as locks:
+        return [finding for item, _ in damaged if (finding := _move(store, item, locks, verify)) is not None]
 
 
 def _check_root(store: Store) -> None:
@@ -94,10 +90,10 @@ def _check_root(store: Store) -> None:
         )
 
 
-def _move(store: Store, episode: StoredEpisode, claims: Claims, verify: bool) -> Finding | None:
+def _move(store: Store, episode: StoredEpisode, locks: Locks, verify: bool) -> Finding | None:
     """Move one episode aside; None if it is no longer there, or no longer damaged."""
     try:
-        holder = claims.acquire(episode.name)
+        holder = locks.acquire(episode.name)
         if not local_path(episode.folder).is_dir():
             return None
         # A new `StoredEpisode`: the old one keeps what it has read.
@@ -111,7 +107,7 @@ def _move(store: Store, episode: StoredEpisode, claims: Claims, verify: bool) ->
             f"{error.strerror or error}. Episodes before it were moved; remove the cause and run the command again."
         ) from None
     finally:
-        claims.release(episode.name)
+        locks.release(episode.name)
 
 
 def _move_aside(store: Path, folder: Path, damaged: DamagedEpisode) -> Path:
@@ -171,7 +167,7 @@ def repair_groups(path: Path, dry_run: bool = False) -> list[str]:
 
 def _write_whole(path: Path, content: bytes) -> None:
     """Write a file in one step, which survives a crash of the machine."""
-    building = path.with_name(f".{path.name}-{process_tag()}")
+    building = path.with_name(f".{path.name}-{uuid.uuid4().hex}")
     try:
         building.write_bytes(content)
         publish_file(building, path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -39,25 +40,23 @@ def run_repair(stores: Sequence[Path], *, verify: bool, dry_run: bool) -> int:
 
 
 def _leftovers(path: Path, dry_run: bool) -> list[str]:
-    """Remove what killed processes left; returns a line for each folder, also for those that stay."""
-    from vla_attention.schemas.stores.partial_folders import dead_partials, partials_of_others, remove_dead_partials
+    """Remove what ended processes left; returns a line for each file and folder, also for those that stay."""
+    from vla_attention.schemas.stores.locks import episode_locks, store_locks
 
     path = path.resolve() if path.is_symlink() else path
-    dead, others = dead_partials(path), partials_of_others(path)
-    no_folders = {one for one in dead if one.is_symlink() or not one.is_dir()}  # no process of ours left these
-    if not dry_run:
-        remove_dead_partials(path)
-    would = "would be removed" if dry_run else "removed"
     lines = []
-    for folder in dead:
-        if folder in no_folders or (not dry_run and folder.exists()):
-            lines.append(f"  left: {visible(str(folder))}, which is no folder or cannot be removed; delete it yourself")
-        else:
-            lines.append(f"  {would}: {visible(str(folder))}, left by a process that has ended")
-    return lines + [
-        f"  left: {visible(str(folder))}, written by another machine or container; delete it when no capture runs there"
-        for folder in others
-    ]
+    for locks in (episode_locks(path), store_locks(path)):
+        found = locks.leftovers()
+        if not dry_run:
+            locks.sweep()
+        for place, holder in found.items():
+            if holder is not None:
+                lines.append(f"  left: {place}, of {holder.describe()}")
+            elif os.path.lexists(place) and not dry_run:
+                lines.append(f"  left: {place}, which cannot be removed; delete it yourself")
+            else:
+                lines.append(f"  {'would be removed' if dry_run else 'removed'}: {place}, of a process that has ended")
+    return lines
 
 
 def _lines(path: Path, findings: Sequence[Finding], total: int, verify: bool, dry_run: bool) -> list[str]:
@@ -70,7 +69,7 @@ def _lines(path: Path, findings: Sequence[Finding], total: int, verify: bool, dr
         if finding.moved_to is not None:
             lines.append(f"    moved to {finding.moved_to}")
         elif finding.holder is not None:
-            lines.append(f"    left in the store, because it is claimed: {finding.holder.describe()}")
+            lines.append(f"    left in the store, because it is being written: {finding.holder.describe()}")
     if not dry_run and any(finding.moved_to is not None for finding in findings):
         lines.append("Run the same capture with --resume to record what was moved aside again.")
     return lines

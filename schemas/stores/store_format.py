@@ -60,8 +60,6 @@ STORE_SUFFIX = ".zarr"
 EPISODES_GROUP = "episodes"
 #: The document of that group. It states nothing but that it is a group.
 EPISODES_DOCUMENT = f"{EPISODES_GROUP}/zarr.json"
-#: Ending of the folder beside the store in which episodes are written. Readers of the store do not look there.
-PARTIAL_SUFFIX = ".partial"
 
 ROW_AXES = ("replan", "layer", "denoise", "head", "query", "key")
 ATOM_AXES = (*ROW_AXES[:-1], "segment")

@@ -1,18 +1,17 @@
 """Workers: the processes that capture, and the SLURM jobs that started them.
 
 A store holds nothing about workers. Its episodes have the same bytes on every machine, and people who share a store do
-not share the names of their machines. This information is only in the small files beside the store (`claims.py`,
-`worker_records.py`).
+not share the names of their machines. This information is only in locks (`locks.py`) and in the logs beside the store
+(`worker_log.py`).
 """
 
 from __future__ import annotations
 
 import os
 import socket
+import uuid
 from dataclasses import dataclass
 from pathlib import Path
-
-from vla_attention.schemas.stores.partial_folders import process_space, process_tag
 
 
 @dataclass(frozen=True)
@@ -49,11 +48,11 @@ def this_worker() -> Worker:
     array, index = environment.get("SLURM_ARRAY_JOB_ID"), environment.get("SLURM_ARRAY_TASK_ID")
     restarts = environment.get("SLURM_RESTART_COUNT", "0")
     return Worker(
-        tag=process_tag(),
+        tag=uuid.uuid4().hex,
         host=socket.gethostname(),
         process=process,
         process_start=_process_start(process),
-        process_space=process_space(),
+        process_space=_process_space(),
         slurm_job=job,
         job_name=f"{array}_{index}" if array and index else job,
         restarts=int(restarts) if restarts.isdigit() else 0,
@@ -71,6 +70,20 @@ def is_known_dead(other: Worker, this: Worker) -> bool:
     if not known or (other.host, other.process_space) != (this.host, this.process_space):
         return False
     return _process_start(other.process) != other.process_start
+
+
+def _process_space() -> str:
+    """Where the numbers of this machine's processes hold; empty where the system does not say it.
+
+    It is the number of the boot, drawn at random when the machine started, and the namespace of process numbers, of
+    which a container may have its own: `4f0d2f0e-... pid:[4026531836]`. The name of a host does not tell two nodes
+    apart: nodes that start from one image may share it, and all machines have the same first namespace.
+    """
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+        return f"{boot} {os.readlink('/proc/self/ns/pid')}"
+    except OSError:
+        return ""
 
 
 def _process_start(process: int) -> str:

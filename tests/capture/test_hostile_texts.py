@@ -62,12 +62,10 @@ def with_hostile_texts(store: Path) -> Path:
         reseal(folder)
     (store / f"a\x1b[2J\n{FORGED}").write_text("foreign")
     (store / "episodes" / "task001_episode000" / f"b\x1b[2J\n{FORGED}").mkdir()
-    claim = store.with_name(f"{store.name}.jobs") / "claims" / "task000_episode000.1"
-    claim.mkdir(parents=True)
+    (store / ".writing" / f"c\x1b[2J\n{FORGED}").mkdir(parents=True)
     worker = {"tag": HOSTILE, "host": HOSTILE, "process": 1, "process_start": "1", "process_space": "1"}
-    (claim / "owner.json").write_text(json.dumps(worker | {"slurm_job": "1", "job_name": HOSTILE}))
-    partial = store.with_name(f"{store.name}.partial")
-    (partial / f"c\x1b[2J\n{FORGED}").mkdir(parents=True)
+    lock = store / ".writing" / "task000_episode000.lock"
+    lock.write_text(json.dumps(worker | {"slurm_job": "1", "job_name": HOSTILE}))
     return store
 
 

@@ -17,7 +17,7 @@ from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.jobs.status import store_status
 from vla_attention.capture.jobs.termination import EXIT_TERMINATED
 from vla_attention.capture.published.evaluate import evaluate_attention_ratio
-from vla_attention.schemas.stores.claims import holders
+from vla_attention.schemas.stores.locks import episode_locks
 
 pytestmark = [pytest.mark.simulator, pytest.mark.thorough]
 
@@ -31,8 +31,8 @@ def test_sigterm_drops_the_episode_in_flight_and_resuming_completes_the_store(tm
     log = tmp_path / "log"
 
     def in_a_later_episode() -> bool:
-        names = [holder.episode for holder in holders(store)]
-        partial = list((tmp_path / "a.zarr.partial").glob("task*"))
+        names = [holder.name for holder in episode_locks(store).holders()]
+        partial = list((store / ".writing").glob("task*-*"))
         return len(names) == len(partial) == 1 and partial[0].name.startswith(f"{names[0]}-") and names[0][-1] != "0"
 
     with log.open("w") as out:
@@ -61,7 +61,7 @@ def test_sigterm_drops_the_episode_in_flight_and_resuming_completes_the_store(tm
     assert "Traceback" not in printed
     assert "\r" not in printed  # no progress bar in a file
     assert not (tmp_path / "a.zarr.partial").exists()
-    assert holders(store) == []
+    assert not (store / ".writing").exists()
     (task,) = store_status(store).tasks
     assert (task.committed, task.expected, task.missing) == (number, 3, tuple(range(number, 3)))
     assert f"process {process.pid}" in task.last_by

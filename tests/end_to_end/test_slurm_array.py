@@ -21,9 +21,7 @@ import pytest
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.jobs.status import store_status
 from vla_attention.capture.published.evaluate import evaluate_attention_ratio
-from vla_attention.schemas.stores.claims import holders
 from vla_attention.schemas.stores.reader import open_store
-from vla_attention.schemas.stores.store_format import PARTIAL_SUFFIX
 
 pytestmark = [
     pytest.mark.simulator,
@@ -102,10 +100,8 @@ def test_an_array_interrupted_in_episodes_equals_a_single_process(tmp_path, monk
         return "\n".join(file.read_text() for file in sorted(tmp_path.glob("slurm-*.out")))
 
     def in_an_episode(task: int) -> bool:
-        """A process has claimed an episode of the task, and its partial folder exists."""
-        partial = store.with_name(store.name + PARTIAL_SUFFIX).glob(f"task{task:03d}_episode*")
-        name = f"task{task:03d}_episode"
-        return any(holder.episode.startswith(name) for holder in holders(store)) and any(True for _ in partial)
+        """A process has locked an episode of the task and begun to write it."""
+        return any((store / ".writing").glob(f"task{task:03d}_episode???-*"))
 
     try:
         # One task gets SIGTERM, as --signal sends it before the time limit, and requeues itself.
@@ -117,7 +113,7 @@ def test_an_array_interrupted_in_episodes_equals_a_single_process(tmp_path, monk
         wait_until("task 1 is in an episode", lambda: in_an_episode(1), logs, 0.05)
         slurm("scontrol", "requeue", f"{array}_1")
         wait_until("task 1 has dropped its episode", lambda: "Stopped by SIGTERM: dropped task001" in log_of(1), logs)
-        assert not any(holder.episode.startswith("task000") for holder in holders(store))
+        assert not any((store / ".writing").glob("task000*"))
         wait_until("the analysis is done", lambda: state_of(analysis) not in ("PENDING", "RUNNING", "COMPLETING"), logs)
         assert state_of(analysis) == "COMPLETED", logs()
     finally:
@@ -127,7 +123,7 @@ def test_an_array_interrupted_in_episodes_equals_a_single_process(tmp_path, monk
     assert status.complete, logs()
     assert [task.committed for task in status.tasks] == [EPISODES] * len(TASKS)
     assert status.writing == ()
-    assert not store.with_name(store.name + PARTIAL_SUFFIX).exists()
+    assert not (store / ".writing").exists()
     assert analyze(["store", "verify", str(store)]) == 0
     assert "requeued 1 times" in log_of(0)
     assert "requeued 1 times" in log_of(1)

@@ -23,4 +23,4 @@ def names(path: Path) -> list[str]:
 
 
 def leftovers(path: Path) -> list[Path]:
-    return list(path.with_name(path.name + ".partial").glob("*"))
+    return [*path.with_name(path.name + ".partial").glob("*"), *path.glob(".writing")]

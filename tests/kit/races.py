@@ -2,7 +2,7 @@
 
 Usage: python -m tests.kit.races FOLDER [--rounds 2] [--processes 8] [--seed 0]; prints a line of JSON for each round.
 
-The command line, the policy (of test size), claims, writer and store are the real ones; the simulator is a
+The command line, the policy (of test size), locks, writer and store are the real ones; the simulator is a
 `StillScene`, so that a capture takes a second. Processes are forked, see `forks.py`.
 """
 
@@ -25,6 +25,7 @@ import pytest
 
 from tests.kit import forks
 from tests.kit.still_scene import capture_without_simulator
+from vla_attention.capture.jobs.worker_log import read_logs
 
 #: Of the suite `robosuite`, of which a `StillScene` shows nothing.
 TASKS, EPISODES = 8, 1
@@ -44,7 +45,7 @@ class Round:
         twice: episodes that two processes say they committed.
         faults: what `vla-attention store verify` finds.
         unlike: files that differ from those of a store that one process filled, or are in one of both only.
-        left: what was beside the store after one more `--resume`, other than the records of the workers.
+        left: what was beside the store after one more `--resume`, other than the logs of the workers.
         tracebacks: what the processes wrote, where it has one.
     """
 
@@ -115,11 +116,11 @@ def run_round(folder: Path, undisturbed: Path, number: int, processes: int) -> R
     store = folder / undisturbed.name  # the name is in nothing that is stored, and differs in nothing
     logs = [folder / f"{process}.log" for process in range(processes)]
     began = [forks.start(capture, store, tasks, log=log) for tasks, log in zip(lists, logs, strict=True)]
-    partial = store.with_name(store.name + ".partial")
+    writing = store / ".writing"
     # After some episodes, however busy the machine is, and at any moment of the next ones.
     wanted, victim, pause = random.randint(0, TASKS // 2), random.randrange(processes), random.uniform(0, 0.5)
     while not all(map(forks.ended, began)):
-        if list(partial.glob("task*")) and len(list((store / "episodes").glob("task*"))) >= wanted:
+        if list(writing.glob("task*-*")) and len(list((store / "episodes").glob("task*"))) >= wanted:
             break
         time.sleep(0.005)
     time.sleep(pause)
@@ -137,9 +138,8 @@ def run_round(folder: Path, undisturbed: Path, number: int, processes: int) -> R
     # What a killed process leaves is removed by the next capture that is started.
     codes += (forks.wait(forks.start(capture, store, range(TASKS), log=folder / "last.log")),)
     faults = forks.answer_of(faults_of, store)
-    jobs = store.with_name(store.name + ".jobs")
-    left = [entry.name for entry in folder.glob("*.zarr.*") if entry != jobs]
-    left += [entry.relative_to(folder).as_posix() for entry in jobs.glob("claims/*")]
+    left = [entry.name for entry in folder.glob("*.zarr.*") if entry.suffix != ".log"]
+    left += [entry.relative_to(folder).as_posix() for entry in store.glob(".writing/*")]
     return Round(
         lists,
         victim,
@@ -164,9 +164,8 @@ def overlapping_lists(random: Random, processes: int) -> tuple[tuple[int, ...], 
 
 
 def _committed_twice(store: Path) -> tuple[str, ...]:
-    """Episodes that are in the records of two workers."""
-    records = store.with_name(store.name + ".jobs").glob("runs/*.json")
-    names = [commit["episode"] for record in records for commit in json.loads(record.read_text())["committed"]]
+    """Episodes that are in the logs of two workers."""
+    names = [episode for record in read_logs(store) for episode, _ in record.committed]
     return tuple(sorted({name for name in names if names.count(name) > 1}))
 
 

@@ -12,14 +12,14 @@ from tests.kit.stores import StoreSpec, write_store
 from tests.kit.tokens import INSTRUCTIONS
 from vla_attention.capture.__main__ import main
 from vla_attention.capture.jobs.status import store_status
-from vla_attention.capture.jobs.worker_records import (
+from vla_attention.capture.jobs.worker_log import (
     PlannedTask,
-    RecordWriter,
+    WorkerLog,
+    log_folder,
     planned_tasks,
-    read_records,
+    read_logs,
 )
 from vla_attention.schemas.errors import Note
-from vla_attention.schemas.stores.claims import jobs_folder
 from vla_attention.schemas.stores.worker import Worker
 
 SPEC = StoreSpec(tasks=(0, 2), episodes=2, replans=1, layers=(0,), heads=(0,), frames=False)
@@ -35,7 +35,7 @@ def store(tmp_path) -> Path:
     return write_store(tmp_path / "a.zarr", spec=SPEC)
 
 
-def test_without_records_the_expected_number_is_unknown(store, capsys):
+def test_without_logs_the_expected_number_is_unknown(store, capsys):
     status = store_status(store)
     assert [(task.task_id, task.committed, task.success, task.expected) for task in status.tasks] == [
         (0, 2, 1, None),
@@ -64,11 +64,11 @@ def test_the_expected_number_can_be_given(store, capsys):
 
 
 def test_plans_of_several_processes_add_up(store, capsys):
-    first = RecordWriter(store, NODE, (planned(0, 2), planned(1, 2)))
+    first = WorkerLog(store, NODE, (planned(0, 2), planned(1, 2)))
     first.add_commit("task000_episode001")
     first.end("stopped")
-    RecordWriter(store, replace(NODE, tag="node8-5-cd", host="node8", job_name="98_0"), (planned(0, 4),))
-    assert {task: plan.episodes for task, plan in planned_tasks(read_records(store)).items()} == {0: 4, 1: 2}
+    WorkerLog(store, replace(NODE, tag="node8-5-cd", host="node8", job_name="98_0"), (planned(0, 4),))
+    assert {task: plan.episodes for task, plan in planned_tasks(read_logs(store)).items()} == {0: 4, 1: 2}
     status = store_status(store)
     by_id = {task.task_id: task for task in status.tasks}
     assert by_id[0].missing == (2, 3)
@@ -81,16 +81,20 @@ def test_plans_of_several_processes_add_up(store, capsys):
     assert "node7 (job 98_2)" in capsys.readouterr().out
 
 
-def test_records_of_an_earlier_store_with_the_same_name_are_ignored(store):
-    RecordWriter(store, NODE, (planned(0, 50),))
+def test_logs_of_an_earlier_store_with_the_same_name_are_ignored(store):
+    WorkerLog(store, NODE, (planned(0, 50),))
     assert store_status(store).complete is False
     os.utime(store / "zarr.json", (1, 1))
-    assert read_records(store) == []
+    assert read_logs(store) == []
     assert store_status(store).complete is None
 
 
-def test_damaged_records_are_named_and_ignored(store):
-    RecordWriter(store, NODE, (planned(0, 2), planned(2, 2)))
-    (jobs_folder(store) / "runs" / "x.json").write_text("{")
-    with pytest.warns(Note, match="1 record in .* cannot be read and is ignored: x.json"):
-        assert store_status(store).complete
+def test_damaged_logs_are_named_and_ignored(store):
+    WorkerLog(store, NODE, (planned(0, 2), planned(2, 2)))
+    (file,) = log_folder(store).iterdir()
+    file.write_text(file.read_text() + '{"event": "committed", "epis')  # killed inside of a line
+    assert store_status(store).complete
+    WorkerLog(store, NODE, (planned(0, 3),)).add_commit("task000_episode000")  # the next process has the same number
+    file.write_text("{\n" + file.read_text())
+    with pytest.warns(Note, match=f"2 lines|1 log in .* cannot be read in full: {file.name}"):
+        assert store_status(store).tasks[0].missing == (2,)

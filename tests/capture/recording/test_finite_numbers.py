@@ -97,7 +97,7 @@ def test_a_policy_that_overflows_is_reported_with_its_first_layer(
     (episode,) = open_store(store).episodes
     assert episode.name == "task000_episode000"
     assert verify_store(open_store(store)) == []
-    assert not (tmp_path / "a.zarr.partial").exists()
+    assert not (tmp_path / "a.zarr" / ".writing").exists()
 
 
 def test_a_checkpoint_with_nan_names_the_tensor_and_makes_no_store(tmp_path, monkeypatch, capsys):

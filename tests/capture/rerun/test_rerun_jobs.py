@@ -9,7 +9,7 @@ import pytest
 
 from vla_attention.capture.__main__ import main
 from vla_attention.capture.jobs.termination import EXIT_TERMINATED, Terminated, Termination
-from vla_attention.capture.jobs.worker_records import read_records
+from vla_attention.capture.jobs.worker_log import read_logs
 
 EPISODES = ["task000_episode000", "task000_episode001", "task001_episode000", "task001_episode001"]
 
@@ -39,7 +39,7 @@ def test_sigterm_drops_the_episode_in_progress(pi_store, tmp_path, monkeypatch, 
     assert f"Stopped by SIGTERM: dropped {EPISODES[1]} at call" in said
     assert f"committed 1 episode ({EPISODES[0]}); 3 of this process's 4 are missing." in said
     assert names(store) == EPISODES[:1]
-    assert [record.state for record in read_records(store)] == ["stopped"]
+    assert [record.state for record in read_logs(store)] == ["stopped"]
     monkeypatch.undo()
     assert main(["rerun", str(pi_store), "--output", str(store), "--check", "0", "--resume"]) == 0
     assert names(store) == EPISODES

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from tests.kit.stores import StoreSpec, root_attributes, write_episode
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Terminated, Termination
-from vla_attention.capture.jobs.worker_records import read_records
+from vla_attention.capture.jobs.worker_log import read_logs
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.rollout.episode_loop import (
     EpisodeJob,
@@ -23,7 +25,8 @@ from vla_attention.capture.rollout.episode_loop import (
 from vla_attention.capture.rollout.progress import Unit
 from vla_attention.capture.rollout.simulation import SimulationFailed
 from vla_attention.capture.store.store_writer import RunStore, open_run
-from vla_attention.schemas.stores.claims import holders
+from vla_attention.schemas.stores.locks import episode_locks
+from vla_attention.schemas.stores.reader import open_store
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=3, replans=1, layers=(0,), heads=(0,), frames=False)
 TASKS = [Task("made_up", number, f"task_{number}", f"lift cube {number}", 0) for number in range(2)]
@@ -66,9 +69,9 @@ def test_every_episode_is_recorded_and_noted(store: RunStore, capsys: pytest.Cap
     names = [job.name for job in JOBS]
     assert [result.folder.name for result in results] == names
     assert source.tried == [*names, "closed"]
-    (record,) = read_records(store.path)
-    assert (record.state, [commit.episode for commit in record.committed]) == ("finished", names)
-    assert holders(store.path) == []
+    (record,) = read_logs(store.path)
+    assert (record.state, [episode for episode, _ in record.committed]) == ("finished", names)
+    assert not (store.path / ".writing").exists()
     said = capsys.readouterr().out
     assert said.count(f"{names[0]} begins") == 1
     assert said.count("success after 4 steps, 1 replans") == 4
@@ -93,7 +96,7 @@ def test_what_another_process_commits_meanwhile_is_refused(store: RunStore, caps
 def test_a_fault_costs_its_episode(store: RunStore, capsys, error: Exception, tries: int) -> None:
     def fail(name: str) -> None:
         if name == JOBS[1].name:
-            assert [holder.episode for holder in holders(store.path)] == [name]
+            assert [holder.name for holder in episode_locks(store.path).holders()] == [name]
             raise error
 
     source = MadeUpSource(store, fail)
@@ -101,12 +104,12 @@ def test_a_fault_costs_its_episode(store: RunStore, capsys, error: Exception, tr
     assert len(loop.record_all(JOBS)) == 3
     assert source.tried.count(JOBS[1].name) == tries
     assert loop.faults.dropped == {JOBS[1].name: str(error)}
-    (record,) = read_records(store.path)
+    (record,) = read_logs(store.path)
     assert (record.state, [drop.episode for drop in record.dropped]) == ("failed", [JOBS[1].name])
     said = capsys.readouterr().out
     assert said.count("The episode begins again.") == tries - 1
     assert said.count("The episode is left out, and the run goes on.") == 1
-    assert holders(store.path) == []
+    assert not (store.path / ".writing").exists()
 
 
 def test_sigterm_drops_one_episode_and_says_what_is_missing(store: RunStore, capsys) -> None:
@@ -120,5 +123,39 @@ def test_sigterm_drops_one_episode_and_says_what_is_missing(store: RunStore, cap
     assert source.tried[-1] == "closed"
     said = capsys.readouterr().out
     assert f"Stopped by SIGTERM: dropped {JOBS[1].name} at call 2; committed 1 episode ({JOBS[0].name}); 3 of" in said
-    assert [record.state for record in read_records(store.path)] == ["stopped"]
-    assert holders(store.path) == []
+    assert [record.state for record in read_logs(store.path)] == ["stopped"]
+    assert not (store.path / ".writing").exists()
+
+
+@pytest.mark.parametrize("committed", [True, False])
+def test_an_episode_that_another_process_took_over_is_looked_at_again(
+    store: RunStore, capsys, monkeypatch, committed: bool
+) -> None:
+    """This process stood still in the second episode; the other one commits it at once, or gives it up later."""
+    other, name = open_run(store.path, root_attributes(SPEC), "resume", durable=False), JOBS[1].name
+
+    def stand_still(of: str) -> None:
+        if of == name and not taken:
+            taken.append(name)
+            os.utime(store.path / ".writing" / f"{name}.lock", (1000, 1000))
+            assert other.locks.acquire(name) is None
+            if committed:
+                write_episode(other, SPEC, 0, 1)
+
+    taken: list[str] = []
+    monkeypatch.setattr(
+        "vla_attention.capture.rollout.episode_loop.time",
+        SimpleNamespace(sleep=lambda seconds: other.locks.release(name)),
+    )
+    source = MadeUpSource(store, stand_still)
+    loop = loop_of(store, source)
+    loop.record_all(JOBS)
+    other.locks.release(name)
+    assert sorted(result.folder.name for result in loop.results) == sorted(
+        job.name for job in JOBS if job.name != name or not committed
+    )
+    assert [episode.name for episode in open_store(store.path).episodes] == sorted(job.name for job in JOBS)
+    assert loop.faults.dropped == {}
+    said = capsys.readouterr().out
+    assert said.count("This process's copy was dropped.") == 1
+    assert ("Waiting for episodes that other processes are writing" in said) is not committed

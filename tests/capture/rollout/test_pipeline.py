@@ -24,7 +24,7 @@ from vla_attention.capture.jobs.termination import EXIT_TERMINATED
 from vla_attention.capture.rerun.base_store import machine_differences
 from vla_attention.capture.rollout import pipeline
 from vla_attention.capture.rollout.policy_call import record_calls
-from vla_attention.schemas.stores.claims import Claims, holders
+from vla_attention.schemas.stores.locks import episode_locks
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.worker import Worker
 
@@ -63,8 +63,7 @@ def test_more_simulators_give_the_same_episodes(scene, tmp_path, capsys):
     assert "Simulators: 3 processes; --num-envs N changes it." in printed
     assert printed.count("no success after 8 steps, 2 replans") == 6
     assert "6 episodes added, 0 solved." in printed
-    assert not (tmp_path / "three.zarr.partial").exists()
-    assert holders(tmp_path / "three.zarr") == []
+    assert not (tmp_path / "three.zarr" / ".writing").exists()
     assert store_status(tmp_path / "three.zarr").complete
     assert analyze(["store", "verify", str(tmp_path / "three.zarr")]) == 0
 
@@ -80,7 +79,7 @@ def test_an_episode_whose_simulator_died_begins_again(scene, tmp_path, capsys):
     again = "task000_episode001: its simulator ended (killed by signal 9); the episode begins again."
     assert capsys.readouterr().out.count(again) == 2
     assert_same_episodes(tmp_path / "one.zarr", tmp_path / "a.zarr")
-    assert not (tmp_path / "a.zarr.partial").exists()
+    assert not (tmp_path / "a.zarr" / ".writing").exists()
 
 
 class Broken(StillScene):
@@ -122,14 +121,13 @@ def test_an_error_of_the_writing_ends_everything(scene, tmp_path, monkeypatch, c
     assert "No space left on device" in said
     assert "Nothing of this episode was kept" in said
     assert said.count("\n") == 1
-    assert not (tmp_path / "a.zarr.partial").exists()
-    assert holders(tmp_path / "a.zarr") == []
+    assert not (tmp_path / "a.zarr" / ".writing").exists()
 
 
-def test_it_waits_for_an_episode_that_another_process_has_claimed(scene, tmp_path, monkeypatch, capsys):
+def test_it_waits_for_an_episode_that_another_process_has_locked(scene, tmp_path, monkeypatch, capsys):
     store = tmp_path / "a.zarr"
     assert record(store, 1, "--task-id", "0", "--num-episodes", "1") == 0
-    other = Claims(store, NODE)
+    other = episode_locks(store, NODE)
     assert other.acquire("task000_episode001") is None
     monkeypatch.setattr(
         "vla_attention.capture.rollout.episode_loop.time",
@@ -248,7 +246,7 @@ class Run:
         return [int(child) for child in children if _is_simulator(child)]
 
     def both_are_in_an_episode(self) -> bool:
-        return len(list(self.store.with_name("a.zarr.partial").glob("task*"))) == 2
+        return len(list((self.store / ".writing").glob("task*-*"))) == 2
 
 
 def _is_simulator(number: str | int) -> bool:
@@ -278,8 +276,7 @@ def test_a_stopped_capture_leaves_no_half_episode_and_no_process(number, code, t
     said = run.log.read_text()
     assert "Traceback" not in said
     if number != signal.SIGKILL:
-        assert not run.store.with_name("a.zarr.partial").exists()
-        assert holders(run.store) == []
+        assert not (run.store / ".writing").exists()
     if number == signal.SIGTERM:
         assert "Stopped by SIGTERM: dropped task000_episode000 at step" in said
         assert ", task000_episode001 at step" in said

@@ -33,10 +33,11 @@ from tests.kit.stores import (
     write_episode,
 )
 from tests.kit.thorough import thorough_except
-from vla_attention.capture.store.episode_writer import StoreWriteFailed
+from vla_attention.capture.store.episode_writer import EpisodeTaken, StoreWriteFailed
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument, UserError
-from vla_attention.schemas.stores.partial_folders import process_tag
+from vla_attention.schemas.stores import worker
+from vla_attention.schemas.stores.locks import Locks
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import (
     RunMismatch,
@@ -153,11 +154,11 @@ def test_bytes_that_come_back_changed_are_never_published(tmp_path, monkeypatch)
 def write_same(path: Path, barrier: Barrier, report: Connection) -> None:
     store = open_run(path, root_attributes(SPEC), "resume")
     start, records = episode_records(SPEC, 0, 0)
+    barrier.wait(60)
     try:
         with store.episode(start, denoise_times(SPEC), 9) as writer:
             for record in records:
                 writer.append(record)
-            barrier.wait(60)
             commit(writer, SPEC, 0, 0)
         report.send("committed")
     except StoreExists as error:
@@ -184,7 +185,7 @@ def test_one_of_two_writers_of_an_episode_wins(tmp_path, uninterrupted):
         child.join(60)
         assert child.exitcode == 0
     assert results.count("committed") == 1
-    assert sum("committed by another process" in result for result in results) == 1
+    assert sum("Another process is writing" in result or "committed by" in result for result in results) == 1
     assert verify_store(open_store(path)) == []
     assert not leftovers(path)
     write_store(path, mode="resume", spec=SPEC)
@@ -220,21 +221,44 @@ def test_a_crash_while_overwriting_leaves_no_half_store(tmp_path, monkeypatch, u
     assert store_bytes(write_store(path, mode="overwrite", spec=SPEC)) == uninterrupted
 
 
-def test_only_dead_processes_of_this_machine_lose_their_partials(tmp_path):
+def test_a_holder_that_stood_still_neither_harms_its_successor_nor_publishes_half(tmp_path, uninterrupted):
+    """At every moment: it goes on after another process took the episode over, before or after its commit."""
     path = write_store(tmp_path / "a.zarr", spec=SPEC)
-    folder = path.with_name("a.zarr.partial")
-    host = os.uname().nodename
-    dead = process_tag().replace(f"-{os.getpid()}-", f"-{dead_process()}-")
-    keep = [
-        f"task000_episode003-{process_tag()}",
-        f"task000_episode003-{dead.replace(host, f'{host}x')}",
-        f"task000_episode003-{host}-{dead_process()}-0123abcd",  # perhaps of another node with this host's name
-        "notes",
-    ]
-    for name in (*keep, f"task000_episode003-{dead}", f"root-{dead}"):
-        (folder / name / "deep").mkdir(parents=True)
-    open_run(path, root_attributes(SPEC), "resume")
-    assert sorted(entry.name for entry in folder.iterdir()) == sorted(keep)
+    before = store_bytes(path)
+    start, records = episode_records(SPEC, 6, 0)
+    name = episode_name(6, 0)
+    for moment in ("append", "commit", "publish"):
+        for committed in (True, False):
+            stopped, other = (open_run(path, root_attributes(SPEC), "resume") for _ in range(2))
+
+            def take_over(other=other, committed=committed) -> None:
+                os.utime(path / ".writing" / f"{name}.lock", (1000, 1000))
+                assert other.locks.acquire(name) is None
+                if committed:
+                    write_episode(other, SPEC, 6, 0)
+
+            expected = StoreExists if committed else EpisodeTaken
+            with stopped.episode(start, denoise_times(SPEC), 9) as writer, pytest.raises(expected):  # noqa: PT012
+                writer.append(records[0])
+                if moment == "append":
+                    take_over()
+                for record in records[1:]:
+                    writer.append(record)
+                if moment == "commit":
+                    take_over()
+                with before_call("rename", 0 if moment == "publish" else -1, take_over):
+                    commit(writer, SPEC, 6, 0)
+            if not committed:
+                assert store_bytes(path) == before | {
+                    f".writing/{name}.lock": (path / ".writing" / f"{name}.lock").read_bytes()
+                }
+                write_episode(other, SPEC, 6, 0)
+            other.locks.release(name)
+            assert verify_store(open_store(path)) == []
+            assert names(path)[-1] == name
+            assert not leftovers(path)
+            shutil.rmtree(path / "episodes" / name)
+    assert store_bytes(path) == uninterrupted
 
 
 def dead_process() -> int:
@@ -266,12 +290,15 @@ class WritersAndCrashes(RuleBasedStateMachine):
         def crash() -> None:
             raise Crash
 
+        number_of_process, start = dead_process(), worker._process_start
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(os, "getpid", dead_process)
+            patch.setattr(os, "getpid", lambda: number_of_process)
+            patch.setattr(worker, "_process_start", lambda of: "1" if of == number_of_process else start(of))
             try:
                 with before_call(kind, number, crash):
                     # Cleaning up is not for the dead.
                     patch.setattr(shutil, "rmtree", lambda *_, **__: None)
+                    patch.setattr(Locks, "release", lambda *_: None)
                     action()
             except (Crash, UserError):
                 return

@@ -248,7 +248,7 @@ def test_an_exception_drops_the_episode_and_only_it(tmp_path, policy):
         assert not run.has(0, 1)
         fill(run, policy, number=1)
     assert [one.name for one in stored(tmp_path).episodes] == ["task000_episode000", "task000_episode001"]
-    assert not (tmp_path / "a.zarr.partial").exists()
+    assert not (tmp_path / "a.zarr" / ".writing").exists()
 
 
 def test_resuming_goes_on_and_refuses_another_run(tmp_path, policy):

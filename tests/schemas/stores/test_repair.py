@@ -6,8 +6,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
@@ -23,13 +21,12 @@ from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main
 from vla_attention.capture.jobs.status import store_status
 from vla_attention.schemas.errors import plural
-from vla_attention.schemas.stores.claims import Claims, holders
-from vla_attention.schemas.stores.partial_folders import partial_folder
+from vla_attention.schemas.stores.locks import Locks, episode_locks
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.repair import damaged_folder, repair_store
 from vla_attention.schemas.stores.store_format import StoreError
 from vla_attention.schemas.stores.verify import verify_store
-from vla_attention.schemas.stores.worker import Worker, this_worker
+from vla_attention.schemas.stores.worker import Worker
 
 SPEC = StoreSpec(tasks=(0, 2), episodes=2, replans=1, layers=(0,), heads=(0,), frames=False)
 DAMAGED, WHOLE = "task000_episode001", ["task000_episode000", "task002_episode000", "task002_episode001"]
@@ -125,7 +122,7 @@ def test_a_damaged_episode_is_listed_moved_aside_and_missing(store, episode, ori
     assert names(store) == WHOLE
     assert verify_store(open_store(store)) == []
     assert [task.missing for task in store_status(store, expected=2).tasks] == [(1,), ()]
-    assert sorted(path.name for path in store.parent.iterdir()) == ["a.zarr", "a.zarr.damaged"]  # no claims are left
+    assert sorted(path.name for path in store.parent.iterdir()) == ["a.zarr", "a.zarr.damaged"]  # and no logs
     assert main(["verify", str(store), "--repair", "--quick"]) == 0
     assert f"{store}: none of 3 episodes is damaged" in capsys.readouterr().out
     write_store(store, mode="resume", spec=SPEC)
@@ -149,17 +146,17 @@ def test_damage_that_only_reading_shows_needs_verify(store, episode, capsys):
     assert "(every byte was read)" in capsys.readouterr().out
 
 
-def test_a_claimed_episode_is_left_alone(store, episode, capsys):
+def test_an_episode_that_is_being_written_is_left_alone(store, episode, capsys):
     empty(episode)
-    claims = Claims(store, NODE)
-    assert claims.acquire(DAMAGED) is None
+    locks = episode_locks(store, NODE)
+    assert locks.acquire(DAMAGED) is None
     assert main(["verify", str(store), "--repair", "--quick"]) == 1
     printed = capsys.readouterr().out
-    assert "left in the store, because it is claimed: task000_episode001 by node7 (job 98_2)" in printed
+    assert "left in the store, because it is being written: task000_episode001 by node7 (job 98_2)" in printed
     assert "--resume" not in printed
     assert episode.is_dir()
-    assert [holder.worker for holder in holders(store)] == [NODE]
-    claims.release(DAMAGED)
+    assert [holder.worker for holder in locks.holders()] == [NODE]
+    locks.release(DAMAGED)
     assert main(["verify", str(store), "--repair", "--quick"]) == 0
     assert names(store) == WHOLE
 
@@ -167,9 +164,7 @@ def test_a_claimed_episode_is_left_alone(store, episode, capsys):
 @pytest.mark.parametrize("dry_run", [True, False])
 @pytest.mark.parametrize("kind", ["folder", "link", "dangling link", "file"])
 def test_what_is_said_to_be_removed_is_gone_and_the_rest_is_there(store, tmp_path, capsys, kind, dry_run):
-    ask = "from vla_attention.schemas.stores.partial_folders import process_tag; print(process_tag())"
-    tag = subprocess.run([sys.executable, "-c", ask], text=True, capture_output=True, check=True).stdout.strip()
-    left, elsewhere = partial_folder(store) / f"{DAMAGED}-{tag}", tmp_path / "elsewhere"
+    left, elsewhere = store / ".writing" / f"{DAMAGED}-0123", tmp_path / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / "mine").write_text("kept")
     left.parent.mkdir()
@@ -181,27 +176,27 @@ def test_what_is_said_to_be_removed_is_gone_and_the_rest_is_there(store, tmp_pat
         left.symlink_to(elsewhere if kind == "link" else tmp_path / "nowhere")
     assert analyze(["store", "verify", str(store), "--repair", *["--dry-run"] * dry_run]) == 0
     line = next(line for line in capsys.readouterr().out.splitlines() if str(left) in line)
-    assert ("removed: " in line) == (kind == "folder")
-    assert os.path.lexists(left) == (dry_run or kind != "folder")
+    assert "removed: " in line
+    assert os.path.lexists(left) == dry_run
     assert (elsewhere / "mine").read_text() == "kept"
 
 
 def test_an_episode_recorded_anew_in_the_meantime_stays(store, episode, original, monkeypatch):
     empty(episode)
-    acquire = Claims.acquire
+    acquire = Locks.acquire
 
-    def after_another_process(claims, name):
+    def after_another_process(locks, name):
         shutil.rmtree(episode)
         shutil.copytree(original / "episodes" / DAMAGED, episode)
-        return acquire(claims, name)
+        return acquire(locks, name)
 
-    monkeypatch.setattr(Claims, "acquire", after_another_process)
+    monkeypatch.setattr(Locks, "acquire", after_another_process)
     assert repair_store(store) == []
     assert verify_store(open_store(store)) == []
     assert len(names(store)) == 4
     monkeypatch.undo()
     empty(episode)
-    monkeypatch.setattr(Claims, "acquire", lambda claims, name: shutil.rmtree(episode))  # another repair was faster
+    monkeypatch.setattr(Locks, "acquire", lambda locks, name: shutil.rmtree(episode))  # another repair was faster
     assert repair_store(store) == []
 
 
@@ -220,9 +215,9 @@ def test_a_failing_repair_harms_nothing(store, episode, monkeypatch):
         with pytest.raises(StoreError, match=f"Cannot move {DAMAGED} of .*: Permission denied"):
             repair_store(store)
     assert episode.is_dir()
-    assert holders(store) == []
-    monkeypatch.setattr(Claims, "acquire", lambda claims, name: refuse(store, damaged_folder(store) / name))
-    with pytest.raises(StoreError, match="Permission denied"):  # not even a claim can be written
+    assert episode_locks(store).holders() == []
+    monkeypatch.setattr(Locks, "acquire", lambda locks, name: refuse(store, damaged_folder(store) / name))
+    with pytest.raises(StoreError, match="Permission denied"):  # not even a lock can be written
         repair_store(store)
     monkeypatch.undo()
     (finding,) = repair_store(store)
@@ -235,20 +230,17 @@ def repair_and_die(store: Path, kind: str, number: int) -> None:
         repair_store(store)
 
 
-@pytest.mark.parametrize("number", thorough_except((1,), range(3)))  # renames: the claim, the episode, the claim's end
 @pytest.mark.parametrize("kind", ["rename", "renamed"])
-def test_a_killed_repair_harms_nothing(store, episode, original, kind, number):
+def test_a_killed_repair_harms_nothing(store, episode, original, kind):
     empty(episode)
-    assert run_child(repair_and_die, store, kind, number) == -signal.SIGKILL
+    assert run_child(repair_and_die, store, kind, 0) == -signal.SIGKILL
     assert [found.name for found in open_store(store).episodes if found.name != DAMAGED] == WHOLE
     repair_store(store)
     assert names(store) == WHOLE
     assert len(list(damaged_folder(store).glob(f"*/{DAMAGED}"))) == 1
     write_store(store, mode="resume", spec=SPEC)
     assert files(store) == files(original)
-    claims = Claims(store, this_worker())
-    assert claims.acquire(DAMAGED) is None  # the claim of the killed process does not stay
-    claims.release(DAMAGED)
+    assert not (store / ".writing").exists()  # the lock of the killed process does not stay
 
 
 def test_resuming_records_what_is_missing_and_says_what_is_damaged(tmp_path, monkeypatch, capsys):

@@ -29,7 +29,7 @@ from vla_attention.analyze.store.copying import copy_store
 from vla_attention.analyze.store.merging import merge_stores
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.schemas.stores.partial_folders import partial_folder, remove_dead_partials
+from vla_attention.schemas.stores.locks import store_locks
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.repair import damaged_folder, repair_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode, StoreExists, episode_name
@@ -124,7 +124,7 @@ class StoreLife(RuleBasedStateMachine):
         else:
             write(self.folder / store, episode)
             self.model[store][episode] = None
-        assert not partial_folder(self.folder / store).exists()
+        assert not store_locks(self.folder / store).folder.exists()
 
     @rule(store=stores, episode=episodes, kind=kinds, number=numbers)
     def die_writing(self, store: str, episode: int, kind: str, number: int) -> None:
@@ -191,7 +191,7 @@ class StoreLife(RuleBasedStateMachine):
             copy(self.folder / store, self.folder / target)
         until = damaged[0] if damaged else len(EPISODES)
         self.model[target] = there | {number: None for number in self.model[store] if number < until}
-        assert not partial_folder(self.folder / target).exists()
+        assert not store_locks(self.folder / target).folder.exists()
 
     @rule(store=stores, kind=kinds, number=numbers)
     def die_copying(self, store: str, kind: str, number: int) -> None:
@@ -203,7 +203,7 @@ class StoreLife(RuleBasedStateMachine):
             listed = self.listed(target)
             assert set(self.model.get(target, ())) <= listed <= {*self.model.get(target, ()), *self.model[store]}
             self.model[target] = dict.fromkeys(listed)
-        remove_dead_partials(self.folder / target)
+        store_locks(self.folder / target).sweep()
 
     @rule(die=st.booleans(), kind=kinds, number=numbers)
     def merge(self, die: bool, kind: str, number: int) -> None:
@@ -220,7 +220,7 @@ class StoreLife(RuleBasedStateMachine):
             run_child(act_and_die, kind, number, merge, one, other, target)
         else:
             merge(one, other, target)
-            assert not partial_folder(target).exists()
+            assert not store_locks(target).folder.exists()
         if target.exists():
             self.model[target.name] = self.model[STORES[0]] | self.model[STORES[1]]
             self.check(target.name)
@@ -229,7 +229,7 @@ class StoreLife(RuleBasedStateMachine):
             del self.model[target.name]
         else:
             assert die
-        remove_dead_partials(target)
+        store_locks(target).sweep()
 
     @invariant()
     def every_store_is_what_the_model_says(self) -> None:
