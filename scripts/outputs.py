@@ -219,7 +219,7 @@ def _content(path: Path, folder: Path) -> object:
 def compare(before: Path, after: Path) -> int:
     """Print what differs; 1 where anything does that is not expected."""
     files = [
-        {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file() and ".jobs/" not in str(path)}
+        {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file() and ".log/" not in str(path)}
         for folder in (before, after)
     ]
     wrong = [f"only before: {name}" for name in sorted(files[0] - files[1])]
