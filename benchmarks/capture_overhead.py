@@ -135,7 +135,7 @@ def usual_way(kept: list[Any]) -> Iterator[None]:
 
 def calls_of(policy: Any, synchronise: Callable[[], None] = lambda: None) -> dict[str, Callable[[], Any]]:
     """Return the kinds of calls, each of which returns the actions; `plain` is the first."""
-    from vla_attention.capture.rollout.policy_call import record_call
+    from vla_attention.capture.engine.call import record_call
 
     given = prepared_input(policy)
 

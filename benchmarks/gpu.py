@@ -72,7 +72,7 @@ def parity_table(policy: Any, wide: Any) -> Table:
     """Compare a call in bfloat16 with one in float32 on the same weights."""
     import numpy as np
 
-    from vla_attention.capture.rollout.policy_call import record_call
+    from vla_attention.capture.engine.call import record_call
 
     recording = recording_of(policy, tuple(range(10)), True)
     found, expected = (record_call(each, prepared_input(each), 0, recording, "here") for each in (policy, wide))

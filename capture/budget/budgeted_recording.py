@@ -13,8 +13,8 @@ from vla_attention.capture.environments.base import EnvironmentSettings, Task
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.policies.policy import Policy
 from vla_attention.capture.rollout.episode import max_replans
-from vla_attention.capture.rollout.progress import say
-from vla_attention.capture.rollout.simulation import StopCheck
+from vla_attention.capture.engine.progress import say
+from vla_attention.capture.engine.simulation import StopCheck
 from vla_attention.capture.store.disk_estimate import DiskEstimate, mean_size
 from vla_attention.capture.store.store_root import read_existing_root
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run

@@ -19,7 +19,7 @@ from vla_attention.capture.environments.suites import find_suite, make_environme
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.policies.policy import Policy
 from vla_attention.capture.rollout.episode import EpisodeRun, record_episode
-from vla_attention.capture.rollout.simulation import StopCheck
+from vla_attention.capture.engine.simulation import StopCheck
 from vla_attention.capture.store.disk_estimate import FEWEST_REPLANS, SampleOfReplans
 from vla_attention.capture.store.replan_records import EpisodeStart, RecordedSteps, ReplanRecord
 from vla_attention.capture.store.store_writer import RunStore

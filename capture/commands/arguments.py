@@ -17,7 +17,7 @@ from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
 from vla_attention.capture.policies.model_arguments import POLICY_THREADS
 from vla_attention.capture.replay.arguments import REPLAY_EXAMPLES, add_replay_arguments
 from vla_attention.capture.rerun.arguments import RERUN_EXAMPLES, add_rerun_arguments
-from vla_attention.capture.rollout.recording_arguments import add_recording_arguments
+from vla_attention.capture.engine.recording_arguments import add_recording_arguments
 from vla_attention.capture.run.command import run_capture_of_family
 from vla_attention.schemas.command_line import OneSentenceParser
 from vla_attention.schemas.errors import BadArgument, listing

@@ -27,7 +27,7 @@ from vla_attention.capture.environments.drawing import check_simulator
 from vla_attention.capture.environments.suites import find_suite
 from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.jobs.termination import Termination
-from vla_attention.capture.rollout.recording_plan import RecordingSettings
+from vla_attention.capture.engine.plan import RecordingSettings
 from vla_attention.capture.run.run_settings import RunSettings, run_settings
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import INSTALL_CAPTURE, BadArgument, UserError, plural

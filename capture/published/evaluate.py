@@ -188,8 +188,8 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], threads: Threa
     check_simulator(jobs[0].settings.suite, jobs[0].settings.libero_assets)
 
     from vla_attention.capture.machine.device import load_torch
-    from vla_attention.capture.rollout.episode_faults import EpisodesMissing
-    from vla_attention.capture.rollout.progress import say
+    from vla_attention.capture.engine.faults import EpisodesMissing
+    from vla_attention.capture.engine.progress import say
     from vla_attention.capture.run.capture_run import run_capture
     from vla_attention.schemas.stores.damaged_episodes import DamagedEpisodesLeft
 
@@ -212,7 +212,7 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], threads: Threa
 
 def _analyze(job: _Job, script: PublishedScript) -> int:
     from vla_attention.capture.jobs.status import store_status
-    from vla_attention.capture.rollout.progress import say
+    from vla_attention.capture.engine.progress import say
     from vla_attention.schemas.stores.root import read_root
 
     arguments, store = job.arguments, job.settings.store
@@ -239,7 +239,7 @@ def _layers(
     typed: Sequence[int] | None, published: Sequence[int], num_layers: int, model_family: str
 ) -> tuple[tuple[int, ...] | None, bool]:
     """Return the layers to analyse (None: all), and whether the user typed them."""
-    from vla_attention.capture.rollout.progress import say
+    from vla_attention.capture.engine.progress import say
 
     if typed is not None:
         return select_layers(typed, num_layers, model_family).labels, True

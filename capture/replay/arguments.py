@@ -13,7 +13,7 @@ from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.model_arguments import POLICY_THREADS
 from vla_attention.capture.policies.robot import NONE
-from vla_attention.capture.rollout.recording_arguments import add_recording_arguments
+from vla_attention.capture.engine.recording_arguments import add_recording_arguments
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.options import add_option
 from vla_attention.schemas.threads import add_threads, use_threads

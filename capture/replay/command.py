@@ -9,7 +9,7 @@ from vla_attention.capture.machine.device import load_torch
 from vla_attention.capture.replay.arguments import is_policy_file
 from vla_attention.capture.replay.policy_file import check_policy_file, load_policy_file
 from vla_attention.capture.replay.replay_plan import plan_replay
-from vla_attention.capture.rollout.progress import say
+from vla_attention.capture.engine.progress import say
 from vla_attention.schemas.errors import plural
 from vla_attention.schemas.threads import Threads
 

@@ -36,9 +36,9 @@ from vla_attention.capture.replay.replay_plan import (
 )
 from vla_attention.capture.replay.video import decoder_version
 from vla_attention.capture.rollout.episode_loop import EpisodeJob, episode_start
-from vla_attention.capture.rollout.policy_call import record_call, replan_record
-from vla_attention.capture.rollout.progress import say
-from vla_attention.capture.rollout.recording_plan import plan_recording, recording_settings, root_attributes
+from vla_attention.capture.engine.call import record_call, replan_record
+from vla_attention.capture.engine.progress import say
+from vla_attention.capture.engine.plan import plan_recording, recording_settings, root_attributes
 from vla_attention.capture.store.episode_writer import EpisodeWriter
 from vla_attention.capture.store.store_writer import RunStore, open_run
 from vla_attention.schemas.errors import listing

@@ -25,8 +25,8 @@ from vla_attention.capture.replay.replay_plan import (
 )
 from vla_attention.capture.replay.video import decoder_version
 from vla_attention.capture.rollout.episode_loop import EpisodeJob
-from vla_attention.capture.rollout.progress import say
-from vla_attention.capture.rollout.recording_plan import recording_settings
+from vla_attention.capture.engine.progress import say
+from vla_attention.capture.engine.plan import recording_settings
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.session import RecordedRun

@@ -19,7 +19,7 @@ from vla_attention.capture.policies.robot import RobotData, read_camera_choices
 from vla_attention.capture.replay.data_set_files import INDEX_COLUMNS
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, LeRobotDataset, open_dataset
 from vla_attention.capture.replay.video import import_av
-from vla_attention.capture.rollout.episode_faults import Faults
+from vla_attention.capture.engine.faults import Faults
 from vla_attention.capture.rollout.episode_loop import (
     EpisodeJob,
     EpisodeResult,
@@ -28,7 +28,7 @@ from vla_attention.capture.rollout.episode_loop import (
     StepReport,
     plan_of,
 )
-from vla_attention.capture.rollout.progress import say
+from vla_attention.capture.engine.progress import say
 from vla_attention.capture.store.disk_estimate import describe, estimate_disk
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, refuse_recorded
 from vla_attention.schemas.errors import BadArgument, listing, plural

@@ -19,8 +19,8 @@ from vla_attention.capture.rerun.interventions_of_rerun import check_on_store, r
 from vla_attention.capture.rerun.rerun_store import Rerun
 from vla_attention.capture.rerun.series import SeriesRun
 from vla_attention.capture.rerun.stored_calls import check_has_inputs
-from vla_attention.capture.rollout.progress import say
-from vla_attention.capture.rollout.recording_plan import plan_recording, recording_settings
+from vla_attention.capture.engine.progress import say
+from vla_attention.capture.engine.plan import plan_recording, recording_settings
 from vla_attention.capture.store.store_writer import WriteMode, refuse_recorded
 from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.interventions import Interventions

@@ -20,7 +20,7 @@ from vla_attention.capture.policies.policy import Policy, stored_picture_sizes
 from vla_attention.capture.rerun.base_store import families_of, instructions_of
 from vla_attention.capture.rerun.fidelity import check_fidelity
 from vla_attention.capture.rerun.stored_calls import Repeater, read_calls
-from vla_attention.capture.rollout.episode_faults import Faults
+from vla_attention.capture.engine.faults import Faults
 from vla_attention.capture.rollout.episode_loop import (
     EpisodeJob,
     EpisodeResult,
@@ -30,9 +30,9 @@ from vla_attention.capture.rollout.episode_loop import (
     episode_start,
     plan_of,
 )
-from vla_attention.capture.rollout.policy_call import replan_record
-from vla_attention.capture.rollout.progress import Progress, say
-from vla_attention.capture.rollout.recording_plan import root_attributes
+from vla_attention.capture.engine.call import replan_record
+from vla_attention.capture.engine.progress import Progress, say
+from vla_attention.capture.engine.plan import root_attributes
 from vla_attention.capture.store.disk_estimate import describe, estimate_disk
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run, remove_without_episodes
 from vla_attention.schemas.interventions import Interventions, RerunSource

@@ -26,7 +26,7 @@ from vla_attention.capture.interventions.resolution import (
 )
 from vla_attention.capture.rerun.base_store import check_may_change
 from vla_attention.capture.rerun.rerun_store import Rerun
-from vla_attention.capture.rollout.progress import say
+from vla_attention.capture.engine.progress import say
 from vla_attention.schemas.errors import BadArgument, UserError, listing
 from vla_attention.schemas.groupings.builtin_groupings import find_grouping
 from vla_attention.schemas.groupings.grouping import REST

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.policies.policy import GivenInputs, Policy, PolicyInput
-from vla_attention.capture.rollout.policy_call import RecordedCall, record_call
+from vla_attention.capture.engine.call import RecordedCall, record_call
 from vla_attention.capture.store.replan_records import RecordedSteps
 from vla_attention.schemas.episode_steps import EXECUTED, GRIPPER, POSES
 from vla_attention.schemas.errors import listing

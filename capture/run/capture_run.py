@@ -22,11 +22,11 @@ from vla_attention.capture.policies.families import family_of_kind
 from vla_attention.capture.policies.identity import announcement, downloads_of
 from vla_attention.capture.policies.policy import BatchPolicy, Policy, is_compiled, stored_picture_sizes
 from vla_attention.capture.rollout.episode import EpisodeRun, check_protocol, max_replans
-from vla_attention.capture.rollout.episode_faults import EpisodesMissing, Faults, describe_missing
+from vla_attention.capture.engine.faults import EpisodesMissing, Faults, describe_missing
 from vla_attention.capture.rollout.episode_loop import EpisodeJob, EpisodeLoop, EpisodeResult, OneByOneLoop
-from vla_attention.capture.rollout.pipeline import PipelinedLoop
-from vla_attention.capture.rollout.progress import say
-from vla_attention.capture.rollout.recording_plan import plan_recording, root_attributes
+from vla_attention.capture.engine.simulators import PipelinedLoop
+from vla_attention.capture.engine.progress import say
+from vla_attention.capture.engine.plan import plan_recording, root_attributes
 from vla_attention.capture.rollout.simulator_source import SimulatorSource
 from vla_attention.capture.run.run_settings import RunSettings, default_num_envs, default_policy_batch
 from vla_attention.capture.store.disk_estimate import DiskEstimate, describe, estimate_disk

@@ -18,7 +18,7 @@ from vla_attention.capture.environments.suites import find_suite, list_tasks
 from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.machine.memory import memory_left
 from vla_attention.capture.policies.family import PolicyFamily
-from vla_attention.capture.rollout.recording_plan import RecordingSettings, recording_settings
+from vla_attention.capture.engine.plan import RecordingSettings, recording_settings
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.options import resolve_tasks

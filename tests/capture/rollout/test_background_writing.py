@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vla_attention.capture.rollout.background_writing import BackgroundWriting
+from vla_attention.capture.engine.writing import BackgroundWriting
 
 
 class Stopped(Exception):

@@ -22,8 +22,8 @@ from vla_attention.capture.rollout.episode_loop import (
     StepReport,
     plan_of,
 )
-from vla_attention.capture.rollout.progress import Unit
-from vla_attention.capture.rollout.simulation import SimulationFailed
+from vla_attention.capture.engine.progress import Unit
+from vla_attention.capture.engine.simulation import SimulationFailed
 from vla_attention.capture.store.store_writer import RunStore, open_run
 from vla_attention.schemas.stores.locks import episode_locks
 from vla_attention.schemas.stores.reader import open_store

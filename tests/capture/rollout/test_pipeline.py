@@ -23,7 +23,7 @@ from vla_attention.capture.jobs.status import store_status
 from vla_attention.capture.jobs.termination import EXIT_TERMINATED
 from vla_attention.capture.rerun.base_store import machine_differences
 from vla_attention.capture.rollout import pipeline
-from vla_attention.capture.rollout.policy_call import record_calls
+from vla_attention.capture.engine.call import record_calls
 from vla_attention.schemas.stores.locks import episode_locks
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.worker import Worker

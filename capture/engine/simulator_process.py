@@ -17,7 +17,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
@@ -29,14 +29,9 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, SharesResets, Suite
 from vla_attention.capture.environments.suites import make_environment
-from vla_attention.capture.rollout.simulation import (
-    CameraPatches,
-    Simulation,
-    SimulationFailed,
-    failure,
-)
+from vla_attention.capture.engine.simulation import CameraPatches, Simulation, SimulationFailed, StopCheck, failure
 from vla_attention.schemas.errors import UserError
-from vla_attention.schemas.stores.store_format import Protocol
+from vla_attention.schemas.stores.store_format import Protocol, episode_name
 from vla_attention.schemas.threads import OTHER_LIBRARIES
 
 #: Mesa's renderer then draws in the thread that asks for a picture. With a thread of its own, which the first one waits
@@ -49,7 +44,7 @@ _END_WITHIN_S = 2.0
 #: The paths of modules are those of the first process, which may have got some while it ran.
 _BOOT = (
     "import sys; sys.path[:] = sys.argv[3:]; "
-    "from vla_attention.capture.rollout.simulator_process import main; main(int(sys.argv[1]), sys.argv[2])"
+    "from vla_attention.capture.engine.simulator_process import main; main(int(sys.argv[1]), sys.argv[2])"
 )
 
 
@@ -80,7 +75,7 @@ class SimulatorSetup:
 
     def server(self, connection: Connection) -> Server:
         """Return what takes `BeginEpisode` and `Execute`."""
-        return _SimulatorServer(connection, self)
+        return _ProcessServer(connection, self)
 
 
 @dataclass(frozen=True)
@@ -106,9 +101,11 @@ class Execute:
 
 @dataclass(frozen=True)
 class ResetsFirst:
-    """Tells that so many resets of earlier episodes are made before the episode begins."""
+    """Tells that so many resets of earlier episodes are made before an episode (its name) of a task begins."""
 
     number: int
+    task_id: int
+    episode: str
 
 
 @dataclass(frozen=True)
@@ -164,6 +161,17 @@ class SimulatorProcess:
         """Let it execute actions: it answers `Advanced`."""
         self._send(request)
 
+    def has_answer(self) -> bool:
+        """Whether it has answered, or has ended."""
+        try:
+            return self.connection.poll()
+        except OSError:
+            return True  # `receive` says so
+
+    def receive(self) -> Any:
+        """Return its next answer; `EOFError` or `OSError` when it has ended."""
+        return self.connection.recv()
+
     def _send(self, message: Any) -> None:
         with contextlib.suppress(OSError):  # it has died, and reading says so
             self.connection.send(message)
@@ -194,14 +202,60 @@ def _has_descriptor(stream: Any) -> bool:
     return True
 
 
-class _SimulatorServer:
-    """Simulates for a policy at the other end."""
+class SimulatorServer:
+    """Simulates for a policy, and answers with `send`.
 
-    def __init__(self, connection: Connection, setup: SimulatorSetup) -> None:
-        self.connection = connection
-        self.setup = setup
+    check: called before every environment step; an exception that it raises ends the episode.
+    """
+
+    def __init__(self, send: Callable[[object], None], setup: SimulatorSetup, check: StopCheck = lambda: None) -> None:
+        self.send, self.setup, self.check = send, setup, check
         self.environment: Environment | None = None
         self.task_id: int | None = None
+
+    def begin(self, request: BeginEpisode) -> None:
+        """Begin an episode, with its waiting steps."""
+        environment, seed = self._environment_of(request.task_id), self.setup.protocol.seed
+        shared = environment if isinstance(environment, SharesResets) else None
+        if shared is not None and request.resets is not None:
+            shared.learn_resets(seed, request.resets)
+        missing = environment.missing_resets(request.episode_index, seed)
+        if missing:
+            self.send(ResetsFirst(missing, request.task_id, episode_name(request.task_id, request.episode_index)))
+        self.simulation = Simulation(environment, self.setup.protocol, self.setup.cameras, self.check)
+        begun = self.simulation.begin(request.episode_index, request.title)
+        if shared is not None:
+            self.send(KnownResets(shared.known_resets(seed)))
+        self.send(begun)
+        self.send(self.simulation.wait())
+
+    def execute(self, request: Execute) -> None:
+        """Execute actions."""
+        self.send(self.simulation.advance(request.actions, request.observe))
+
+    def close(self) -> None:
+        """Close the environment."""
+        environment, self.environment = self.environment, None
+        if environment is not None:
+            environment.close()
+
+    def made(self, task_id: int) -> Environment:
+        """Make the environment of a task."""
+        return make_environment(self.setup.suite, task_id, self.setup.settings)
+
+    def _environment_of(self, task_id: int) -> Environment:
+        if self.environment is None or self.task_id != task_id:
+            self.close()
+            self.environment, self.task_id = self.made(task_id), task_id
+        return self.environment
+
+
+class _ProcessServer(SimulatorServer):
+    """Simulates for a policy at the other end of a connection."""
+
+    def __init__(self, connection: Connection, setup: SimulatorSetup) -> None:
+        super().__init__(connection.send, setup)
+        self.connection = connection
         #: The title of the episode, for messages.
         self.title = "an episode"
 
@@ -210,37 +264,20 @@ class _SimulatorServer:
         while True:
             message = self.connection.recv()
             if isinstance(message, BeginEpisode):
-                self._begin(message)
+                self.title = message.title
+                self.begin(message)
             else:
-                self.connection.send(self.simulation.advance(message.actions, message.observe))
+                self.execute(message)
 
-    def _begin(self, request: BeginEpisode) -> None:
-        self.title = request.title
-        environment, seed = self._environment_of(request.task_id), self.setup.protocol.seed
-        shared = environment if isinstance(environment, SharesResets) else None
-        if shared is not None and request.resets is not None:
-            shared.learn_resets(seed, request.resets)
-        missing = environment.missing_resets(request.episode_index, seed)
-        if missing:
-            self.connection.send(ResetsFirst(missing))
-        self.simulation = Simulation(environment, self.setup.protocol, self.setup.cameras)
-        begun = self.simulation.begin(request.episode_index, request.title)
-        if shared is not None:
-            self.connection.send(KnownResets(shared.known_resets(seed)))
-        self.connection.send(begun)
-        self.connection.send(self.simulation.wait())
+    def made(self, task_id: int) -> Environment:
+        """Make the environment of a task.
 
-    def _environment_of(self, task_id: int) -> Environment:
-        if self.environment is None or self.task_id != task_id:
-            if self.environment is not None:
-                gc.unfreeze()
-                self.environment.close()
-                self.environment = None
-            self.environment = make_environment(self.setup.suite, task_id, self.setup.settings)
-            self.task_id = task_id
-            # Every reset of robosuite collects garbage; what lives as long as the scene need not be looked at again.
-            gc.freeze()
-        return self.environment
+        Every reset of robosuite collects garbage; what lives as long as the scene need not be looked at again.
+        """
+        gc.unfreeze()
+        environment = super().made(task_id)
+        gc.freeze()
+        return environment
 
 
 def main(descriptor: int, temporary: str | None = None) -> None:

@@ -1,0 +1,153 @@
+"""Where the policy calls of episodes come from: simulators, a store, or the frames of a data set.
+
+`loop.py` begins episodes of a source, makes their policy calls, and stores them.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.capture.engine.call import PolicyCall
+from vla_attention.capture.engine.progress import say
+from vla_attention.capture.environments.base import Task
+from vla_attention.capture.jobs.worker_log import PlannedTask
+from vla_attention.capture.store.replan_records import EpisodeStart, RecordedSteps
+from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.stores.store_format import episode_name
+
+
+@dataclass(frozen=True)
+class EpisodeJob:
+    """An episode that is to be recorded. size: most units of it, for the progress; title: its name there."""
+
+    task: Task
+    episode_index: int
+    size: int
+    title: str
+
+    @property
+    def name(self) -> str:
+        """The episode's name in the store."""
+        return episode_name(self.task.task_id, self.episode_index)
+
+
+def plan_of(jobs: Sequence[EpisodeJob]) -> tuple[PlannedTask, ...]:
+    """Return the tasks of the jobs with the indices of their episodes, for the logs of workers."""
+    indices: dict[int, set[int]] = {}
+    for job in jobs:
+        indices.setdefault(job.task.task_id, set()).add(job.episode_index)
+    tasks = {job.task.task_id: job.task for job in reversed(jobs)}
+    return tuple(
+        PlannedTask.of_episodes(number, tasks[number].name, tasks[number].instruction, indices[number])
+        for number in sorted(indices)
+    )
+
+
+def episode_start(
+    job: EpisodeJob,
+    machine: Mapping[str, str],
+    *,
+    state_digest: str,
+    objects: tuple[SceneObject, ...] = (),
+    state_index: int | None = None,
+) -> EpisodeStart:
+    """Return what is known of an episode before its first replan.
+
+    machine: provenance of this process. state_digest, state_index: of the initial state, whose index is the episode's
+    where none is given.
+    """
+    task = job.task
+    return EpisodeStart(
+        task_id=task.task_id,
+        task_name=task.name,
+        instruction=task.instruction,
+        episode_index=job.episode_index,
+        initial_state_index=job.episode_index if state_index is None else state_index,
+        initial_state_digest=state_digest,
+        objects=objects,
+        provenance=dict(machine),
+        task_family=task.task_family,
+    )
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How an episode ended. success: None where it is not known. steps: None where no simulator told them."""
+
+    success: bool | None
+    num_steps: int
+    steps: RecordedSteps | None = None
+
+
+@dataclass(frozen=True)
+class Committed:
+    """An episode that its source has recorded and committed itself, with so many replans."""
+
+    outcome: Outcome
+    num_replans: int
+    folder: Path
+
+
+class Episode(ABC):
+    """An episode that is under way.
+
+    Attributes:
+        start: what the store says of it; known with its first policy call.
+        max_replans: policy calls that it can have, at most.
+        done: steps or calls so far.
+        connection: where it hears of what it waits for; None for one that never waits.
+    """
+
+    start: EpisodeStart
+    max_replans: int
+    done: int = 0
+    connection: Connection | None = None
+
+    @abstractmethod
+    def poll(self) -> PolicyCall | Outcome | Committed | None:
+        """Go on, and return the next policy call, or how the episode ended; None: neither is there yet.
+
+        Raises:
+            SourceLost: what it runs in has ended; it may be begun again.
+            SimulationFailed, and other faults of this episode alone (`faults.py`).
+        """
+
+    @abstractmethod
+    def advance(self, actions: NDArray[np.float64]) -> None:
+        """Take what the last policy call gave, (horizon, action dim)."""
+
+    def overdue(self) -> str | None:
+        """Return how it hangs, in the words of `SourceLost`; None while it does not."""
+        return None
+
+    def close(self, error: Exception | None = None) -> None:  # noqa: B027
+        """Give back what it runs in. error: the fault with which it ended."""
+
+
+class Source(ABC):
+    """Begins episodes, of which up to `capacity` run at a time. say: prints a line for the person at the terminal."""
+
+    capacity: int = 1
+    say: Callable[[str], None] = staticmethod(say)
+
+    def choose(self, left: Sequence[EpisodeJob]) -> int | None:
+        """Return the place of the episode to begin next; None: none now."""
+        return 0
+
+    @abstractmethod
+    def open(self, job: EpisodeJob) -> Episode:
+        """Begin an episode."""
+
+    def close(self) -> None:  # noqa: B027
+        """Free what was made ready."""
+
+
+class SourceLost(Exception):
+    """What an episode ran in has ended, or was ended because it hung; the text says how."""
