@@ -96,7 +96,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
     yield "tasks", ["vla-capture", "tasks", "cubes"]
     yield "capture_verify", ["vla-capture", "verify", cubes]
     yield "capture_repair", ["vla-capture", "verify", cubes, "--repair", "--quick"]
-    yield "doctor", ["vla-capture", "doctor", "--no-trial", "--output", cubes, "--threads", "1"]
+    yield "doctor", ["vla-capture", "doctor", "--output", cubes, "--threads", "1"]
     for place in _stores(folder):
         kind = place.removeprefix("stores/").replace("/", "_").removesuffix(".zarr")
         for name, words in QUESTIONS.items():

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vla_attention.capture.commands.parity_command import run_parity_command
-from vla_attention.capture.doctor.arguments import DOCTOR_EXAMPLES, add_doctor_arguments
+from vla_attention.capture.doctor.command import DOCTOR_EXAMPLES, add_doctor_arguments
 from vla_attention.capture.effects.arguments import add_effect_arguments
 from vla_attention.capture.environments.suites import ALL_SUITES, STANDARD_SUITES, SUITES, find_suite, list_tasks
 from vla_attention.capture.interventions.arguments import add_intervention_arguments
@@ -96,10 +96,9 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
     doctor = commands.add_parser(
         "doctor",
         help="what this machine can do for a run, and what is missing for it",
-        description="Takes the options of a capture and prints a line for everything that it needs: threads, memory, "
-        "GPU, drawing, simulator and assets, disk, checkpoint, precision, time and size, each with what to do. Exit "
-        "code 1 when something is missing. With --accept, ten episodes of a published checkpoint are held against its "
-        "published success rate.",
+        description="Takes the options of a capture and prints a line for everything that it needs: memory, simulator "
+        "and assets, drawing, disk, GPU, checkpoint, each with what to do. Loads no policy and runs no simulator. Exit "
+        "code 1 when something is missing.",
         epilog=f"examples:\n{DOCTOR_EXAMPLES}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -48,21 +48,6 @@ class PublishedScript:
     variables: Mapping[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class PublishedRate:
-    """How often a published checkpoint solved the tasks of a suite, with this family's evaluation.
-
-    checkpoint: its name, as `--checkpoint` takes it. solved, episodes: the rate as counts. source: where it is
-    published, in words.
-    """
-
-    checkpoint: str
-    suite: str
-    solved: int
-    episodes: int
-    source: str
-
-
 def no_arguments(arguments: argparse.Namespace) -> list[str]:
     """Return no arguments: the analysis keeps its own defaults."""
     return []
@@ -111,8 +96,8 @@ class PolicyFamily:
     analysis_arguments: Callable[[argparse.Namespace], list[str]] = no_arguments
     parity: ParityCases | None = None
     published: PublishedScript | None = None
-    #: Success rates of checkpoints, for `vla-capture doctor --accept`; of each checkpoint the default suite first.
-    published_rates: tuple[PublishedRate, ...] = ()
+    #: The suites that checkpoints were trained on and evaluated in, by the names that `--checkpoint` takes.
+    trained_on: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     #: Whether `build` takes a `robot_data` among the arguments (`robot.py`), and then gives a policy for data sets.
     reads_data_sets: bool = False
     #: The kinds of its policies, as stores name them (`PolicyIdentity.family`); empty for the family's name alone.

@@ -242,8 +242,7 @@ def _checkpoint_line(identity: PolicyIdentity) -> str:
 
 def _other_suite_line(identity: PolicyIdentity, suite: str) -> str:
     """A warning where a checkpoint whose suites are known runs in one of another kind; empty elsewhere."""
-    rates = family_of_kind(identity.family).published_rates
-    known = [rate.suite for rate in rates if rate.checkpoint == identity.checkpoint]
+    known = family_of_kind(identity.family).trained_on.get(identity.checkpoint, ())
     kinds = {name.partition("_")[0] for name in known}
     if not known or suite.partition("_")[0] in kinds:
         return ""
