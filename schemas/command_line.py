@@ -29,7 +29,7 @@ _MOST_EXAMPLES = 3
 _MAIN_OPTIONS = {
     *("--checkpoint", "--task-suite", "--task", "--num-episodes", "--effects", "--knockout", "--series", "--policy"),
     *("--layers", "--grouping", "--group", "--ratio", "--episode", "--open", "--video"),
-    *("--csv", "--output", "--resume", "--budget", "--repair", "--tar"),
+    *("--csv", "--output", "--resume", "--repair", "--tar"),
     *("--without", "--help-all"),
 }
 

@@ -68,8 +68,6 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
         "--output", "stores/two.zarr",
     ]  # fmt: skip
     yield "capture_task", ["vla-capture", "pi", "--task-id", "1", *TWO_TASKS[3:], "--output", "stores/task.zarr"]
-    budget = ["--budget", "3MB", "--output", "stores/budget.zarr"]
-    yield "capture_budget", ["vla-capture", "pi", *TWO_TASKS, *budget]
     yield "capture_cosmos", [
         "vla-capture", "cosmos", "--task-suite", "robosuite", "--task-id", "0", "--num-episodes", "1", "--max-steps",
         "6", "--threads", "1", "--num-envs", "1", "--output", "stores/cosmos.zarr",

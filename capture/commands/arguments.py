@@ -237,12 +237,6 @@ def _add_output_arguments(
         f"may be given twice, once for each (default: {default})",
     )
     group.add_argument("--save-viz", action="store_true", help="analyse afterwards, with pictures of every episode")
-    group.add_argument(
-        "--budget",
-        metavar="SIZE",
-        help="most disk space of the store, such as 20GB: a few replans are tried, and what is recorded is the most "
-        "that fits; precision, denoise steps, layers and heads that are given stay as they are (docs/store.md)",
-    )
     existing = group.add_mutually_exclusive_group()
     resume = "continue an existing store with what is missing" + (" (default)" if script else "")
     existing.add_argument("--resume", action="store_true", help=resume)
