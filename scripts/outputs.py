@@ -130,7 +130,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
         yield f"{program}_help", [program, "--help"]
     for name in _commands_of("analyze"):
         yield f"analyze_{name}_help", ["vla-analyze", name, "--help"]
-    for name in ("pi", "cosmos", "rerun", "replay", "status", "doctor", "tasks", "parity", "verify"):
+    for name in ("pi", "cosmos", "rerun", "replay", "status", "doctor", "tasks", "verify"):
         yield f"capture_{name}_help", ["vla-capture", name, "--help"]
 
 

@@ -1,7 +1,7 @@
-"""The entry of a policy family: its options, how a policy is built, its parity cases, its published script.
+"""The entry of a policy family: its options, how a policy is built, its published script.
 
 Each family has a module `family.py` with one `PolicyFamily`. Importing it must be cheap, because every command line
-does so: torch and the model's code are imported inside `build` and the parity command.
+does so: torch and the model's code are imported inside `build`.
 """
 
 from __future__ import annotations
@@ -16,22 +16,6 @@ from vla_attention.capture.environments.episode_protocol import OPENPI, Evaluati
 if TYPE_CHECKING:
     from vla_attention.capture.policies.policy import Policy
     from vla_attention.schemas.stores.store_format import PolicyIdentity
-
-
-@dataclass(frozen=True)
-class ParityCases:
-    """The cases of a family that `vla-attention capture parity CASE` runs.
-
-    recognises: tells from the content of a case.json whether the case is of this family. run: takes the parsed
-    arguments and the device, prints the differences, and returns the exit code. formats: the names that `--format`
-    takes; empty when it is refused. default_limit: the largest difference that passes, for the help text of `--limit`;
-    empty when that option is refused.
-    """
-
-    recognises: Callable[[Mapping[str, Any]], bool]
-    run: Callable[[argparse.Namespace, str], int]
-    formats: tuple[str, ...] = ()
-    default_limit: str = ""
 
 
 @dataclass(frozen=True)
@@ -94,7 +78,6 @@ class PolicyFamily:
     default_suite: str = "robosuite"
     #: parsed arguments -> further arguments of an analysis that follows the capture
     analysis_arguments: Callable[[argparse.Namespace], list[str]] = no_arguments
-    parity: ParityCases | None = None
     published: PublishedScript | None = None
     #: The suites that checkpoints were trained on and evaluated in, by the names that `--checkpoint` takes.
     trained_on: Mapping[str, tuple[str, ...]] = field(default_factory=dict)

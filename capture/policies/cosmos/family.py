@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
 from vla_attention.capture.environments.suites import STANDARD_SUITES
-from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedScript
+from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
 from vla_attention.capture.policies.model_arguments import UNTRAINED_POLICIES, add_model_arguments
 from vla_attention.schemas.errors import BadArgument
 
@@ -148,14 +148,6 @@ def _check_files(arguments: argparse.Namespace) -> None:
             read_tensors(file)  # mapped into memory: the numbers are not read
 
 
-def _run_parity(arguments: argparse.Namespace, device: str) -> int:
-    from vla_attention.capture.policies.cosmos.parity import run_parity
-
-    if arguments.format is not None or arguments.limit is not None:
-        raise BadArgument("Cosmos cases have one format and their own limits; leave out --format and --limit.")
-    return run_parity(arguments.case, as_json=arguments.json, device=device)
-
-
 FAMILY = PolicyFamily(
     name="cosmos",
     title="Cosmos Policy",
@@ -169,7 +161,6 @@ FAMILY = PolicyFamily(
     seed_of="seed of the noise; the simulator's is 0, as published",
     built_in=UNTRAINED_POLICIES,
     analysis_arguments=_analysis_arguments,
-    parity=ParityCases(recognises=lambda content: isinstance(content.get("kind"), str), run=_run_parity),
     published=PublishedScript(
         program="evaluate-attention-ratio-cosmos",
         checkpoint=CHECKPOINT,

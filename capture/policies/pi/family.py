@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from vla_attention.capture.environments.episode_protocol import CAMERAS, LEROBOT, OPENPI
 from vla_attention.capture.environments.suites import STANDARD_SUITES
-from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedScript
+from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
 from vla_attention.capture.policies.model_arguments import UNTRAINED_POLICIES, add_model_arguments
 from vla_attention.capture.policies.robot import NONE, Robot, read_camera_choices
 from vla_attention.schemas.jsonable import from_json
@@ -152,12 +152,6 @@ def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
     return settings
 
 
-def _run_parity(arguments: argparse.Namespace, device: str) -> int:
-    from vla_attention.capture.policies.pi.parity import run_parity
-
-    return run_parity(arguments.case, arguments.format, limit=arguments.limit, as_json=arguments.json, device=device)
-
-
 FAMILY = PolicyFamily(
     name="pi",
     title="pi0 or pi0.5",
@@ -171,12 +165,6 @@ FAMILY = PolicyFamily(
     layers_note="; also the published scripts' numbers 18..35 (25 = block 7)",
     built_in=(*SHIPPED, *UNTRAINED_POLICIES),
     default_suite="cubes",
-    parity=ParityCases(
-        recognises=lambda content: "model" in content or "config" in content,
-        run=_run_parity,
-        formats=("orbax", "openpi", "lerobot"),
-        default_limit="5e-5; 0.1 for bfloat16 cases",
-    ),
     published=PublishedScript(
         program="evaluate-attention-ratio",
         checkpoint="~/.cache/openpi/openpi-assets/checkpoints/pi05_libero",

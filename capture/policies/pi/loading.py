@@ -13,8 +13,6 @@ from vla_attention.capture.policies.checkpoints import UnsupportedCheckpoint
 from vla_attention.capture.policies.hub import downloads, hub_version
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.model_arguments import UNTRAINED, UNTRAINED_TINY
-from vla_attention.capture.policies.parity_case import CASE_FILE
-from vla_attention.capture.policies.pi.case import CONFIG_FILE, read_config, stated_name, states_sizes
 from vla_attention.capture.policies.pi.compiled import compile_steps
 from vla_attention.capture.policies.pi.config import (
     CAMERA_SLOTS,
@@ -46,6 +44,13 @@ from vla_attention.capture.policies.pi.processing import (
     simulator_cameras,
 )
 from vla_attention.capture.policies.pi.sizes import is_pi05
+from vla_attention.capture.policies.pi.stated_sizes import (
+    CASE_FILE,
+    CONFIG_FILE,
+    read_config,
+    stated_name,
+    states_sizes,
+)
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
 from vla_attention.capture.policies.robot import Robot, RobotData
 from vla_attention.capture.policies.weights import find_dtype
