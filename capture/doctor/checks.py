@@ -70,7 +70,8 @@ def find_gpu(device: str, torch: Any, driver: Path = Path("/proc/driver/nvidia/v
     if torch.cuda.is_available():
         used = device if asked else "cuda"
         free, total = torch.cuda.mem_get_info(used)
-        text = f"{torch.cuda.get_device_name(used)}, {format_bytes(free)} of {format_bytes(total)} free."
+        memory, build = f"{format_bytes(free)} of {format_bytes(total)} free", f"with CUDA {torch.version.cuda}"
+        text = f"{torch.cuda.get_device_name(used)}, {memory}, torch {torch.__version__} {build}."
         return Finding("GPU", "ok", f"{text} --device cpu leaves it unused." if device == "cpu" else text)
     if torch.version.cuda is None:
         why = f"torch {torch.__version__} is built without CUDA"

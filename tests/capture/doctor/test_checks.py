@@ -138,6 +138,7 @@ def test_a_gpu_is_named_with_its_memory():
     cuda = SimpleNamespace(
         is_available=lambda: True, mem_get_info=lambda device: (6e9, 80e9), get_device_name=lambda device: "H100"
     )
-    found = find_gpu("cuda:1", SimpleNamespace(cuda=cuda))
+    version = SimpleNamespace(cuda="12.8")
+    found = find_gpu("cuda:1", SimpleNamespace(cuda=cuda, version=version, __version__="2.9"))
     assert found.status == "ok"
     assert "H100, 6 GB of 80 GB" in found.text
