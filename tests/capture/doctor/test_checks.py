@@ -54,6 +54,7 @@ def test_a_jax_checkpoint_without_its_arrays_is_missing(tmp_path: Path, monkeypa
     ],
 )
 def test_every_part_of_a_cosmos_checkpoint_is_looked_for(tmp_path: Path, monkeypatch, absent: str | None, said: str):
+    pytest.importorskip("diffusers")
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
     folder = write_dummy_folder(tmp_path / "checkpoint", DUMMY_CONFIG, ["lift the cube"])
     if absent is not None:
@@ -64,6 +65,7 @@ def test_every_part_of_a_cosmos_checkpoint_is_looked_for(tmp_path: Path, monkeyp
 
 def test_a_file_of_no_weights_is_missing(tmp_path: Path, monkeypatch):
     """What a copy without large files leaves in the place of each."""
+    pytest.importorskip("diffusers")
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
     cosmos = write_dummy_folder(tmp_path / "cosmos", DUMMY_CONFIG, ["lift the cube"])
     pi = Path(shutil.copytree(GOLDEN / "pi05_batch2" / "checkpoint_lerobot", tmp_path / "pi"))
