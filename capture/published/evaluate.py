@@ -140,8 +140,6 @@ def _jobs(arguments: argparse.Namespace) -> list[_Job]:
         settings = replace(
             settings,
             recording=replace(settings.recording, layers=None),
-            # The layers to analyse are chosen afterwards, so a budget gives up no layer.
-            fixed=replace(settings.fixed, layers=True),
             array_task_ids=tuple(number for name, number in of_array if name == suite),
         )
         jobs.append(_Job(one, settings, one.output_dir, given is None))

@@ -28,6 +28,7 @@ from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.stores.locks import Holder, Locks
 from vla_attention.schemas.stores.store_format import StoreExists, episode_name
+from vla_attention.schemas.stores.store_place import room_at
 
 #: Seconds between two looks for an episode that another process is writing.
 _LOOK_EVERY_S = 5.0
@@ -213,13 +214,22 @@ class EpisodeLoop(ABC):
         self.faults.note_recorded()
 
     def show_end(self, job: EpisodeJob, progress: EpisodeProgress, result: EpisodeResult, num_bytes: int) -> None:
-        """Show that an episode is committed."""
+        """Show that an episode is committed, and after the first one what the others will take."""
+        seconds, share = progress.seconds, 1.0
         if self.unit == "call":
             progress.drop()
-            return
-        outcome = "success" if result.success else "no success"
-        size = f"{result.num_replans} replans, {format_bytes(num_bytes)}"
-        progress.end(f"{outcome} after {result.num_steps} steps, {size}", job.task.instruction)
+        else:
+            share = min(1.0, max(1, result.num_steps) / job.size)
+            outcome = "success" if result.success else "no success"
+            size = f"{result.num_replans} replans, {format_bytes(num_bytes)}"
+            progress.end(f"{outcome} after {result.num_steps} steps, {size}", job.task.instruction)
+        if len(self.results) == 1:
+            self.progress.say_rest(seconds, num_bytes, share, self.at_a_time, room_at(self.store.path).bytes)
+
+    @property
+    def at_a_time(self) -> int:
+        """Episodes that run at a time."""
+        return 1
 
     def note_fault(self, name: str, progress: EpisodeProgress, error: Exception) -> bool:
         """Note that an episode was dropped after a fault; returns whether it shall be tried again.

@@ -137,6 +137,11 @@ class PipelinedLoop(EpisodeLoop):
             stack.callback(self._end_simulators)
             yield
 
+    @property
+    def at_a_time(self) -> int:
+        """Simulators, each with an episode."""
+        return self.num_envs
+
     def attempt_all(self, missing: Sequence[EpisodeJob]) -> list[tuple[EpisodeJob, Holder]]:
         """Record every episode that nobody has; return those that other processes are writing."""
         self.termination.check()

@@ -77,6 +77,18 @@ def test_every_episode_is_recorded_and_noted(store: RunStore, capsys: pytest.Cap
     assert said.count("success after 4 steps, 1 replans") == 4
 
 
+@pytest.mark.parametrize("unit", ["step", "call"])
+def test_what_is_left_is_said_once_and_not_of_one_episode(store: RunStore, capsys, monkeypatch, unit: Unit) -> None:
+    monkeypatch.setenv("SLURM_JOB_END_TIME", "1")
+    loop_of(store, MadeUpSource(store), unit).record_all(JOBS[:1])
+    assert "first episode" not in capsys.readouterr().out
+    loop_of(store, MadeUpSource(store), unit).record_all(JOBS[1:])
+    said = capsys.readouterr().out
+    assert said.count("The first episode took") == 1
+    assert "2 more episodes, 1 at a time" in said
+    assert "NOT suffice" in said
+
+
 def test_what_another_process_commits_meanwhile_is_refused(store: RunStore, capsys) -> None:
     source = MadeUpSource(store, lambda name: name == JOBS[2].name and write_episode(store, SPEC, 1, 0))
     loop = loop_of(store, source)
