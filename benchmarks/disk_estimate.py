@@ -1,70 +1,82 @@
-"""How far the estimate of `--budget` and `vla-capture doctor` is from what is written, by policy and precision.
+"""How far the bound that a run prints before it starts is from what it writes, by policy and precision.
 
 Usage: python benchmarks/disk_estimate.py [--libero-assets PATH] [--policies NAME ...]
 
-For each policy the first 8 replans of two or three tasks are tried, as `--budget` does. Then longer episodes of other
-tasks are rolled out and written at every precision by the store's own writer; the ratio is estimate / written. The
-bound is the one that a run prints without `--budget`. No times are measured, so other work does not matter.
+Episodes of one or two tasks are recorded at every precision, one simulator at a time. No times are measured, so other
+work does not matter.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import dataclass, replace
+import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
 from measurement import Table, measured, write_rows
 
-from vla_attention.capture.budget.trial import run_trial
 from vla_attention.capture.commands.arguments import build_parser
-from vla_attention.capture.environments.base import EnvironmentSettings
-from vla_attention.capture.interventions.run_changes import RunChanges
-from vla_attention.capture.policies.policy import stored_picture_sizes
-from vla_attention.capture.run.capture_run import plan_run
+from vla_attention.capture.policies.policy import Policy, stored_picture_sizes
+from vla_attention.capture.run.capture_run import run_capture
 from vla_attention.capture.run.run_settings import run_settings
-from vla_attention.capture.store.disk_estimate import SampleOfReplans, estimate_disk, mean_size
+from vla_attention.capture.store.disk_estimate import estimate_disk
+from vla_attention.capture.store.store_root import read_existing_root
 from vla_attention.schemas.command_line import format_bytes
-from vla_attention.schemas.interventions import Interventions
 
 BITS = (4, 7, 10, 12, 23)
 
 
 @dataclass(frozen=True)
 class Case:
-    """A policy in a suite; `tried` are the tasks of the trial, `written` those of the longer episodes."""
+    """A policy in a suite. tasks: of the episodes. replans: most of an episode."""
 
     words: str
-    tried: tuple[int, ...]
-    written: tuple[int, ...]
+    tasks: tuple[int, ...]
     replans: int
 
 
 CASES = {
-    "pi05_cubes": Case("pi --task-suite cubes", (0, 8, 16), (3, 12), 30),
-    "pi untrained-tiny": Case("pi --checkpoint untrained-tiny --task-suite robosuite", (0, 4, 7), (1, 5), 30),
-    "cosmos untrained-tiny": Case("cosmos --checkpoint untrained-tiny --task-suite robosuite", (0, 4, 7), (1, 5), 20),
-    "pi untrained": Case("pi --checkpoint untrained --task-suite robosuite", (0, 7), (1,), 16),
-    "pi untrained, LIBERO": Case("pi --checkpoint untrained --task-suite libero_goal", (0, 9), (2,), 16),
-    "cosmos untrained": Case("cosmos --checkpoint untrained --task-suite robosuite", (0, 7), (1,), 12),
+    "pi05_cubes": Case("pi --task-suite cubes", (3, 12), 30),
+    "pi untrained-tiny": Case("pi --checkpoint untrained-tiny --task-suite robosuite", (1, 5), 30),
+    "cosmos untrained-tiny": Case("cosmos --checkpoint untrained-tiny --task-suite robosuite", (1, 5), 20),
+    "pi untrained": Case("pi --checkpoint untrained --task-suite robosuite", (1,), 16),
+    "pi untrained, LIBERO": Case("pi --checkpoint untrained --task-suite libero_goal", (2,), 16),
+    "cosmos untrained": Case("cosmos --checkpoint untrained --task-suite robosuite", (1,), 12),
 }
 
 
-def samples_of(case: Case, assets: Path | None) -> tuple[list[SampleOfReplans], list[SampleOfReplans], list[int]]:
-    """Return the replans of the trial, those of the longer episodes, and the bytes of the pictures of a call."""
-    arguments = build_parser().parse_args([*case.words.split(), "--output", "none.zarr"])
-    settings = run_settings(arguments)
-    policy = arguments.family.build(arguments, "cpu")
-    plan = plan_run(settings, policy, {"made": "by a benchmark"})
-    attributes, tasks, environment = plan.attributes, plan.tasks, EnvironmentSettings(plan.evaluation, assets)
+@dataclass(frozen=True)
+class Episode:
+    """What an episode of so many replans took, and the bound of it, in bytes."""
 
-    def sample(task: int, **options: int) -> SampleOfReplans:
-        changes = RunChanges(Interventions(), {})
-        return run_trial(policy, attributes, tasks[task], environment, changes, **options).sample
+    replans: int
+    written: int
+    bound: int
 
-    tried = [sample(task) for task in case.tried]
-    written = [sample(task, most_replans=case.replans) for task in case.written]
-    return tried, written, stored_picture_sizes(policy, attributes.protocol.image_size)
+
+def options(case: Case, *more: str) -> argparse.Namespace:
+    """The options of a capture."""
+    tasks = [str(task) for task in case.tasks]
+    words = [*case.words.split(), "--task-id", *tasks, "--num-episodes", "1", "--num-envs", "1", *more]
+    return build_parser(words).parse_args(words)
+
+
+def record(case: Case, policy: Policy, bits: int, assets: Path | None) -> list[Episode]:
+    """Record the episodes of a case at a precision."""
+    with tempfile.TemporaryDirectory() as folder:
+        more = ["--output", f"{folder}/a.zarr", "--precision", str(bits)]
+        more += ["--max-steps", str(case.replans * policy.default_replan_steps)]
+        more += ["--libero-assets", str(assets)] if assets is not None else []
+        settings = run_settings(options(case, *more))
+        episodes = []
+        for result in run_capture(settings, policy, "cpu"):
+            root = read_existing_root(settings.store)
+            pictures = stored_picture_sizes(policy, root.protocol.image_size)
+            bound = estimate_disk(root.recording, root.sites, pictures, result.num_replans, 1).total_bytes
+            written = sum(file.stat().st_size for file in result.folder.rglob("*") if file.is_file())
+            episodes.append(Episode(result.num_replans, written, bound))
+        return episodes
 
 
 def main() -> int:
@@ -76,30 +88,26 @@ def main() -> int:
     for name in arguments.policies:
         if "LIBERO" in name and arguments.libero_assets is None:
             continue
-        tried, written, pictures = samples_of(CASES[name], arguments.libero_assets)
-        replans = len(written[0].records)
+        case = CASES[name]
+        of_policy = options(case)
+        policy = of_policy.family.build(of_policy, "cpu")
         for bits in BITS:
-            recording = replace(tried[0].attributes.recording, mantissa_bits=bits)
-            expected = mean_size([sample.size(recording) for sample in tried]).bytes_of(replans)
-            real = [sample.bytes_written(recording) for sample in written]
-            bound = estimate_disk(recording, tried[0].attributes.sites, pictures, replans, 1).total_bytes
+            episodes = record(case, policy, bits, arguments.libero_assets)
+            replans = sum(episode.replans for episode in episodes)
             rows.append(
                 {
                     "policy": name,
                     "bits": str(bits),
-                    "replans": str(replans),
-                    "written": format_bytes(sum(real) / len(real) / replans),
-                    "ratio": measured([expected / size for size in real]),
-                    "bound": measured([bound / size for size in real]),
+                    "replans": str(max(episode.replans for episode in episodes)),
+                    "written": format_bytes(sum(episode.written for episode in episodes) / replans),
+                    "bound": measured([episode.bound / episode.written for episode in episodes]),
                 }
             )
-            print(name, bits, [round(expected / size, 3) for size in real], round(bound / real[0], 2), flush=True)
     columns = {
         "policy": "policy",
         "bits": "mantissa bits",
         "replans": "replans",
         "written": "written per replan",
-        "ratio": "measured estimate / written",
         "bound": "printed bound / written",
     }
     write_rows("disk_estimate", {"policies": Table(columns, rows)})

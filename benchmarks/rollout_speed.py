@@ -31,11 +31,12 @@ from benchmarks.measurement import Table, fix_threads, in_turn, measured, ratios
 fix_threads(1)
 os.environ.setdefault("MUJOCO_GL", "egl")
 
+from vla_attention.capture.rollout import background_writing, episode, episode_loop, pipeline  # noqa: E402
+
 from vla_attention.capture.commands.arguments import build_parser  # noqa: E402
+from vla_attention.capture.engine.simulation import Simulation  # noqa: E402
 from vla_attention.capture.machine.device import load_torch  # noqa: E402
 from vla_attention.capture.policies.policy import Policy  # noqa: E402
-from vla_attention.capture.rollout import background_writing, episode, episode_loop, pipeline  # noqa: E402
-from vla_attention.capture.engine.simulation import Simulation  # noqa: E402
 from vla_attention.capture.run import capture_run  # noqa: E402
 from vla_attention.capture.run.run_settings import run_settings  # noqa: E402
 from vla_attention.capture.store.episode_writer import EpisodeWriter  # noqa: E402

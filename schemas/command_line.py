@@ -28,8 +28,8 @@ _MOST_OPTIONS = 6
 _MOST_EXAMPLES = 3
 _MAIN_OPTIONS = {
     *("--checkpoint", "--task-suite", "--task", "--num-episodes", "--effects", "--knockout", "--series", "--policy"),
-    *("--layers", "--grouping", "--group", "--ratio", "--episode", "--open", "--video", "--accept"),
-    *("--csv", "--output", "--resume", "--budget", "--repair", "--tar"),
+    *("--layers", "--grouping", "--group", "--ratio", "--episode", "--open", "--video"),
+    *("--csv", "--output", "--resume", "--repair", "--tar"),
     *("--without", "--help-all"),
 }
 

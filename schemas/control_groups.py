@@ -1,23 +1,22 @@
-"""The control groups of this process, as the kernel tells them: their limits count for threads and for memory."""
+"""The control group of this process, as the kernel tells it: its limits count for threads and for memory."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 
-def own_groups(root: Path, controller: str) -> dict[int, str]:
-    """Return the version of each tree of control groups that limits `controller`, and this process's group there.
+def of_own_group(name: str, root: Path = Path("/")) -> str:
+    """Return the text of a file of this process's control group (version 2), such as `cpu.max`; empty without one.
 
-    controller: `cpu` or `memory`. root: folder in place of /, for tests.
+    root: folder in place of /, for tests.
     """
-    paths = {}
-    for line in text_of(root / "proc/self/cgroup").splitlines():
-        number, controllers, path = line.split(":", 2)
-        if number == "0" and not controllers:
-            paths[2] = path
-        elif controller in controllers.split(","):
-            paths[1] = path
-    return paths
+    own = re.search(r"^0::/(.*)$", text_of(root / "proc/self/cgroup"), re.MULTILINE)
+    if own is None:
+        return ""
+    mount = root / "sys/fs/cgroup"
+    # A container may see the path of its group on the host, and the group itself in the place of the whole tree.
+    return text_of(mount / own[1] / name) or text_of(mount / name)
 
 
 def text_of(path: Path) -> str:

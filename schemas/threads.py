@@ -6,26 +6,25 @@ where other work has the cores, or several workers share a node, a policy call t
 read their environment variables once, when they are loaded, so `use_threads` comes before them.
 
 Order of precedence: `--threads`, OMP_NUM_THREADS, then the smallest of the cores that this process may run on, the
-CPU quota of its control groups, and what SLURM gave to the task.
+CPU quota of its control group, and what SLURM gave to the task.
 """
 
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vla_attention.schemas.control_groups import own_groups, text_of
+from vla_attention.schemas.control_groups import of_own_group, text_of
 from vla_attention.schemas.errors import BadArgument
 
 if TYPE_CHECKING:
     import argparse
 
 _OPENMP = "OMP_NUM_THREADS"
-_SLURM = ("SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE")
+_SLURM = "SLURM_CPUS_PER_TASK"
 #: Set to the same number, unless the user has set them. LP_: Mesa's renderer, which draws on nodes without a GPU.
 OTHER_LIBRARIES = ("MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "POLARS_MAX_THREADS", "LP_NUM_THREADS")
 #: Let threads that wait sleep: the standard's variable, and those of the GNU (torch's own) and the Intel runtime.
@@ -57,7 +56,7 @@ def choose_threads(given: int | None, environment: Mapping[str, str], cores: int
         given: the value of `--threads`; None without one.
         environment: environment variables.
         cores: number of cores that the process may run on.
-        quota: processor seconds per second that its control groups allow; None without a limit.
+        quota: processor seconds per second that its control group allows; None without a limit.
 
     Raises:
         BadArgument: `given` or OMP_NUM_THREADS is no number of threads.
@@ -75,19 +74,10 @@ def choose_threads(given: int | None, environment: Mapping[str, str], cores: int
     limits = [Threads(cores, "the cores that this process may use")]
     if quota is not None:
         limits.append(Threads(max(1, int(quota)), "the CPU quota of its control group"))
-    limits += _slurm_limits(environment)
+    of_task = environment.get(_SLURM, "")
+    if of_task.isdecimal() and int(of_task):
+        limits.append(Threads(int(of_task), _SLURM))
     return min(limits, key=lambda limit: limit.number)
-
-
-def _slurm_limits(environment: Mapping[str, str]) -> list[Threads]:
-    """Return what SLURM gave: to the task if the job says how much, else its share of the node's part of the job."""
-    values = {name: int(text) for name, text in environment.items() if name in _SLURM and text.isdecimal()}
-    task, node = (values.get(name, 0) for name in _SLURM)
-    if task:
-        return [Threads(task, _SLURM[0])]
-    # Tasks per node of this step, as in 2(x3),1: two on each of three nodes, one on the fourth.
-    tasks = max(map(int, re.findall(r"(?<![x\d])\d+", environment.get("SLURM_STEP_TASKS_PER_NODE", ""))), default=1)
-    return [Threads(max(1, node // max(1, tasks)), _SLURM[1])] if node else []
 
 
 def use_threads(given: int | None = None) -> Threads:
@@ -141,47 +131,13 @@ def count_cores(processors: Iterable[int], root: Path = Path("/")) -> int:
 
 
 def cpu_quota(root: Path = Path("/")) -> float | None:
-    """Return the processor seconds per second that control groups allow this process; None without a limit.
-
-    A group is limited by its parents too, so the smallest quota on the way up counts. Both versions of control groups
-    are read, and where a container sees only a part of the tree, that part.
+    """Return the processor seconds per second that the control group allows this process; None without a limit.
 
     Args:
         root: folder in place of /, for tests.
     """
-    quotas = []
-    for mount, group, version in _cpu_groups(root):
-        for folder in (group, *group.parents):
-            quota = _quota_of(mount / folder, version)
-            if quota is not None:
-                quotas.append(quota)
-    return min(quotas, default=None)
-
-
-def _cpu_groups(root: Path) -> list[tuple[Path, Path, int]]:
-    """Return (where the tree is mounted, this process's group below it, version) of each tree that limits the CPU."""
-    paths = own_groups(root, "cpu")
-    groups = []
-    for line in text_of(root / "proc/self/mountinfo").splitlines():
-        before, _, after = line.partition(" - ")
-        tree, mount = before.split()[3:5]
-        kind, _, options = after.split(maxsplit=2)
-        version = {"cgroup2": 2, "cgroup": 1}.get(kind)
-        if version not in paths or (version == 1 and "cpu" not in options.split(",")):
-            continue
-        # A container without a namespace of its own sees its group's path on the host, and that group as the mount.
-        group = Path(paths[version])
-        below = group.relative_to(tree) if group.is_relative_to(tree) else group.relative_to("/")
-        groups.append((root / mount.lstrip("/"), below, version))
-    return groups
-
-
-def _quota_of(folder: Path, version: int) -> float | None:
-    if version == 2:
-        words = text_of(folder / "cpu.max").split()
-    else:
-        words = [text_of(folder / f"cpu.cfs_{name}_us").strip() for name in ("quota", "period")]
-    # `max` and -1 stand for no limit; a group that is not visible from here has no file.
+    words = of_own_group("cpu.max", root).split()
+    # `max` stands for no limit.
     if len(words) != 2 or not all(word.isdecimal() for word in words) or int(words[1]) == 0:
         return None
     return int(words[0]) / int(words[1])

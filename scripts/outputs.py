@@ -68,8 +68,6 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
         "--output", "stores/two.zarr",
     ]  # fmt: skip
     yield "capture_task", ["vla-capture", "pi", "--task-id", "1", *TWO_TASKS[3:], "--output", "stores/task.zarr"]
-    budget = ["--budget", "3MB", "--output", "stores/budget.zarr"]
-    yield "capture_budget", ["vla-capture", "pi", *TWO_TASKS, *budget]
     yield "capture_cosmos", [
         "vla-capture", "cosmos", "--task-suite", "robosuite", "--task-id", "0", "--num-episodes", "1", "--max-steps",
         "6", "--threads", "1", "--num-envs", "1", "--output", "stores/cosmos.zarr",
@@ -96,7 +94,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
     yield "tasks", ["vla-capture", "tasks", "cubes"]
     yield "capture_verify", ["vla-capture", "verify", cubes]
     yield "capture_repair", ["vla-capture", "verify", cubes, "--repair", "--quick"]
-    yield "doctor", ["vla-capture", "doctor", "--no-trial", "--output", cubes, "--threads", "1"]
+    yield "doctor", ["vla-capture", "doctor", "--output", cubes, "--threads", "1"]
     for place in _stores(folder):
         kind = place.removeprefix("stores/").replace("/", "_").removesuffix(".zarr")
         for name, words in QUESTIONS.items():
@@ -132,7 +130,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
         yield f"{program}_help", [program, "--help"]
     for name in _commands_of("analyze"):
         yield f"analyze_{name}_help", ["vla-analyze", name, "--help"]
-    for name in ("pi", "cosmos", "rerun", "replay", "status", "doctor", "tasks", "parity", "verify"):
+    for name in ("pi", "cosmos", "rerun", "replay", "status", "doctor", "tasks", "verify"):
         yield f"capture_{name}_help", ["vla-capture", name, "--help"]
 
 

@@ -99,7 +99,7 @@ FAULTS = (
         "schemas/stores/locks.py",
         "silent >= self.dead_after_s or",
         "silent >= 0 or",
-        ("tests/schemas/stores/test_locks.py", "tests/capture/rollout"),
+        ("tests/schemas/stores/test_locks.py", "tests/capture/engine"),
     ),
     Fault(
         "wrong weight of denoise steps: the last one alone",
@@ -141,7 +141,7 @@ FAULTS = (
         "capture/rollout/episode_loop.py",
         "            except EPISODE_FAULTS as error:\n                again = self.note_fault(",
         "            except Exception as error:\n                again = not (",
-        ("tests/capture/rollout", "tests/capture/rerun"),
+        ("tests/capture/engine", "tests/capture/rerun"),
     ),
     Fault(
         "picture turned",
@@ -190,14 +190,14 @@ FAULTS = (
         "capture/policies/pi/policy.py",
         "torch.cat([each.tensors[name] for each in policy_inputs])",
         'torch.cat([each.tensors[name] for each in policy_inputs]).roll(int(name == "tokens"), 0)',
-        ("tests/capture/rollout/test_pipeline.py",),
+        ("tests/capture/engine/test_pipeline.py",),
     ),
     Fault(
         "resumed twice: a committed episode is recorded again",
         "capture/rollout/episode_loop.py",
         "return self.store.has(job.task.task_id, job.episode_index)",
         "return False",
-        ("tests/capture/rollout", "tests/capture/rerun"),
+        ("tests/capture/engine", "tests/capture/rerun"),
     ),
 )
 

@@ -6,31 +6,27 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from vla_attention.capture.commands.parity_command import run_parity_command
-from vla_attention.capture.doctor.arguments import DOCTOR_EXAMPLES, add_doctor_arguments
+from vla_attention.capture.doctor.command import DOCTOR_EXAMPLES, add_doctor_arguments
 from vla_attention.capture.effects.arguments import add_effect_arguments
+from vla_attention.capture.engine.recording_arguments import add_recording_arguments
 from vla_attention.capture.environments.suites import ALL_SUITES, STANDARD_SUITES, SUITES, find_suite, list_tasks
 from vla_attention.capture.interventions.arguments import add_intervention_arguments
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
-from vla_attention.capture.policies.model_arguments import POLICY_THREADS
 from vla_attention.capture.replay.arguments import REPLAY_EXAMPLES, add_replay_arguments
 from vla_attention.capture.rerun.arguments import RERUN_EXAMPLES, add_rerun_arguments
-from vla_attention.capture.engine.recording_arguments import add_recording_arguments
 from vla_attention.capture.run.command import run_capture_of_family
 from vla_attention.schemas.command_line import OneSentenceParser
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.options import add_capture_output, add_task
 from vla_attention.schemas.stores import verify_command
 from vla_attention.schemas.stores.repair_command import VERIFY_HELP
-from vla_attention.schemas.threads import add_threads
 
 _FURTHER_EXAMPLES = """\
   vla-attention capture status runs/libero_10.zarr                     what is there, what is missing, who is writing
   vla-attention capture verify runs/libero_10.zarr               check everything; --repair moves damaged episodes aside
   vla-attention capture doctor                                         what this machine can do, and what is missing
-  vla-attention capture parity CASE                            our numbers against a reference's, on your own checkpoint
 """
 
 
@@ -58,13 +54,6 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
         )
         _add_capture_arguments(capture, family)
         capture.set_defaults(command=run_capture_of_family, family=family)
-    parity = commands.add_parser(
-        "parity",
-        help="compare a policy with what a reference implementation computed",
-        description="Run a case folder (case.json, a checkpoint, inputs.npz, expected.npz) and print the largest "
-        "differences. Exit code 0: all within the limit, 1: beyond it, 2: the case cannot be used.",
-    )
-    _add_parity_arguments(parity, families)
     replay = commands.add_parser(
         "replay",
         help="make policy calls on the frames of a data set of a robot",
@@ -96,10 +85,9 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
     doctor = commands.add_parser(
         "doctor",
         help="what this machine can do for a run, and what is missing for it",
-        description="Takes the options of a capture and prints a line for everything that it needs: threads, memory, "
-        "GPU, drawing, simulator and assets, disk, checkpoint, precision, time and size, each with what to do. Exit "
-        "code 1 when something is missing. With --accept, ten episodes of a published checkpoint are held against its "
-        "published success rate.",
+        description="Takes the options of a capture and prints a line for everything that it needs: memory, simulator "
+        "and assets, drawing, disk, GPU, checkpoint, each with what to do. Loads no policy and runs no simulator. Exit "
+        "code 1 when something is missing.",
         epilog=f"examples:\n{DOCTOR_EXAMPLES}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -238,12 +226,6 @@ def _add_output_arguments(
         f"may be given twice, once for each (default: {default})",
     )
     group.add_argument("--save-viz", action="store_true", help="analyse afterwards, with pictures of every episode")
-    group.add_argument(
-        "--budget",
-        metavar="SIZE",
-        help="most disk space of the store, such as 20GB: a few replans are tried, and what is recorded is the most "
-        "that fits; precision, denoise steps, layers and heads that are given stay as they are (docs/store.md)",
-    )
     existing = group.add_mutually_exclusive_group()
     resume = "continue an existing store with what is missing" + (" (default)" if script else "")
     existing.add_argument("--resume", action="store_true", help=resume)
@@ -253,24 +235,6 @@ def _add_output_arguments(
         help="with --resume: read every byte of the episodes that are there, instead of only seals, presence and sizes",
     )
     existing.add_argument("--overwrite", action="store_true", help="delete an existing store first")
-
-
-def _add_parity_arguments(parser: argparse.ArgumentParser, families: tuple[PolicyFamily, ...]) -> None:
-    cases = [family.parity for family in families if family.parity is not None]
-    formats = listing(name for case in cases for name in case.formats)
-    limit = listing(case.default_limit for case in cases if case.default_limit)
-    parser.add_argument("case", type=Path, metavar="CASE", help="case folder")
-    parser.add_argument("--format", metavar="NAME", help=f"{formats} (default: every format that the case carries)")
-    parser.add_argument("--json", action="store_true", help="print the result as JSON")
-    parser.add_argument(
-        "--limit",
-        type=float,
-        metavar="X",
-        help=f"largest difference that passes (default: {limit})",
-    )
-    parser.add_argument("--device", default="cpu", help="auto, cpu (default), cuda, cuda:1 ...")
-    add_threads(parser, POLICY_THREADS)
-    parser.set_defaults(command=run_parity_command)
 
 
 def _add_status_arguments(parser: argparse.ArgumentParser) -> None:

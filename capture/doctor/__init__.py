@@ -1,1 +1,1 @@
-"""`vla-capture doctor`: what this machine can do for a run, and whether a published checkpoint does what it should."""
+"""`vla-attention capture doctor`: what a run needs, and what this machine lacks of it."""

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.engine.observation_checks import CameraBlack
 from vla_attention.capture.engine.simulation import SimulationFailed
+from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.store.episode_writer import ReplanRefused
 from vla_attention.schemas.errors import UserError, listing
 from vla_attention.schemas.stores.store_format import CorruptEpisode, StoreError

@@ -1,4 +1,4 @@
-"""The loop over episodes: locks, policy calls, commits, faults. Whatever the source, one loop, for one or many at a time.
+"""The loop over episodes, one or many at a time, whatever their source: locks, policy calls, commits, faults.
 
 Where episodes run in several processes, these, the policy and the writing overlap. With batches of 1 the policy is
 called for one episode after the other: every call has the input that it has alone, and every episode is the same to the
@@ -28,7 +28,7 @@ from vla_attention.capture.engine.call import Caller, PolicyCall, RecordedCall
 from vla_attention.capture.engine.faults import EPISODE_FAULTS, Faults, MachineBroken, SimulatorDied
 from vla_attention.capture.engine.progress import EpisodeProgress, Progress, Unit
 from vla_attention.capture.engine.source import Committed, Episode, EpisodeJob, Outcome, Source, SourceLost
-from vla_attention.capture.engine.writing import EpisodeInBackground, WritingThread
+from vla_attention.capture.engine.writing import EpisodeInBackground, WritingThread, bytes_of
 from vla_attention.capture.jobs.termination import Terminated, Termination
 from vla_attention.capture.jobs.worker_log import PlannedTask, WorkerLog
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
@@ -37,6 +37,7 @@ from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.stores.locks import Holder
 from vla_attention.schemas.stores.store_format import StoreExists
+from vla_attention.schemas.stores.store_place import room_at
 
 #: Seconds between two looks for an episode that another process is writing.
 _LOOK_EVERY_S = 5.0
@@ -131,7 +132,7 @@ class EpisodeLoop:
             stack.enter_context(self.store.locks)
             self.progress = Progress(len(missing), sum(job.size for job in missing), self.unit)
             stack.callback(self.progress.close)
-            self.source.say = self.progress.say  # type: ignore[method-assign]
+            self.source.say = self.progress.say
             try:
                 with self._opened():
                     self._record_until_complete(missing)
@@ -211,6 +212,8 @@ class EpisodeLoop:
         if self._has(job):
             self.progress.skip(job.name)
             return False
+        if self.caller is None and not self.store.path.exists():  # `va.record` makes the store with its first call
+            return True
         holder = self.store.locks.acquire(job.name)
         if holder is not None:
             return holder
@@ -254,7 +257,7 @@ class EpisodeLoop:
                 running.num_replans, running.outcome = num_replans, outcome
                 self._running.remove(running)
                 running.close()
-                self._note_commit(running, folder, 0)
+                self._note_commit(running, folder, bytes_of(folder))
                 return
             case None:
                 if (how := running.episode.overdue()) is not None:
@@ -412,12 +415,18 @@ class EpisodeLoop:
         self.store.locks.release(job.name)
 
     def _show_end(self, running: _Running, result: EpisodeResult, num_bytes: int) -> None:
+        """Show that an episode is committed, and after the first one what the others will take."""
+        job, seconds, share = running.job, running.progress.seconds, 1.0
         if self.unit == "call":
             running.progress.drop()
-            return
-        ended = "success" if result.success else "no success"
-        size = f"{result.num_replans} replans, {format_bytes(num_bytes)}"
-        running.progress.end(f"{ended} after {result.num_steps} steps, {size}", running.job.task.instruction)
+        else:
+            share = min(1.0, max(1, result.num_steps) / job.size)
+            ended = "success" if result.success else "no success"
+            size = f"{result.num_replans} replans, {format_bytes(num_bytes)}"
+            running.progress.end(f"{ended} after {result.num_steps} steps, {size}", job.task.instruction)
+        if len(self.results) == 1:
+            room = room_at(self.store.path).bytes
+            self.progress.say_rest(seconds, num_bytes, share, self.source.capacity, room)
 
     def _describe_stop(self, missing: Sequence[EpisodeJob]) -> str:
         committed = listing([result.folder.name for result in self.results], 40)
@@ -433,5 +442,3 @@ class EpisodeLoop:
 def _wake(connection: Connection) -> None:
     with contextlib.suppress(OSError):  # nobody waits any more
         connection.send_bytes(b".")
-
-

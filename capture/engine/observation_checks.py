@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.environments.base import Observation, camera_frame
 from vla_attention.capture.engine.simulation import SimulationFailed
+from vla_attention.capture.environments.base import Observation, camera_frame
 from vla_attention.capture.store.episode_writer import CONSTANT_CAMERAS
 from vla_attention.schemas.errors import Note, listing
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
 from tqdm import tqdm
 
+from vla_attention.schemas.command_line import format_bytes
+from vla_attention.schemas.errors import plural
 from vla_attention.schemas.safe_text import plain_stderr, print_line, visible
 
 #: What is counted of an episode: environment steps, or policy calls where no environment runs.
@@ -23,6 +27,55 @@ _MOST_SHOWN = 4
 def say(line: str) -> None:
     """Print one line immediately, also into a file that somebody follows; see `safe_text.print_line`."""
     print_line(line)
+
+
+def duration(seconds: float) -> str:
+    """Return seconds as text: 40 s, 12 min, 3.5 h."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def seconds_of_job(environment: Mapping[str, str], now: float) -> float | None:
+    """Return the seconds until a SLURM job's time limit; None in no job, or where SLURM does not say it.
+
+    environment: variables. now: seconds since the epoch.
+    """
+    end = environment.get("SLURM_JOB_END_TIME", "")
+    return float(end) - now if end.isdecimal() else None
+
+
+def describe_rest(
+    seconds: float, size: int, share: float, left: int, at_a_time: int, room: int, job_seconds: float | None
+) -> str:
+    """Return what the episodes that are left will take, if they are like the first one.
+
+    Args:
+        seconds: of the first episode.
+        size: its bytes.
+        share: how much of its longest length it had, above 0 and at most 1: a longer one takes more.
+        left: episodes that this process has yet to complete.
+        at_a_time: episodes that run at a time.
+        room: bytes that are free on the disk.
+        job_seconds: until the SLURM job's time limit; None without one.
+    """
+    likely, most = seconds * left / at_a_time, seconds * left / at_a_time / share
+    time_left, disk = f"about {duration(likely)}", f"about {format_bytes(size * left)}"
+    if share < 1:
+        time_left += f" (at most {duration(most)}, if all run to their last step)"
+        disk += f" (at most {format_bytes(size * left / share)})"
+    line = (
+        f"The first episode took {duration(seconds)} and {format_bytes(size)}. For {plural(left, 'more episode')}, "
+        f"{at_a_time} at a time: {time_left}, {disk} of {format_bytes(room)} that are free."
+    )
+    if job_seconds is None:
+        return line
+    limit = f" The job's time limit, in {duration(max(0.0, job_seconds))}, "
+    if most <= job_seconds:
+        return f"{line}{limit}suffices."
+    if likely <= job_seconds:
+        return f"{line}{limit}suffices unless episodes run to their last step."
+    return f"{line}{limit}does NOT suffice: another job with --resume adds what is missing then."
 
 
 @dataclass(eq=False)
@@ -42,9 +95,14 @@ class EpisodeProgress:
         self.done, self.replans = done, replans
         self.progress.show()
 
+    @property
+    def seconds(self) -> float:
+        """Seconds since it was begun."""
+        return time.monotonic() - self.begun_at
+
     def end(self, result: str, instruction: str) -> None:
         """Show how the episode ended."""
-        self.progress.end(self, f"{result}, {time.monotonic() - self.begun_at:.0f} s ({instruction})")
+        self.progress.end(self, f"{result}, {self.seconds:.0f} s ({instruction})")
 
     def drop(self) -> None:
         """Show the episode no more: another process was faster, or this one stops."""
@@ -126,6 +184,13 @@ class Progress:
     def say(self, line: str) -> None:
         """Print one line, above the bar if there is one."""
         say(line) if self._bar.disable else self._bar.write(visible(line))
+
+    def say_rest(self, seconds: float, size: int, share: float, at_a_time: int, room: int) -> None:
+        """Print what the episodes that are left will take, if there are any: arguments as in `describe_rest`."""
+        left = self._num_episodes - self._num_begun + len(self._running)
+        if left:
+            of_job = seconds_of_job(os.environ, time.time())
+            self.say(describe_rest(seconds, size, share, left, at_a_time, room, of_job))
 
     def close(self) -> None:
         """Remove the bar."""

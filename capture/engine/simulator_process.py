@@ -27,9 +27,9 @@ from typing import Protocol as Interface
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.capture.engine.simulation import CameraPatches, Simulation, SimulationFailed, StopCheck, failure
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, SharesResets, Suite
 from vla_attention.capture.environments.suites import make_environment
-from vla_attention.capture.engine.simulation import CameraPatches, Simulation, SimulationFailed, StopCheck, failure
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.store_format import Protocol, episode_name
 from vla_attention.schemas.threads import OTHER_LIBRARIES

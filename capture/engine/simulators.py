@@ -1,4 +1,6 @@
-"""Episodes of simulators, after the protocol of the published evaluations: in this process, or in processes of their own.
+"""Episodes of simulators, after the protocol of the published evaluations.
+
+One simulator is in this process, several are in processes of their own.
 
 After the waiting steps there is one policy call for every `replan_steps` executed actions, until the task is solved or
 `max_steps` actions have been executed.
@@ -81,7 +83,9 @@ def check_protocol(protocol: Protocol, policy: Policy) -> None:
 class Simulator(Interface):
     """One simulator: a `SimulatorProcess`, or a `LocalSimulator`."""
 
-    connection: Connection | None
+    @property
+    def connection(self) -> Connection | None:
+        """Where its answers come; None where it has answered when `begin` and `execute` return."""
 
     def begin(self, request: BeginEpisode) -> None:
         """Let it begin an episode: it answers `Begun` and, after the waiting steps, `Advanced`."""

@@ -93,7 +93,12 @@ class EpisodeInBackground:
             raise ValueError("an episode without replans cannot be committed")
         folder = self._writer.commit(outcome.success, outcome.num_steps, outcome.steps)
         self.close()
-        self.committed = folder, sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+        self.committed = folder, bytes_of(folder)
+
+
+def bytes_of(folder: Path) -> int:
+    """Return the bytes of the files of an episode."""
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
 
 
 class WritingThread:

@@ -118,8 +118,9 @@ def find_assets(configured: Path | None) -> Path:
         if all((folder / name).is_dir() for name in ASSET_SUBFOLDERS):
             return folder
     raise LiberoAssetsMissing(
-        f"No LIBERO assets (scenes, objects, textures) were found in {own_places[0]} or {own_places[1]}; download the "
-        f"hub dataset {ASSETS_SOURCE} and give its folder with --libero-assets PATH or {ASSETS_VARIABLE}=PATH."
+        f"No LIBERO assets (scenes, objects, textures) were found in {own_places[0]} or {own_places[1]}; fetch them "
+        f"with `hf download --repo-type dataset {ASSETS_SOURCE} --local-dir {own_places[1]}`, or give a folder of "
+        f"them with --libero-assets PATH or {ASSETS_VARIABLE}=PATH."
     )
 
 

@@ -1,4 +1,4 @@
-"""How much memory this process may still take: of the machine, its control groups, and its SLURM job."""
+"""How much memory this process may still take: of the machine, its control group, and its SLURM job."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
-from vla_attention.schemas.control_groups import own_groups, text_of
+from vla_attention.schemas.control_groups import of_own_group, text_of
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ def memory_limits(root: Path = Path("/")) -> list[MemoryLimit]:
 
     root: where `proc` and `sys` are.
     """
-    return [*_of_machine(root), *_of_control_groups(root), *_of_slurm(root)]
+    return [*_of_machine(root), *_of_control_group(root), *_of_slurm(root)]
 
 
 def _of_machine(root: Path) -> Iterator[MemoryLimit]:
@@ -38,24 +38,16 @@ def _of_machine(root: Path) -> Iterator[MemoryLimit]:
         yield MemoryLimit(1024.0 * int(available[1]), "the machine")
 
 
-def _of_control_groups(root: Path) -> Iterator[MemoryLimit]:
-    """Yield what each control group above this process leaves; a container and a SLURM job mostly are one.
+def _of_control_group(root: Path) -> Iterator[MemoryLimit]:
+    """Yield what the control group of this process leaves; a container mostly is one.
 
     Pages of files that were not used for a while count as taken there, but are given back.
     """
-    for version, path in own_groups(root, "memory").items():
-        mount, names = root / "sys/fs/cgroup", ("memory.max", "memory.current", "inactive_file")
-        if version == 1:
-            mount = root / "sys/fs/cgroup/memory"
-            names = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
-        below_root = PurePosixPath(path.lstrip("/"))
-        for group in (below_root, *below_root.parents):
-            most, taken = (text_of(mount / group / name).strip() for name in names[:2])
-            given_back = re.search(rf"^{names[2]} (\d+)", text_of(mount / group / "memory.stat"), re.MULTILINE)
-            if most.isdecimal() and taken.isdecimal():
-                yield MemoryLimit(
-                    max(0.0, float(most) - int(taken) + (int(given_back[1]) if given_back else 0)), "its control group"
-                )
+    most, taken = (of_own_group(f"memory.{name}", root).strip() for name in ("max", "current"))
+    given_back = re.search(r"^inactive_file (\d+)", of_own_group("memory.stat", root), re.MULTILINE)
+    if most.isdecimal() and taken.isdecimal():
+        left = int(most) - int(taken) + (int(given_back[1]) if given_back else 0)
+        yield MemoryLimit(max(0.0, float(left)), "its control group")
 
 
 def _of_slurm(root: Path) -> Iterator[MemoryLimit]:

@@ -20,11 +20,8 @@ def policy_families() -> tuple[PolicyFamily, ...]:
 
 
 def default_family() -> PolicyFamily:
-    """Return the family of the trained policy that comes along: the one whose success rate is known."""
-    families = policy_families()
-    return next(
-        family for family in families if any(rate.checkpoint in family.built_in for rate in family.published_rates)
-    )
+    """Return the family of the trained policy that comes along."""
+    return next(family for family in policy_families() if any(name in family.built_in for name in family.trained_on))
 
 
 def family_of_kind(kind: str) -> PolicyFamily:

@@ -1,7 +1,7 @@
-"""The entry of a policy family: its options, how a policy is built, its parity cases, its published script.
+"""The entry of a policy family: its options, how a policy is built, its published script.
 
 Each family has a module `family.py` with one `PolicyFamily`. Importing it must be cheap, because every command line
-does so: torch and the model's code are imported inside `build` and the parity command.
+does so: torch and the model's code are imported inside `build`.
 """
 
 from __future__ import annotations
@@ -19,22 +19,6 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ParityCases:
-    """The cases of a family that `vla-attention capture parity CASE` runs.
-
-    recognises: tells from the content of a case.json whether the case is of this family. run: takes the parsed
-    arguments and the device, prints the differences, and returns the exit code. formats: the names that `--format`
-    takes; empty when it is refused. default_limit: the largest difference that passes, for the help text of `--limit`;
-    empty when that option is refused.
-    """
-
-    recognises: Callable[[Mapping[str, Any]], bool]
-    run: Callable[[argparse.Namespace, str], int]
-    formats: tuple[str, ...] = ()
-    default_limit: str = ""
-
-
-@dataclass(frozen=True)
 class PublishedScript:
     """The published script whose command line a family keeps, with the defaults of that script.
 
@@ -46,21 +30,6 @@ class PublishedScript:
     checkpoint: str
     layers: tuple[int, ...]
     variables: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class PublishedRate:
-    """How often a published checkpoint solved the tasks of a suite, with this family's evaluation.
-
-    checkpoint: its name, as `--checkpoint` takes it. solved, episodes: the rate as counts. source: where it is
-    published, in words.
-    """
-
-    checkpoint: str
-    suite: str
-    solved: int
-    episodes: int
-    source: str
 
 
 def no_arguments(arguments: argparse.Namespace) -> list[str]:
@@ -109,10 +78,9 @@ class PolicyFamily:
     default_suite: str = "robosuite"
     #: parsed arguments -> further arguments of an analysis that follows the capture
     analysis_arguments: Callable[[argparse.Namespace], list[str]] = no_arguments
-    parity: ParityCases | None = None
     published: PublishedScript | None = None
-    #: Success rates of checkpoints, for `vla-capture doctor --accept`; of each checkpoint the default suite first.
-    published_rates: tuple[PublishedRate, ...] = ()
+    #: The suites that checkpoints were trained on and evaluated in, by the names that `--checkpoint` takes.
+    trained_on: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     #: Whether `build` takes a `robot_data` among the arguments (`robot.py`), and then gives a policy for data sets.
     reads_data_sets: bool = False
     #: The kinds of its policies, as stores name them (`PolicyIdentity.family`); empty for the family's name alone.

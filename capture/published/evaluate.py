@@ -140,8 +140,6 @@ def _jobs(arguments: argparse.Namespace) -> list[_Job]:
         settings = replace(
             settings,
             recording=replace(settings.recording, layers=None),
-            # The layers to analyse are chosen afterwards, so a budget gives up no layer.
-            fixed=replace(settings.fixed, layers=True),
             array_task_ids=tuple(number for name, number in of_array if name == suite),
         )
         jobs.append(_Job(one, settings, one.output_dir, given is None))
@@ -187,9 +185,9 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], threads: Threa
         check_writable(job.settings.store.parent, "--output")
     check_simulator(jobs[0].settings.suite, jobs[0].settings.libero_assets)
 
-    from vla_attention.capture.machine.device import load_torch
     from vla_attention.capture.engine.faults import EpisodesMissing
     from vla_attention.capture.engine.progress import say
+    from vla_attention.capture.machine.device import load_torch
     from vla_attention.capture.run.capture_run import run_capture
     from vla_attention.schemas.stores.damaged_episodes import DamagedEpisodesLeft
 
@@ -211,8 +209,8 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], threads: Threa
 
 
 def _analyze(job: _Job, script: PublishedScript) -> int:
-    from vla_attention.capture.jobs.status import store_status
     from vla_attention.capture.engine.progress import say
+    from vla_attention.capture.jobs.status import store_status
     from vla_attention.schemas.stores.root import read_root
 
     arguments, store = job.arguments, job.settings.store

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vla_attention.capture.effects.arguments import add_effect_arguments
+from vla_attention.capture.engine.recording_arguments import add_recording_arguments
 from vla_attention.capture.interventions.arguments import add_intervention_arguments
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.model_arguments import POLICY_THREADS
 from vla_attention.capture.policies.robot import NONE
-from vla_attention.capture.engine.recording_arguments import add_recording_arguments
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.options import add_option
 from vla_attention.schemas.threads import add_threads, use_threads

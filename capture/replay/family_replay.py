@@ -5,10 +5,8 @@ from __future__ import annotations
 import argparse
 import hashlib
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 from typing import Protocol, cast
 
 import numpy as np
@@ -17,7 +15,11 @@ from numpy.typing import NDArray
 from vla_attention.capture.effects.arguments import effect_settings
 from vla_attention.capture.effects.conditions import describe_effects
 from vla_attention.capture.effects.mean_pictures import pictures_of
-from vla_attention.capture.effects.measurement import EffectMeasurement, EpisodeEffectsMeasured, measurement_of
+from vla_attention.capture.effects.measurement import measurement_of
+from vla_attention.capture.engine.call import Caller, PolicyCall
+from vla_attention.capture.engine.plan import plan_recording, recording_settings, root_attributes
+from vla_attention.capture.engine.progress import say
+from vla_attention.capture.engine.source import Episode, EpisodeJob, Outcome, Source, episode_start
 from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.machine.provenance import describe_machine
 from vla_attention.capture.policies.family import PolicyFamily
@@ -26,7 +28,6 @@ from vla_attention.capture.policies.policy import Policy, PolicyInput
 from vla_attention.capture.policies.robot import Robot
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, DataSetFrame, LeRobotDataset
 from vla_attention.capture.replay.replay_plan import (
-    BeforeCall,
     ReplayPlan,
     announce,
     columns_of,
@@ -35,12 +36,8 @@ from vla_attention.capture.replay.replay_plan import (
     success_of,
 )
 from vla_attention.capture.replay.video import decoder_version
-from vla_attention.capture.rollout.episode_loop import EpisodeJob, episode_start
-from vla_attention.capture.engine.call import record_call, replan_record
-from vla_attention.capture.engine.progress import say
-from vla_attention.capture.engine.plan import plan_recording, recording_settings, root_attributes
-from vla_attention.capture.store.episode_writer import EpisodeWriter
-from vla_attention.capture.store.store_writer import RunStore, open_run
+from vla_attention.capture.store.replan_records import EpisodeStart
+from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.layout import picture_size
 
@@ -58,72 +55,70 @@ class RobotPolicy(Policy, Protocol):
         """Turn a frame into the model's input; pictures: column -> (height, width, 3) uint8."""
 
 
-@dataclass(frozen=True)
-class Replay:
-    """A policy on a data set.
+@dataclass
+class Frames(Source):
+    """The frames of a data set's episodes, for a policy of a family.
 
     every: a call at frame 0, every, 2 · every ... instruction: what the policy reads instead of the tasks; None: the
-    tasks. machine: provenance of this process.
+    tasks. machine: provenance that is stored with every episode.
     """
 
     policy: RobotPolicy
-    store: RunStore
+    caller: Caller
+    plan: ReplayPlan
     every: int
-    seed: int
-    instruction: str | None
     machine: Mapping[str, str]
-    effects: EffectMeasurement | None = None
+
+    def open(self, job: EpisodeJob) -> FramesOfEpisode:
+        """Open an episode."""
+        episode, robot = self.plan.data.episode(job.episode_index), self.policy.robot
+        state = joined(episode, robot.state)
+        actions = joined(episode, robot.actions) if robot.actions else None
+        digest = hashlib.sha256(np.ascontiguousarray(state[0]).tobytes()).hexdigest()
+        start = episode_start(job, self.machine, state_digest=digest)
+        frames = episode.frames(self.every, tuple(robot.cameras.values()))
+        return FramesOfEpisode(self, job, episode, start, job.size, frames, state, actions)
 
 
-def replay_episode(replay: Replay, job: EpisodeJob, episode: DataSetEpisode, before_call: BeforeCall) -> Path:
-    """Make the policy calls of one episode, and commit them; returns its folder in the store.
+@dataclass
+class FramesOfEpisode(Episode):
+    """One episode. state: (frame, number); actions: (frame, number), None where the policy's are not recorded.
 
     The step of a replan is the number of its frame. The recorded actions of a replan are those from its frame on, as
     many as the policy gives, fewer at the end of the episode. Whether the task was solved is not known unless the data
     set has a column `next.success`.
     """
-    policy, recording = replay.policy, replay.store.attributes.recording
-    state = joined(episode, policy.robot.state)
-    actions = joined(episode, policy.robot.actions) if policy.robot.actions else None
-    digest = hashlib.sha256(np.ascontiguousarray(state[0]).tobytes()).hexdigest()
-    start = episode_start(job.task, job.episode_index, replay.machine, state_digest=digest, objects=())
-    denoise_times = policy.denoise_times()[list(recording.denoise_steps)]
-    effects = None if replay.effects is None else replay.effects.begin()
-    with replay.store.episode(start, np.asarray(denoise_times), job.size) as writer:
-        cameras = tuple(policy.robot.cameras.values())
-        for frame in episode.frames(replay.every, cameras):
-            before_call(len(writer.records))
-            _append_call(replay, writer, frame, job.task.task_id, state[frame.index], actions, effects)
-        return writer.commit(success_of(episode), episode.length)
 
+    source: Frames
+    job: EpisodeJob
+    episode: DataSetEpisode
+    start: EpisodeStart
+    max_replans: int
+    frames: Iterator[DataSetFrame]
+    state: NDArray[np.float64]
+    actions: NDArray[np.float64] | None
+    done: int = 0
 
-def _append_call(
-    replay: Replay,
-    writer: EpisodeWriter,
-    frame: DataSetFrame,
-    task_id: int,
-    state: NDArray[np.float64],
-    actions: NDArray[np.float64] | None,
-    effects: EpisodeEffectsMeasured | None,
-) -> None:
-    policy, recording = replay.policy, replay.store.attributes.recording
-    instruction = frame.instruction if replay.instruction is None else replay.instruction
-    policy_input = policy.prepare_robot(frame.images, state, instruction)
-    seed = policy.replan_noise_seed(replay.seed, task_id, frame.episode, len(writer.records))
-    where = f"replan {len(writer.records)} (frame {frame.index}) of {writer.what}"
-    call = record_call(policy, policy_input, seed, recording, where)
-    context = CallContext(task_id, frame.episode, len(writer.records))
-    writer.append(
-        replan_record(
-            policy_input,
-            call,
-            recording,
-            env_step=frame.index,
-            noise_seed=seed,
-            effects=None if effects is None else effects.measure(policy_input, seed, call.actions, context),
+    def poll(self) -> PolicyCall | Outcome:
+        """Return the policy call of the next frame."""
+        frame = next(self.frames, None)
+        if frame is None:
+            return Outcome(success_of(self.episode), self.episode.length)
+        plan, policy, actions = self.source.plan, self.source.policy, self.actions
+        instruction = frame.instruction if plan.instruction is None else plan.instruction
+        context = CallContext(self.job.task.task_id, frame.episode, self.done)
+        return PolicyCall(
+            policy.prepare_robot(frame.images, self.state[frame.index], instruction),
+            self.source.caller.drawn_seed(plan.seed, context),
+            context,
+            frame.index,
+            f"replan {self.done} (frame {frame.index}) of episode {self.job.name} of {plan.store}",
             dataset_actions=None if actions is None else actions[frame.index : frame.index + policy.action_horizon],
         )
-    )
+
+    def advance(self, actions: NDArray[np.float64]) -> None:
+        """Go to the next frame, whatever the actions are."""
+        self.done += 1
 
 
 def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: str) -> int:
@@ -155,8 +150,9 @@ def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: 
     effects = measurement_of(recording.effects, policy, [], say, pictures)
     if recording.effects is not None:
         say(describe_effects(recording.effects))
-    replay = Replay(policy, store, every, plan.seed, plan.instruction, attributes.provenance, effects)
-    return len(record_episodes(plan, store, todo, every, partial(replay_episode, replay)))
+    caller = Caller(policy, recording, effects=effects)
+    source = Frames(policy, caller, plan, every, attributes.provenance)
+    return record_episodes(plan, store, todo, every, source, caller)
 
 
 def _picture_sizes(data: LeRobotDataset, policy: RobotPolicy) -> list[int]:

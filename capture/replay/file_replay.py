@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Generator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from vla_attention.capture.engine.plan import recording_settings
+from vla_attention.capture.engine.progress import say
+from vla_attention.capture.engine.source import Committed, Episode, EpisodeJob, Outcome, Source
 from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.policies.noise import noise_seed
 from vla_attention.capture.policies.robot import NONE, RobotData
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode
 from vla_attention.capture.replay.policy_file import ReplayPolicy
 from vla_attention.capture.replay.replay_plan import (
-    BeforeCall,
     ReplayPlan,
     announce,
     columns_of,
@@ -24,9 +29,6 @@ from vla_attention.capture.replay.replay_plan import (
     success_of,
 )
 from vla_attention.capture.replay.video import decoder_version
-from vla_attention.capture.rollout.episode_loop import EpisodeJob
-from vla_attention.capture.engine.progress import say
-from vla_attention.capture.engine.plan import recording_settings
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.session import RecordedRun
@@ -37,9 +39,12 @@ from vla_attention.schemas.stores.root import read_run
 from vla_attention.schemas.stores.store_format import RootAttributes
 
 
-@dataclass(frozen=True)
-class FileReplay:
-    """One policy of a file on one data set. cameras: camera of the layout -> column. state, actions: columns."""
+@dataclass
+class FramesForFile(Source):
+    """The frames of a data set's episodes, for the policy of a file, whose calls `va.record` records.
+
+    cameras: camera of the layout -> column. state, actions: columns.
+    """
 
     given: ReplayPolicy
     run: RecordedRun
@@ -50,8 +55,13 @@ class FileReplay:
     state: tuple[str, ...]
     actions: tuple[str, ...]
 
-    def replay_episode(self, job: EpisodeJob, episode: DataSetEpisode, before_call: BeforeCall) -> Path:
-        """Make the policy calls of one episode, and commit them; returns its folder in the store."""
+    def open(self, job: EpisodeJob) -> RecordedByRun:
+        """Open an episode."""
+        episode = self.plan.data.episode(job.episode_index)
+        return RecordedByRun(Outcome(success_of(episode), episode.length), self._calls(job, episode))
+
+    def _calls(self, job: EpisodeJob, episode: DataSetEpisode) -> Generator[None, None, Path]:
+        """Make a policy call at a time, and commit all of them; returns the episode's folder in the store."""
         instruction, task = self.plan.instruction, job.task
         state = joined(episode, self.state) if self.state else None
         actions = joined(episode, self.actions) if self.actions else None
@@ -64,7 +74,6 @@ class FileReplay:
             task_name=task.name,
         ) as recorded:
             for number, frame in enumerate(episode.frames(self.every, columns)):
-                before_call(number)
                 frame = frame if instruction is None else replace(frame, instruction=instruction)
                 seed = noise_seed(self.seed, task.task_id, episode.index, number)
                 torch.manual_seed(seed)
@@ -79,10 +88,37 @@ class FileReplay:
                     dataset_actions=None if actions is None else actions[frame.index : last],
                 ) as replan:
                     replan.actions = self.given.act(frame)
+                yield
             recorded.success = success_of(episode)
             recorded.num_steps = episode.length
         assert recorded.folder is not None  # an episode without a recorded call is an error
         return recorded.folder
+
+
+@dataclass
+class RecordedByRun(Episode):
+    """One episode. calls: makes one at a time, and commits them."""
+
+    outcome: Outcome
+    calls: Generator[None, None, Path]
+    done: int = 0
+
+    def poll(self) -> Committed | None:
+        """Make the next call."""
+        try:
+            next(self.calls)
+        except StopIteration as end:
+            return Committed(self.outcome, self.done, end.value)
+        self.done += 1
+        return None
+
+    def advance(self, actions: NDArray[np.float64]) -> None:
+        """Never called: it gives no calls away."""
+        raise NotImplementedError
+
+    def close(self, error: Exception | None = None) -> None:
+        """Drop what was not committed."""
+        self.calls.close()
 
 
 def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: ReplayPolicy) -> int:
@@ -129,12 +165,13 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
     if base is not None:
         _check_base(arguments.rerun_of, base[0], run.attributes)
     sizes = [math.prod(picture_size(run.attributes.sites, camera)) * 3 for camera in cameras]
+    store = RunStore(plan.store, run.attributes)
+    run.locks = store.locks
     with run:
         todo = announce(plan, run.attributes, layout.action_horizon, sizes)
         seed = plan.seed if interventions.noise is None else interventions.noise.seed
-        replay = FileReplay(given, run, plan, every, seed, cameras, state, actions)
-        store = RunStore(plan.store, run.attributes)
-        added = len(record_episodes(plan, store, todo, every, replay.replay_episode))
+        source = FramesForFile(given, run, plan, every, seed, cameras, state, actions)
+        added = record_episodes(plan, store, todo, every, source, None)
     if run.num_dropped:
         say(f"In {run.num_dropped} policy calls no attention ran; they are not in the store.")
     if added:

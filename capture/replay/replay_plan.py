@@ -5,13 +5,18 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.capture.engine.call import Caller
+from vla_attention.capture.engine.faults import Faults
+from vla_attention.capture.engine.loop import EpisodeLoop
+from vla_attention.capture.engine.progress import say
+from vla_attention.capture.engine.source import EpisodeJob, Source, plan_of
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.identity import announcement
@@ -19,16 +24,6 @@ from vla_attention.capture.policies.robot import RobotData, read_camera_choices
 from vla_attention.capture.replay.data_set_files import INDEX_COLUMNS
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, LeRobotDataset, open_dataset
 from vla_attention.capture.replay.video import import_av
-from vla_attention.capture.engine.faults import Faults
-from vla_attention.capture.rollout.episode_loop import (
-    EpisodeJob,
-    EpisodeResult,
-    EpisodeSource,
-    OneByOneLoop,
-    StepReport,
-    plan_of,
-)
-from vla_attention.capture.engine.progress import say
 from vla_attention.capture.store.disk_estimate import describe, estimate_disk
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, refuse_recorded
 from vla_attention.schemas.errors import BadArgument, listing, plural
@@ -47,11 +42,6 @@ from vla_attention.schemas.stores.store_place import check_place, check_writable
 
 #: The column that says of every frame whether the task is solved, where a data set has it.
 SUCCESS_COLUMN = "next.success"
-
-#: Called before every policy call with the number of calls done; an exception that it raises drops the episode.
-BeforeCall = Callable[[int], None]
-#: Makes the policy calls of an episode and commits them; returns its folder.
-EpisodeReplay = Callable[[EpisodeJob, DataSetEpisode, BeforeCall], Path]
 
 
 @dataclass(frozen=True)
@@ -213,45 +203,27 @@ def announce(
     return todo
 
 
-@dataclass(frozen=True)
-class FramesSource(EpisodeSource):
-    """The policy's calls on the frames of a data set. replay: makes those of an episode, and commits them."""
-
-    plan: ReplayPlan
-    every: int
-    replay: EpisodeReplay
-
-    def record(self, job: EpisodeJob, report: StepReport) -> EpisodeResult:
-        """Make the policy calls of an episode and commit them."""
-        episode = self.plan.data.episode(job.episode_index)
-
-        def before_call(done: int) -> None:
-            self.plan.termination.check()
-            report(done, done)
-
-        folder = self.replay(job, episode, before_call)
-        return EpisodeResult(job.task.task_id, job.episode_index, success_of(episode), episode.length, job.size, folder)
-
-
 def record_episodes(
-    plan: ReplayPlan, store: RunStore, todo: Sequence[int], every: int, replay: EpisodeReplay
-) -> list[EpisodeResult]:
-    """Make the calls of the episodes; returns those that were added. The plan notes those that a fault left out.
+    plan: ReplayPlan, store: RunStore, todo: Sequence[int], every: int, source: Source, caller: Caller | None
+) -> int:
+    """Make the calls of the episodes; returns how many were added. The plan notes those that a fault left out.
+
+    caller: makes the calls; None where the source makes them.
 
     Raises:
         Terminated: SIGTERM was received; the episode in progress was dropped.
     """
     if not todo:
-        return []
+        return 0
     jobs = []
     with progress_bar(len(todo), "episodes") as advance:
         for index in todo:
             jobs.append(plan.job(index, every))
             advance(1)
-    loop = OneByOneLoop(store, plan_of(jobs), plan.termination, "call", FramesSource(plan, every, replay))
+    loop = EpisodeLoop(store, plan_of(jobs), plan.termination, "call", source, caller)
     results = loop.record_all(jobs)
     plan.faults.dropped.update(loop.faults.dropped)
-    return results
+    return len(results)
 
 
 def chosen_episodes(data: LeRobotDataset, words: Sequence[str] | None, limit: int | None) -> tuple[int, ...]:

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vla_attention.capture.effects.arguments import add_effect_arguments
+from vla_attention.capture.engine.recording_arguments import add_recording_arguments
 from vla_attention.capture.interventions.arguments import add_intervention_arguments
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import family_of_kind
-from vla_attention.capture.engine.recording_arguments import add_recording_arguments
 from vla_attention.schemas.errors import BadArgument, UnknownName, UserError
 from vla_attention.schemas.options import add_capture_output, add_task
 from vla_attention.schemas.threads import use_threads

@@ -8,6 +8,8 @@ from pathlib import Path
 from vla_attention.capture.effects.arguments import NO_EFFECTS, effect_settings
 from vla_attention.capture.effects.conditions import refuse_both
 from vla_attention.capture.effects.mean_pictures import pictures_of
+from vla_attention.capture.engine.plan import plan_recording, recording_settings
+from vla_attention.capture.engine.progress import say
 from vla_attention.capture.interventions.resolution import check_not_compiled, check_places, interventions_for
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.machine.device import load_torch
@@ -19,8 +21,6 @@ from vla_attention.capture.rerun.interventions_of_rerun import check_on_store, r
 from vla_attention.capture.rerun.rerun_store import Rerun
 from vla_attention.capture.rerun.series import SeriesRun
 from vla_attention.capture.rerun.stored_calls import check_has_inputs
-from vla_attention.capture.engine.progress import say
-from vla_attention.capture.engine.plan import plan_recording, recording_settings
 from vla_attention.capture.store.store_writer import WriteMode, refuse_recorded
 from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.interventions import Interventions

@@ -8,9 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.capture.engine.call import Caller
 from vla_attention.capture.policies.policy import PolicyInput
+from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.rerun.base_store import machine_differences
-from vla_attention.capture.rerun.stored_calls import Repeater, StoredCalls
+from vla_attention.capture.rerun.stored_calls import StoredCalls
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, round_mantissa
 from vla_attention.schemas.stores.store_format import Recording, StoreError
@@ -66,7 +68,7 @@ class Fidelity:
 
 
 def check_fidelity(
-    unchanged: Repeater,
+    unchanged: Caller,
     recording: Recording,
     calls: StoredCalls,
     num_replans: int,
@@ -81,13 +83,15 @@ def check_fidelity(
         InputsDiffer: the prompt or the roles of the keys are other ones.
     """
     # Contributions are recorded beside the calls, and do not change them.
-    repeater = replace(unchanged, recording=replace(recording, contributions=False))
+    caller = replace(unchanged, recording=replace(recording, contributions=False))
     num_replans = min(num_replans, calls.num_replans)
     actions, largest, changed, count = [], 0.0, 0, 0
     for replan in range(num_replans):
-        policy_input = repeater.prepare(calls, replan)
-        check_same_tokens(calls, replan, policy_input)
-        call = repeater.call(calls, replan, policy_input)
+        again = calls.again(caller, replan)
+        check_same_tokens(calls, replan, again.policy_input)
+        (call,) = caller.make([again])
+        if isinstance(call, NumbersNotFinite):
+            raise call
         actions.append(call.actions)
         for site, recorded in call.rows.items():
             stored = calls.episode.read(f"{site}/rows", replan)

@@ -10,30 +10,26 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_attention.capture.effects.conditions import describe_effects
 from vla_attention.capture.effects.mean_pictures import MeanPictures
-from vla_attention.capture.effects.measurement import EffectMeasurement, measurement_of
+from vla_attention.capture.effects.measurement import measurement_of
+from vla_attention.capture.engine.call import Caller, PolicyCall
+from vla_attention.capture.engine.faults import Faults
+from vla_attention.capture.engine.loop import EpisodeLoop
+from vla_attention.capture.engine.plan import root_attributes
+from vla_attention.capture.engine.progress import Progress, say
+from vla_attention.capture.engine.source import Episode, EpisodeJob, Outcome, Source, episode_start, plan_of
 from vla_attention.capture.environments.base import Task
+from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.policy import Policy, stored_picture_sizes
 from vla_attention.capture.rerun.base_store import families_of, instructions_of
 from vla_attention.capture.rerun.fidelity import check_fidelity
-from vla_attention.capture.rerun.stored_calls import Repeater, read_calls
-from vla_attention.capture.engine.faults import Faults
-from vla_attention.capture.rollout.episode_loop import (
-    EpisodeJob,
-    EpisodeResult,
-    EpisodeSource,
-    OneByOneLoop,
-    StepReport,
-    episode_start,
-    plan_of,
-)
-from vla_attention.capture.engine.call import replan_record
-from vla_attention.capture.engine.progress import Progress, say
-from vla_attention.capture.engine.plan import root_attributes
+from vla_attention.capture.rerun.stored_calls import StoredCalls, read_calls
 from vla_attention.capture.store.disk_estimate import describe, estimate_disk
+from vla_attention.capture.store.replan_records import EpisodeStart
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run, remove_without_episodes
 from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
@@ -63,75 +59,59 @@ def job_of(base: Store, episode: StoredEpisode) -> EpisodeJob:
     return EpisodeJob(task, attributes.episode_index, attributes.num_replans, episode.name)
 
 
-@dataclass(frozen=True)
-class StoredCallsSource(EpisodeSource):
+@dataclass
+class StoredEpisodes(Source):
     """The policy calls of a store's episodes, made again.
 
-    episodes: by their names. machine: provenance that is stored with every episode. effects: what measures the effects
-    of calls; None where they are not recorded.
+    episodes: by their names. machine: provenance that is stored with every episode.
     """
 
-    repeater: Repeater
+    caller: Caller
     store: RunStore
     episodes: Mapping[str, StoredEpisode]
     machine: Mapping[str, str]
-    termination: Termination
-    effects: EffectMeasurement | None = None
 
-    def record(self, job: EpisodeJob, report: StepReport) -> EpisodeResult:
-        """Rerun an episode and commit it.
-
-        Outcome, steps, environment steps and object coverage are those of the stored episode: nothing is executed. With
-        interventions the stored actions are kept beside the changed ones, to know the base by them.
-        """
+    def open(self, job: EpisodeJob) -> EpisodeAgain:
+        """Read what the calls of an episode were given."""
         with _reading_the_base():
             calls = read_calls(self.episodes[job.name])
-        attributes, recording, repeater = calls.attributes, self.store.attributes.recording, self.repeater
+        attributes = calls.attributes
         start = episode_start(
-            job.task,
-            job.episode_index,
+            job,
             self.machine,
             state_digest=attributes.initial_state_digest,
             objects=attributes.objects,
             state_index=attributes.initial_state_index,
         )
-        effects = None if self.effects is None else self.effects.begin()
-        denoise_times = repeater.policy.denoise_times()[list(recording.denoise_steps)]
-        with self.store.episode(start, np.asarray(denoise_times), calls.num_replans) as writer:
-            for replan in range(calls.num_replans):
-                self.termination.check()
-                with _reading_the_base():
-                    policy_input = repeater.prepare(calls, replan)
-                call, seed = repeater.call(calls, replan, policy_input), repeater.noise_seed(calls, replan)
-                measured = None
-                if effects is not None:
-                    context = calls.context(replan, repeater.instructions)
-                    measured = effects.measure(policy_input, seed, call.actions, context)
-                writer.append(
-                    replan_record(
-                        policy_input,
-                        call,
-                        recording,
-                        env_step=int(calls.env_step[replan]),
-                        noise_seed=seed,
-                        effects=measured,
-                        coverage=calls.coverage_of(replan),
-                        dataset_actions=calls.dataset_actions_of(replan),
-                        base_actions=None if self.store.attributes.interventions.is_none else calls.actions[replan],
-                    )
-                )
-                report(replan + 1, replan + 1)
-            with _reading_the_base():
-                steps = calls.steps
-            folder = writer.commit(attributes.success, attributes.num_steps, steps)
-        return EpisodeResult(
-            job.task.task_id,
-            job.episode_index,
-            attributes.success,
-            attributes.num_steps,
-            calls.num_replans,
-            folder,
-        )
+        keep_actions = not self.store.attributes.interventions.is_none
+        return EpisodeAgain(self.caller, calls, start, calls.num_replans, keep_actions=keep_actions)
+
+
+@dataclass
+class EpisodeAgain(Episode):
+    """A stored episode whose calls are made again.
+
+    Outcome, steps, environment steps and object coverage are those of the stored episode: nothing is executed.
+    """
+
+    caller: Caller
+    calls: StoredCalls
+    start: EpisodeStart
+    max_replans: int
+    keep_actions: bool
+    done: int = 0
+
+    def poll(self) -> PolicyCall | Outcome:
+        """Return the next call."""
+        attributes = self.calls.attributes
+        with _reading_the_base():
+            if self.done == self.calls.num_replans:
+                return Outcome(attributes.success, attributes.num_steps, self.calls.steps)
+            return self.calls.again(self.caller, self.done, keep_actions=self.keep_actions)
+
+    def advance(self, actions: NDArray[np.float64]) -> None:
+        """Go to the next call, whatever the actions are."""
+        self.done += 1
 
 
 @contextmanager
@@ -168,13 +148,16 @@ class Rerun:
         return instructions_of(self.base)
 
     @cached_property
-    def unchanged(self) -> Repeater:
+    def unchanged(self) -> Caller:
         """Makes the calls again as they were. The store's own interventions on attention are made again.
 
         Its changes of prompt, pictures and noise are in what the calls were given.
         """
         of_attention = replace(self.base.attributes.interventions, prompt=None, images=(), noise=None)
-        return Repeater(self.policy, self.recording, of_attention, self.instructions, allow_empty=True)
+        return self._caller(of_attention, allow_empty=True)
+
+    def _caller(self, interventions: Interventions, *, allow_empty: bool) -> Caller:
+        return Caller(self.policy, self.recording, RunChanges(interventions, self.instructions, allow_empty))
 
     def check(self, limit: int | None) -> float | None:
         """Make calls of the first episode again as they were, and print how far they are from the stored ones.
@@ -220,7 +203,7 @@ class Rerun:
             mode: what to do if it exists.
             interventions: what is changed, with block indices for layers.
             wanted: which episodes.
-            allow_empty: as of `Repeater`.
+            allow_empty: leave calls unchanged in which a group has no key, or an object is out of view.
 
         Raises:
             StoreExists: something is at `target` and the mode is `new`.
@@ -235,14 +218,13 @@ class Rerun:
             say(f"{len(jobs) - len(todo)} of {len(jobs)} episodes are complete already; {len(todo)} to run.")
         if not todo:
             return 0
-        repeater = self.unchanged
-        if not interventions.is_none:
-            repeater = Repeater(self.policy, self.recording, interventions, self.instructions, allow_empty)
+        caller = self.unchanged if interventions.is_none else self._caller(interventions, allow_empty=allow_empty)
         effects = measurement_of(self.recording.effects, self.policy, families_of(self.base), say, self.pictures)
         if self.recording.effects is not None:
             say(describe_effects(self.recording.effects))
-        source = StoredCallsSource(repeater, store, episodes, self.machine, self.termination, effects)
-        loop = OneByOneLoop(store, plan_of(jobs), self.termination, "call", source)
+        caller = replace(caller, effects=effects)
+        source = StoredEpisodes(caller, store, episodes, self.machine)
+        loop = EpisodeLoop(store, plan_of(jobs), self.termination, "call", source, caller)
         try:
             loop.record_all(todo)
         finally:
@@ -250,7 +232,7 @@ class Rerun:
                 remove_without_episodes(store.path)
         self.faults.dropped.update({f"{name} of {target}": fault for name, fault in loop.faults.dropped.items()})
         # With the stored prompts this was said before the first call.
-        if interventions.prompt is not None and (line := repeater.attention.describe_empty()):
+        if interventions.prompt is not None and (line := caller.changes.describe_empty()):
             say(line)
         return len(loop.results)
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.effects.arguments import NO_EFFECTS
+from vla_attention.capture.engine.progress import duration, say
 from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
 from vla_attention.capture.interventions.condition_name import knockout_of_group
@@ -26,7 +27,6 @@ from vla_attention.capture.interventions.resolution import (
 )
 from vla_attention.capture.rerun.base_store import check_may_change
 from vla_attention.capture.rerun.rerun_store import Rerun
-from vla_attention.capture.engine.progress import say
 from vla_attention.schemas.errors import BadArgument, UserError, listing
 from vla_attention.schemas.groupings.builtin_groupings import find_grouping
 from vla_attention.schemas.groupings.grouping import REST
@@ -240,7 +240,7 @@ class SeriesRun:
         conditions = self.series.conditions
         changes = [interventions_for(condition.interventions, rerun.policy) for condition in conditions]
         calls = [calls_of[name] for condition in conditions for name in condition.episodes]
-        time = "" if seconds_of_call is None else f", about {_duration(sum(calls) * seconds_of_call)} if none is there"
+        time = "" if seconds_of_call is None else f", about {duration(sum(calls) * seconds_of_call)} if none is there"
         say(f"Series: {len(conditions)} conditions, {sum(calls)} policy calls{time}. Folder: {self.folder}")
         say(rerun.describe_disk(self.folder, calls))
         impossible = []
@@ -286,10 +286,3 @@ def _template(arguments: argparse.Namespace) -> KeyKnockout:
     words.knockout = ["role:image"]  # any selector: the plan replaces it
     words.noise_seed = None
     return read_interventions(words).keys[0]
-
-
-def _duration(seconds: float) -> str:
-    """Return seconds as text: 40 s, 12 min, 3.5 h."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -1,24 +1,21 @@
-"""The policy calls of a stored episode: what each was given, its noise, what it gave; and making them again."""
+"""The policy calls of a stored episode: what each was given, its noise, what it gave; and the same calls once more."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
-from vla_attention.capture.interventions.run_changes import RunChanges
-from vla_attention.capture.policies.policy import GivenInputs, Policy, PolicyInput
-from vla_attention.capture.engine.call import RecordedCall, record_call
+from vla_attention.capture.engine.call import Caller, PolicyCall
+from vla_attention.capture.interventions.changed_inputs import CallContext
+from vla_attention.capture.policies.policy import GivenInputs, Policy
 from vla_attention.capture.store.replan_records import RecordedSteps
 from vla_attention.schemas.episode_steps import EXECUTED, GRIPPER, POSES
 from vla_attention.schemas.errors import listing
-from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
-from vla_attention.schemas.stores.store_format import EpisodeAttributes, Recording, StoreError
+from vla_attention.schemas.stores.store_format import EpisodeAttributes, StoreError
 
 
 class StoreWithoutInputs(StoreError):
@@ -76,6 +73,24 @@ class StoredCalls:
             instructions=instructions,
             objects=self.attributes.objects,
             coverage=self.coverage_of(replan),
+        )
+
+    def again(self, caller: Caller, replan: int, *, keep_actions: bool = False) -> PolicyCall:
+        """Return a policy call to be made again, with what the caller changes.
+
+        keep_actions: store the stored actions beside the new ones, to know the base by them.
+        """
+        context = self.context(replan, caller.changes.instructions)
+        stored_seed, env_step = int(self.noise_seed[replan]), int(self.env_step[replan])
+        changes = caller.changes.interventions
+        return PolicyCall(
+            caller.prepared(self.given(replan), context),
+            stored_seed if changes.noise is None else caller.drawn_seed(changes.noise.seed, context),
+            context,
+            env_step,
+            f"replan {replan} (environment step {env_step}) of the rerun of {self.episode.name}",
+            dataset_actions=self.dataset_actions_of(replan),
+            base_actions=self.actions[replan] if keep_actions else None,
         )
 
     def dataset_actions_of(self, replan: int) -> NDArray[np.float64] | None:
@@ -148,45 +163,3 @@ def check_has_inputs(store: Store, policy: Policy) -> None:
                 f"{episode.name} has only the rounded ones of {listing(inexact)}; stores that were captured with this "
                 "version also hold the cameras' own pictures."
             )
-
-
-@dataclass(frozen=True)
-class Repeater:
-    """Makes stored policy calls again.
-
-    interventions: what is changed, with block indices for layers. instructions: of the store's tasks, by task id.
-    allow_empty: leave calls unchanged in which a group has no key, or an object is out of view.
-    """
-
-    policy: Policy
-    recording: Recording
-    interventions: Interventions = field(default_factory=Interventions)
-    instructions: Mapping[int, str] = field(default_factory=dict)
-    allow_empty: bool = False
-
-    @cached_property
-    def attention(self) -> RunChanges:
-        """The changes of attention; it counts the calls without any."""
-        return RunChanges(self.interventions, self.instructions, self.allow_empty)
-
-    def prepare(self, calls: StoredCalls, replan: int) -> PolicyInput:
-        """Return the model's input of a call."""
-        given, policy = calls.given(replan), self.policy
-        if self.interventions.changes_input:
-            context = calls.context(replan, self.instructions)
-            given = changed_inputs(given, self.interventions, policy.sites, context, allow_empty=self.allow_empty)
-        return policy.prepare_again(given)
-
-    def noise_seed(self, calls: StoredCalls, replan: int) -> int:
-        """Return the seed of a call's noise."""
-        noise, attributes = self.interventions.noise, calls.attributes
-        if noise is None:
-            return int(calls.noise_seed[replan])
-        return self.policy.replan_noise_seed(noise.seed, attributes.task_id, attributes.episode_index, replan)
-
-    def call(self, calls: StoredCalls, replan: int, policy_input: PolicyInput) -> RecordedCall:
-        """Call the policy."""
-        context = calls.context(replan, self.instructions)
-        editors = self.attention.editors(self.policy.sites, policy_input, context)
-        where = f"replan {replan} (environment step {calls.env_step[replan]}) of the rerun of {calls.episode.name}"
-        return record_call(self.policy, policy_input, self.noise_seed(calls, replan), self.recording, where, editors)

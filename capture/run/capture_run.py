@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-from vla_attention.capture.budget.budgeted_recording import Budget, BudgetedRecording, open_within_budget
 from vla_attention.capture.effects.conditions import describe_effects, refuse_both
 from vla_attention.capture.effects.mean_pictures import pictures_of
 from vla_attention.capture.effects.measurement import EffectMeasurement, measurement_of
+from vla_attention.capture.engine.call import Caller
+from vla_attention.capture.engine.faults import EpisodesMissing, Faults, describe_missing
+from vla_attention.capture.engine.loop import EpisodeLoop, EpisodeResult
+from vla_attention.capture.engine.plan import plan_recording, root_attributes
+from vla_attention.capture.engine.progress import say
+from vla_attention.capture.engine.simulators import Simulators, check_protocol, max_replans
+from vla_attention.capture.engine.source import EpisodeJob
 from vla_attention.capture.environments.base import EnvironmentSettings, Task, check_initial_state_index
 from vla_attention.capture.environments.episode_protocol import WAIT_STEPS, EvaluationProtocol
 from vla_attention.capture.environments.suites import list_tasks
@@ -21,16 +27,9 @@ from vla_attention.capture.machine.provenance import POLICY_BATCH, describe_mach
 from vla_attention.capture.policies.families import family_of_kind
 from vla_attention.capture.policies.identity import announcement, downloads_of
 from vla_attention.capture.policies.policy import BatchPolicy, Policy, is_compiled, stored_picture_sizes
-from vla_attention.capture.rollout.episode import EpisodeRun, check_protocol, max_replans
-from vla_attention.capture.engine.faults import EpisodesMissing, Faults, describe_missing
-from vla_attention.capture.rollout.episode_loop import EpisodeJob, EpisodeLoop, EpisodeResult, OneByOneLoop
-from vla_attention.capture.engine.simulators import PipelinedLoop
-from vla_attention.capture.engine.progress import say
-from vla_attention.capture.engine.plan import plan_recording, root_attributes
-from vla_attention.capture.rollout.simulator_source import SimulatorSource
 from vla_attention.capture.run.run_settings import RunSettings, default_num_envs, default_policy_batch
-from vla_attention.capture.store.disk_estimate import DiskEstimate, describe, estimate_disk
-from vla_attention.capture.store.store_writer import RunStore
+from vla_attention.capture.store.disk_estimate import describe, estimate_disk
+from vla_attention.capture.store.store_writer import RunStore, open_run
 from vla_attention.schemas.errors import BadArgument, listing, plural
 from vla_attention.schemas.stores.damaged_episodes import DamagedEpisodesLeft, find_damaged, what_to_do
 from vla_attention.schemas.stores.store_format import (
@@ -137,19 +136,7 @@ def _record_missing(
     if run_plan.note:
         say(run_plan.note)
     environment_settings = EnvironmentSettings(run_plan.evaluation, settings.libero_assets)
-    budgeted = None
-    if settings.budget is not None:
-        planned = {task.task_id for task in wanted} | set(settings.array_task_ids)
-        budgeted = BudgetedRecording(
-            Budget(settings.budget, settings.fixed, len(planned) * settings.num_episodes),
-            policy,
-            wanted,
-            environment_settings,
-            plan_changes(settings, policy, tasks),
-            termination.check,
-            run_plan.effects,
-        )
-    store, estimate = open_within_budget(settings.store, attributes, settings.mode, budgeted)
+    store = open_run(settings.store, attributes, settings.mode)
     done = store.committed()
     jobs = [
         EpisodeJob(task, episode, attributes.protocol.max_steps, f"task {task.task_id} episode {episode}")
@@ -159,7 +146,7 @@ def _record_missing(
     todo = [job for job in jobs if (job.task.task_id, job.episode_index) not in done]
     names = {job.name for job in jobs}
     damaged = find_damaged(store.path, names, settings.verify) if done else []
-    _announce(policy, store, len(names), len(todo), len(damaged), estimate)
+    _announce(policy, store, len(names), len(todo), len(damaged))
     for fault in damaged:
         say(f"Not recorded again without vla-attention capture verify --repair: {fault.describe()}")
     damaged_names = [fault.name for fault in damaged]
@@ -175,17 +162,14 @@ def _record_missing(
     batch = num_envs if largest_batch is None else min(largest_batch, num_envs)
     if batch > 1:  # calls of a batch round differently, and which share one depends on the simulators' speed
         machine = {**machine, POLICY_BATCH: str(batch)}
-    run = EpisodeRun(policy, store, machine, changes, termination.check, effects=run_plan.effects)
-    loop: EpisodeLoop
     if num_envs > 1:
         batches = f" Policy calls in batches of at most {batch}; --policy-batch N changes it." if batch > 1 else ""
         say(f"Simulators: {num_envs} processes; --num-envs N changes it.{batches}")
-        loop = PipelinedLoop(
-            store, plan, termination, "step", settings.suite, environment_settings, run, num_envs, batch
-        )
-    else:
-        source = SimulatorSource(settings.suite, environment_settings, run)
-        loop = OneByOneLoop(store, plan, termination, "step", source)
+    caller = Caller(policy, attributes.recording, changes, run_plan.effects)
+    source = Simulators(
+        settings.suite, environment_settings, store, caller, machine, termination.check, max(1, num_envs)
+    )
+    loop = EpisodeLoop(store, plan, termination, "step", source, caller, batch)
     results = loop.record_all(todo)
     if (empty := changes.describe_empty()) is not None:
         say(empty)
@@ -238,8 +222,7 @@ def _checkpoint_line(identity: PolicyIdentity) -> str:
 
 def _other_suite_line(identity: PolicyIdentity, suite: str) -> str:
     """A warning where a checkpoint whose suites are known runs in one of another kind; empty elsewhere."""
-    rates = family_of_kind(identity.family).published_rates
-    known = [rate.suite for rate in rates if rate.checkpoint == identity.checkpoint]
+    known = family_of_kind(identity.family).trained_on.get(identity.checkpoint, ())
     kinds = {name.partition("_")[0] for name in known}
     if not known or suite.partition("_")[0] in kinds:
         return ""
@@ -248,14 +231,7 @@ def _other_suite_line(identity: PolicyIdentity, suite: str) -> str:
     )
 
 
-def _announce(
-    policy: Policy,
-    store: RunStore,
-    num_wanted: int,
-    num_todo: int,
-    num_damaged: int,
-    measured: DiskEstimate | None = None,
-) -> None:
+def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int, num_damaged: int) -> None:
     identity, recording, protocol = store.attributes.policy, store.attributes.recording, store.attributes.protocol
     for line in announcement(identity):
         say(line)
@@ -277,11 +253,8 @@ def _announce(
     )
     if recording.effects is not None:
         say(describe_effects(recording.effects))
-    if measured is None:
-        pictures = stored_picture_sizes(policy, protocol.image_size)
-        bound = estimate_disk(recording, store.attributes.sites, pictures, max_replans(protocol), num_todo)
-    else:
-        bound = replace(measured, num_episodes=num_todo)
+    pictures = stored_picture_sizes(policy, protocol.image_size)
+    bound = estimate_disk(recording, store.attributes.sites, pictures, max_replans(protocol), num_todo)
     say(describe(bound, store.path))
     if num_todo < num_wanted:
         complete = num_wanted - num_todo - num_damaged

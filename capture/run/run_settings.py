@@ -11,14 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vla_attention.capture.budget.budget import Fixed, parse_budget
+from vla_attention.capture.engine.plan import RecordingSettings, recording_settings
 from vla_attention.capture.environments.base import Suite, check_task_id
 from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
 from vla_attention.capture.environments.suites import find_suite, list_tasks
 from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.machine.memory import memory_left
 from vla_attention.capture.policies.family import PolicyFamily
-from vla_attention.capture.engine.plan import RecordingSettings, recording_settings
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.options import resolve_tasks
@@ -45,8 +44,7 @@ class RunSettings:
     other processes of the same array job run; the store is expected to hold these too. verify: read every byte of the
     episodes that an existing store has, before they count as done. interventions: what is changed, with layer
     numbers as typed. allow_empty: leave a replan unchanged where a group of an intervention has no key. num_envs:
-    simulators that run at a time; None takes as many as there are cores. budget: bytes of the store; what `fixed`
-    leaves open of the recording is chosen to fit. None: no choice is made.
+    simulators that run at a time; None takes as many as there are cores.
     """
 
     suite: Suite
@@ -65,8 +63,6 @@ class RunSettings:
     interventions: Interventions = field(default_factory=Interventions)
     allow_empty: bool = False
     num_envs: int | None = None
-    budget: int | None = None
-    fixed: Fixed = field(default_factory=Fixed)
     policy_batch: int | None = None
 
 
@@ -102,13 +98,6 @@ def run_settings(arguments: argparse.Namespace) -> RunSettings:
         interventions=read_interventions(arguments),
         allow_empty=arguments.allow_empty,
         num_envs=arguments.num_envs,
-        budget=None if arguments.budget is None else parse_budget(arguments.budget),
-        fixed=Fixed(
-            precision=arguments.precision is not None,
-            denoise_steps=arguments.denoise_steps is not None,
-            layers=arguments.layers is not None,
-            heads=arguments.heads is not None,
-        ),
         policy_batch=arguments.policy_batch,
     )
 

@@ -44,6 +44,7 @@ from vla_attention.capture.torch_policies.replan_text import PromptIds, ReplanTe
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder, SiteRows, final_contribution
 from vla_attention.capture.torch_policies.watch import watch_attention
 from vla_attention.schemas.errors import BadArgument, Note, UserError
+from vla_attention.schemas.stores.locks import Locks
 from vla_attention.schemas.stores.store_format import EPISODES_GROUP, RootAttributes, StoreExists, episode_name
 
 #: More replans than any episode has; the writer collects rows in blocks of two megabytes.
@@ -113,6 +114,8 @@ class RecordedRun:
         self._undecided = undecided
         self._durable = durable
         self._store: RunStore | None = None
+        #: Of whoever records with this run; None: the run has its own.
+        self.locks: Locks | None = None
         self._entered = False
         self._in_block = False
         self.every_function = False
@@ -146,6 +149,8 @@ class RecordedRun:
     def _open(self) -> None:
         self._store = open_run(self.path, self.attributes, self._mode, durable=self._durable)
         self.path = self._store.path
+        if self.locks is not None:
+            self._store.locks = self.locks
 
     def _decide(self, *, contributions: bool, because: str = "") -> None:
         """Note whether contributions are recorded; because: for the store."""

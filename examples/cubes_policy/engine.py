@@ -13,12 +13,12 @@ from typing import Any, Generic, TypeVar
 
 from tqdm import tqdm
 
-from vla_attention.capture.environments.cubes.environment import CubesEnvironment
-from vla_attention.capture.environments.cubes.tasks import CubeTask
-from vla_attention.capture.environments.episode_protocol import OPENPI, WAIT_STEPS
 from vla_attention.capture.engine.faults import Faults
 from vla_attention.capture.engine.simulation import Advanced, Simulation, SimulationFailed
 from vla_attention.capture.engine.simulator_process import Failed, Server, SimulatorProcess
+from vla_attention.capture.environments.cubes.environment import CubesEnvironment
+from vla_attention.capture.environments.cubes.tasks import CubeTask
+from vla_attention.capture.environments.episode_protocol import OPENPI, WAIT_STEPS
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.store_format import Protocol
 

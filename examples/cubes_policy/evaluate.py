@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from examples.cubes_policy.engine import begin_episode, cubes_protocol, share_among_processes
 from examples.cubes_policy.experts import expert_action, read_state
+from vla_attention.capture.engine.simulation import Advanced
 from vla_attention.capture.environments.base import (
     EnvironmentSettings,
     Suite,
@@ -33,7 +34,6 @@ from vla_attention.capture.environments.suites import SUITES, find_suite, list_t
 from vla_attention.capture.foreign_files.checked_files import read_object
 from vla_attention.capture.interventions.changed_inputs import BLACK, blank
 from vla_attention.capture.policies.policy import Policy, PolicyInput
-from vla_attention.capture.engine.simulation import Advanced
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.stores.store_format import Protocol
 from vla_attention.schemas.stores.store_place import refuse_in_store

@@ -22,7 +22,7 @@ from vla_attention.schemas.stores.locks import episode_locks
 pytestmark = [pytest.mark.simulator, pytest.mark.thorough]
 
 DUMMY = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--replan-steps", "4", "--task-id", "0"]
-DUMMY += ["--num-envs", "1"]  # several simulators: tests/capture/rollout/test_pipeline.py
+DUMMY += ["--num-envs", "1"]  # several simulators: tests/capture/engine/test_pipeline.py
 
 
 def test_sigterm_drops_the_episode_in_flight_and_resuming_completes_the_store(tmp_path):

@@ -13,11 +13,10 @@ from torch import Tensor
 from tests.capture.policies.pi.jax_leaves import to_jax_leaves
 from tests.kit.paths import GOLDEN as ALL_GOLDEN
 from tests.kit.paths import SHARED
-from vla_attention.capture.policies.pi.case import Case, read_case
+from tests.kit.pi_parity import Case, read_case, run_case
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.loading import load_pi_model
 from vla_attention.capture.policies.pi.model import PiModel
-from vla_attention.capture.policies.pi.parity import run_case
 
 GOLDEN = ALL_GOLDEN / "pi"
 #: Larger cases, too large for the repository.

@@ -100,11 +100,11 @@ def faults_of(store: Path) -> list[str]:
 def capture(store: Path, tasks: Sequence[int]) -> int:
     """Capture the tasks' episodes; for a process of its own, which it changes."""
     from vla_attention.capture.__main__ import main
-    from vla_attention.capture.rollout import episode_loop
+    from vla_attention.capture.engine import loop
 
     patch = pytest.MonkeyPatch()
     capture_without_simulator(patch)
-    patch.setattr(episode_loop, "_LOOK_EVERY_S", 0.3)
+    patch.setattr(loop, "_LOOK_EVERY_S", 0.3)
     chosen = ["--task-id", *map(str, tasks), "--num-episodes", str(EPISODES)]
     return main([*_ARGUMENTS.split(), *chosen, "--output", str(store), "--resume"])
 

@@ -65,7 +65,7 @@ class ToldScene(StillScene):
 def capture_without_simulator(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let captures of this test run in a `ToldScene`."""
     monkeypatch.setattr(
-        "vla_attention.capture.rollout.simulator_source.make_environment",
+        "vla_attention.capture.engine.simulator_process.make_environment",
         lambda suite, task_id, settings: ToldScene(task_id),
     )
     monkeypatch.setattr("vla_attention.capture.run.capture_run.default_num_envs", lambda: 1)

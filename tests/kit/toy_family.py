@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 from typing import Any
 
 from vla_attention.capture.environments.episode_protocol import OPENPI
-from vla_attention.capture.policies.family import ParityCases, PolicyFamily
+from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.model_arguments import POLICY_THREADS
 from vla_attention.schemas.threads import add_threads
 
@@ -98,15 +97,6 @@ def _analysis_arguments(arguments: argparse.Namespace) -> list[str]:
     return ["--group", "seen=camera:view", "--group", "read=role:instruction", "--ratio", "seen/read"]
 
 
-def _is_toy_case(content: Mapping[str, Any]) -> bool:
-    return "toy" in content
-
-
-def _run_parity(arguments: argparse.Namespace, device: str) -> int:
-    print(f"toy parity of {arguments.case.name}")
-    return 0
-
-
 FAMILY = PolicyFamily(
     name="toy",
     title="Toy Policy",
@@ -117,5 +107,4 @@ FAMILY = PolicyFamily(
     store_prefix="toy_",
     replan_default="2",
     analysis_arguments=_analysis_arguments,
-    parity=ParityCases(recognises=_is_toy_case, run=_run_parity),
 )

@@ -6,7 +6,8 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
-from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedRate, PublishedScript
+from vla_attention.capture.environments.suites import STANDARD_SUITES
+from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
 from vla_attention.capture.policies.model_arguments import UNTRAINED_POLICIES, add_model_arguments
 from vla_attention.schemas.errors import BadArgument
 
@@ -19,13 +20,6 @@ if TYPE_CHECKING:
 COSMOS = EvaluationProtocol("cosmos", image_size=256, seeding="always 0", default_seed=7)
 
 CHECKPOINT = "nvidia/Cosmos-Policy-LIBERO-Predict2-2B"
-_SOURCE = "config.json of the checkpoint's repository, and arXiv:2601.16163"
-#: Per cent by suite. Counted as one evaluation of 50 episodes of each of the ten tasks.
-_RATES = {"libero_spatial": 98.1, "libero_object": 100.0, "libero_goal": 98.2, "libero_10": 97.6}
-
-PUBLISHED_RATES = tuple(
-    PublishedRate(CHECKPOINT, suite, round(5 * rate), 500, _SOURCE) for suite, rate in _RATES.items()
-)
 
 _EXAMPLES = f"""\
   vla-attention capture cosmos                                         untrained policy, built-in tasks
@@ -130,24 +124,28 @@ def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
 def _check_files(arguments: argparse.Namespace) -> None:
     from pathlib import Path
 
-    from vla_attention.capture.policies.cosmos.locate import STATISTICS_NAME, find_beside, find_checkpoint, find_weights
+    from vla_attention.capture.policies.cosmos.locate import (
+        EMBEDDINGS_NAME,
+        STATISTICS_NAME,
+        find_beside,
+        find_checkpoint,
+        find_vae,
+        find_weights,
+    )
     from vla_attention.capture.policies.cosmos.preprocess import read_statistics
+    from vla_attention.capture.policies.cosmos.t5_pickle import read_embeddings
+    from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
     from vla_attention.capture.policies.hub import split_hub_name
 
     name = arguments.checkpoint
     on_hub = split_hub_name(name) is not None and not Path(name).expanduser().exists()
     if name not in UNTRAINED_POLICIES and not on_hub:
         folder = find_checkpoint(name)
-        find_weights(folder)
+        weights = find_weights(folder)
         read_statistics(find_beside(folder, arguments.dataset_stats_path, STATISTICS_NAME))
-
-
-def _run_parity(arguments: argparse.Namespace, device: str) -> int:
-    from vla_attention.capture.policies.cosmos.parity import run_parity
-
-    if arguments.format is not None or arguments.limit is not None:
-        raise BadArgument("Cosmos cases have one format and their own limits; leave out --format and --limit.")
-    return run_parity(arguments.case, as_json=arguments.json, device=device)
+        read_embeddings(find_beside(folder, arguments.t5_text_embeddings_path, EMBEDDINGS_NAME))
+        for file in (weights, find_vae(folder, arguments.vae_path)):
+            read_tensors(file)  # mapped into memory: the numbers are not read
 
 
 FAMILY = PolicyFamily(
@@ -163,14 +161,13 @@ FAMILY = PolicyFamily(
     seed_of="seed of the noise; the simulator's is 0, as published",
     built_in=UNTRAINED_POLICIES,
     analysis_arguments=_analysis_arguments,
-    parity=ParityCases(recognises=lambda content: isinstance(content.get("kind"), str), run=_run_parity),
     published=PublishedScript(
         program="evaluate-attention-ratio-cosmos",
         checkpoint=CHECKPOINT,
         layers=(25, 26, 27),
         variables={"QUERY_FRAME": "--query-frame", "VISUAL_FRAME": "--visual-frame", "TEXT_FRAME": "--text-frame"},
     ),
-    published_rates=PUBLISHED_RATES,
+    trained_on={CHECKPOINT: STANDARD_SUITES},
     rebuild=_rebuild,
     check_files=_check_files,
 )

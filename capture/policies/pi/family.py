@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_attention.capture.environments.episode_protocol import CAMERAS, LEROBOT, OPENPI
-from vla_attention.capture.policies.family import ParityCases, PolicyFamily, PublishedRate, PublishedScript
+from vla_attention.capture.environments.suites import STANDARD_SUITES
+from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
 from vla_attention.capture.policies.model_arguments import UNTRAINED_POLICIES, add_model_arguments
 from vla_attention.capture.policies.robot import NONE, Robot, read_camera_choices
 from vla_attention.schemas.jsonable import from_json
@@ -20,23 +21,10 @@ if TYPE_CHECKING:
 CUBES_POLICY = "pi05_cubes"
 SHIPPED: dict[str, Path] = {CUBES_POLICY: Path(__file__).parent / CUBES_POLICY}
 
-_OPENPI = "examples/libero/README.md of openpi"
-_LEROBOT = "docs/source/libero.mdx of LeRobot"
-#: Per cent by suite. openpi's client runs 50 episodes of each of the ten tasks, LeRobot's page says 10.
-_OF_OPENPI = {"libero_spatial": 98.8, "libero_object": 98.2, "libero_goal": 98.0, "libero_10": 92.4}
-_OF_LEROBOT = {"libero_spatial": 97.0, "libero_object": 99.0, "libero_goal": 98.0, "libero_10": 96.0}
-
-PUBLISHED_RATES = (
-    PublishedRate(CUBES_POLICY, "cubes", 842, 850, "docs/cubes.md"),
-    *(
-        PublishedRate("gs://openpi-assets/checkpoints/pi05_libero", suite, round(5 * rate), 500, _OPENPI)
-        for suite, rate in _OF_OPENPI.items()
-    ),
-    *(
-        PublishedRate(name, suite, round(rate), 100, _LEROBOT)
-        for name in ("lerobot/pi05_libero_finetuned", "lerobot/pi05_libero_finetuned_v044")
-        for suite, rate in _OF_LEROBOT.items()
-    ),
+_OF_LIBERO = (
+    "gs://openpi-assets/checkpoints/pi05_libero",
+    "lerobot/pi05_libero_finetuned",
+    "lerobot/pi05_libero_finetuned_v044",
 )
 
 _EXAMPLES = """\
@@ -164,12 +152,6 @@ def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
     return settings
 
 
-def _run_parity(arguments: argparse.Namespace, device: str) -> int:
-    from vla_attention.capture.policies.pi.parity import run_parity
-
-    return run_parity(arguments.case, arguments.format, limit=arguments.limit, as_json=arguments.json, device=device)
-
-
 FAMILY = PolicyFamily(
     name="pi",
     title="pi0 or pi0.5",
@@ -183,19 +165,13 @@ FAMILY = PolicyFamily(
     layers_note="; also the published scripts' numbers 18..35 (25 = block 7)",
     built_in=(*SHIPPED, *UNTRAINED_POLICIES),
     default_suite="cubes",
-    parity=ParityCases(
-        recognises=lambda content: "model" in content or "config" in content,
-        run=_run_parity,
-        formats=("orbax", "openpi", "lerobot"),
-        default_limit="5e-5; 0.1 for bfloat16 cases",
-    ),
     published=PublishedScript(
         program="evaluate-attention-ratio",
         checkpoint="~/.cache/openpi/openpi-assets/checkpoints/pi05_libero",
         layers=(25, 26, 27),
         variables={"PROTOCOL": "--protocol"},
     ),
-    published_rates=PUBLISHED_RATES,
+    trained_on={CUBES_POLICY: ("cubes",)} | dict.fromkeys(_OF_LIBERO, STANDARD_SUITES),
     kinds=("pi0", "pi05"),
     reads_data_sets=True,
     rebuild=_rebuild,

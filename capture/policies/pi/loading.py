@@ -10,11 +10,9 @@ from pathlib import Path
 import torch
 
 from vla_attention.capture.policies.checkpoints import UnsupportedCheckpoint
-from vla_attention.capture.policies.hub import downloads, hub_version, split_hub_name
+from vla_attention.capture.policies.hub import downloads, hub_version
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.model_arguments import UNTRAINED, UNTRAINED_TINY
-from vla_attention.capture.policies.parity_case import CASE_FILE
-from vla_attention.capture.policies.pi.case import CONFIG_FILE, read_config, stated_name, states_sizes
 from vla_attention.capture.policies.pi.compiled import compile_steps
 from vla_attention.capture.policies.pi.config import (
     CAMERA_SLOTS,
@@ -32,9 +30,9 @@ from vla_attention.capture.policies.pi.formats import CheckpointFormat, detect_f
 from vla_attention.capture.policies.pi.lerobot import load_lerobot, load_lerobot_weights
 from vla_attention.capture.policies.pi.lerobot_config import read_lerobot_config
 from vla_attention.capture.policies.pi.lerobot_pipeline import read_lerobot_pipeline
-from vla_attention.capture.policies.pi.locate import find_checkpoint, find_tokenizer
+from vla_attention.capture.policies.pi.locate import find_checkpoint, find_tokenizer, would_be_fetched
 from vla_attention.capture.policies.pi.model import PiModel
-from vla_attention.capture.policies.pi.openpi_jax import implied_config_name, list_leaves, load_openpi_jax
+from vla_attention.capture.policies.pi.openpi_jax import OpenLeaf, implied_config_name, list_leaves, load_openpi_jax
 from vla_attention.capture.policies.pi.openpi_torch import load_openpi_torch, open_tensors
 from vla_attention.capture.policies.pi.policy import PiPolicy
 from vla_attention.capture.policies.pi.preprocess import RELATIVE_ACTIONS, read_norm_stats
@@ -46,6 +44,13 @@ from vla_attention.capture.policies.pi.processing import (
     simulator_cameras,
 )
 from vla_attention.capture.policies.pi.sizes import is_pi05
+from vla_attention.capture.policies.pi.stated_sizes import (
+    CASE_FILE,
+    CONFIG_FILE,
+    read_config,
+    stated_name,
+    states_sizes,
+)
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
 from vla_attention.capture.policies.robot import Robot, RobotData
 from vla_attention.capture.policies.weights import find_dtype
@@ -363,8 +368,7 @@ def check_pi_files(
     asset_id: str | None,
 ) -> None:
     """Raise what `build_pi_policy` would for a checkpoint of this machine that lacks a file; reads no weights."""
-    is_address = checkpoint.startswith("gs://") or split_hub_name(checkpoint) is not None
-    if checkpoint in (*SHIPPED, *_UNTRAINED) or (is_address and not Path(checkpoint).expanduser().exists()):
+    if checkpoint in (*SHIPPED, *_UNTRAINED) or would_be_fetched(checkpoint):
         return
     folder = find_checkpoint(checkpoint)
     options = CheckpointOptions(
@@ -377,7 +381,8 @@ def check_pi_files(
     found = detect_format(folder, options.checkpoint_format)
     choose_config(folder, found, options)
     if found == "openpi_jax":
-        list_leaves(folder / "params")
+        for leaf in list_leaves(folder / "params"):
+            OpenLeaf(folder / "params", leaf)
     else:
         with open_tensors(folder):
             pass

@@ -68,6 +68,20 @@ def find_checkpoint(name: str) -> Path:
     return fetch_from_hub(on_hub[0], HUB_FILES, how, revision=on_hub[1])
 
 
+def would_be_fetched(name: str) -> bool:
+    """Whether `find_checkpoint` would ask the hub, or the bucket of openpi, for a checkpoint."""
+    if name.startswith("gs://"):
+        return not _in_openpi_cache(name).is_dir()
+    return split_hub_name(name) is not None and not Path(name).expanduser().exists()
+
+
+def _in_openpi_cache(url: str) -> Path:
+    # A rerun takes the address from a store, and a download replaces what is at its place.
+    inner = url.removeprefix("gs://").rstrip("/")
+    check_inner_path(inner)
+    return openpi_cache() / inner
+
+
 def _where_else(path: Path) -> str:
     """Return where a checkpoint of openpi is whose path leads nowhere: a name alone, or a place in openpi's cache."""
     published = openpi_cache() / OPENPI_CHECKPOINTS
@@ -86,9 +100,7 @@ def openpi_cache() -> Path:
 
 
 def _from_openpi_cache(url: str) -> Path:
-    # A rerun takes the address from a store, and a download replaces what is at its place.
-    check_inner_path(url.removeprefix("gs://"))
-    target = openpi_cache() / url.removeprefix("gs://")
+    target = _in_openpi_cache(url)
     if target.is_dir():
         return target
     how = f"fetch it with `gsutil -m cp -r {url} {target.parent}/` (so that {target / 'params'} exists)"

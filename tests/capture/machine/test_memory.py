@@ -1,4 +1,4 @@
-"""What of the memory is left: the least of what the machine, control groups and a SLURM job leave."""
+"""What of the memory is left: the least of what the machine, a control group and a SLURM job leave."""
 
 from __future__ import annotations
 
@@ -44,6 +44,16 @@ def test_a_slurm_job_has_what_it_asked_for(root, given, expected, monkeypatch):
     for name, value in given.items():
         monkeypatch.setenv(name, value)
     assert left(root)[1:] == ([] if expected is None else [(expected, "the SLURM job")])
+
+
+def test_a_control_group_leaves_what_is_neither_taken_nor_given_back(root):
+    write(root, "proc/self/cgroup", "0::/job_7\n")
+    files = {"max": f"{8 * GB}\n", "current": f"{7 * GB}\n", "stat": f"anon 5\ninactive_file {2 * GB}\n"}
+    for name, text in files.items():
+        write(root, f"sys/fs/cgroup/job_7/memory.{name}", text)
+    assert left(root)[1:] == [(3, "its control group")]
+    write(root, "sys/fs/cgroup/job_7/memory.max", "max\n")
+    assert left(root)[1:] == []
 
 
 def test_the_least_counts(root, monkeypatch):

@@ -8,9 +8,9 @@ import pytest
 import zarr
 
 from vla_attention.capture.__main__ import main
+from vla_attention.capture.engine import simulator_process
 from vla_attention.capture.environments.base import Observation, StepResult
 from vla_attention.capture.policies import families
-from vla_attention.capture.rollout import simulator_source
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 
 
@@ -48,7 +48,7 @@ class StubEnvironment:
 @pytest.fixture
 def toy_is_registered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(families, "FAMILY_MODULES", (*families.FAMILY_MODULES, "tests.kit.toy_family"))
-    monkeypatch.setattr(simulator_source, "make_environment", lambda suite, task_id, settings: StubEnvironment())
+    monkeypatch.setattr(simulator_process, "make_environment", lambda suite, task_id, settings: StubEnvironment())
     monkeypatch.setattr("vla_attention.capture.run.capture_run.default_num_envs", lambda: 1)
     monkeypatch.setattr("vla_attention.capture.environments.drawing.check_drawing", lambda suite, libero_assets: "")
 

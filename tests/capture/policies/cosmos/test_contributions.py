@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from tests.kit.cosmos_helpers import GOLDEN, recorders_of
+from tests.kit.cosmos_parity import read_case
 from vla_attention.capture.policies.cosmos import dit
-from vla_attention.capture.policies.cosmos.case import read_case
 from vla_attention.capture.policies.cosmos.model import CallObserver
 from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
 

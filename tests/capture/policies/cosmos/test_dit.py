@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.kit.cosmos_helpers import GOLDEN
+from tests.kit.cosmos_parity import EverythingObserver
 from tests.kit.examples import examples
 from vla_attention.capture.policies.cosmos.config import DitConfig, VaeConfig
 from vla_attention.capture.policies.cosmos.dit import Dit, rotate
 from vla_attention.capture.policies.cosmos.dit_weights import build_dit, dit_tensors, infer_dit_config
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, random_dit_weights
-from vla_attention.capture.policies.cosmos.parity import EverythingObserver
 from vla_attention.capture.policies.cosmos.vae import expected_vae_shapes, infer_vae_config
 
 

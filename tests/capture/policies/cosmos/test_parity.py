@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.kit.cosmos_helpers import GOLDEN, LARGE_GOLDEN
-from vla_attention.capture.policies.cosmos.parity import describe, run_case
+from tests.kit.cosmos_parity import describe, run_case
 
 CASES = [path.name for path in sorted(GOLDEN.iterdir()) if path.is_dir()]
 LARGE_CASES = ["dit_libero_T9", "policy_T9_64px", "policy_T9_224px_slim"]

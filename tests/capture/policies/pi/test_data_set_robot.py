@@ -10,12 +10,12 @@ import pytest
 
 from tests.kit.pi_golden import GOLDEN
 from tests.kit.small_tokenizer import train_small_tokenizer
-from vla_attention.capture.policies.pi.case import read_config
 from vla_attention.capture.policies.pi.config import find_config
 from vla_attention.capture.policies.pi.data_set_robot import openpi_robot
 from vla_attention.capture.policies.pi.lerobot import lerobot_image
 from vla_attention.capture.policies.pi.loading import CheckpointOptions, choose_config, load_pi_policy
 from vla_attention.capture.policies.pi.preprocess import read_norm_stats
+from vla_attention.capture.policies.pi.stated_sizes import read_config
 from vla_attention.capture.policies.robot import Robot, RobotData
 from vla_attention.schemas.errors import BadArgument
 

@@ -157,14 +157,14 @@ def two_statistics(folder: Path) -> None:
 def test_what_else_trainers_leave_is_said_with_the_next_step(
     tmp_path, tokenizer, capsys, change: Callable[[Path], None], said: str
 ):
-    """By capture, and by a doctor that loads nothing."""
+    """By capture, and by the doctor, which loads nothing."""
     folder = trained(tmp_path / "checkpoint")
     change(folder)
     with pytest.raises(UserError, match=said):
         build(folder, tokenizer, model_config=CASE)
     words = ["--checkpoint", str(folder), "--model-config", str(CASE), "--tokenizer", tokenizer]
     capsys.readouterr()
-    assert capture(["doctor", "pi", "--no-trial", *words]) == 1
+    assert capture(["doctor", "pi", *words]) == 1
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines if " checkpoint " in line[:20]] == ["MISSING"]
 
@@ -172,11 +172,11 @@ def test_what_else_trainers_leave_is_said_with_the_next_step(
 def test_doctor_is_content_with_a_whole_checkpoint(tmp_path, tokenizer, capsys):
     folder = trained(tmp_path / "checkpoint")
     words = ["--checkpoint", str(folder), "--model-config", str(CASE), "--tokenizer", tokenizer]
-    assert "MISSING  checkpoint" not in (capture(["doctor", "pi", "--no-trial", *words]), capsys.readouterr().out)[1]
+    assert "MISSING  checkpoint" not in (capture(["doctor", "pi", *words]), capsys.readouterr().out)[1]
     empty = tmp_path / "empty"
     empty.mkdir()
     for family, option in (("pi", "--checkpoint"), ("cosmos", "--ckpt-path")):
-        assert capture(["doctor", family, "--no-trial", option, str(empty)]) == 1
+        assert capture(["doctor", family, option, str(empty)]) == 1
         assert "MISSING  checkpoint" in capsys.readouterr().out
 
 

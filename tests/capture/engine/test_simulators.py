@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 import zarr
 
-from tests.capture.rollout.simulators_in_threads import TINY, ThreadOfTests, assert_same_episodes, record
+from tests.capture.engine.simulators_in_threads import TINY, ThreadOfTests, assert_same_episodes, record
 from tests.kit.still_scene import StillScene
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
+from vla_attention.capture.engine.call import Caller
+from vla_attention.capture.engine.loop import EpisodeLoop
 from vla_attention.capture.jobs.status import store_status
 from vla_attention.capture.jobs.termination import EXIT_TERMINATED
 from vla_attention.capture.rerun.base_store import machine_differences
-from vla_attention.capture.rollout import pipeline
-from vla_attention.capture.engine.call import record_calls
 from vla_attention.schemas.stores.locks import episode_locks
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.worker import Worker
@@ -96,7 +96,7 @@ class Broken(StillScene):
     [
         (
             RuntimeError("the context\nis lost"),
-            "of .*a.zarr failed: the context is lost (RuntimeError, test_pipeline.py:",
+            "of .*a.zarr failed: the context is lost (RuntimeError, test_simulators.py:",
         )
     ],
 )
@@ -130,7 +130,7 @@ def test_it_waits_for_an_episode_that_another_process_has_locked(scene, tmp_path
     other = episode_locks(store, NODE)
     assert other.acquire("task000_episode001") is None
     monkeypatch.setattr(
-        "vla_attention.capture.rollout.episode_loop.time",
+        "vla_attention.capture.engine.loop.time",
         SimpleNamespace(sleep=lambda seconds: other.release("task000_episode001")),
     )
     assert record(store, 2, "--task-id", "0", "--num-episodes", "4", "--resume") == 0
@@ -142,19 +142,19 @@ def test_it_waits_for_an_episode_that_another_process_has_locked(scene, tmp_path
 
 def in_whole_batches(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Let the policy wait until every simulator that runs has come to its call; returns the sizes of batches."""
-    receive, sizes = pipeline.PipelinedLoop._receive, []
+    poll, make, sizes = EpisodeLoop._poll, Caller.make, []
 
-    def receive_all(self: pipeline.PipelinedLoop) -> None:
-        receive(self)
+    def poll_all(self: EpisodeLoop) -> None:
+        poll(self)
         while len(self._ready) < len(self._running):
-            receive(self)
+            poll(self)
 
-    def note(policy: Any, calls: Any, recording: Any) -> Any:
+    def note(self: Caller, calls: Any) -> Any:
         sizes.append(len(calls))
-        return record_calls(policy, calls, recording)
+        return make(self, calls)
 
-    monkeypatch.setattr(pipeline.PipelinedLoop, "_receive", receive_all)
-    monkeypatch.setattr(pipeline, "record_calls", note)
+    monkeypatch.setattr(EpisodeLoop, "_poll", poll_all)
+    monkeypatch.setattr(Caller, "make", note)
     return sizes
 
 

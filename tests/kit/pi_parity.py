@@ -1,29 +1,69 @@
-"""Run a parity case, and compare our actions and attention with the reference's."""
+"""Parity cases of the pi models: our actions and attention against those of openpi's JAX code."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from vla_attention.capture.policies.parity_case import UnusableCase, json_number, print_results
-from vla_attention.capture.policies.pi.case import (
-    CHECKPOINT_FOLDERS,
-    Case,
-    CaseFormat,
-    find_case_format,
-    read_case,
-)
+from tests.kit.parity import json_number, read_arrays, read_case_file
+from vla_attention.capture.policies.pi.config import PiConfig
+from vla_attention.capture.policies.pi.formats import CheckpointFormat
 from vla_attention.capture.policies.pi.loading import load_pi_model
 from vla_attention.capture.policies.pi.model import PiModel
-from vla_attention.capture.policies.weights import dtype_name
+from vla_attention.capture.policies.pi.stated_sizes import CASE_FILE, read_config
+from vla_attention.capture.policies.weights import DTYPES, dtype_name
 from vla_attention.capture.recording.attention import RowCollector
-from vla_attention.schemas.errors import BadArgument, listing
+
+CaseFormat = Literal["orbax", "openpi", "lerobot"]
+
+#: For each format of a case: the folder of the checkpoint, and the loader's name of the format.
+CHECKPOINT_FOLDERS: dict[CaseFormat, tuple[str, CheckpointFormat]] = {
+    "orbax": ("checkpoint", "openpi_jax"),
+    "openpi": ("checkpoint_openpi_torch", "openpi_torch"),
+    "lerobot": ("checkpoint_lerobot", "lerobot"),
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A case folder: sizes, inputs and expected results.
+
+    inputs: image_<slot> (batch, height, width, 3) uint8, image_mask_<slot> (batch,), state (batch, action dim),
+    tokenized_prompt and tokenized_prompt_mask (batch, text), noise (batch, horizon, action dim), num_steps.
+    expected: actions (batch, horizon, action dim), attn (denoise, layer, batch, head, query, key), all suffix queries.
+    """
+
+    name: str
+    folder: Path
+    config: PiConfig
+    dtype: torch.dtype
+    inputs: Mapping[str, np.ndarray]
+    expected: Mapping[str, np.ndarray]
+
+    @property
+    def formats(self) -> tuple[CaseFormat, ...]:
+        """The formats of the case's checkpoints."""
+        return tuple(name for name, (folder, _) in CHECKPOINT_FOLDERS.items() if (self.folder / folder).is_dir())
+
+
+def read_case(folder: Path) -> Case:
+    """Read a case folder."""
+    content = read_case_file(folder)
+    return Case(
+        name=str(content.get("name", folder.name)),
+        folder=folder,
+        config=read_config(folder / CASE_FILE),
+        dtype=DTYPES[content.get("compute_dtype", "float32")],
+        inputs=read_arrays(folder / "inputs.npz"),
+        expected=read_arrays(folder / "expected.npz"),
+    )
+
 
 #: Largest difference of attention and actions that passes, by the precision of the case. In float32 the reference
 #: itself moves by 1.6e-5 between its compiled and its eager run; in bfloat16 it moves attention by up to 0.05 from
@@ -89,15 +129,10 @@ def run_case(case: Case, model: PiModel, collector: AllRows | None = None) -> np
         pixels = given[f"image_{camera}"].astype(np.float32) / 255.0 * 2.0 - 1.0
         return torch.from_numpy(np.ascontiguousarray(pixels.transpose(0, 3, 1, 2))).to(device)
 
-    tokens = tensor("tokenized_prompt", np.int64)
-    if tokens.numel() and not 0 <= int(tokens.min()) <= int(tokens.max()) < case.config.vocab_size:
-        raise BadArgument(
-            f"The prompt of the case '{case.name}' has token ids outside 0 to {case.config.vocab_size - 1}."
-        )
     actions = model.sample_actions(
         images={camera: image(camera) for camera in case.config.cameras},
         image_masks={camera: tensor(f"image_mask_{camera}", np.bool_) for camera in case.config.cameras},
-        tokens=tokens,
+        tokens=tensor("tokenized_prompt", np.int64),
         token_mask=tensor("tokenized_prompt_mask", np.bool_),
         state=tensor("state", np.float32),
         noise=tensor("noise", np.float32),
@@ -107,16 +142,14 @@ def run_case(case: Case, model: PiModel, collector: AllRows | None = None) -> np
     return actions.cpu().numpy()
 
 
-def measure(case: Case, case_format: CaseFormat, *, limit: float | None = None, device: str = "cpu") -> Parity:
+def measure(case: Case, case_format: CaseFormat, *, device: str = "cpu") -> Parity:
     """Load the case's checkpoint of that format, run it, and compare with the expected results.
 
     Cases are made by openpi's JAX model, so its time convention is used for every format.
     """
-    if limit is not None and not limit > 0:
-        raise BadArgument(f"Cannot use a limit of {limit}; expected a positive number.")
-    folder, checkpoint_format = case.checkpoint(case_format)
+    folder, checkpoint_format = CHECKPOINT_FOLDERS[case_format]
     model, _ = load_pi_model(
-        folder, checkpoint_format=checkpoint_format, config=case.config, dtype=case.dtype, device=device
+        case.folder / folder, checkpoint_format=checkpoint_format, config=case.config, dtype=case.dtype, device=device
     )
     collector = AllRows(case.expected["attn"])
     actions = run_case(case, model, collector)
@@ -124,7 +157,7 @@ def measure(case: Case, case_format: CaseFormat, *, limit: float | None = None, 
     return Parity(
         case=case.name,
         case_format=case_format,
-        limit=LIMITS[case.dtype] if limit is None else limit,
+        limit=LIMITS[case.dtype],
         actions=float(worst),
         attention=collector.largest,
     )
@@ -154,14 +187,9 @@ def describe(case: Case, result: Parity) -> str:
     return "\n".join(lines)
 
 
-def run_parity(
-    folder: Path, case_format: str | None, *, limit: float | None = None, as_json: bool = False, device: str = "cpu"
-) -> int:
-    """Compare a case in one format, or in all of its formats; print the results, return 0 if all pass, else 1."""
+def run_parity(folder: Path, *, device: str = "cpu") -> Iterator[tuple[Parity, str]]:
+    """Compare a case in all of its formats; yield each result, also as text."""
     case = read_case(folder)
-    formats = case.formats if case_format is None else (find_case_format(case_format),)
-    if not formats:
-        wanted = listing(name for name, _ in CHECKPOINT_FOLDERS.values())
-        raise UnusableCase(f"The case '{folder}' carries no checkpoint: it should have a folder of {wanted}.")
-    results = (measure(case, chosen, limit=limit, device=device) for chosen in formats)
-    return print_results(results, lambda result: describe(case, result), as_json=as_json)
+    for case_format in case.formats:
+        result = measure(case, case_format, device=device)
+        yield result, describe(case, result)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.capture.rollout.simulators_in_threads import assert_same_episodes, record
+from tests.capture.engine.simulators_in_threads import assert_same_episodes, record
 from tests.kit.spoiled_policy import spoil_actions
 from tests.kit.still_scene import StillScene
 from vla_attention.analyze.__main__ import main as analyze
@@ -29,7 +29,7 @@ both = pytest.mark.parametrize("num_envs", [1, 2], ids=["serial", "pipelined"])
 def whole(tmp_path_factory) -> Iterator[Path]:
     """The store of three episodes without a fault."""
     with pytest.MonkeyPatch.context() as patch:
-        from tests.capture.rollout.simulators_in_threads import simulators_in_threads
+        from tests.capture.engine.simulators_in_threads import simulators_in_threads
 
         simulators_in_threads(patch)
         store = tmp_path_factory.mktemp("whole") / "a.zarr"
@@ -105,7 +105,7 @@ class StateIsNan(Faulty):
 
 FAULTS = {
     "raises in a step": (Raising, " failed: the context is lost: "),
-    "raises in a reset": (RaisingInReset, "no such state (ValueError, test_episode_faults.py:"),
+    "raises in a reset": (RaisingInReset, "no such state (ValueError, test_faults.py:"),
     "black picture": (
         Black,
         "The picture of agentview at replan 1 (environment step 14) of episode task000_episode001",

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from tests.capture.rollout.simulators_in_threads import simulators_in_threads
+from tests.capture.engine.simulators_in_threads import simulators_in_threads
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ import zarr
 
 from tests.kit.still_scene import StillScene
 from vla_attention.capture.__main__ import main as capture
-from vla_attention.capture.rollout import pipeline, simulator_process
+from vla_attention.capture.engine import simulator_process, simulators
 
 TINY = ["pi", "--checkpoint", "untrained-tiny", "--replan-steps", "4", "--max-steps", "8"]
 
@@ -47,6 +47,12 @@ class ThreadOfTests:
     def execute(self, request: simulator_process.Execute) -> None:
         self.connection.send(request)
 
+    def has_answer(self) -> bool:
+        return self.connection.poll()
+
+    def receive(self) -> object:
+        return self.connection.recv()
+
     def how_it_ended(self) -> str:
         return "killed by signal 9"
 
@@ -60,10 +66,7 @@ def simulators_in_threads(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     made = SimpleNamespace(make=StillScene)
     monkeypatch.setattr(ThreadOfTests, "started", [], raising=False)
     monkeypatch.setattr(simulator_process, "make_environment", lambda suite, task_id, settings: made.make())
-    monkeypatch.setattr(
-        "vla_attention.capture.rollout.simulator_source.make_environment", lambda suite, task_id, settings: made.make()
-    )
-    monkeypatch.setattr(pipeline, "SimulatorProcess", ThreadOfTests)
+    monkeypatch.setattr(simulators, "SimulatorProcess", ThreadOfTests)
     monkeypatch.setattr("vla_attention.capture.environments.drawing.check_drawing", lambda suite, libero_assets: "")
     return made
 

@@ -4,26 +4,21 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from tests.kit.stores import StoreSpec, root_attributes, write_episode
+from vla_attention.capture.engine.loop import EpisodeLoop
+from vla_attention.capture.engine.progress import Unit
+from vla_attention.capture.engine.simulation import SimulationFailed
+from vla_attention.capture.engine.source import Committed, Episode, EpisodeJob, Outcome, Source, plan_of
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Terminated, Termination
 from vla_attention.capture.jobs.worker_log import read_logs
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
-from vla_attention.capture.rollout.episode_loop import (
-    EpisodeJob,
-    EpisodeResult,
-    EpisodeSource,
-    OneByOneLoop,
-    StepReport,
-    plan_of,
-)
-from vla_attention.capture.engine.progress import Unit
-from vla_attention.capture.engine.simulation import SimulationFailed
 from vla_attention.capture.store.store_writer import RunStore, open_run
 from vla_attention.schemas.stores.locks import episode_locks
 from vla_attention.schemas.stores.reader import open_store
@@ -33,22 +28,41 @@ TASKS = [Task("made_up", number, f"task_{number}", f"lift cube {number}", 0) for
 JOBS = [EpisodeJob(task, index, 4, f"task {task.task_id} episode {index}") for task in TASKS for index in range(2)]
 
 
-class MadeUpSource(EpisodeSource):
+@dataclass
+class MadeUpEpisode(Episode):
+    """Is committed at the second look; its first one is one step."""
+
+    source: MadeUpSource
+    job: EpisodeJob
+    done: int = 0
+
+    def poll(self) -> Committed | None:
+        if not self.done:
+            self.done = 2
+            return None
+        self.source.before(self.job.name)
+        folder = write_episode(self.source.store, SPEC, self.job.task.task_id, self.job.episode_index)
+        return Committed(Outcome(True, 4), 1, folder)
+
+    def advance(self, actions: object) -> None:
+        raise NotImplementedError
+
+    def close(self, error: Exception | None = None) -> None:
+        self.source.tried.append(f"{self.job.name} closed")
+
+
+class MadeUpSource(Source):
     """Writes made-up episodes. before: called before each is written, with its name."""
 
     def __init__(self, store: RunStore, before: Callable[[str], object] = lambda name: None) -> None:
         self.store, self.before = store, before
         self.tried: list[str] = []
 
-    def begin(self, job: EpisodeJob) -> str | None:
-        return f"{job.name} begins" if job is JOBS[0] else None
-
-    def record(self, job: EpisodeJob, report: StepReport) -> EpisodeResult:
+    def open(self, job: EpisodeJob) -> MadeUpEpisode:
         self.tried.append(job.name)
-        report(2, 1)
-        self.before(job.name)
-        folder = write_episode(self.store, SPEC, job.task.task_id, job.episode_index)
-        return EpisodeResult(job.task.task_id, job.episode_index, True, 4, 1, folder)
+        if job is JOBS[0]:
+            self.say(f"{job.name} begins")
+        return MadeUpEpisode(self, job)
 
     def close(self) -> None:
         self.tried.append("closed")
@@ -59,8 +73,8 @@ def store(tmp_path: Path) -> RunStore:
     return open_run(tmp_path / "a.zarr", root_attributes(SPEC), "new", durable=False)
 
 
-def loop_of(store: RunStore, source: MadeUpSource, unit: Unit = "step") -> OneByOneLoop:
-    return OneByOneLoop(store, plan_of(JOBS), Termination(), unit, source)
+def loop_of(store: RunStore, source: MadeUpSource, unit: Unit = "step") -> EpisodeLoop:
+    return EpisodeLoop(store, plan_of(JOBS), Termination(), unit, source, None)
 
 
 def test_every_episode_is_recorded_and_noted(store: RunStore, capsys: pytest.CaptureFixture[str]) -> None:
@@ -68,13 +82,25 @@ def test_every_episode_is_recorded_and_noted(store: RunStore, capsys: pytest.Cap
     results = loop_of(store, source).record_all(JOBS)
     names = [job.name for job in JOBS]
     assert [result.folder.name for result in results] == names
-    assert source.tried == [*names, "closed"]
+    assert source.tried == [*(word for name in names for word in (name, f"{name} closed")), "closed"]
     (record,) = read_logs(store.path)
     assert (record.state, [episode for episode, _ in record.committed]) == ("finished", names)
     assert not (store.path / ".writing").exists()
     said = capsys.readouterr().out
     assert said.count(f"{names[0]} begins") == 1
     assert said.count("success after 4 steps, 1 replans") == 4
+
+
+@pytest.mark.parametrize("unit", ["step", "call"])
+def test_what_is_left_is_said_once_and_not_of_one_episode(store: RunStore, capsys, monkeypatch, unit: Unit) -> None:
+    monkeypatch.setenv("SLURM_JOB_END_TIME", "1")
+    loop_of(store, MadeUpSource(store), unit).record_all(JOBS[:1])
+    assert "first episode" not in capsys.readouterr().out
+    loop_of(store, MadeUpSource(store), unit).record_all(JOBS[1:])
+    said = capsys.readouterr().out
+    assert said.count("The first episode took") == 1
+    assert "2 more episodes, 1 at a time" in said
+    assert "NOT suffice" in said
 
 
 def test_what_another_process_commits_meanwhile_is_refused(store: RunStore, capsys) -> None:
@@ -144,7 +170,7 @@ def test_an_episode_that_another_process_took_over_is_looked_at_again(
 
     taken: list[str] = []
     monkeypatch.setattr(
-        "vla_attention.capture.rollout.episode_loop.time",
+        "vla_attention.capture.engine.loop.time",
         SimpleNamespace(sleep=lambda seconds: other.locks.release(name)),
     )
     source = MadeUpSource(store, stand_still)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,11 +10,15 @@ import numpy as np
 import pytest
 import torch
 
+from vla_attention.capture.engine import simulator_process
+from vla_attention.capture.engine.call import Caller
+from vla_attention.capture.engine.simulation import StopCheck
+from vla_attention.capture.engine.simulators import Simulators, check_protocol, max_replans
+from vla_attention.capture.engine.source import EpisodeJob, Outcome
 from vla_attention.capture.environments.base import Moment, Observation, StepResult, Task
 from vla_attention.capture.environments.episode_protocol import WAIT_ACTION, WAIT_STEPS
 from vla_attention.capture.policies.policy import PolicyInput
-from vla_attention.capture.rollout.episode import EpisodeRun, check_protocol, max_replans, record_episode
-from vla_attention.capture.store.replan_records import RecordedSteps, ReplanRecord
+from vla_attention.capture.store.replan_records import ReplanRecord
 from vla_attention.schemas.episode_steps import TaskGoal
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import SceneObject
@@ -116,31 +118,36 @@ class FakeStore:
         )
         self.records: list[ReplanRecord] = []
         self.path = Path("runs/made_up.zarr")
-        self.ending: tuple[bool, int] | None = None
-        self.dropped = False
-
-    @contextmanager
-    def episode(self, start: Any, denoise_times: np.ndarray, most_replans: int) -> Iterator[FakeStore]:
-        self.start, self.denoise_times, self.most_replans = start, denoise_times, most_replans
-        try:
-            yield self
-        except BaseException:
-            self.dropped = True
-            raise
-
-    def append(self, record: ReplanRecord) -> None:
-        self.records.append(record)
-
-    def commit(self, success: bool, num_steps: int, steps: RecordedSteps | None) -> Path:
-        self.ending, self.steps = (success, num_steps), steps
-        return Path("task003_episode002")
 
 
-def test_waiting_steps_then_a_policy_call_for_every_chunk() -> None:
+def run_episode(
+    monkeypatch: pytest.MonkeyPatch,
+    environment: FakeEnvironment,
+    store: FakeStore,
+    policy: FakePolicy | None = None,
+    *,
+    index: int = 0,
+    check: StopCheck = lambda: None,
+) -> tuple[Outcome, SimpleNamespace]:
+    """Run an episode in this process; also returns the `start`, `max_replans`, and (step, replans) after each call."""
+    monkeypatch.setattr(simulator_process, "make_environment", lambda suite, task_id, settings: environment)
+    caller = Caller(policy or FakePolicy(), store.attributes.recording)
+    source = Simulators(None, None, store, caller, {"host": "x"}, check)  # type: ignore[arg-type]
+    episode = source.open(EpisodeJob(TASK, index, 8, ""))
+    done: list[int] = []
+    while not isinstance(given := episode.poll(), Outcome):
+        assert given is not None
+        (made,) = caller.make([given])
+        store.records.append(caller.record(given, made, None))
+        episode.advance(made.actions)
+        done.append(episode.done)
+    done.append(episode.done)
+    return given, SimpleNamespace(start=episode.start, max_replans=episode.max_replans, done=done[1:])
+
+
+def test_waiting_steps_then_a_policy_call_for_every_chunk(monkeypatch) -> None:
     environment, policy, store = FakeEnvironment(), FakePolicy(), FakeStore()
-    reports: list[tuple[int, int]] = []
-    run = EpisodeRun(policy, store, {"host": "x"})
-    result = record_episode(run, environment, TASK, 2, lambda step, replans: reports.append((step, replans)))
+    outcome, told = run_episode(monkeypatch, environment, store, policy, index=2)
     assert environment.start == (2, 7)
     np.testing.assert_array_equal(environment.actions[:WAIT_STEPS], [WAIT_ACTION] * WAIT_STEPS)
     # Three of the four actions of each chunk are executed, and only two of the last: max_steps is 8.
@@ -150,19 +157,17 @@ def test_waiting_steps_then_a_policy_call_for_every_chunk() -> None:
     assert policy.inputs == environment.observed
     assert [record.env_step for record in store.records] == [WAIT_STEPS, WAIT_STEPS + 3, WAIT_STEPS + 6]
     assert [record.noise_seed for record in store.records] == [7320, 7321, 7322]
-    assert reports == [(3, 1), (6, 2), (8, 3)]
-    assert (result.success, result.num_steps, result.num_replans) == (False, 8, 3)
-    assert store.ending == (False, 8)
-    assert store.most_replans == 3
-    assert store.denoise_times.tolist() == [0.5]
-    assert (store.start.initial_state_index, store.start.initial_state_digest) == (2, "d" * 64)
+    assert told.done == [3, 6, 8]
+    assert outcome == Outcome(False, 8)
+    assert told.max_replans == 3
+    assert (told.start.initial_state_index, told.start.initial_state_digest) == (2, "d" * 64)
+    assert told.start.provenance == {"host": "x"}
 
 
-def test_a_solved_task_ends_the_episode() -> None:
+def test_a_solved_task_ends_the_episode(monkeypatch) -> None:
     environment, store = FakeEnvironment(solved_after=WAIT_STEPS + 2), FakeStore()
-    result = record_episode(EpisodeRun(FakePolicy(), store, {}), environment, TASK, 0)
-    assert (result.success, result.num_steps, result.num_replans) == (True, 2, 1)
-    assert store.ending == (True, 2)
+    assert run_episode(monkeypatch, environment, store)[0] == Outcome(True, 2)
+    assert len(store.records) == 1
 
 
 class WatchedEnvironment(FakeEnvironment):
@@ -181,10 +186,9 @@ class WatchedEnvironment(FakeEnvironment):
         )
 
 
-def test_what_is_told_of_every_step_is_stored() -> None:
-    environment, store = WatchedEnvironment(solved_after=WAIT_STEPS + 4), FakeStore()
-    record_episode(EpisodeRun(FakePolicy(), store, {}), environment, TASK, 0)
-    steps = store.steps
+def test_what_is_told_of_every_step_is_stored(monkeypatch) -> None:
+    environment = WatchedEnvironment(solved_after=WAIT_STEPS + 4)
+    steps = run_episode(monkeypatch, environment, FakeStore())[0].steps
     assert steps is not None
     assert steps.poses[:, 0, 2].tolist() == [WAIT_STEPS + i for i in range(5)]
     # Three actions of the first chunk, and the one of the second that solved the task.
@@ -195,15 +199,9 @@ def test_what_is_told_of_every_step_is_stored() -> None:
     assert [goal.first_held for goal in steps.attributes.goals] == [4, 2]
 
 
-def test_an_environment_that_tells_nothing_leaves_no_steps() -> None:
-    store = FakeStore()
-    record_episode(EpisodeRun(FakePolicy(), store, {}), FakeEnvironment(), TASK, 0)
-    assert store.steps is None
-
-
-def test_a_replan_is_stored_with_its_rows_and_coverage() -> None:
+def test_a_replan_is_stored_with_its_rows_and_coverage(monkeypatch) -> None:
     store = FakeStore(max_steps=1)
-    record_episode(EpisodeRun(FakePolicy(), store, {}), FakeEnvironment(), TASK, 0)
+    run_episode(monkeypatch, FakeEnvironment(), store)
     (record,) = store.records
     rows = record.rows["joint"]
     assert rows.rows.shape == (1, 1, 2, 1, 4)
@@ -223,30 +221,27 @@ def test_a_replan_is_stored_with_its_rows_and_coverage() -> None:
         (np.full((4, 2), 2, dtype=np.int32), "holds indices 2 to 2; with 2 objects, 0 to 1 are valid"),
     ],
 )
-def test_a_segmentation_that_does_not_fit_its_picture_is_refused(segmentation, message) -> None:
-    environment, store = FakeEnvironment(), FakeStore()
+def test_a_segmentation_that_does_not_fit_its_picture_is_refused(monkeypatch, segmentation, message) -> None:
+    environment = FakeEnvironment()
     environment.segmentation = lambda camera: segmentation
     with pytest.raises(BadArgument, match=message) as caught:
-        record_episode(EpisodeRun(FakePolicy(), store, {}), environment, TASK, 2)
+        run_episode(monkeypatch, environment, FakeStore(), index=2)
     assert str(caught.value).startswith(
         "Cannot store replan 0 (environment step 10) of episode task003_episode002 of runs/made_up.zarr, "
         "camera 'agentview': "
     )
-    assert store.dropped
 
 
-def test_an_error_of_the_check_drops_the_episode() -> None:
-    environment, store = FakeEnvironment(), FakeStore()
+def test_the_check_is_made_before_every_step(monkeypatch) -> None:
+    environment = FakeEnvironment()
 
     def stop_after_twelve_steps() -> None:
         if len(environment.actions) == 12:
             raise KeyboardInterrupt
 
-    run = EpisodeRun(FakePolicy(), store, {}, check=stop_after_twelve_steps)
     with pytest.raises(KeyboardInterrupt):
-        record_episode(run, environment, TASK, 0)
-    assert store.dropped
-    assert store.ending is None
+        run_episode(monkeypatch, environment, FakeStore(), check=stop_after_twelve_steps)
+    assert len(environment.actions) == 12
 
 
 @pytest.mark.parametrize(("replan_steps", "max_steps", "message"), [(5, 8, "expected 1 to 4"), (4, 0, "at least 1")])

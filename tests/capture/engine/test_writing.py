@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vla_attention.capture.engine.writing import BackgroundWriting
+from vla_attention.capture.engine.source import Outcome
+from vla_attention.capture.engine.writing import WritingThread
 
 
 class Stopped(Exception):
@@ -56,22 +57,22 @@ def record(number: int, num_bytes: int = 60) -> Any:
     return SimpleNamespace(number=number, rows={"joint": rows}, frames={}, camera_frames={}, coverage={})
 
 
-class Writing(BackgroundWriting):
+class Writing(WritingThread):
     """With an event for what is told to the process that gave the work; it may hold 100 bytes."""
 
     def __init__(self) -> None:
         self.told = threading.Event()
         self.stopping = False
-        super().__init__(notify=self.told.set, check=self.stop, most_waiting_bytes=100)
+        super().__init__(done=self.told.set, check=self.stop, most_waiting_bytes=100)
 
     def stop(self) -> None:
         if self.stopping:
             raise Stopped
 
-    def commits_after_notice(self) -> Any:
-        assert self.told.wait(60)
-        self.told.clear()
-        return self.take_commits()
+    def wait_until(self, holds: Callable[[], object]) -> None:
+        while not holds():
+            assert self.told.wait(60)
+            self.told.clear()
 
 
 def begin(writing: Writing, store: MadeUpStore, name: str) -> Any:
@@ -85,11 +86,10 @@ def test_replans_and_commits_are_written_in_order() -> None:
         one.append(record(0, 1))
         other.append(record(0, 1))
         one.append(record(1, 1))
-        one.commit(True, 7, None)
-        (committed,) = writing.commits_after_notice()
-        assert committed.episode is one
-        assert committed.folder == Path("one-that-is-not-there")
-        assert writing.take_commits() == []
+        one.commit(Outcome(True, 7))
+        writing.wait_until(lambda: one.committed)
+        assert one.committed == (Path("one-that-is-not-there"), 0)
+        assert other.committed is None
     # The other one is dropped with the end of the block.
     expected = ["one: open", "one: 0", "other: open", "other: 0", "one: 1", "one: commit True 7", "one: close"]
     assert store.log == [*expected, "other: close"]
@@ -109,21 +109,26 @@ def test_what_waits_is_bounded() -> None:
         store.may_append.set()
         episode.append(record(2))
         episode.append(record(3, 1000))  # waits until nothing else does, and is not refused
-        episode.commit(False, 0, None)
-        assert len(writing.commits_after_notice()) == 1
+        episode.commit(Outcome(False, 0))
+        writing.wait_until(lambda: episode.committed)
     assert store.log[1:4] == ["one: 0", "one: 2", "one: 3"]
 
 
-def test_a_failure_is_raised_where_the_work_comes_from() -> None:
+def test_a_failure_ends_its_episode_and_no_other() -> None:
     store = MadeUpStore()
     store.refuses = OSError("the disk is full")
     with Writing() as writing:
         episode, other = begin(writing, store, "one"), begin(writing, store, "other")
         other.append(record(0, 1))
         episode.append(record(0, 1))
-        episode.commit(True, 1, None)
-        with pytest.raises(OSError, match="the disk is full"):
-            writing.commits_after_notice()
-        with pytest.raises(OSError, match="the disk is full"):
-            other.append(record(1, 1))
-    assert {"one: close", "other: close"} <= set(store.log)
+        episode.commit(Outcome(True, 1))
+        episode.append(record(1, 1))
+        writing.wait_until(lambda: episode.error)
+        assert str(episode.error) == "the disk is full"
+        other.append(record(1, 1))
+        other.drop()
+        other.append(record(2, 1))
+        writing.wait_until(lambda: "other: close" in store.log)
+    assert store.log.count("one: close") == 1
+    assert "one: 1" not in store.log
+    assert "other: 2" not in store.log
