@@ -79,8 +79,6 @@ PICTURE_SIDE = 8192
 PICTURE_PIXELS = 10_000_000
 #: Bytes of a picture as a PNG or JPEG: such a one of four numbers of two bytes a pixel, not compressed.
 PICTURE_BYTES = 80_000_000
-#: Scans of a JPEG, each a pass over all pixels. A progressive one has ten; each takes a few bytes and ten milliseconds.
-PICTURE_SCANS = 100
 
 # Servers.
 
@@ -113,36 +111,10 @@ ARRAY_AXES = 8
 
 # Data sets of robots.
 
-#: Columns of a data set. Robots have some dozens of cameras, joints and rewards.
-DATA_SET_COLUMNS = 1000
-#: Episodes, and the names of tasks beside them. The largest published data sets have 440,000, of a task or two each.
+#: Episodes; the largest published data sets have 440,000.
 DATA_SET_EPISODES = 1_000_000
-DATA_SET_TASKS = 2_000_000
-#: Bytes of a file of lines (episodes, tasks), and of the texts of a table. 440,000 episodes have 45 MB of lines.
+#: Bytes of a file of lines (episodes, tasks). 440,000 episodes have 45 MB of lines.
 DATA_SET_TEXT_BYTES = 128_000_000
-#: Megabytes at which a data set may say that it begins another file. LeRobot says 100 and 200; this is a terabyte.
-DATA_SET_FILE_MB = 1_000_000
-#: Bytes of a footer of a Parquet file. LeRobot writes a group of rows every ten episodes: 10,000 episodes with the
-#: statistics of thirty columns have 25 MB, and a file that has 100 MB in all is followed by another one.
-TABLE_FOOTER_BYTES = 64_000_000
-#: Columns of a table, with all parts of them. The table of episodes has six statistics of each column of the data.
-TABLE_COLUMNS = 20_000
-#: Parts of a column in one another: a list has two, a picture one.
-TABLE_NESTING = 32
-#: Pages of the columns that are read. A file of 3,000 episodes with a group of rows each has 6,000 a column.
-TABLE_PAGES = 200_000
-#: Bytes in memory for each stored one of a table, beyond `CLAIMED_BYTES`. Numbers that hardly change are stored as
-#: their places in a list of values: of four bytes, half a byte is left.
-TABLE_EXPANSION = 10
-
-#: Pictures of a video. Videos of a data set have 200 to 500 MB: a million small pictures of a simulator.
-VIDEO_FRAMES = 2_000_000
-#: Pictures of a video for each frame of its data set: one may have been recorded at a higher rate. And pictures beside
-#: those, for a data set of few frames.
-VIDEO_FRAMES_PER_FRAME = 10
-VIDEO_SPARE_FRAMES = 10_000
-#: Boxes of an MP4. One that was recorded as it was written has five for each second.
-VIDEO_BOXES = 200_000
 #: Key frames before the last one at which decoding begins again, where a picture does not come out: in an open group,
 #: pictures need the one before.
 VIDEO_EARLIER_KEYS = 8

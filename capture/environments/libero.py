@@ -21,24 +21,20 @@ from vla_attention.schemas.episode_steps import TaskGoal
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 
-#: Bytes of a file of initial states; 50 states of LIBERO have 30 kB.
-MAX_STATES_BYTES = 64_000_000
-
 
 def load_initial_states(path: Path) -> NDArray[np.float64]:
     """Read the stored initial states of a task, (state, 1 + position + velocity) float64: flattened MuJoCo states.
 
-    The files are pickles, written by torch.save, of a numpy array. torch's restricted reader opens them if the few
-    numpy functions that rebuild an array are allowed, by their names in numpy 1. No other code in a file can run.
+    The files are numpy arrays, written by torch.save with numpy 1. torch's restricted reader opens them if the few
+    functions that rebuild an array are allowed. No other code in a file can run.
 
     Raises:
         UnusableTask: the file is missing, damaged, or holds anything else.
     """
-    from vla_attention.capture.foreign_files.pickles import ARRAYS, PickleRefused
     from vla_attention.capture.foreign_files.torch_files import load_torch
 
     rebuild = np.empty(0).__reduce__()[0]
-    allowed: list[Any] = [
+    array_types = [
         (rebuild, "numpy.core.multiarray._reconstruct"),
         rebuild,
         np.ndarray,
@@ -47,18 +43,10 @@ def load_initial_states(path: Path) -> NDArray[np.float64]:
     ]
     install_again = "install LIBERO again with 'make setup'"
     try:
-        size = check_regular(path, UnusableTask)
-        if size > MAX_STATES_BYTES:
-            raise UnusableTask(f"'{path}' has {size} bytes; initial states of {MAX_STATES_BYTES} at most are read.")
-        states = np.asarray(load_torch(path, ARRAYS, allowed), dtype=np.float64)
+        states = np.asarray(load_torch(path, UnusableTask, array_types), dtype=np.float64)
     except FileNotFoundError:
         raise UnusableTask(f"There are no initial states at '{path}'; {install_again}.") from None
-    except PickleRefused as error:
-        raise UnusableTask(
-            f"The initial states in '{path}' were refused: the file {error}; nothing of it was executed. To get them "
-            f"anew, {install_again}."
-        ) from error
-    except (TypeError, ValueError, OSError) as error:
+    except (TypeError, ValueError) as error:
         if isinstance(error, UserError):
             raise
         raise UnusableTask(f"'{path}' holds no initial states ({error}); {install_again}.") from error

@@ -1,1 +1,1 @@
-"""Files from elsewhere (checkpoints, initial states): checked before a library reads them or takes memory for them."""
+"""Files from elsewhere: checked, or read in a process with limits; nothing in them is executed."""

@@ -1,7 +1,4 @@
-"""Pictures of a data set, PNG and JPEG only: pillow starts Ghostscript for an EPS, whatever its file is called.
-
-A few hundred bytes can say that they are 100,000 x 100,000 pixels. Their size is read before they are decoded.
-"""
+"""Pictures of a data set, PNG and JPEG only: pillow starts Ghostscript for an EPS, whatever its file is called."""
 
 from __future__ import annotations
 
@@ -10,10 +7,10 @@ import io
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.schemas.limits import PICTURE_BYTES, PICTURE_PIXELS, PICTURE_SCANS, PICTURE_SIDE
+from vla_attention.schemas.limits import PICTURE_PIXELS, PICTURE_SIDE
 
-#: How a PNG and a JPEG begin, and each scan of a JPEG; in its pixels these two bytes do not occur.
-_PNG, _JPEG, _SCAN = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"\xff\xda"
+#: How a PNG and a JPEG begin.
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 
 
 class PictureRefused(ValueError):
@@ -28,13 +25,9 @@ def decode_picture(content: bytes) -> NDArray[np.uint8]:
     """
     from PIL import JpegImagePlugin, PngImagePlugin
 
-    if len(content) > PICTURE_BYTES:
-        raise PictureRefused(f"has {len(content):,} bytes; expected at most {PICTURE_BYTES:,}")
-    if content.startswith(_JPEG) and content.count(_SCAN) > PICTURE_SCANS:
-        raise PictureRefused(f"is a JPEG of {content.count(_SCAN):,} scans; expected at most {PICTURE_SCANS}")
     if not content.startswith((_PNG, _JPEG)):
         raise PictureRefused("cannot be decoded: it is no PNG and no JPEG")
-    # Not by `Image.open`, which warns of large pictures on the terminal before their size is known here.
+    # Not by `Image.open`, which warns of large pictures before their size is known here.
     kind = PngImagePlugin.PngImageFile if content.startswith(_PNG) else JpegImagePlugin.JpegImageFile
     try:
         with kind(io.BytesIO(content)) as image:

@@ -17,20 +17,12 @@ from vla_attention.capture.replay.data_set_episodes import (
     Paths,
     episodes_of_lines,
     episodes_of_tables,
-    limited,
     tasks_of_lines,
     tasks_of_table,
 )
 from vla_attention.capture.replay.data_tables import DamagedDataSet, DataSetError, DataSetNotFound
 from vla_attention.schemas.errors import listing
-from vla_attention.schemas.limits import (
-    ARRAY_AXES,
-    CLAIMED_BYTES,
-    DATA_SET_COLUMNS,
-    DATA_SET_FILE_MB,
-    PICTURE_PIXELS,
-    PICTURE_SIDE,
-)
+from vla_attention.schemas.limits import TEXT_CHARACTERS
 
 
 class UnsupportedDataSet(DataSetError):
@@ -47,8 +39,6 @@ FILE_PER_EPISODE, FILE_OF_MANY = ("v2.0", "v2.1"), ("v3.0",)
 VERSIONS = (*FILE_PER_EPISODE, *FILE_OF_MANY)
 #: Columns that every data set has, and that are numbers of its own.
 INDEX_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-#: Of a picture at most: three colours and how opaque it is.
-_CHANNELS = 4
 #: What is read before the episodes are known.
 META_FILES = ("meta/*.json", "meta/*.jsonl", "meta/*.parquet", "meta/episodes/**")
 
@@ -107,11 +97,10 @@ def read_info(folder: Path) -> DataSetInfo:
             "LeRobot's own script, or download it in one of these versions."
         )
     try:
-        limited(f"The number of features in '{path}'", len(content["features"]), DATA_SET_COLUMNS)
-        features = {name: _feature(path, name, stated) for name, stated in content["features"].items()}
+        features = {name: _feature(name, stated) for name, stated in content["features"].items()}
         fps = float(content["fps"])
         videos = [name for name, feature in features.items() if feature.dtype == "video"]
-        paths = Paths(f"'{path}'", content, videos, _files_per_folder(path, content))
+        paths = Paths(f"'{path}'", content, videos, int(content.get("chunks_size") or 1000))
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         if isinstance(error, DataSetError):
             raise
@@ -122,6 +111,8 @@ def read_info(folder: Path) -> DataSetInfo:
         tasks, episodes = tasks_of_table(folder), episodes_of_tables(folder, paths)
     else:
         tasks, episodes = tasks_of_lines(folder), episodes_of_lines(folder, paths)
+    if any(len(task) > TEXT_CHARACTERS for task in tasks.values()):
+        raise DamagedDataSet(f"The data set '{folder}' has a task of more than {TEXT_CHARACTERS:,} characters.")
     next(iter(episodes.values()), None)  # a template that cannot be filled is said now
     return DataSetInfo(
         version=version,
@@ -133,36 +124,16 @@ def read_info(folder: Path) -> DataSetInfo:
     )
 
 
-def _files_per_folder(path: Path, content: Mapping[str, Any]) -> int:
-    """Check the numbers that say how a data set is divided into files; returns how many files a folder has."""
-    per_folder = int(content.get("chunks_size") or 1000)
-    if per_folder < 1:
-        raise DamagedDataSet(f"'{path}' has the chunks_size {per_folder}; expected at least 1.")
-    for name in ("data_files_size_in_mb", "video_files_size_in_mb"):
-        size = content.get(name)
-        if size is not None and not 0 < float(size) <= DATA_SET_FILE_MB:
-            raise DamagedDataSet(
-                f"'{path}' has the {name} {size}; expected more than 0, and at most {DATA_SET_FILE_MB:,}."
-            )
-    return per_folder
-
-
-def _feature(path: Path, name: str, stated: Mapping[str, Any]) -> Feature:
+def _feature(name: str, stated: Mapping[str, Any]) -> Feature:
     names = stated.get("names")
     if isinstance(names, Mapping):  # as {"motors": [...]}
         names = next((value for value in names.values() if isinstance(value, list)), [])
     info = stated.get("info") or stated.get("video_info") or {}
     depth = bool(info.get("is_depth_map") or info.get("video.is_depth_map"))
     shape = tuple(int(size) for size in stated["shape"])
-    if len(shape) > ARRAY_AXES or any(size < 0 for size in shape):
+    if any(size < 0 for size in shape):
         raise ValueError(f"the column '{name}' has the shape {shape}")
-    feature = Feature(name, str(stated["dtype"]), shape, tuple(str(part) for part in names or ()), depth)
-    if feature.is_camera:
-        limited(f"The longest side of pictures of '{name}' in '{path}'", max(shape, default=0), PICTURE_SIDE)
-        limited(f"The size of pictures of '{name}' in '{path}'", math.prod(shape), _CHANNELS * PICTURE_PIXELS)
-    else:
-        limited(f"The number of values of '{name}' in '{path}'", math.prod(shape), CLAIMED_BYTES // 8)
-    return feature
+    return Feature(name, str(stated["dtype"]), shape, tuple(str(part) for part in names or ()), depth)
 
 
 def _json_object(path: Path) -> dict[str, Any]:

@@ -7,29 +7,25 @@ import hashlib
 import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.foreign_files.pictures import PictureRefused, decode_picture
+from vla_attention.capture.foreign_files.bounded import BoundedProcess
 from vla_attention.capture.replay.data_set_episodes import EpisodeEntry
-from vla_attention.capture.replay.data_set_files import INFO, META_FILES, DataSetInfo, Feature, read_info
-from vla_attention.capture.replay.data_tables import DamagedDataSet, DataSetNotFound, DataTable, stacked
-from vla_attention.capture.replay.video import VideoFile
-from vla_attention.schemas.errors import BadArgument, UnknownName, listing, unknown_name
-from vla_attention.schemas.limits import (
-    CLAIMED_BYTES,
-    PICTURE_BYTES,
-    VIDEO_FRAMES,
-    VIDEO_FRAMES_PER_FRAME,
-    VIDEO_SPARE_FRAMES,
+from vla_attention.capture.replay.data_set_files import INFO, META_FILES, Feature, read_info
+from vla_attention.capture.replay.data_set_reader import (
+    numeric_columns,
+    read_numbers,
+    read_pictures,
+    read_video_picture,
+    rows_of_episode,
 )
-from vla_attention.schemas.regular_files import read_regular
+from vla_attention.capture.replay.data_tables import DamagedDataSet, DataSetNotFound
+from vla_attention.schemas.errors import BadArgument, UnknownName, listing, unknown_name
 
 #: How far the time of a picture may be from the time of its row, as a part of the time between two frames. LeRobot
 #: itself refuses more than 0.1 ms.
@@ -59,24 +55,18 @@ class DataSetFrame:
 
 
 class LeRobotDataset:
-    """A data set: its columns, tasks and episodes. Made by `open_dataset`."""
+    """A data set: its columns, tasks and episodes. Made by `open_dataset`; its files are read in a `BoundedProcess`."""
 
     def __init__(
-        self,
-        folder: Path,
-        name: str,
-        info: DataSetInfo,
-        fetch: Fetch | None = None,
-        downloads: Mapping[str, str] | None = None,
+        self, folder: Path, name: str, fetch: Fetch | None = None, downloads: Mapping[str, str] | None = None
     ) -> None:
         self.folder = folder
         #: the commit of the files from the hub, for a store's provenance
         self.downloads = dict(downloads or {})
         self.name = name
-        self.info = info
+        self.process = BoundedProcess(DamagedDataSet)
+        self.info = self.process.call(folder / "meta", read_info, folder)
         self._fetch = fetch
-        #: the table of the last episode: the next one is often in it
-        self._table: DataTable | None = None
 
     @property
     def fps(self) -> float:
@@ -132,9 +122,7 @@ class LeRobotDataset:
         """
         entry = self.entry(index)
         self.fetch([entry.data])
-        if self._table is None or self._table.path != self.folder / entry.data:
-            self._table = DataTable(self.folder / entry.data)
-        return DataSetEpisode(self, entry, self._table)
+        return DataSetEpisode(self, entry)
 
     def fetch(self, paths: Sequence[str]) -> None:
         """Fetch files of a data set of the hub, by their paths inside of it; nothing for one that is a folder."""
@@ -170,13 +158,21 @@ class DataSetEpisode:
     length: frames. seconds: (frame,) float64, since the beginning. task_indices: (frame,) the task of each frame.
     """
 
-    def __init__(self, dataset: LeRobotDataset, entry: EpisodeEntry, table: DataTable) -> None:
+    def __init__(self, dataset: LeRobotDataset, entry: EpisodeEntry) -> None:
         self.dataset = dataset
         self.entry = entry
         self.index = entry.index
         self.length = entry.length
-        self._table = table
-        self._first = self._find_rows()
+        self._what = f"episode {entry.index} of '{dataset.name}'"
+        self._table = dataset.folder / entry.data
+        self._rows = dataset.process.call(self._table, rows_of_episode, self._table, entry.index)
+        if len(self._rows) != self.length or not np.array_equal(
+            self._index_column("frame_index"), np.arange(self.length)
+        ):
+            raise DamagedDataSet(
+                f"Episode {self.index} of '{dataset.name}' has {len(self._rows)} rows in '{self._table}'; the meta "
+                f"files say frames 0 to {self.length - 1}, one after the other."
+            )
         self.seconds = self._index_column("timestamp")
         self._check_rate()
         self.task_indices = self._index_column("task_index").astype(np.int64)
@@ -186,19 +182,6 @@ class DataSetEpisode:
                 f"Episode {self.index} of '{dataset.name}' has the task {unknown[0]}, which the meta files do not name."
             )
 
-    def _find_rows(self) -> int:
-        """Return the first row of the episode, after checking that its frames are there, one after the other."""
-        table = self._table
-        rows = table.rows_of("episode_index", self.index)
-        if len(rows) == self.length:
-            self._first = rows.start
-            if np.array_equal(self._index_column("frame_index"), np.arange(self.length)):
-                return rows.start
-        raise DamagedDataSet(
-            f"Episode {self.index} of '{self.dataset.name}' has {len(rows)} rows in '{table.path}'; the meta files say "
-            f"frames 0 to {self.length - 1}, one after the other."
-        )
-
     def _check_rate(self) -> None:
         """Raise `DamagedDataSet` if the time stamps are of another frame rate than the meta files say."""
         if self.length < 2:
@@ -207,16 +190,14 @@ class DataSetEpisode:
         if not abs(apart * fps - 1) <= RATE_TOLERANCE:
             rate = f" ({1 / apart:.4g} frames per second)" if apart > 0 else ""
             raise DamagedDataSet(
-                f"The frames of episode {self.index} of '{self.dataset.name}' are {apart:.4g} s apart{rate}, and "
+                f"The frames of {self._what} are {apart:.4g} s apart{rate}, and "
                 f"{INFO} says fps {fps:g}. Correct the one that is wrong: it says when the policy is called."
             )
 
     def _index_column(self, name: str) -> NDArray[np.float64]:
         values = self._finite(name)
         if values.shape != (self.length, 1):
-            raise DamagedDataSet(
-                f"'{self._table.path}' has lists in its column '{name}'; expected a number in each row."
-            )
+            raise DamagedDataSet(f"'{self._table}' has lists in its column '{name}'; expected a number in each row.")
         return values[:, 0]
 
     @property
@@ -239,25 +220,27 @@ class DataSetEpisode:
         stated = math.prod(feature.shape)
         if values.shape[1] != stated:
             raise DamagedDataSet(
-                f"The column '{name}' of episode {self.index} of '{self.dataset.name}' has {values.shape[1]} numbers "
-                f"in each frame, and {INFO} says {stated}."
+                f"The column '{name}' of {self._what} has {values.shape[1]} numbers in each frame, and {INFO} says "
+                f"{stated}."
             )
         return values
 
     def _finite(self, name: str) -> NDArray[np.float64]:
-        column = self._table.read([name], self._first, self.length)[name]
-        values = stacked(column)
-        if values is None:
+        values = self._numbers([name])[name]
+        if isinstance(values, str):
             raise BadArgument(
-                f"The column '{name}' of '{self.dataset.name}' holds {column.dtype}, not as many numbers in each frame."
+                f"The column '{name}' of '{self.dataset.name}' holds {values}, not as many numbers in each frame."
             )
         numbers = _as_floats(values)
         if not np.isfinite(numbers).all():
             raise DamagedDataSet(
-                f"The column '{name}' of episode {self.index} of '{self.dataset.name}' has numbers that are NaN or "
-                f"infinite, the first at frame {int(np.argmin(np.isfinite(numbers).all(axis=1)))}."
+                f"The column '{name}' of {self._what} has numbers that are NaN or infinite, the first at frame "
+                f"{int(np.argmin(np.isfinite(numbers).all(axis=1)))}."
             )
         return numbers
+
+    def _numbers(self, columns: Sequence[str]) -> dict[str, NDArray[np.generic] | str]:
+        return self.dataset.process.call(self._table, read_numbers, self._table, columns, self._rows)
 
     def frames(self, every: int = 1, cameras: Sequence[str] | None = None) -> Iterator[DataSetFrame]:
         """Yield frame 0, `every`, 2 · `every` ... with pictures.
@@ -277,102 +260,45 @@ class DataSetEpisode:
                 raise BadArgument(f"The column '{name}' of '{self.dataset.name}' holds no colour pictures.")
         numbers = self._values()
         self.dataset.fetch([self.entry.videos[name].path for name in names if name in self.entry.videos])
-        most = VIDEO_SPARE_FRAMES + VIDEO_FRAMES_PER_FRAME * self.dataset.info.episodes.num_frames
-        most = min(most, VIDEO_FRAMES)
-        with ExitStack() as opened:
-            videos = {
-                name: opened.enter_context(VideoFile(self.dataset.folder / self.entry.videos[name].path, most))
-                for name in names
-                if name in self.entry.videos
-            }
-            wanted = range(0, self.length, every)
-            stored = self._stored_pictures([name for name in names if name not in videos], wanted)
-            for frame in wanted:
-                images = next(stored) | {name: self._of_video(name, video, frame) for name, video in videos.items()}
-                yield self._frame(frame, {name: images[name] for name in names}, numbers)
+        for frame in range(0, self.length, every):
+            images = self._pictures(names, frame)
+            task = int(self.task_indices[frame])
+            yield DataSetFrame(
+                episode=self.index,
+                index=frame,
+                seconds=float(self.seconds[frame]),
+                task_index=task,
+                instruction=self.dataset.tasks[task],
+                images={name: images[name] for name in names},
+                values={name: _as_floats(values[frame]) for name, values in numbers.items()},
+            )
 
     def _values(self) -> dict[str, NDArray[np.generic]]:
         """Every column that has as many numbers in each frame, (frame, number), as it is stored."""
-        numeric = {}
-        for name, feature in self.dataset.features.items():
-            if feature.dtype in ("image", "video") or name not in self._table.columns:
-                continue
-            if self._table.file.is_numeric(name):
-                values = stacked(self._table.read([name], self._first, self.length)[name])
-                if values is not None:  # lists of several lengths are nothing that a policy reads as numbers
-                    numeric[name] = values
-        return numeric
+        numeric = self.dataset.process.call(self._table, numeric_columns, self._table)
+        pictures = {name for name, feature in self.dataset.features.items() if feature.dtype in ("image", "video")}
+        numbers = self._numbers([name for name in self.dataset.features if name in numeric and name not in pictures])
+        # Lists of several lengths are nothing that a policy reads as numbers.
+        return {name: values for name, values in numbers.items() if not isinstance(values, str)}
 
-    def _frame(
-        self, frame: int, images: Mapping[str, NDArray[np.uint8]], numbers: Mapping[str, NDArray[np.generic]]
-    ) -> DataSetFrame:
-        task = int(self.task_indices[frame])
-        return DataSetFrame(
-            episode=self.index,
-            index=frame,
-            seconds=float(self.seconds[frame]),
-            task_index=task,
-            instruction=self.dataset.tasks[task],
-            images=images,
-            values={name: _as_floats(values[frame]) for name, values in numbers.items()},
-        )
-
-    def _of_video(self, name: str, video: VideoFile, frame: int) -> NDArray[np.uint8]:
-        seconds = self.entry.videos[name].begins_at + float(self.seconds[frame])
-        return video.picture(seconds, TIME_TOLERANCE / self.dataset.fps)
-
-    def _stored_pictures(self, names: Sequence[str], frames: Sequence[int]) -> Iterator[dict[str, NDArray[np.uint8]]]:
-        """Yield for each of the frames, which are in order, the pictures that are in the table: name -> picture."""
-        if not names:
-            yield from ({} for _ in frames)
-            return
-        missing = [name for name in names if name not in self._table.columns]
-        if missing:
-            raise DamagedDataSet(
-                f"'{self._table.path}' has no column {listing(missing)}; it has {listing(self._table.columns)}."
+    def _pictures(self, names: Sequence[str], frame: int) -> dict[str, NDArray[np.uint8]]:
+        call, folder = self.dataset.process.call, self.dataset.folder
+        videos = {name: self.entry.videos[name] for name in names if name in self.entry.videos}
+        stored = tuple(name for name in names if name not in videos)
+        images: dict[str, NDArray[np.uint8]] = {}
+        if stored:
+            images = call(
+                self._table, read_pictures, folder, self._table, stored, self._rows, frame, episode=self._what
             )
-        row_bytes = self._table.file.bytes_per_row(names, self._first, self.length)
-        at_once = max(1, int(CLAIMED_BYTES / max(1.0, row_bytes)))
-        for here in _blocks(frames, at_once):
-            rows = self._table.read(names, self._first + here[0], here[-1] + 1 - here[0])
-            for frame in here:
-                yield {name: self._decoded(name, rows[name][frame - here[0]]) for name in names}
-
-    def _decoded(self, name: str, cell: Any) -> NDArray[np.uint8]:
-        what = f"A picture of '{name}' in episode {self.index} of '{self.dataset.name}'"
-        if cell is not None and not isinstance(cell, Mapping):
-            raise DamagedDataSet(f"{what} is a {type(cell).__name__} in its table; expected the bytes of a picture.")
-        content = None if cell is None else cell.get("bytes")
-        try:
-            if content is None:
-                place = Path("" if cell is None else cell.get("path") or "")
-                file = self.dataset.folder / place
-                # A path that leads out of the data set is not followed.
-                if place == Path() or place.is_absolute() or ".." in place.parts or not file.is_file():
-                    raise DataSetNotFound(f"{what} is neither in its table nor in a file of the data set ('{place}').")
-                content = read_regular(file, PICTURE_BYTES)
-            return decode_picture(content)
-        except PictureRefused as error:
-            raise DamagedDataSet(f"{what} {error}.") from error
-        except OSError as error:
-            if isinstance(error, DataSetNotFound):
-                raise
-            raise DamagedDataSet(f"{what} cannot be read: {error.strerror or error}.") from error
+        for name, video in videos.items():
+            path, seconds = folder / video.path, video.begins_at + float(self.seconds[frame])
+            images[name] = call(path, read_video_picture, path, seconds, TIME_TOLERANCE / self.dataset.fps)
+        return images
 
 
 def _as_floats(values: NDArray[np.generic]) -> NDArray[np.float64]:
     with np.errstate(invalid="ignore"):  # numpy would warn of some of the numbers that are none
         return values.astype(np.float64)
-
-
-def _blocks(frames: Sequence[int], most: int) -> Iterator[Sequence[int]]:
-    """Divide frames, which are in order, so that the last of a block is fewer than `most` rows behind its first."""
-    first = 0
-    for last in range(len(frames)):
-        if frames[last] - frames[first] >= most:
-            yield frames[first:last]
-            first = last
-    yield frames[first:]
 
 
 def open_dataset(name: str | Path) -> LeRobotDataset:
@@ -393,11 +319,11 @@ def open_dataset(name: str | Path) -> LeRobotDataset:
     if folder.is_dir() or on_hub is None:
         if not folder.exists():
             raise DataSetNotFound(f"There is no data set at '{name}'; give a folder, or ORG/NAME of the hub.")
-        return LeRobotDataset(folder, folder.resolve().name, read_info(folder))
+        return LeRobotDataset(folder, folder.resolve().name)
     repository, revision = on_hub
     copy = _lerobot_home() / repository
     if revision is None and (copy / INFO).is_file():
-        return LeRobotDataset(copy, repository, read_info(copy))
+        return LeRobotDataset(copy, repository)
     how = (
         f"fetch it where there is a network with `hf download --repo-type dataset {name}`, copy the folder here and "
         "give its path (there is no such local folder)"
@@ -413,7 +339,7 @@ def open_dataset(name: str | Path) -> LeRobotDataset:
             # Paths come from the data set: a star in one would fetch every file of the repository.
             fetch_from_hub(repository, [*map(glob.escape, paths)], how, kind="dataset", revision=commit)
 
-    return LeRobotDataset(folder, repository, read_info(folder), fetch, downloads(folder))
+    return LeRobotDataset(folder, repository, fetch, downloads(folder))
 
 
 def _lerobot_home() -> Path:

@@ -18,19 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.foreign_files.mp4_files import Mp4Refused, check_mp4
 from vla_attention.capture.replay.data_set_files import UndecodableVideo
 from vla_attention.capture.replay.data_tables import DamagedDataSet, DataSetNotFound
 from vla_attention.schemas.errors import MissingDependency
-from vla_attention.schemas.limits import PICTURE_PIXELS, PICTURE_SIDE, VIDEO_EARLIER_KEYS, VIDEO_FRAMES
+from vla_attention.schemas.limits import PICTURE_PIXELS, PICTURE_SIDE, VIDEO_EARLIER_KEYS
 
-#: How FFmpeg opens a file. Only MP4, whose lists are checked before; of a list of files or addresses (concat, HLS) each
-#: would be opened. A decoder refuses pictures of more pixels before it takes memory for them.
-_OPTIONS = {
-    "format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2",
-    "protocol_whitelist": "file",
-    "max_pixels": str(PICTURE_PIXELS),
-}
+#: How FFmpeg opens a file: only as MP4. Of a list of files or addresses (concat, HLS), it would open each.
+_OPTIONS = {"format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2", "protocol_whitelist": "file"}
 
 
 def import_av() -> Any:
@@ -62,35 +56,31 @@ class VideoFile:
 
     Args:
         path: of an MP4 file.
-        most_pictures: as it may have; a file that says more is damaged.
 
     Raises:
         DataSetNotFound: there is no such file.
         UndecodableVideo: the file is no video, is damaged, or the installed PyAV has no decoder for its codec.
     """
 
-    def __init__(self, path: Path, most_pictures: int = VIDEO_FRAMES) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self._av = import_av()
         if not path.is_file():
             raise DataSetNotFound(f"There is no video '{path}', which the data set names.")
         try:
-            self._bytes = check_mp4(path, most_pictures)
             # With the name of the protocol: the first part of a name with a colon would be one.
             self._container = self._av.open(f"file:{path}", options=_OPTIONS)
-        except Mp4Refused as error:
-            raise UndecodableVideo(f"'{path}' is no video that can be read: it {error}.") from error
         except (self._av.error.FFmpegError, ValueError, OSError) as error:
             raise UndecodableVideo(f"'{path}' is no video that can be read ({_reason(error)}).") from error
         try:
-            self._read_packets(most_pictures)
+            self._read_packets()
         except BaseException:
             self._container.close()
             raise
         self._decoded: Iterator[Any] = iter(())
         self._current: Any = None
 
-    def _read_packets(self, most_pictures: int) -> None:
+    def _read_packets(self) -> None:
         if not self._container.streams.video:
             raise UndecodableVideo(f"'{self.path}' holds no pictures.")
         self._stream = stream = self._container.streams.video[0]
@@ -101,21 +91,18 @@ class VideoFile:
             )
         self.codec: str = stream.codec_context.codec.canonical_name
         self.size: tuple[int, int] = (stream.codec_context.height, stream.codec_context.width)
-        if min(self.size) < 1 or max(self.size) > PICTURE_SIDE or math.prod(self.size) > PICTURE_PIXELS:
-            stated = f"{self.size[1]:,} x {self.size[0]:,} pixels" if min(self.size) > 0 else "no size that is known"
+        if max(self.size) > PICTURE_SIDE or math.prod(self.size) > PICTURE_PIXELS:
             raise UndecodableVideo(
-                f"'{self.path}' says that its pictures have {stated}; expected at most {PICTURE_SIDE:,} pixels on a "
-                f"side and {PICTURE_PIXELS:,} in all."
+                f"'{self.path}' says that its pictures have {self.size[1]:,} x {self.size[0]:,} pixels; expected at "
+                f"most {PICTURE_SIDE:,} on a side and {PICTURE_PIXELS:,} in all."
             )
-        stream.codec_context.options = {"max_pixels": _OPTIONS["max_pixels"]}
-        stamps, keys, read = array("q"), array("q"), 0
+        stamps, keys, read, size = array("q"), array("q"), 0, self.path.stat().st_size
         try:
             for packet in self._container.demux(stream):
                 read += packet.size
-                if read > self._bytes or len(stamps) > most_pictures:
+                if read > size:
                     raise UndecodableVideo(
-                        f"'{self.path}' is damaged: it has {self._bytes:,} bytes, and more than {len(stamps):,} "
-                        f"pictures of {read:,} bytes."
+                        f"'{self.path}' is damaged: it has {size:,} bytes, and pictures of more than {read:,} bytes."
                     )
                 if packet.pts is not None and not packet.is_discard:
                     stamps.append(packet.pts)

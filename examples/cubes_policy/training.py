@@ -22,8 +22,7 @@ from examples.cubes_policy.network import initial_model, small_config
 from examples.cubes_policy.objectives import Heads, losses, total
 from examples.cubes_policy.vocabulary import make_tokenizer
 from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS
-from vla_attention.capture.foreign_files.checked_files import check_regular, read_object
-from vla_attention.capture.foreign_files.pickles import TENSORS, PickleRefused
+from vla_attention.capture.foreign_files.checked_files import read_object
 from vla_attention.capture.foreign_files.torch_files import load_torch
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.model import PiModel
@@ -310,13 +309,7 @@ def read_settings(output: Path) -> dict[str, Any]:
 
 def _read_checkpoint(path: Path) -> dict[str, Any]:
     """Read a checkpoint of a training; `UnusableTraining` for one that is damaged or something else."""
-    try:
-        check_regular(path, UnusableTraining)
-        state = load_torch(path, TENSORS)
-    except PickleRefused as error:
-        raise UnusableTraining(
-            f"The checkpoint '{path}' was refused: it {error}; nothing of it was executed."
-        ) from error
+    state = load_torch(path, UnusableTraining)
     if not isinstance(state, dict) or not {"average", "step", "seconds", "schedule"} <= state.keys():
         raise UnusableTraining(f"'{path}' is no checkpoint of a training.")
     return state

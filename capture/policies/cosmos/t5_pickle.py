@@ -10,30 +10,22 @@ import pickle
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, NoReturn
+from typing import Any
 
+import torch
 import torch._utils
 from torch import Tensor
 
+from vla_attention.capture.foreign_files.bounded import BoundedProcess
 from vla_attention.capture.foreign_files.checked_files import check_regular
-from vla_attention.capture.foreign_files.pickles import (
-    TENSORS,
-    Check,
-    PickleDamaged,
-    PickleRefused,
-    anything,
-    check_pickle,
-    nothing,
-)
-from vla_attention.capture.foreign_files.torch_files import check_tensors, load_torch
+from vla_attention.capture.foreign_files.torch_files import reason_of, tensor_problem
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
-from vla_attention.capture.policies.cosmos.tensor_files import RefusedPickle
 from vla_attention.schemas.errors import UnknownName, listing
 
 
 def _load_storage(content: bytes) -> Any:
     """Read a storage with PyTorch's own restricted reader, on the CPU; replaces the pickle's `_load_from_bytes`."""
-    return load_torch(io.BytesIO(content), TENSORS)
+    return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
 
 
 #: The only functions that such a file may call.
@@ -44,25 +36,17 @@ _ALLOWED: dict[tuple[str, str], Callable[..., Any]] = {
 }
 
 
-#: The same by their names in the pickle, with what their arguments have to be.
-_CALLS: dict[str, Check] = {".".join(name): nothing if name[1] == "OrderedDict" else anything for name in _ALLOWED}
-#: Bytes of a file. One embedding of T5-11b has 1 MB; LIBERO has 130 tasks.
-MAX_EMBEDDINGS_BYTES = 2_000_000_000
-
-
 class _RestrictedUnpickler(pickle.Unpickler):
     """Reads tensors only; any other object is refused before it is created."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return one of the allowed functions; `RefusedPickle` for any other."""
+        """Return one of the allowed functions; `UnpicklingError` for any other."""
         allowed = _ALLOWED.get((module, name))
         if allowed is None:
-            raise RefusedPickle(f"asks for {module}.{name}")
+            raise pickle.UnpicklingError(
+                f"it asks for {module}.{name}, and text embeddings need tensors only; nothing of it was executed"
+            )
         return allowed
-
-    def persistent_load(self, identifier: Any) -> NoReturn:
-        """Raise `RefusedPickle`: a file of embeddings needs nothing outside itself."""
-        raise RefusedPickle("refers to something outside itself")
 
 
 @dataclass(frozen=True)
@@ -93,47 +77,38 @@ class TextEmbeddings:
 
 
 def read_embeddings(path: str | Path) -> TextEmbeddings:
-    """Read a pickle of text embeddings.
+    """Read a pickle of text embeddings, in a process with limits.
 
-    Raises `CheckpointNotFound`, `UnreadableCheckpoint`, or `RefusedPickle` when it holds more than tensors; nothing of
-    it was executed then.
+    Raises `CheckpointNotFound`, or `UnreadableCheckpoint` when it is damaged, takes too much, or holds more than
+    tensors; nothing of it was executed then.
     """
     path = Path(path)
     try:
-        size = check_regular(path, UnreadableCheckpoint)
+        check_regular(path, UnreadableCheckpoint)
     except FileNotFoundError:
         raise CheckpointNotFound(
             f"There are no text embeddings at '{path}'; give --t5-text-embeddings-path (libero_t5_embeddings.pkl of "
             "the checkpoint)."
         ) from None
-    if size > MAX_EMBEDDINGS_BYTES:
-        raise UnreadableCheckpoint(
-            f"'{path}' has {size} bytes; text embeddings of {MAX_EMBEDDINGS_BYTES} at most are read."
-        )
+    process = BoundedProcess(UnreadableCheckpoint)
+    stored = process.call(path, checked_embeddings, path)
+    process.close()
     with path.open("rb") as file:
-        content = _read(file, path)
-        file.seek(0)
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return TextEmbeddings(str(path), _checked(content, path), digest)
+    return TextEmbeddings(str(path), torch.load(io.BytesIO(stored), weights_only=True), digest)
 
 
-def _read(file: BinaryIO, path: Path) -> Any:
+def checked_embeddings(path: Path) -> bytes:
+    """Read and check a pickle of text embeddings; returns them as torch.save writes them."""
     try:
-        check_pickle(file, _CALLS, most_numbers=0)
-        file.seek(0)
-        return _RestrictedUnpickler(file).load()
-    except (PickleRefused, RefusedPickle) as error:
-        if isinstance(error, PickleDamaged):
-            raise UnreadableCheckpoint(f"'{path}' cannot be read as text embeddings: it {error}.") from error
-        raise RefusedPickle(
-            f"'{path}' was refused: it {error}, and text embeddings need tensors only; nothing of it was executed."
-        ) from error
+        with path.open("rb") as file:
+            found = _RestrictedUnpickler(file).load()
+    except MemoryError:
+        raise
     except Exception as error:  # a damaged pickle raises almost anything
-        first = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise UnreadableCheckpoint(f"'{path}' cannot be read as text embeddings ({first}).") from error
-
-
-def _checked(found: Any, path: Path) -> dict[str, Tensor]:
+        raise UnreadableCheckpoint(
+            f"'{path}' was refused as text embeddings: {reason_of(error)}. Get it again from its source."
+        ) from error
     if not isinstance(found, dict) or not found:
         raise UnreadableCheckpoint(
             f"'{path}' holds no text embeddings (a dictionary of instructions), but {type(found).__name__}."
@@ -146,10 +121,10 @@ def _checked(found: Any, path: Path) -> dict[str, Tensor]:
                 f"is {tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__}."
             )
         shapes.add(tuple(value.shape))
-    try:
-        check_tensors(found.values())
-    except PickleRefused as error:
-        raise UnreadableCheckpoint(f"'{path}' {error}.") from error
+    if problem := tensor_problem(found.values()):
+        raise UnreadableCheckpoint(f"'{path}' was refused as text embeddings: it {problem}.")
     if len(shapes) > 1:
         raise UnreadableCheckpoint(f"The embeddings of '{path}' have different shapes: {listing(sorted(shapes))}.")
-    return dict(found)
+    stored = io.BytesIO()
+    torch.save(dict(found), stored)
+    return stored.getvalue()

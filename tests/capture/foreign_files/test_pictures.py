@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import struct
+import zlib
 
 import numpy as np
 import pytest
@@ -45,3 +47,11 @@ def test_no_program_is_started_for_an_eps(tmp_path, monkeypatch):
     with pytest.raises(PictureRefused, match="is no PNG and no JPEG"):
         decode_picture(EPS)
     assert not trace.exists()
+
+
+def test_a_picture_of_a_billion_pixels_is_refused_before_it_is_decoded():
+    header = struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0)
+    content = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + b"IHDR" + header
+    content += struct.pack(">I", zlib.crc32(b"IHDR" + header))
+    with pytest.raises(PictureRefused, match=r"has 30,000 x 30,000 pixels; expected at most 8,192 on a side"):
+        decode_picture(content + struct.pack(">I", 0) + b"IDAT" + struct.pack(">I", zlib.crc32(b"IDAT")))

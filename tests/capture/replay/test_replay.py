@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from tests.kit.lerobot_data_sets import H264, episodes_of_store, made_up_episode
 from tests.kit.pi_golden import GOLDEN
 from tests.kit.small_tokenizer import train_small_tokenizer
 from tests.kit.still_scene import capture_without_simulator
+from tests.thorough.hostile_data_sets.run_cases import CASES
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.stores.reader import open_store
@@ -201,3 +203,10 @@ def test_a_checkpoint_of_another_robot_is_refused(tmp_path, capsys, tokenizer):
     assert (
         "states have 8 numbers, and those of the data set 'data' 14: observation.state (14)" in capsys.readouterr().err
     )
+
+
+@pytest.mark.parametrize("name", ["table: a billion rows in a kilobyte", "picture: a PNG header of 100,000 x 100,000"])
+def test_a_data_set_that_asks_for_all_memory_is_refused(tmp_path, capsys, name):
+    (tmp_path / "case").mkdir()
+    assert capture(CASES[name].make(tmp_path / "case")) == 2
+    assert re.search(CASES[name].sentence, capsys.readouterr().err)

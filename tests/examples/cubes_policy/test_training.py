@@ -133,9 +133,9 @@ def test_a_folder_in_use_and_other_settings_are_refused(demonstrations, whole):
 
 def test_a_checkpoint_that_executes_or_is_damaged_is_refused(tmp_path):
     for content, said in (
-        (executing_pickle(tmp_path), r"asks for posix\.system; nothing of it was executed"),
+        (executing_pickle(tmp_path), r"asks for posix\.system, .* nothing of it was executed"),
         (b"\x80\x02}.", "is no checkpoint of a training"),
-        (b"\x80", "was refused: it is damaged"),
+        (b"\x80", "cannot be read as a file of torch.save"),
     ):
         torch_zip(tmp_path / "checkpoint.pt", content)
         with pytest.raises(UnusableTraining, match=said):

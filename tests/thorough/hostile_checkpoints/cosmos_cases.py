@@ -16,11 +16,11 @@ import torch
 
 from tests.kit.cosmos_checkpoint import WEIGHTS_NAME, write_dummy_folder
 from tests.thorough.hostile_checkpoints.hostile_files import (
+    NO_TORCH_FILE,
     TRACE,
     Case,
     Execute,
     Make,
-    call,
     deep,
     edit,
     executing_pickle,
@@ -102,21 +102,8 @@ def claims(path: Path) -> None:
     old_torch(path, b"\x80\x02}" + text("net.a") + rebuilt + b"s.")
 
 
-def directory_of_a_terabyte(path: Path) -> None:
-    """A zip whose end says that its directory has 2 GB, before which the file has zeros."""
-    end = struct.pack("<4s4H2LH", b"PK\x05\x06", 0, 0, 65535, 65535, 2_000_000_000, 4, 0)
-    sparse(path, 2_000_000_004, b"PK\x03\x04")
-    with path.open("ab") as file:
-        file.write(end)
-
-
 def huge_blocks(state: dict[str, object]) -> None:
     state["net.blocks.999999999.self_attn.q_norm.weight"] = torch.zeros(1)
-
-
-def one_storage(state: dict[str, object]) -> None:
-    shared = torch.zeros(1_000_000)
-    state.update({f"net.shared{i}": shared for i in range(2000)})
 
 
 def claimed_width(state: dict[str, object]) -> None:
@@ -139,29 +126,20 @@ COSMOS: dict[str, Case] = {
         embeddings(lambda path: path.write_bytes(pickle.dumps({"a": Execute(path.parent.parent / TRACE)}))),
         r"asks for \w+\.system.*nothing of it was executed",
     ),
-    "text whose storage executes": Case(embeddings(execute_through_storage), r"asks for \w+\.system"),
-    "10 GB of zeros by a call": Case(
-        pickled(call("builtins", "bytearray", b"\x8a\x05" + (10**10).to_bytes(5, "little") + b"\x85")),
-        "asks for builtins.bytearray",
-    ),
+    "text whose storage executes": Case(embeddings(execute_through_storage), r"refused as text .* GLOBAL \w+\.system"),
     "entry 4 billion of a table": Case(
-        embeddings(lambda path: path.write_bytes(table_bomb())), "a table entry of number"
+        embeddings(lambda path: path.write_bytes(table_bomb())),
+        "with 4 GB .* asked for more memory",
     ),
-    "a text of 4 GB": Case(
-        embeddings(lambda path: sparse(path, 1_000_000_000, b"\x80\x04X\xff\xff\xff\x3a")),
-        "has an item of 989855743 bytes",
+    "a text of 10 GB": Case(
+        embeddings(lambda path: sparse(path, 10**10 + 20, b"\x80\x04\x8d" + (10**10).to_bytes(8, "little"))),
+        "with 4 GB .* asked for more memory",
     ),
-    "a compressed pickle": Case(pickled(b"\x80\x02" + b"0" * 50_000_000, zipfile.ZIP_DEFLATED), "compressed zip"),
-    "a directory of 2 GB": Case(weights(directory_of_a_terabyte), "has a directory of 2000000000 bytes"),
-    "a storage of 10^15 numbers": Case(weights(claims), "asks for 1000000000000000 numbers"),
+    "a compressed pickle": Case(pickled(b"\x80\x02" + b"0" * 50_000_000, zipfile.ZIP_DEFLATED), NO_TORCH_FILE),
+    "a storage of 10^15 numbers": Case(weights(claims), NO_TORCH_FILE),
     "a tensor with a step of 0": Case(saved(claimed_width), "whose numbers it does not hold"),
-    "two thousand tensors of one storage": Case(saved(one_storage), "bytes of numbers for them"),
-    "text embeddings of 5 GB": Case(
-        embeddings(lambda path: sparse(path, 5 * 10**9)), "text embeddings of 2000000000 at most"
-    ),
-    "a key that is hashed for an hour": Case(
-        pickled(hash_bomb()), "instruction DUP|tuple of more than|a key that is no name"
-    ),
+    "text embeddings of 5 GB": Case(embeddings(lambda path: sparse(path, 5 * 10**9)), "refused as text embeddings"),
+    "a key that is hashed for an hour": Case(pickled(hash_bomb()), NO_TORCH_FILE),
     "block 999,999,999": Case(saved(huge_blocks), "1 extra: blocks.999999999|missing"),
     "quantized weights": Case(saved(whole_numbers), "numbers of type torch.int8"),
     "weights that are a link": Case(weights(lambda path: link(path, "/etc/hostname")), "leads out of its folder"),

@@ -33,6 +33,8 @@ class Execute:
         return os.system, (f"touch {self.trace}",)
 
 
+#: What is said of a file that torch cannot read.
+NO_TORCH_FILE = "cannot be read as a file of torch.save"
 #: What an executed pickle leaves, in the folder of its case.
 TRACE = "executed"
 
@@ -46,20 +48,9 @@ def hash_bomb() -> bytes:
     return b"\x80\x02}" + b")" + b"2\x86" * 40 + b"K\x01s."
 
 
-def hash_bomb_with_table() -> bytes:
-    """The same without the instruction that doubles, which some readers do not know."""
-    steps = b"".join(b"q" + bytes([i]) + b"h" + bytes([i]) + b"\x86" for i in range(40))
-    return b"\x80\x02})" + steps + b"K\x01s."
-
-
 def table_bomb() -> bytes:
     """An entry of number 4 billion in a table: Python's own reader takes 64 GB for it."""
     return b"\x80\x02}r" + struct.pack("<I", 2**32 - 16) + b"."
-
-
-def call(module: str, name: str, arguments: bytes) -> bytes:
-    """A dictionary with the result of a call; arguments: instructions that make a tuple."""
-    return b"\x80\x02}X\x05\x00\x00\x00net.a" + f"c{module}\n{name}\n".encode() + arguments + b"Rs."
 
 
 def text(value: str) -> bytes:

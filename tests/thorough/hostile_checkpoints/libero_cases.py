@@ -11,10 +11,10 @@ import numpy as np
 import torch
 
 from tests.thorough.hostile_checkpoints.hostile_files import (
+    NO_TORCH_FILE,
     TRACE,
     Case,
     executing_pickle,
-    hash_bomb_with_table,
     pipe,
     sparse,
     torch_zip,
@@ -96,15 +96,12 @@ def executing_task(path: Path) -> None:
 
 LIBERO: dict[str, Case] = {
     "initial states that execute": Case(
-        states(lambda path: torch_zip(path, executing_pickle(path.parents[5]))), r"asks for \w+\.system; nothing of it"
-    ),
-    "initial states that are hashed for an hour": Case(
-        states(lambda path: torch_zip(path, hash_bomb_with_table())), "tuple of more than 10000 items"
+        states(lambda path: torch_zip(path, executing_pickle(path.parents[5]))), r"asks for \w+\.system.*nothing of it"
     ),
     "initial states that are a table": Case(as_states({"a": 1}), "holds no initial states"),
     "initial states of another scene": Case(as_states(np.zeros((50, 3))), "do not belong together|cannot be built"),
     "a pipe for initial states": Case(states(pipe), "it is a FIFO"),
-    "initial states of 5 GB": Case(states(lambda path: sparse(path, 5 * 10**9)), "initial states of 64000000 at most"),
+    "initial states of 5 GB": Case(states(lambda path: sparse(path, 5 * 10**9)), NO_TORCH_FILE),
     "a task that executes": Case(task(executing_task), "as an angle .*Nothing of it was executed"),
     "a task of parentheses": Case(task(lambda path: path.write_text("(" * 100_000 + ")" * 100_000)), "parentheses"),
     "a pipe for a task": Case(task(pipe), "it is a FIFO"),

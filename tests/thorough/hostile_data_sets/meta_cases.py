@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from tests.thorough.hostile_checkpoints.hostile_files import pipe, sparse
-from tests.thorough.hostile_data_sets.made import CAMERA, Case, hostile, info, written
+from tests.thorough.hostile_data_sets.made import Case, hostile, info, written
 from tests.thorough.hostile_data_sets.parquet_writer import constant, counting, texts, write_parquet
 
 LINES, TASKS = "meta/episodes.jsonl", "meta/tasks.jsonl"
@@ -44,10 +44,8 @@ INFO: dict[str, Case] = {
     "lists in lists": Case(written("meta/info.json", b"[" * 100_000), "nested more than 64 deep"),
     "a number of 5,000 digits": Case(written("meta/info.json", b'{"fps": ' + b"9" * 5000 + b"}"), "4,000 digits"),
     "a feature of 10^12 numbers": Case(
-        info(lambda it: it["features"]["action"].update(shape=[10**6, 10**6])), r"values of 'action' .* expected 0 to"
-    ),
-    "pictures of 100,000 x 100,000": Case(
-        info(lambda it: it["features"][CAMERA].update(shape=[100_000, 100_000, 3])), r"expected 0 to 8,192"
+        info(lambda it: it["features"]["action"].update(shape=[10**6, 10**6])),
+        "are the actions is not known",
     ),
     "a template of a megabyte": Case(
         info(lambda it: it.update(data_path="{episode_index:099d}" * 50_000)), "expected at most 4,096"
@@ -57,16 +55,13 @@ INFO: dict[str, Case] = {
 LINES_CASES: dict[str, Case] = {
     "episodes without end": Case(
         hostile(lambda robot: sparse(robot / LINES, 2**43, lines(10))),
-        r"bytes of .*episodes\.jsonl.*expected 0 to 128,000,000",
-    ),
-    "a million episodes and one": Case(
-        hostile(lambda robot: (robot / LINES).write_bytes(lines(1_000_001))), "expected 0 to 1,000,000"
+        r"episodes\.jsonl' cannot be read: it has .* expected at most 128,000,000",
     ),
     "a line of 100 MB": Case(
         hostile(lambda robot: (robot / LINES).write_bytes(b'{"a": "' + b"x" * 100_000_000)),
-        "a line of more than 32,000,000 bytes",
+        "is not one JSON object per line",
     ),
-    "a million lists": Case(written(LINES, b"[" + b"[]," * 1_100_000 + b"[]]"), "more than 1,000,000 lists"),
+    "a million lists": Case(written(LINES, b"[" + b"[]," * 1_100_000 + b"[]]"), "is not one JSON object per line"),
     "an episode of a trillion frames": Case(
         written(LINES, lines(1, length=10**12)), r"has 4 rows .* frames 0 to 999999999999"
     ),
@@ -75,17 +70,17 @@ LINES_CASES: dict[str, Case] = {
     ),
     "a pipe for episodes": Case(hostile(lambda robot: pipe(robot / LINES)), r"no '.*episodes\.jsonl'"),
     "tasks without end": Case(
-        hostile(lambda robot: sparse(robot / TASKS, 2**43)), r"bytes of .*tasks\.jsonl.*expected 0 to"
+        hostile(lambda robot: sparse(robot / TASKS, 2**43)), r"tasks\.jsonl' cannot be read: it has .* expected at most"
     ),
 }
 
 TABLE_CASES: dict[str, Case] = {
     "a task a million times": Case(
         hostile(tasks_table(1_000_000, b"x" * 100_000), version="v3.0"),
-        "bytes of all texts .* expected 0 to 128,000,000",
+        "meta' cannot be read with 4 GB of memory",
     ),
     "a billion episodes": Case(
-        hostile(episodes_table(1_000_000_000, b"a"), version="v3.0"), "number of episodes .* expected 0 to 1,000,000"
+        hostile(episodes_table(1_000_000_000, b"a"), version="v3.0"), "meta' cannot be read with 4 GB of memory"
     ),
     "an episode of 2^62 frames": Case(hostile(episodes_table(1, b"a", length=2**62), version="v3.0"), "has 4 rows"),
     "a file of number -1": Case(

@@ -33,21 +33,3 @@ def exchange(content: bytes, path: Sequence[str], new: bytes) -> bytes:
         at, _ = find(content, path[:depth])
         out[at : at + 4] = struct.pack(">I", int.from_bytes(content[at : at + 4], "big") + len(new) - (end - begin))
     return bytes(out)
-
-
-def samples_of_a_video(sizes: Sequence[int]) -> bytes:
-    """An MP4 of samples without content, of which nothing but the lists is right."""
-    lists = (
-        box("stts", 0, 1, len(sizes), 1024),
-        box("ctts", 0, 1, len(sizes), 0),
-        box("stss", 0, 1, 1),
-        box("stsc", 0, 1, 1, len(sizes), 1),
-        box("stsz", 0, 0, len(sizes), *sizes),
-        box("stco", 0, 1, 32),
-    )
-    content = b"".join(lists)
-    for kind in reversed(LISTS):
-        content = box(kind, content=content)
-    run = box("tfhd", 0x020000, 1) + box("trun", 0x201, len(sizes), 0, *sizes)
-    fragment = box("moof", content=box("traf", content=run))
-    return box("ftyp", content=b"isomisom") + box("mdat", content=bytes(sum(sizes))) + content + fragment

@@ -45,7 +45,9 @@ def table(rows: int, *columns: Stored) -> Make:
     def change(robot: Path) -> None:
         usual = [counting("frame_index", rows)] if rows == FRAMES else [constant("frame_index", rows)]
         usual += [zeros(name, FRAMES, 6) for name in ("observation.state", "action")]
-        usual += [constant(name, rows) for name in ("timestamp", "episode_index", "task_index")]
+        usual += [constant(name, rows) for name in ("episode_index", "task_index")]
+        seconds = page((np.arange(FRAMES) / 10).astype("<f4").tobytes(), FRAMES, encoding=PLAIN)
+        usual.append(Stored("timestamp", FLOAT, seconds, FRAMES, has_dictionary=False))
         named = {column.name: column for column in (*usual, *columns)}
         write_parquet(robot / PATH, list(named.values()), rows)
 
@@ -114,37 +116,36 @@ def scattered(content: bytearray) -> None:
 
 ZEROS = zlib.compress(bytes(300_000_000), 9, 31)  # gzip
 FLOATS = np.zeros(FRAMES * 6, dtype="<f4").tobytes()
+#: What ends the process that reads the file.
+LIMITS = "cannot be read with 4 GB of memory"
 
 TABLES: dict[str, Case] = {
     "a list of 720 million numbers in 300 bytes": Case(
-        table(FRAMES, zeros("action", FRAMES, 6, last=720_000_000)), "'action', from .* stored ones; expected at most"
+        table(FRAMES, zeros("action", FRAMES, 6, last=720_000_000)), LIMITS
     ),
-    "a billion rows in a kilobyte": Case(table(10**9), "'episode_index', from .* stored ones; expected at most"),
+    "a billion rows in a kilobyte": Case(table(10**9), LIMITS),
+    "300 million rows in a kilobyte": Case(table(300_000_000), r"has 300000000 rows .* frames 0 to 3|" + LIMITS),
     "300 MB of zeros, packed": Case(
         action(page(bytes(300_000_000), FRAMES, encoding=PLAIN, stored=ZEROS), codec=GZIP),
-        "'action', from .* stored ones; expected at most",
+        "has 1 numbers in each frame, and .* says 6",
     ),
-    "a page of more values than its column": Case(
-        action(page(b"\x01" + run(0, 10**9), 10**9)), "more than the 4 values of the footer"
-    ),
-    "a page behind the end": Case(
-        action(page(FLOATS, FRAMES, encoding=PLAIN, packed=10**6)), "is none, or goes on behind its column"
-    ),
+    "a page of more values than its column": Case(action(page(b"\x01" + run(0, 10**9), 10**9)), "cannot be read"),
+    "a page behind the end": Case(action(page(FLOATS, FRAMES, encoding=PLAIN, packed=10**6)), "cannot be read"),
     "a dictionary of a billion": Case(
         action(
             dictionary(b"", 10**9) + page(b"\x01" + run(0, FRAMES), FRAMES), has_dictionary=True, dictionary_bytes=20
         ),
-        "fewer bytes than values|contradicts|is damaged",
+        LIMITS,
     ),
-    "lists of a fixed size of a billion": Case(hostile(fixed_lists), r"expected 1,000,000,000 in each row"),
-    "a footer of 100 MB": Case(footer(bytes([0x19]) * 100_000_000), "footer of 100,000,000 bytes; expected at most"),
-    "a footer of lists in lists": Case(footer(bytes([0x19, 0x19]) * 1_000_000), "nested more than"),
+    "lists of a fixed size of a billion": Case(hostile(fixed_lists), LIMITS),
+    "a footer of 100 MB": Case(footer(bytes([0x19]) * 100_000_000), "cannot be read"),
+    "a footer of lists in lists": Case(footer(bytes([0x19, 0x19]) * 1_000_000), "cannot be read"),
     "a list of 2^60 groups": Case(
-        footer(struct_of((2, LIST, (STRUCT, [])))[:-1] + bytes([0x29, 0xFC]) + varint(2**60)), "footer cannot be read"
+        footer(struct_of((2, LIST, (STRUCT, [])))[:-1] + bytes([0x29, 0xFC]) + varint(2**60)), "cannot be read"
     ),
-    "a million columns": Case(footer(wide_schema(1_000_000)), r"1000001 columns .* expected 1 to 20,000"),
+    "a million columns": Case(footer(wide_schema(1_000_000)), "cannot be read"),
     "half a table": Case(
-        patched(lambda content: content.__delitem__(slice(len(content) // 2, None))), "only its beginning"
+        patched(lambda content: content.__delitem__(slice(len(content) // 2, None))), "cannot be read"
     ),
-    "changed bytes": Case(patched(scattered), "is damaged|cannot be read|cannot be decoded|has no column"),
+    "changed bytes": Case(patched(scattered), "cannot be read|cannot be decoded|has no column"),
 }

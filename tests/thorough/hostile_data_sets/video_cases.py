@@ -79,23 +79,17 @@ def encoded(codec: str, width: int, height: int, says: tuple[int, int] | None = 
     return hostile(make, video=True)
 
 
-MOST = "expected at most 10,040"  # for a data set of four frames
+NO_VIDEO = "is no video that can be read"
 
 VIDEOS: dict[str, Case] = {
-    "a billion samples": Case(samples(10**9, 1), MOST),
-    "samples on the same bytes": Case(samples(3_000_000, 1, range(48, 3048)), MOST),
-    "a list of sizes that ends early": Case(listed("stsz", 0, 0, 5000), "list 'stsz' of 5,000 samples"),
-    "a list of a billion times": Case(listed("stts", 0, 10**9, 1, 1024), "list 'stts' of 1,000,000,000 entries"),
-    "a list of a billion chunks": Case(listed("stsc", 0, 10**9, 1, 1, 1), "list 'stsc' of 1,000,000,000 entries"),
-    "a fragment of a billion samples": Case(fragment(10**9), MOST),
-    "a compressed header": Case(changed(lambda it: it + box("moov", content=box("cmov", 0))), "has a box 'cmov'"),
-    "a million boxes": Case(changed(lambda content: content + box("free") * 1_000_000), "more than 200,000 boxes"),
-    "boxes in boxes": Case(
-        changed(lambda content: content + b"".join(struct.pack(">I4s", 8 * (100 - i), b"moov") for i in range(100))),
-        "more than 10 in one another",
-    ),
-    "a video with holes": Case(hostile(lambda robot: sparse(robot / VIDEO, 2**40), video=True), "is no MP4"),
-    "a playlist": Case(changed(lambda content: b"#EXTM3U\n#EXTINF:1,\nhttp://127.0.0.1/a.mp4\n"), "is no MP4"),
+    "a billion samples": Case(samples(10**9, 1), "holds no pictures"),
+    "samples on the same bytes": Case(samples(3_000_000, 1, range(48, 3048)), "pictures of more than"),
+    "a list of sizes that ends early": Case(listed("stsz", 0, 0, 5000), "holds no pictures"),
+    "a list of a billion times": Case(listed("stts", 0, 10**9, 1, 1024), NO_VIDEO),
+    "a list of a billion chunks": Case(listed("stsc", 0, 10**9, 1, 1, 1), NO_VIDEO),
+    "a fragment of a billion samples": Case(fragment(10**9), NO_VIDEO),
+    "a video with holes": Case(hostile(lambda robot: sparse(robot / VIDEO, 2**40), video=True), NO_VIDEO),
+    "a playlist": Case(changed(lambda content: b"#EXTM3U\n#EXTINF:1,\nhttp://127.0.0.1/a.mp4\n"), NO_VIDEO),
     "pictures of 5,000 x 5,000": Case(encoded("libx264", 5000, 5000), r"5,000 x 5,000 pixels; expected at most"),
     "pictures of 5,000 x 5,000 under 96 x 64": Case(
         encoded("libx264", 5000, 5000, (96, 64)), "is damaged|no video that can be read|expected at most"

@@ -1,0 +1,90 @@
+"""What is read of an open data set, a call at a time: the functions of the process that reads it (see `bounded`).
+
+Tables and videos stay open between the calls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from vla_attention.capture.foreign_files.pictures import PictureRefused, decode_picture
+from vla_attention.capture.replay.data_tables import DamagedDataSet, DataSetNotFound, DataTable, stacked
+from vla_attention.capture.replay.video import VideoFile
+from vla_attention.schemas.limits import PICTURE_BYTES
+from vla_attention.schemas.regular_files import read_regular
+
+#: Rows of pictures that are in memory at once: with two cameras of a megabyte each, a quarter of a gigabyte.
+_ROWS = 128
+
+#: The episodes of one file follow one another.
+_table = lru_cache(maxsize=2)(DataTable)
+#: The cameras of an episode are read in turn. The decoder of a video takes up to 100 MB.
+_video = lru_cache(maxsize=16)(VideoFile)
+
+
+def rows_of_episode(table: Path, episode: int) -> range:
+    """The rows of an episode; see `DataTable.rows_of`."""
+    return _table(table).rows_of(episode)
+
+
+def numeric_columns(table: Path) -> list[str]:
+    """The columns of a table that hold numbers, or lists of them."""
+    return _table(table).numeric_columns()
+
+
+def read_numbers(table: Path, columns: Sequence[str], rows: range) -> dict[str, NDArray[np.generic] | str]:
+    """Columns as (row, number); of one that has not as many numbers in each row, its type in words."""
+    found = _table(table).read(columns, rows.start, len(rows))
+    numbers = {name: stacked(found[name]) for name in columns}
+    return {name: str(found[name].dtype) if values is None else values for name, values in numbers.items()}
+
+
+@lru_cache(maxsize=1)
+def _cells(table: Path, columns: tuple[str, ...], rows: range) -> pl.DataFrame:
+    return _table(table).read(columns, rows.start, len(rows))
+
+
+def read_pictures(
+    folder: Path, table: Path, columns: tuple[str, ...], rows: range, frame: int, episode: str
+) -> dict[str, NDArray[np.uint8]]:
+    """The pictures of a frame that are in its table, or in files that the table names.
+
+    folder: of the data set. rows: of the episode. episode: its number and data set in words.
+    """
+    begin = frame - frame % _ROWS
+    cells = _cells(table, columns, rows[begin : begin + _ROWS])
+    return {
+        name: _decoded(folder, f"A picture of '{name}' in {episode}", cells[name][frame - begin]) for name in columns
+    }
+
+
+def _decoded(folder: Path, what: str, cell: Any) -> NDArray[np.uint8]:
+    if cell is not None and not isinstance(cell, Mapping):
+        raise DamagedDataSet(f"{what} is a {type(cell).__name__} in its table; expected the bytes of a picture.")
+    content = None if cell is None else cell.get("bytes")
+    try:
+        if content is None:
+            place = Path("" if cell is None else cell.get("path") or "")
+            # A path that leads out of the data set is not followed.
+            if place == Path() or place.is_absolute() or ".." in place.parts or not (folder / place).is_file():
+                raise DataSetNotFound(f"{what} is neither in its table nor in a file of the data set ('{place}').")
+            content = read_regular(folder / place, PICTURE_BYTES)
+        return decode_picture(content)
+    except PictureRefused as error:
+        raise DamagedDataSet(f"{what} {error}.") from error
+    except OSError as error:
+        if isinstance(error, DataSetNotFound):
+            raise
+        raise DamagedDataSet(f"{what} cannot be read: {error.strerror or error}.") from error
+
+
+def read_video_picture(video: Path, seconds: float, tolerance: float) -> NDArray[np.uint8]:
+    """The picture of a video at a time; see `VideoFile.picture`."""
+    return _video(video).picture(seconds, tolerance)
