@@ -56,8 +56,11 @@ def cost_table(rounds: int, number: int, threads: int) -> Table:
     from vla_attention.capture.effects.arguments import EffectSettings
     from vla_attention.capture.effects.conditions import UNCHANGED, planned_effects
     from vla_attention.capture.effects.measurement import EffectMeasurement, siblings_of
+    from vla_attention.capture.engine.call import Caller
+    from vla_attention.capture.interventions.run_changes import RunChanges
     from vla_attention.capture.policies.families import default_family
-    from vla_attention.capture.rerun.stored_calls import Repeater, read_calls
+    from vla_attention.capture.rerun.stored_calls import read_calls
+    from vla_attention.schemas.interventions import Interventions
     from vla_attention.schemas.stores.reader import open_store
 
     torch.set_num_threads(threads)
@@ -68,12 +71,13 @@ def cost_table(rounds: int, number: int, threads: int) -> Table:
     tasks = {episode.attributes.task_id: episode.attributes for episode in store.episodes}
     instructions = {number: task.instruction for number, task in tasks.items()}
     families = siblings_of((number, task.instruction, task.task_family) for number, task in tasks.items())
-    repeater = Repeater(policy, store.attributes.recording, instructions=instructions)
+    caller = Caller(policy, store.attributes.recording, RunChanges(Interventions(), instructions))
     calls = []
     for episode in store.episodes[:number]:
         stored = read_calls(episode)
-        given, seed = repeater.prepare(stored, 1), repeater.noise_seed(stored, 1)
-        calls.append((given, seed, policy.act(given, seed), stored.context(1, instructions)))
+        call = stored.again(caller, 1)
+        given, seed = call.policy_input, call.noise_seed
+        calls.append((given, seed, policy.act(given, seed), call.context))
 
     def measure(kind: str):
         items, readers, steps, kept = KINDS[kind]

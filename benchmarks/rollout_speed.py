@@ -31,10 +31,12 @@ from benchmarks.measurement import Table, fix_threads, in_turn, measured, ratios
 fix_threads(1)
 os.environ.setdefault("MUJOCO_GL", "egl")
 
-from vla_attention.capture.rollout import background_writing, episode, episode_loop, pipeline  # noqa: E402
-
 from vla_attention.capture.commands.arguments import build_parser  # noqa: E402
+from vla_attention.capture.engine import loop as loops  # noqa: E402
+from vla_attention.capture.engine.call import Caller  # noqa: E402
 from vla_attention.capture.engine.simulation import Simulation  # noqa: E402
+from vla_attention.capture.engine.simulators import SimulatedEpisode, SimulatorProcess  # noqa: E402
+from vla_attention.capture.engine.writing import EpisodeInBackground, WritingThread  # noqa: E402
 from vla_attention.capture.machine.device import load_torch  # noqa: E402
 from vla_attention.capture.policies.policy import Policy  # noqa: E402
 from vla_attention.capture.run import capture_run  # noqa: E402
@@ -76,18 +78,16 @@ def processor_seconds() -> float:
     return time.process_time() + sum(int(stat[11]) + int(stat[12]) for stat in stats) / os.sysconf("SC_CLK_TCK")
 
 
-class NotWritten(background_writing.EpisodeInBackground):
+class NotWritten(EpisodeInBackground):
     """Drops its replans; its commit gives a folder that holds nothing."""
-
-    folder = Path(tempfile.gettempdir())
 
     def append(self, record: Any) -> None:
         return
 
-    def commit(self, success: bool, num_steps: int) -> None:
+    def commit(self, outcome: Any) -> None:
         name = f"task{self.start.task_id:03d}_episode{self.start.episode_index:03d}"
-        committed = background_writing.Committed(self, Path(name), 0)
-        self.writing.put(lambda: self.writing.done(committed), 0)
+        self.committed = Path(tempfile.gettempdir()) / name, 0
+        self.thread.put(lambda: None)
 
 
 def measure(policy: Policy, arguments: argparse.Namespace, num_envs: int, written: bool, peak_mb: list[float]) -> Run:
@@ -99,41 +99,41 @@ def measure(policy: Policy, arguments: argparse.Namespace, num_envs: int, writte
         words += ["--output", str(Path(folder) / "run.zarr"), "--num-envs", str(num_envs)]
         settings = run_settings(build_parser().parse_args(words))
         commits: list[tuple[float, float]] = []
-        note, made = episode_loop.EpisodeLoop.note_commit, pipeline.BackgroundWriting.episode
+        note, made = loops.EpisodeLoop._note_commit, WritingThread.episode
 
-        def note_commit(loop: Any, result: Any) -> None:
+        def note_commit(loop: Any, *given: Any) -> None:
             commits.append((time.monotonic(), processor_seconds()))
-            note(loop, result)
+            note(loop, *given)
 
-        close = pipeline.SimulatorProcess.close
+        close = SimulatorProcess.close
 
         def close_measured(process: Any) -> None:
             status = Path(f"/proc/{process.number}/status").read_text()
             peak_mb.append(float(status.partition("VmHWM:")[2].split()[0]) / 1024)
             close(process)
 
-        episode_loop.EpisodeLoop.note_commit = note_commit  # type: ignore[method-assign]
-        pipeline.SimulatorProcess.close = close_measured  # type: ignore[method-assign]
+        loops.EpisodeLoop._note_commit = note_commit  # type: ignore[method-assign]
+        SimulatorProcess.close = close_measured  # type: ignore[method-assign]
         if not written:
-            pipeline.BackgroundWriting.episode = lambda self, *given: NotWritten(self, *given)  # type: ignore
+            WritingThread.episode = lambda self, *given: NotWritten(self, *given)  # type: ignore
         own = {(Simulation, name): getattr(Simulation, name) for name in ("begin", "wait", "advance")} | {
             (EpisodeWriter, name): getattr(EpisodeWriter, name) for name in ("append", "commit")
         }
-        call, prepare = episode.record_calls, episode.EpisodeRecording.prepare
+        call, prepare = Caller.make, SimulatedEpisode._prepared
         if num_envs == 1:
             for (kind, name), method in own.items():
                 setattr(kind, name, parts.timed("simulation" if kind is Simulation else "writing", method))
-            episode.record_calls = parts.timed("policy", call)
-            episode.EpisodeRecording.prepare = parts.timed("policy", prepare)  # type: ignore[method-assign]
+            Caller.make = parts.timed("policy", call)  # type: ignore[method-assign]
+            SimulatedEpisode._prepared = parts.timed("policy", prepare)  # type: ignore[method-assign]
         try:
             capture_run.run_capture(settings, policy, "cpu")
         finally:
-            pipeline.SimulatorProcess.close = close  # type: ignore[method-assign]
-            episode_loop.EpisodeLoop.note_commit = note  # type: ignore[method-assign]
-            pipeline.BackgroundWriting.episode = made  # type: ignore[method-assign]
+            SimulatorProcess.close = close  # type: ignore[method-assign]
+            loops.EpisodeLoop._note_commit = note  # type: ignore[method-assign]
+            WritingThread.episode = made  # type: ignore[method-assign]
             for (kind, name), method in own.items():
                 setattr(kind, name, method)
-            episode.record_calls, episode.EpisodeRecording.prepare = call, prepare  # type: ignore[method-assign]
+            Caller.make, SimulatedEpisode._prepared = call, prepare  # type: ignore[method-assign]
     num_counted = len(commits) - num_envs
     seconds, core_seconds = (last - first for first, last in zip(commits[num_envs - 1], commits[-1], strict=True))
     shares = {part: each / len(commits) for part, each in parts.seconds.items()}

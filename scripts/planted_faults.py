@@ -138,9 +138,9 @@ FAULTS = (
     ),
     Fault(
         "swallowed exception: an episode that fails is left out",
-        "capture/rollout/episode_loop.py",
-        "            except EPISODE_FAULTS as error:\n                again = self.note_fault(",
-        "            except Exception as error:\n                again = not (",
+        "capture/engine/loop.py",
+        "(StoreExists, *EPISODE_FAULTS) as error:\n            self._fail(running, error)",
+        "Exception as error:\n            self._refused(running, error)",
         ("tests/capture/engine", "tests/capture/rerun"),
     ),
     Fault(
@@ -190,11 +190,11 @@ FAULTS = (
         "capture/policies/pi/policy.py",
         "torch.cat([each.tensors[name] for each in policy_inputs])",
         'torch.cat([each.tensors[name] for each in policy_inputs]).roll(int(name == "tokens"), 0)',
-        ("tests/capture/engine/test_pipeline.py",),
+        ("tests/capture/engine/test_simulators.py",),
     ),
     Fault(
         "resumed twice: a committed episode is recorded again",
-        "capture/rollout/episode_loop.py",
+        "capture/engine/loop.py",
         "return self.store.has(job.task.task_id, job.episode_index)",
         "return False",
         ("tests/capture/engine", "tests/capture/rerun"),
