@@ -88,8 +88,6 @@ ANSWER_WITHIN_S = 60.0
 #: Bytes a second that an answer must have on average, beyond its first `ANSWER_WITHIN_S`. A line of 1 Mbit/s, shared by
 #: eight requests, gives each 15,000. A server that sends a byte a second is never silent.
 SLOWEST_BYTES_A_SECOND = 10_000
-#: Bytes of a web page that lists a folder. Servers write about 120 an entry, so these are 100,000 episodes.
-LISTING_BYTES = 16_000_000
 #: Names in a folder that is listed elsewhere, or files below it.
 LISTED_NAMES = 1_000_000
 

@@ -1,6 +1,8 @@
 """Files that are elsewhere, through fsspec (the extra `remote`).
 
-Only the bytes that are asked for are fetched, and nothing is kept: `vla-attention store copy` brings a store here.
+Only the bytes that are asked for are fetched, and nothing is kept: `vla-attention store copy` brings a store here. An
+answer that is longer than what was asked for, or that does not end in time, is an error; `sealed_files.py` notices one
+that is shorter or another.
 `hf://datasets/ORG/NAME/PATH` is read by the addresses under which the hub serves files, so that a part of a file is one
 request; fsspec's own file system of the hub asks for a description of the file each time.
 """
@@ -10,19 +12,29 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Sequence
+from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
+from threading import Thread
 from typing import Any
 
 from vla_attention.schemas.errors import BadArgument, UserError
-from vla_attention.schemas.limits import ANSWER_WITHIN_S, ROOT_BYTES, SLOWEST_BYTES_A_SECOND, WHOLE_FILE_BYTES
-from vla_attention.schemas.stores.bounded_fetch import TooSlow, asked_within, fetched, names_in
+from vla_attention.schemas.limits import (
+    ANSWER_WITHIN_S,
+    LISTED_NAMES,
+    ROOT_BYTES,
+    SLOWEST_BYTES_A_SECOND,
+    WHOLE_FILE_BYTES,
+)
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder, Memory, copy_into, split
 from vla_attention.schemas.stores.store_url import HUB_PROTOCOL, HubAddress, StorePlace, StoreUrl, stated_commit
 
 #: Protocols whose addresses may be `//name:password@host`; elsewhere @ stands before a revision.
 _WITH_PASSWORDS = ("http", "https", "ftp", "sftp", "ssh", "smb", "webdav")
+
+#: Compressed answers to a range are ranges of compressed files.
+_AS_IT_IS = {"Accept-Encoding": "identity"}
 
 
 class RemoteFailure(UserError, OSError):
@@ -70,10 +82,9 @@ def at_commit(place: StorePlace) -> StorePlace:
     address = HubAddress.of(place.url)
     if address.is_commit:
         return place
-    files, _ = _file_system(place.url)
     asked = address.revision_address(_hub()[0])
     try:
-        answer = _asked(place.url, lambda: fetched(files, asked, None, None, ROOT_BYTES, ANSWER_WITHIN_S))
+        answer = _asked(place.url, "cat_file", asked, most=ROOT_BYTES)
     except FileNotFoundError:
         raise RemoteFailure(
             f"{place.url} cannot be read: the hub knows no revision {address.revision} of {address.repository}. "
@@ -113,18 +124,21 @@ class RemoteFolder:
 
     def size(self, file: str) -> int:
         """See `ByteSource`."""
-        files, path = _file_system(self.url)
-        size = _asked(self.url, lambda: asked_within(files, "size", f"{path}/{file}", seconds=ANSWER_WITHIN_S))
-        return int(size or 0)
+        return int(_asked(self.url, "size", f"{_file_system(self.url)[1]}/{file}") or 0)
 
     def names(self, folder: str) -> list[str]:
-        """The names in a folder, where the server lists them."""
+        """The names in a folder; web servers list none."""
         files, path = _hub_listing(self.url) if self.url.startswith(HUB_PROTOCOL) else _file_system(self.url)
-        return sorted(_asked(self.url, lambda: names_in(files, f"{path}/{folder}", ANSWER_WITHIN_S)))
+        names = _asked(self.url, "ls", f"{path}/{folder}", files=files, detail=False)
+        if len(names) > LISTED_NAMES:
+            raise RemoteFailure(f"{self.url} cannot be read: its list has more than {LISTED_NAMES:,} names.")
+        return sorted(str(name).rstrip("/").rpartition("/")[2] for name in names)
 
     def _fetch(self, file: str, start: int | None, end: int | None, most: int) -> bytes:
-        files, path = _file_system(self.url)
-        content: bytes = _asked(self.url, lambda: fetched(files, f"{path}/{file}", start, end, most, ANSWER_WITHIN_S))
+        # Of a whole file, one byte more than it may have: one of any size would be read into memory.
+        first, last = (0, most + 1) if start is None else (start, end)
+        path = f"{_file_system(self.url)[1]}/{file}"
+        content: bytes = _asked(self.url, "cat_file", path, most=most, start=first, end=last)
         if len(content) <= most:
             return content
         if start is not None:
@@ -153,11 +167,10 @@ def _file_system_of(url: str, _process: int, *_hub_variables: str | None) -> tup
     try:
         if url.startswith(HUB_PROTOCOL):
             endpoint, headers = _hub()
-            options = {"headers": headers, "timeout": _time_limits()}
+            options = {"headers": {**headers, **_AS_IT_IS}, "timeout": _time_limits()}
             return fsspec.filesystem("https", client_kwargs=options), HubAddress.of(url).file_address(endpoint)
-        files, path = url_to_fs(
-            url, **({"client_kwargs": {"timeout": _time_limits()}} if is_web(StoreUrl(url)) else {})
-        )
+        options = {"client_kwargs": {"headers": _AS_IT_IS, "timeout": _time_limits()}}
+        files, path = url_to_fs(url, **(options if is_web(StoreUrl(url)) else {}))
     except ImportError as error:
         raise _missing(url, error) from None
     except ValueError as error:
@@ -200,23 +213,18 @@ def _missing(url: str, error: ImportError) -> RemoteFailure:
     )
 
 
-def _asked(url: str, ask: Any) -> Any:
-    """What a file system answers; what it raises in its own classes becomes an `OSError` with the address."""
+def _asked(url: str, method: str, *given: Any, files: Any = None, most: int = 0, **named: Any) -> Any:
+    """What a method of a file system answers within its time; what it raises becomes an `OSError` with the address.
+
+    files: the file system, if it is not that of the address. most: bytes that are expected, at most.
+    """
+    files, seconds = files or _file_system(url)[0], ANSWER_WITHIN_S + most / SLOWEST_BYTES_A_SECOND
     try:
-        return ask()
-    except FileNotFoundError:
+        return _within(seconds, files, method, given, named)
+    except (FileNotFoundError, NotImplementedError):
         raise
-    except NotImplementedError:
-        raise
-    except TooSlow as slow:
-        if slow.received:
-            raise RemoteFailure(
-                f"{url} cannot be read: its server sent {slow.received:,} bytes in {slow.seconds:.0f} s; expected at "
-                f"least {SLOWEST_BYTES_A_SECOND:,} a second. Try again later, or from elsewhere."
-            ) from None
-        raise RemoteFailure(f"{url} cannot be read: its server sent nothing for {slow.seconds:.1f} s.") from None
     except TimeoutError:
-        raise RemoteFailure(f"{url} cannot be read: its server sent nothing for {ANSWER_WITHIN_S:g} s.") from None
+        raise RemoteFailure(f"{url} cannot be read: its server gave no whole answer within {seconds:.0f} s.") from None
     except OSError as error:
         reason = error.strerror or str(error).partition("\n")[0]
         raise RemoteFailure(f"{url} cannot be read: {reason}.") from None
@@ -224,3 +232,22 @@ def _asked(url: str, ask: Any) -> Any:
         if getattr(error, "status", None) == 416:  # a part beyond the file's end
             return b""
         raise RemoteFailure(f"{url} cannot be read: {type(error).__name__} {error}.".rstrip(". ") + ".") from None
+
+
+def _within(seconds: float, files: Any, method: str, given: tuple[Any, ...], named: dict[str, Any]) -> Any:
+    """Call a method; `TimeoutError` when it has given nothing after so many seconds."""
+    if getattr(files, "async_impl", False):
+        from fsspec.asyn import sync
+
+        # Ends the request, too, which goes on in a thread otherwise.
+        return sync(files.loop, getattr(files, f"_{method}"), *given, timeout=seconds, **named)
+    answer: Future[Any] = Future()
+
+    def ask() -> None:
+        try:
+            answer.set_result(getattr(files, method)(*given, **named))
+        except BaseException as error:
+            answer.set_exception(error)
+
+    Thread(target=ask, name="asks elsewhere", daemon=True).start()  # nobody waits for one that hangs
+    return answer.result(seconds)

@@ -114,7 +114,7 @@ def list_episodes(path: StorePlace) -> tuple[list[StorePlace], list[str]]:
     """
     if isinstance(path, StoreUrl):
         try:
-            names = (listed_names(path) if is_web(path) else []) or RemoteFolder(path.url).names(EPISODES_GROUP)
+            names = listed_names(path) if is_web(path) else RemoteFolder(path.url).names(EPISODES_GROUP)
         except (OSError, NotImplementedError) as error:
             raise StoreError(
                 f"The episodes of {path} cannot be listed ({str(error).rstrip('.')}), and it has no {NAMES_FILE}; "
@@ -153,15 +153,14 @@ def names_document(names: Sequence[str]) -> bytes:
 
 
 def listed_names(path: StoreUrl) -> list[str]:
-    """The names that a copy's `NAMES_FILE` lists, for web servers, which list nothing; empty where there is none.
+    """The names that a copy's `NAMES_FILE` lists, for web servers, which list nothing.
 
     Raises:
         StoreError: the file says something else.
+        OSError: there is none.
     """
     try:
         names = decode_json(source_of(path).whole(NAMES_FILE, most=DOCUMENT_BYTES))
-    except FileNotFoundError:
-        return []
     except ValueError as error:
         raise StoreError(f"The store {path} cannot be read: its {NAMES_FILE}: {error}.") from None
     if not isinstance(names, list) or not all(isinstance(name, str) and is_episode_name(name) for name in names):

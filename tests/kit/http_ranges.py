@@ -27,7 +27,6 @@ class Served:
         announce: whether an answer states how long it is without `change`, so that one cut short breaks off.
         status: answers every request with this one.
         redirect: a server to which every request is sent on.
-        pieces: what is sent of a path instead of its file, piece after piece, as a web page of unknown length.
         authorizations: what requests gave to say who asks; "" for nothing.
     """
 
@@ -39,7 +38,6 @@ class Served:
     announce: bool = False
     status: int = 200
     redirect: str = ""
-    pieces: Callable[[str], Iterator[bytes] | None] = lambda path: None
     authorizations: set[str] = field(default_factory=set)
 
     def forget(self) -> None:
@@ -66,9 +64,6 @@ def serve(folder: Path) -> Iterator[Served]:
             served.authorizations.add(self.headers.get("Authorization") or "")
             if served.redirect:
                 self.answer(302, b"", path, {"Location": f"{served.redirect}/{path}"})
-                return
-            if (pieces := served.pieces(path)) is not None:
-                self.stream(path, pieces)
                 return
             file = folder / path
             if served.status != 200 or not file.is_file():
@@ -103,16 +98,6 @@ def serve(folder: Path) -> Iterator[Served]:
                 self.wfile.write(changed)
             if served.announce and len(changed) != len(content):
                 self.close_connection = True
-
-        def stream(self, path: str, pieces: Iterator[bytes]) -> None:
-            self.send_response(200)
-            self.send_header("Content-Type", "text/html")
-            self.send_header("Connection", "close")
-            self.end_headers()
-            for piece in pieces:
-                self.wfile.write(piece)
-                self.wfile.flush()
-                served.sent[path] = served.sent.get(path, 0) + len(piece)
 
         def log_message(self, *_: Any) -> None:
             """Nothing is printed."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -18,6 +19,7 @@ from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.store.copying import copy_store
 from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.stores import remote_source
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import StoreError
 from vla_attention.schemas.stores.store_url import StoreUrl, store_place
@@ -136,6 +138,18 @@ def test_an_answer_of_another_place_is_never_a_number(server, copied):
     whole = {f"a.zarr/{file.relative_to(copied)}": file.read_bytes() for file in copied.rglob("c.*")}
     server.change = lambda path, content: whole[path][: len(content)] if path in whole else content
     assert read_all(f"{server.url}/a.zarr", copied)
+
+
+def test_a_server_that_does_not_answer_is_a_sentence(server, monkeypatch):
+    monkeypatch.setattr(remote_source, "ANSWER_WITHIN_S", 0.2)
+    monkeypatch.setattr(remote_source, "SLOWEST_BYTES_A_SECOND", 10**9)
+    ends = threading.Event()
+    server.change = lambda path, content: content if ends.wait(60) else b""
+    try:
+        with pytest.raises(UserError, match="gave no whole answer within 0 s"):
+            open_store(f"{server.url}/a.zarr")
+    finally:
+        ends.set()
 
 
 def test_a_server_without_ranges_is_refused_with_a_sentence(server, copied, capsys):

@@ -105,12 +105,19 @@ def point_main_at(hub: Path, commit: str) -> None:
 
 
 def list_commit(hub: Path, commit: str) -> None:
-    """What the hub says of a commit: that it is one, and the files of its store's group of episodes."""
+    """What the hub says of a commit: that it is one, and what its store's group of episodes has."""
     (hub / "api/datasets/org/name/revision" / commit).write_text(json.dumps({"id": "org/name", "sha": commit}))
     base, lists = hub / f"datasets/org/name/resolve/{commit}", hub / f"api/datasets/org/name/tree/{commit}/runs/a.zarr"
-    files = [file for file in sorted((base / "runs/a.zarr/episodes").rglob("*")) if file.is_file()]
     lists.mkdir(parents=True)
-    entries = [{"type": "file", "path": str(file.relative_to(base)), "size": 1, "oid": "0" * 40} for file in files]
+    entries = [
+        {
+            "type": "directory" if path.is_dir() else "file",
+            "path": str(path.relative_to(base)),
+            "size": 1,
+            "oid": "0" * 40,
+        }
+        for path in sorted((base / "runs/a.zarr/episodes").iterdir())
+    ]
     (lists / "episodes").write_text(json.dumps(entries))
 
 
