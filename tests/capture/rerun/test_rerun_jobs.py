@@ -27,18 +27,18 @@ def status(store: Path, capsys: pytest.CaptureFixture[str]) -> dict:
 
 def test_sigterm_drops_the_episode_in_progress(pi_store, tmp_path, monkeypatch, capsys):
     store = tmp_path / "again.zarr"
-    checks = iter(range(1_000_000))
 
     def check(termination: Termination) -> None:
-        if len(list((store / "episodes").glob("task*"))) == 1 and next(checks) == 4:
+        if any((store / "episodes").glob("task*")):
             raise Terminated
 
     monkeypatch.setattr(Termination, "check", check)
     assert main(["rerun", str(pi_store), "--output", str(store), "--check", "0"]) == EXIT_TERMINATED
     said = capsys.readouterr().out
-    assert "Stopped by SIGTERM: dropped task00" in said
-    committed = names(store)  # the calls of the next ones are made while the first one is written
-    assert 1 <= len(committed) < 4
+    assert "Stopped by SIGTERM: " in said
+    # Calls of the next episodes are made while the first one is written, and one that is being committed is whole.
+    committed = names(store)
+    assert committed == EPISODES[: len(committed)] != []
     assert f"; {4 - len(committed)} of this process's 4 are missing." in said
     assert [record.state for record in read_logs(store)] == ["stopped"]
     monkeypatch.undo()
