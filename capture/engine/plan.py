@@ -5,15 +5,20 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 from typing import Protocol as Interface
 
 from vla_attention.capture.effects.arguments import EffectSettings, effect_settings
+from vla_attention.capture.engine.progress import say
+from vla_attention.capture.policies.identity import announcement
+from vla_attention.capture.store.disk_estimate import DiskEstimate, describe
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.layers import select_layers
 from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.precision import DEFAULT_MANTISSA_BITS, parse_precision
+from vla_attention.schemas.stores.damaged_episodes import DamagedEpisode
 from vla_attention.schemas.stores.store_format import (
     FORMAT_NAME,
     STORE_VERSION,
@@ -163,3 +168,42 @@ def root_attributes(
         rerun_of=rerun_of,
         data_set=data_set,
     )
+
+
+_QUERIES = {"mean": "the mean over", "steps": "the action steps' means over", "all": "each of"}
+
+
+def announce(
+    attributes: RootAttributes,
+    source: Sequence[str],
+    bound: DiskEstimate,
+    store: Path,
+    wanted: int,
+    damaged: Sequence[DamagedEpisode],
+) -> None:
+    """Print what a run records, the disk that it can take, and what its store has already.
+
+    source: lines on where the policy calls come from. bound: of the episodes that are missing. wanted: number of the
+    episodes that were asked for. damaged: those that are in the store and cannot be used.
+    """
+    recording, todo = attributes.recording, bound.num_episodes
+    lines = [*announcement(attributes.policy), *source]
+    if not attributes.interventions.is_none:
+        lines.append(f"Interventions: {attributes.interventions.describe()}.")
+    lines.append(
+        f"Recording {len(recording.layers)} layers, denoise steps {listing(recording.denoise_steps)}, "
+        f"{len(recording.heads)} heads, {_QUERIES[recording.queries]} {recording.num_action_queries} action queries, "
+        f"{', '.join(str(site.num_keys) for site in attributes.sites)} keys."
+    )
+    if recording.effects is not None:
+        from vla_attention.capture.effects.conditions import describe_effects
+
+        lines.append(describe_effects(recording.effects))
+    lines.append(describe(bound, store))
+    if todo < wanted:
+        of_damaged = f" and {len(damaged)} damaged" if damaged else ""
+        complete = wanted - todo - len(damaged)
+        lines.append(f"{complete} of {wanted} episodes are complete already{of_damaged}; {todo} to run.")
+    lines += [f"Not recorded again without vla-attention capture verify --repair: {one.describe()}" for one in damaged]
+    for line in lines:
+        say(line)

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.effects.arguments import effect_settings
-from vla_attention.capture.effects.conditions import describe_effects
 from vla_attention.capture.effects.mean_pictures import pictures_of
 from vla_attention.capture.effects.measurement import measurement_of
 from vla_attention.capture.engine.call import Caller, PolicyCall
@@ -29,7 +28,7 @@ from vla_attention.capture.policies.robot import Robot
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, DataSetFrame, LeRobotDataset
 from vla_attention.capture.replay.replay_plan import (
     ReplayPlan,
-    announce,
+    announce_replay,
     columns_of,
     joined,
     record_episodes,
@@ -141,15 +140,13 @@ def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: 
         data_set=plan.source(columns_of(robot.cameras, robot.state, robot.actions)),
     )
     store = open_run(plan.store, attributes, plan.mode)
-    todo = announce(plan, attributes, policy.action_horizon, _picture_sizes(plan.data, policy))
+    todo = announce_replay(plan, attributes, policy.action_horizon, _picture_sizes(plan.data, policy))
     masked = [camera for camera in policy.sites[0].cameras if camera not in robot.cameras]
     if masked:
         say(f"Black and masked: {listing(masked)}.")
     # A data set knows no families of tasks, so there are no words to exchange.
     pictures = pictures_of(effect_settings(arguments), policy, attributes.protocol.suite)
     effects = measurement_of(recording.effects, policy, [], say, pictures)
-    if recording.effects is not None:
-        say(describe_effects(recording.effects))
     caller = Caller(policy, recording, effects=effects)
     source = Frames(policy, caller, plan, every, attributes.provenance)
     return record_episodes(plan, store, todo, every, source, caller)

@@ -22,7 +22,7 @@ from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode
 from vla_attention.capture.replay.policy_file import ReplayPolicy
 from vla_attention.capture.replay.replay_plan import (
     ReplayPlan,
-    announce,
+    announce_replay,
     columns_of,
     joined,
     record_episodes,
@@ -168,7 +168,7 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
     store = RunStore(plan.store, run.attributes)
     run.locks = store.locks
     with run:
-        todo = announce(plan, run.attributes, layout.action_horizon, sizes)
+        todo = announce_replay(plan, run.attributes, layout.action_horizon, sizes)
         seed = plan.seed if interventions.noise is None else interventions.noise.seed
         source = FramesForFile(given, run, plan, every, seed, cameras, state, actions)
         added = record_episodes(plan, store, todo, every, source, None)

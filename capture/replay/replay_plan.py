@@ -15,18 +15,17 @@ from numpy.typing import NDArray
 from vla_attention.capture.engine.call import Caller
 from vla_attention.capture.engine.faults import Faults
 from vla_attention.capture.engine.loop import EpisodeLoop
-from vla_attention.capture.engine.progress import say
+from vla_attention.capture.engine.plan import announce
 from vla_attention.capture.engine.source import EpisodeJob, Source, plan_of
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Termination
-from vla_attention.capture.policies.identity import announcement
 from vla_attention.capture.policies.robot import RobotData, read_camera_choices
 from vla_attention.capture.replay.data_set_files import INDEX_COLUMNS
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, LeRobotDataset, open_dataset
 from vla_attention.capture.replay.video import import_av
-from vla_attention.capture.store.disk_estimate import describe, estimate_disk
+from vla_attention.capture.store.disk_estimate import estimate_disk
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, refuse_recorded
-from vla_attention.schemas.errors import BadArgument, listing, plural
+from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.damaged_episodes import find_damaged
@@ -164,42 +163,29 @@ def columns_of(cameras: Mapping[str, str], state: Sequence[str], actions: Sequen
     return named | {"state": ", ".join(state) or "none", "actions": ", ".join(actions) or "none"}
 
 
-def announce(
+def announce_replay(
     plan: ReplayPlan, attributes: RootAttributes, horizon: int, picture_sizes: Sequence[int]
 ) -> tuple[int, ...]:
     """Print what will be recorded and how much disk it can take; returns the episodes that the store lacks.
 
     horizon: actions of a policy call; 0 where it is not known. picture_sizes: bytes of the pictures of a call.
     """
-    identity, recording, info = attributes.policy, attributes.recording, plan.data.info
-    every = attributes.protocol.replan_steps
-    source = attributes.data_set
+    info, every, source = plan.data.info, attributes.protocol.replan_steps, attributes.data_set
     stored = sorted(path.name for path in episode_folders(plan.store)) if plan.store.exists() else []
     done = {parse_episode_name(name)[1] for name in stored}
     todo = tuple(index for index in plan.wanted if index not in done)
-    for line in announcement(identity):
-        say(line)
-    say(
+    calls = [plan.calls(index, every) for index in todo]
+    lines = [
         f"Data set: {plan.data.name}, LeRobotDataset {info.version}, {plural(len(info.episodes), 'episode')} of "
         f"{plural(len(info.tasks), 'task')} at {info.fps:g} frames per second, robot {info.robot_type}."
-    )
+    ]
     if source is not None:
-        say(f"Columns: {'; '.join(f'{what} = {column}' for what, column in source.columns.items())}.")
-    if not attributes.interventions.is_none:
-        say(f"Interventions: {attributes.interventions.describe()}.")
-    calls = [plan.calls(index, every) for index in todo]
+        lines.append(f"Columns: {'; '.join(f'{what} = {column}' for what, column in source.columns.items())}.")
     of_actions = f", of {horizon} actions each" if horizon else ""
-    say(f"Policy calls: {sum(calls)}, every {every} frames ({every / info.fps:.3g} s){of_actions}.")
-    say(
-        f"Recording {len(recording.layers)} layers, denoise steps {listing(recording.denoise_steps)}, "
-        f"{len(recording.heads)} heads, {', '.join(str(site.num_keys) for site in attributes.sites)} keys."
-    )
-    estimate = estimate_disk(recording, attributes.sites, picture_sizes, max(calls, default=0), len(calls))
-    say(describe(estimate, plan.store))
-    if len(todo) < len(plan.wanted):
-        say(f"{len(plan.wanted) - len(todo)} of {len(plan.wanted)} episodes are complete already; {len(todo)} to run.")
-    for fault in find_damaged(plan.store, set(stored), False) if stored else []:
-        say(f"Not recorded again without vla-attention capture verify --repair: {fault.describe()}")
+    lines.append(f"Policy calls: {sum(calls)}, every {every} frames ({every / info.fps:.3g} s){of_actions}.")
+    bound = estimate_disk(attributes.recording, attributes.sites, picture_sizes, max(calls, default=0), len(calls))
+    damaged = find_damaged(plan.store, set(stored), False) if stored else []
+    announce(attributes, lines, bound, plan.store, len(plan.wanted), damaged)
     return todo
 
 

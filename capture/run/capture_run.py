@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from vla_attention.capture.effects.conditions import describe_effects, refuse_both
+from vla_attention.capture.effects.conditions import refuse_both
 from vla_attention.capture.effects.mean_pictures import pictures_of
 from vla_attention.capture.effects.measurement import EffectMeasurement, measurement_of
 from vla_attention.capture.engine.call import Caller
 from vla_attention.capture.engine.faults import EpisodesMissing, Faults, describe_missing
 from vla_attention.capture.engine.loop import EpisodeLoop, EpisodeResult
-from vla_attention.capture.engine.plan import plan_recording, root_attributes
+from vla_attention.capture.engine.plan import announce, plan_recording, root_attributes
 from vla_attention.capture.engine.progress import say
 from vla_attention.capture.engine.simulators import Simulators, check_protocol, max_replans
 from vla_attention.capture.engine.source import EpisodeJob
@@ -25,11 +25,11 @@ from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.jobs.worker_log import PlannedTask, planned_tasks, read_logs
 from vla_attention.capture.machine.provenance import POLICY_BATCH, describe_machine
 from vla_attention.capture.policies.families import family_of_kind
-from vla_attention.capture.policies.identity import announcement, downloads_of
+from vla_attention.capture.policies.identity import downloads_of
 from vla_attention.capture.policies.policy import BatchPolicy, Policy, is_compiled, stored_picture_sizes
 from vla_attention.capture.run.run_settings import RunSettings, default_num_envs, default_policy_batch
-from vla_attention.capture.store.disk_estimate import describe, estimate_disk
-from vla_attention.capture.store.store_writer import RunStore, open_run
+from vla_attention.capture.store.disk_estimate import estimate_disk
+from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument, listing, plural
 from vla_attention.schemas.stores.damaged_episodes import DamagedEpisodesLeft, find_damaged, what_to_do
 from vla_attention.schemas.stores.store_format import (
@@ -37,8 +37,6 @@ from vla_attention.schemas.stores.store_format import (
     Protocol,
     RootAttributes,
 )
-
-_QUERIES = {"mean": "the mean over", "steps": "the action steps' means over", "all": "each of"}
 
 
 def plan_protocol(settings: RunSettings, evaluation: EvaluationProtocol, policy: Policy) -> Protocol:
@@ -146,9 +144,9 @@ def _record_missing(
     todo = [job for job in jobs if (job.task.task_id, job.episode_index) not in done]
     names = {job.name for job in jobs}
     damaged = find_damaged(store.path, names, settings.verify) if done else []
-    _announce(policy, store, len(names), len(todo), len(damaged))
-    for fault in damaged:
-        say(f"Not recorded again without vla-attention capture verify --repair: {fault.describe()}")
+    pictures = stored_picture_sizes(policy, attributes.protocol.image_size)
+    bound = estimate_disk(attributes.recording, attributes.sites, pictures, max_replans(attributes.protocol), len(todo))
+    announce(attributes, list(_lines_on_source(attributes)), bound, store.path, len(names), damaged)
     damaged_names = [fault.name for fault in damaged]
     expected = {task.task_id: task for task in (*wanted, *(tasks[index] for index in settings.array_task_ids))}
     plan = tuple(
@@ -231,32 +229,15 @@ def _other_suite_line(identity: PolicyIdentity, suite: str) -> str:
     )
 
 
-def _announce(policy: Policy, store: RunStore, num_wanted: int, num_todo: int, num_damaged: int) -> None:
-    identity, recording, protocol = store.attributes.policy, store.attributes.recording, store.attributes.protocol
-    for line in announcement(identity):
-        say(line)
+def _lines_on_source(attributes: RootAttributes) -> Iterator[str]:
+    """Lines on where the policy calls come from: the checkpoint, the protocol, and what is executed."""
+    identity, protocol = attributes.policy, attributes.protocol
     if not identity.untrained:
-        say(_checkpoint_line(identity))
+        yield _checkpoint_line(identity)
     if line := _other_suite_line(identity, protocol.suite):
-        say(line)
-    say(
+        yield line
+    yield (
         f"Protocol: {protocol.name} (docs/protocol.md), seed {protocol.seed}, pictures of {protocol.image_size} "
         f"pixels, {protocol.wait_steps} waiting steps, at most {protocol.max_steps} steps after them."
     )
-    if not store.attributes.interventions.is_none:
-        say(f"Interventions: {store.attributes.interventions.describe()}.")
-    say(f"A policy call gives {identity.action_horizon} actions, of which {protocol.replan_steps} are executed.")
-    say(
-        f"Recording {len(recording.layers)} layers, denoise steps {listing(recording.denoise_steps)}, "
-        f"{len(recording.heads)} heads, {_QUERIES[recording.queries]} {recording.num_action_queries} action queries, "
-        f"{', '.join(str(site.num_keys) for site in store.attributes.sites)} keys."
-    )
-    if recording.effects is not None:
-        say(describe_effects(recording.effects))
-    pictures = stored_picture_sizes(policy, protocol.image_size)
-    bound = estimate_disk(recording, store.attributes.sites, pictures, max_replans(protocol), num_todo)
-    say(describe(bound, store.path))
-    if num_todo < num_wanted:
-        complete = num_wanted - num_todo - num_damaged
-        damaged = f" and {num_damaged} damaged" if num_damaged else ""
-        say(f"{complete} of {num_wanted} episodes are complete already{damaged}; {num_todo} to run.")
+    yield f"A policy call gives {identity.action_horizon} actions, of which {protocol.replan_steps} are executed."
