@@ -1,4 +1,4 @@
-"""Options that both command lines share: names that they had before, ranges of numbers, and tasks. Nothing heavy."""
+"""Options that both command lines share: ranges of numbers, tasks, and the published names. Nothing heavy."""
 
 from __future__ import annotations
 
@@ -15,44 +15,6 @@ _RANGE = re.compile(r"(\d+)-(\d+)")
 #: Numbers that a range may name; axes of stores are far shorter.
 _MOST_IN_RANGE = 10_000
 TASK_HELP = "task ids, ranges as 0-3, several as 0,5, or the instruction in quotes"
-
-
-def add_option(
-    group: argparse._ActionsContainer,
-    name: str,
-    *,
-    was: Sequence[str] = (),
-    published: Sequence[str] = (),
-    **options: Any,
-) -> argparse.Action:
-    """Add an option that is also accepted by other names, which no help shows.
-
-    Args:
-        group: the parser, or a group of it.
-        name: its name.
-        was: names that it had in earlier versions; each use says the new one, once.
-        published: names of the published scripts, accepted in silence.
-        options: as `add_argument` takes them; `action` may be a class.
-    """
-    action = group.add_argument(name, **options)
-    hidden = {key: value for key, value in options.items() if key not in ("help", "default", "dest", "required")}
-    hidden |= {"dest": action.dest, "default": argparse.SUPPRESS, "help": argparse.SUPPRESS}
-    for other in published:
-        group.add_argument(other, **hidden)
-    for other in was:
-        group.add_argument(other, **hidden | {"action": _renamed(type(action), name)})
-    return action
-
-
-def _renamed(action: type[argparse.Action], name: str) -> type[argparse.Action]:
-    """An action that does the same and says the new name."""
-
-    class Renamed(action):  # type: ignore[misc, valid-type]
-        def __call__(self, parser: Any, namespace: Any, values: Any, option_string: str | None = None) -> None:
-            warnings.warn(Note(f"{option_string} is called {name} now."), stacklevel=2)
-            super().__call__(parser, namespace, values, option_string)
-
-    return Renamed
 
 
 class Numbers(argparse.Action):
@@ -88,20 +50,11 @@ def task_choice(text: str) -> list[int] | str:
     return text if any(character.isalpha() for character in text) else number_range(text)
 
 
-def add_task(group: argparse._ActionsContainer, dest: str, which: str, *, was: Sequence[str] = ()) -> None:
+def add_task(group: argparse._ActionsContainer, dest: str, which: str) -> None:
     """`--task`, which the published scripts call `--task-id`; which: what it chooses, for the help."""
-    add_option(
-        group,
-        "--task",
-        was=was,
-        published=("--task-id",),
-        dest=dest,
-        type=task_choice,
-        nargs="+",
-        action=Numbers,
-        metavar="TASK",
-        help=f"{which}: {TASK_HELP} (default: all)",
-    )
+    options: dict[str, Any] = {"dest": dest, "type": task_choice, "nargs": "+", "action": Numbers, "metavar": "TASK"}
+    group.add_argument("--task", **options, help=f"{which}: {TASK_HELP} (default: all)")
+    group.add_argument("--task-id", **options, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
 
 
 class OutputPath(argparse.Action):
@@ -114,11 +67,13 @@ class OutputPath(argparse.Action):
 
 
 def add_capture_output(group: argparse._ActionsContainer, store: str, text: str) -> None:
-    """`--output` of a command that writes stores. store: the metavar; text: the help."""
+    """`--output` of a command that writes stores. store: the metavar; text: the help.
+
+    The published scripts call it `--output-dir`.
+    """
     group.add_argument("--output", action=OutputPath, default=argparse.SUPPRESS, metavar=store, help=text)
     group.add_argument("--output-dir", type=Path, dest="output_dir", help=argparse.SUPPRESS)
-    renamed = _renamed(argparse._StoreAction, "--output")
-    group.add_argument("--store", action=renamed, type=Path, dest="store", help=argparse.SUPPRESS)
+    group.set_defaults(store=None)
 
 
 def resolve_tasks(chosen: Sequence[int | str], instructions: Mapping[int, str], where: str) -> tuple[int, ...]:

@@ -6,7 +6,6 @@ import argparse
 from typing import TYPE_CHECKING
 
 from vla_attention.schemas.command_line import command_parser
-from vla_attention.schemas.options import add_option
 from vla_attention.schemas.stores.store_url import store_place
 
 if TYPE_CHECKING:
@@ -48,10 +47,8 @@ def build_parser() -> argparse.ArgumentParser:
         help="also answer under this host's name, that of a proxy (JupyterHub, Open OnDemand); may be repeated",
     )
     parser.add_argument("--no-open", action="store_true", help="print the link only")
-    add_option(
-        parser,
+    parser.add_argument(
         "--output",
-        was=("--site",),
         type=Path,
         metavar="FOLDER",
         help="write the page, and links to the stores, into a folder that any web server can serve, and stop",

@@ -56,7 +56,7 @@ def record(
     policy: KnownPolicy, store: Path, tasks: list[int] | None, episodes: int, max_steps: int | None, *further: str
 ) -> Store:
     """Record rollouts of a policy, or go on with them, and open the store."""
-    arguments = [policy.family, "--checkpoint", policy.checkpoint, "--task-suite", policy.suite, "--store", str(store)]
+    arguments = [policy.family, "--checkpoint", policy.checkpoint, "--task-suite", policy.suite, "--output", str(store)]
     arguments += ["--num-episodes", str(episodes), "--threads", "1"]
     if tasks is not None:
         arguments += ["--task-id", *map(str, tasks)]

@@ -56,7 +56,7 @@ def success_under(
             continue
         say(f"{policy.name}: {name}")
         options = [option.format(synonyms=synonyms, first=cameras[0], last=cameras[-1]) for option in CONDITIONS[name]]
-        light = ["--layers", "0", "--heads", "0", "--denoise-steps", "last", "--no-contributions", "--no-frames"]
+        light = ["--layers", "0", "--heads", "0", "--denoise", "last", "--no-contributions", "--no-frames"]
         store = record(policy, folder / f"success_{number}.zarr", tasks, episodes, max_steps, *light, *options)
         found.append({"policy": policy.name, "control": policy.control, "condition": name} | success(store))
     return found

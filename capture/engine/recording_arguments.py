@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from vla_attention.schemas.options import Numbers, add_option, number_range
+from vla_attention.schemas.options import Numbers, number_range
 from vla_attention.schemas.precision import DEFAULT_MANTISSA_BITS
 
 
@@ -18,10 +18,8 @@ def add_recording_arguments(parser: argparse.ArgumentParser, layers: str, *, rer
     group = parser.add_argument_group(f"what is recorded{' (default: as in the store)' if rerun else ''}")
     numbers: dict[str, Any] = {"type": number_range, "nargs": "+", "action": Numbers, "metavar": "N"}
     group.add_argument("--layers", **numbers, help=layers)
-    add_option(
-        group,
+    group.add_argument(
         "--denoise",
-        was=("--denoise-steps",),
         dest="denoise_steps",
         nargs="+",
         metavar="STEP",

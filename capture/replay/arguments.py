@@ -15,7 +15,6 @@ from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.model_arguments import POLICY_THREADS
 from vla_attention.capture.policies.robot import NONE
 from vla_attention.schemas.errors import BadArgument, listing
-from vla_attention.schemas.options import add_option
 from vla_attention.schemas.threads import add_threads, use_threads
 
 REPLAY_EXAMPLES = """\
@@ -133,10 +132,8 @@ def _add_frame_arguments(parser: argparse.ArgumentParser, every: str) -> None:
         metavar="N",
         help=f"a policy call at frame 0, N, 2N ... of each episode (default: {every})",
     )
-    add_option(
-        group,
+    group.add_argument(
         "--episode",
-        was=("--episodes",),
         dest="episodes",
         nargs="+",
         metavar="N",
@@ -159,10 +156,8 @@ def _add_change_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_output_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("output")
-    add_option(
-        group,
+    group.add_argument(
         "--output",
-        was=("--store",),
         dest="store",
         type=Path,
         metavar="NAME.zarr",

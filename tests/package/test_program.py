@@ -41,7 +41,7 @@ def test_without_torch_a_capture_says_how_to_install_it(tmp_path):
     code = (
         "import sys; sys.modules['torch'] = None\n"
         "from vla_attention.__main__ import main\n"
-        f"sys.exit(main(['capture', 'pi', '--store', {str(tmp_path / 'new.zarr')!r}]))"
+        f"sys.exit(main(['capture', 'pi', '--output', {str(tmp_path / 'new.zarr')!r}]))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 2

@@ -94,7 +94,7 @@ def test_smolvla_is_replayed_over_it(tmp_path, capsys):
     (tmp_path / "vlm").mkdir()
     file, store = tmp_path / "my_smolvla.py", tmp_path / "replay.zarr"
     file.write_text(FILE.format(folder=str(tmp_path / "vlm")))
-    arguments = ["replay", tmp_path / "data", "--policy", file, "--every", 4, "--episodes", "1-2", "--output", store]
+    arguments = ["replay", tmp_path / "data", "--policy", file, "--every", 4, "--episode", "1-2", "--output", store]
     assert capture([str(argument) for argument in arguments]) == 0
     assert "2 episodes added" in capsys.readouterr().out
     opened = open_store(store)

@@ -10,15 +10,14 @@ import pytest
 
 from vla_attention.schemas.errors import BadArgument, Note, UnknownName
 from vla_attention.schemas.layers import select_layers
-from vla_attention.schemas.options import Numbers, add_capture_output, add_option, add_task, number_range, resolve_tasks
+from vla_attention.schemas.options import Numbers, add_capture_output, add_task, number_range, resolve_tasks
 
 INSTRUCTIONS = {0: "lift the red cube", 1: "lift the green cube", 4: "Lift the  red cube"}
 
 
 def parser() -> argparse.ArgumentParser:
     made = argparse.ArgumentParser()
-    add_task(made, "task_id", "tasks", was=("--tasks",))
-    add_option(made, "--denoise", was=("--denoise-steps",), nargs="+")
+    add_task(made, "task_id", "tasks")
     made.add_argument("--layers", type=number_range, nargs="+", action=Numbers)
     add_capture_output(made, "PATH", "the store")
     return made
@@ -31,7 +30,7 @@ def test_published_names_are_silent_and_no_help_shows_either():
     assert (given.task_id, str(given.output_dir), given.store) == ([5], "results", None)
     shown = parser().format_help()
     assert "--task " in shown
-    for name in ("--task-id", "--tasks", "--denoise-steps", "--store", "--output-dir"):
+    for name in ("--task-id", "--output-dir"):
         assert name not in shown
 
 

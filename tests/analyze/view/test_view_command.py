@@ -62,7 +62,7 @@ def test_a_damaged_episode_has_no_numbers_and_the_others_have(store, tmp_path):
 def test_a_site_is_the_page_its_documents_and_a_link_to_the_store(store, tmp_path, capsys):
     folder = tmp_path / "site"
     for _ in range(2):  # a second time over the first
-        assert main(["view", str(store), "--site", str(folder)]) == 0
+        assert main(["view", str(store), "--output", str(folder)]) == 0
         printed = capsys.readouterr().out
         assert f"stores/0 (a link to {store})" in printed
         assert "range requests" in printed
@@ -112,7 +112,7 @@ def test_a_site_publishes_nothing_but_the_store(store, tmp_path, capsys, name):
     (tmp_path / "secret/id").write_text("secret")
     shutil.copytree(store, tmp_path / "a.zarr")
     FOREIGN[name](tmp_path / "a.zarr", tmp_path / "secret")
-    assert main(["view", str(tmp_path / "a.zarr"), "--site", str(tmp_path / "site")]) == 2
+    assert main(["view", str(tmp_path / "a.zarr"), "--output", str(tmp_path / "site")]) == 2
     assert f"Cannot write a site of {tmp_path / 'a.zarr'}: {name} would be published" in capsys.readouterr().err
     assert not (tmp_path / "site").exists()
 
@@ -122,15 +122,15 @@ def test_what_an_upload_takes_along(store, tmp_path, capsys):
     """Of a second site in the same place, too: the links of the first are gone, and others are refused."""
     other = write_store(tmp_path / "b.zarr", spec=SPEC, suite="other")
     site = tmp_path / "site"
-    assert main(["view", str(store), str(other), "--site", str(site)]) == 0
-    assert main(["view", str(store), "--site", str(site)]) == 0
+    assert main(["view", str(store), str(other), "--output", str(site)]) == 0
+    assert main(["view", str(store), "--output", str(site)]) == 0
     published = upload(site, tmp_path / "uploaded")
     files = {f"stores/0/{file.relative_to(store)}" for file in store.rglob("*") if file.is_file()}
     assert set(published) == {*PAGE_FILES, "stores.json", "stores/0.summary.json", *files}
     capsys.readouterr()
     for link in ("mine", "stores/mine"):
         (site / link).symlink_to(tmp_path)
-        assert main(["view", str(store), "--site", str(site)]) == 2
+        assert main(["view", str(store), "--output", str(site)]) == 2
         assert f"it has the link {link}, and an upload that follows links" in capsys.readouterr().err
         (site / link).unlink()
 
@@ -144,7 +144,7 @@ def test_a_site_is_written_into_no_store_and_over_nothing_else(store, tmp_path, 
         (tmp_path / place).mkdir(parents=True)
         (tmp_path / place / "zarr.json").write_text("{}")
     before = sorted(tmp_path.rglob("*"))
-    assert main(["view", str(store), "--site", str(tmp_path / place)]) == 2
+    assert main(["view", str(store), "--output", str(tmp_path / place)]) == 2
     assert "Cannot write a site into" in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == before
 

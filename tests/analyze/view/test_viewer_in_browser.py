@@ -161,7 +161,7 @@ def test_a_damaged_chunk_is_a_sentence_and_no_number(browser, store, tmp_path):
 
 @pytest.mark.thorough
 def test_a_static_site_shows_the_same(browser, server, store, tmp_path, capsys):
-    assert main(["view", str(store), "--site", str(tmp_path / "site")]) == 0
+    assert main(["view", str(store), "--output", str(tmp_path / "site")]) == 0
     found = []
     with serve(tmp_path / "site") as site, watched_page(browser) as watched:
         for link in (server.link, f"{site.url}/index.html"):

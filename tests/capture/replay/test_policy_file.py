@@ -94,7 +94,7 @@ def _noise(seed: int) -> torch.Tensor:
 def test_a_file_s_replay_is_continued(tmp_path, data, file, capsys):
     store = tmp_path / "replay.zarr"
     options = ("replay", data, "--policy", file, "--output", store, "--layers", 0, 2, "--queries", "all")
-    assert run(*options, "--episodes", 2) == 0
+    assert run(*options, "--episode", 2) == 0
     assert run(*options, "--resume") == 0
     assert "1 of 3 episodes are complete already; 2 to run." in capsys.readouterr().out
     episode = zarr.open_group(store / "episodes" / "task000_episode002", mode="r")

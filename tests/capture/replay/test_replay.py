@@ -101,7 +101,7 @@ def test_the_store_says_what_was_replayed(tmp_path, capsys):
     cameras = ("--camera", "base_0_rgb=front", "--camera", "left_wrist_0_rgb=observation.images.wrist")
     store = tmp_path / "replay.zarr"
     options = (*TINY, *cameras, "--every", 3, "--output", store)
-    assert run("replay", data, *options, "--episodes", "1-2") == 0
+    assert run("replay", data, *options, "--episode", "1-2") == 0
     capsys.readouterr()
     root = open_store(store).attributes
     assert (root.protocol.name, root.protocol.suite, root.protocol.replan_steps) == ("dataset", "so101_pick", 3)
@@ -177,7 +177,7 @@ def test_a_replay_can_be_rerun_with_interventions(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--episodes", 3], "has no episode 3; its episodes are 0 to 2"),
+        (["--episode", 3], "has no episode 3; its episodes are 0 to 2"),
         (["--camera", "base=image"], "Unknown camera of the policy 'base'. Did you mean 'base_0_rgb'?"),
         (["--camera", "base_0_rgb=front"], "Unknown camera of the data set 'data' 'front'"),
         (["--policy", "smolvla"], "Cannot use --policy smolvla; expected pi"),
