@@ -134,7 +134,8 @@ class Series:
         changed = sorted(name for name, files in before.items() if now.get(name) != files)
         problems += [f"{name} changed" for name in changed]
         complete = len(now) == len(self.tasks) * _EPISODES
-        different = unlike(self.store, self.reference) if complete else ()
+        found = unlike(self.store, self.reference) if complete else ()
+        different = [file for file in found if not file.startswith(".writing/")]  # of the process that was killed
         problems += [f"unlike the undisturbed store: {', '.join(different[:5])}"] if different else []
         # What is equal to the undisturbed store is as whole as that one, which was verified.
         faults = forks.answer_of(faults_of, self.store) if self.store.exists() and (different or not complete) else []
