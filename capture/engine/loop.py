@@ -32,10 +32,11 @@ from vla_attention.capture.engine.writing import EpisodeInBackground, WritingThr
 from vla_attention.capture.jobs.termination import Terminated, Termination
 from vla_attention.capture.jobs.worker_log import PlannedTask, WorkerLog
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
+from vla_attention.capture.store.episode_writer import EpisodeTaken
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import listing, plural
-from vla_attention.schemas.stores.locks import Holder
+from vla_attention.schemas.stores.locks import Held, Holder
 from vla_attention.schemas.stores.store_format import StoreExists
 from vla_attention.schemas.stores.store_place import room_at
 
@@ -374,7 +375,7 @@ class EpisodeLoop:
         """
         self.positions.pop(running.job.name, None)
         self.progress.say(f"{error} This process's copy was dropped.")
-        again = not self._has(running.job)
+        again = isinstance(error, (EpisodeTaken, Held)) and not self._has(running.job)
         if again:
             running.progress.put_back()
         else:
