@@ -1,7 +1,7 @@
 """Reading JSON and TOML that somebody else may have written: size, nesting and numbers are bounded.
 
 Every problem is a `ValueError` with a sentence: not a traceback of Python's recursion, of its limit of digits, or of
-memory. `jsonable.py` decodes what comes out into dataclasses.
+memory. `jsonable.py` makes documents of what comes out.
 """
 
 from __future__ import annotations
@@ -11,11 +11,13 @@ import re
 import tomllib
 from typing import Any
 
-from vla_attention.schemas.limits import DOCUMENT_BYTES, DOCUMENT_NESTS, NESTING
+from vla_attention.schemas.limits import DOCUMENT_BYTES, DOCUMENT_NESTS, NESTING, WHOLE_NUMBER
 
 _OTHER_BYTES = bytes(set(range(256)) - set(b"[]{}"))
 #: Strings of JSON, in which brackets mean nothing. The quantifier gives nothing back, so that the time is linear.
 _STRING = re.compile(rb'"(?:[^"\\]|\\.)*+"', re.DOTALL)
+#: Digits as 0, what may stand before a number as a space, anything else as x.
+_SHAPE = bytes((b"0" if b in b"0123456789" else b" " if b in b" \t\n\r:,[-" else b"x")[0] for b in range(256))
 #: An escaped part of a surrogate pair; half a pair can be neither printed nor written to a file.
 _SURROGATE = re.compile(rb"\\u[dD][89a-fA-F]")
 #: Strings and comments of TOML, likewise.
@@ -37,20 +39,23 @@ def decode_json(content: bytes, most: int = DOCUMENT_BYTES, nests: int = DOCUMEN
         raise ValueError(f"it has {len(content):,} bytes; expected at most {most:,}")
     _check_brackets(content, nests)
     try:
-        document = json.loads(content)
+        is_long = b" " + b"0" * 19 in b" " + content.translate(_SHAPE)  # a whole number, or digits in a text
+        document = json.loads(content.decode("utf-8-sig"), parse_int=_bounded if is_long else None)
         if _SURROGATE.search(content):
             json.dumps(document, ensure_ascii=False).encode()
         return document
     except RecursionError:
         raise ValueError(_too_deep()) from None
-    except json.JSONDecodeError:
-        raise
     except UnicodeEncodeError:
         raise ValueError("it has half a surrogate pair, which is no character") from None
     except UnicodeDecodeError as error:
         raise ValueError(f"it is no text in UTF-8: {error.reason} at byte {error.start}") from None
-    except ValueError:
-        raise ValueError("it has a whole number of more than 4,000 digits") from None
+
+
+def _bounded(digits: str) -> int:
+    if len(digits) > 20 or not -WHOLE_NUMBER <= int(digits) < WHOLE_NUMBER:
+        raise ValueError("it has a whole number that does not fit into 64 bits")
+    return int(digits)
 
 
 def _check_brackets(content: bytes, nests: int) -> None:

@@ -6,10 +6,11 @@ The simulator may be in this process (`record_episode`) or in another one (`pipe
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol as Interface
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from vla_attention.capture.effects.measurement import EffectMeasurement, EpisodeEffectsMeasured
