@@ -52,7 +52,7 @@ def from_json(declared: type[T], data: Any, where: str = "$") -> T:
         for key, item in data[name].items():
             from_json(get_args(fields[name])[1], item, f"{where}.{name}.{shortened(key)}")
     _, unknown, given = problem.partition("Object contains unknown field ")
-    nearest = f"{did_you_mean(given, fields)} Existing: {listing(fields)}." if unknown and not path else ""
+    nearest = f"{did_you_mean(given[1:-1], fields)} Existing: {listing(fields)}." if unknown and not path else ""
     raise MalformedDocument(f"{where}{path}: {problem.rstrip('.')}.{nearest}")
 
 
