@@ -6,11 +6,11 @@ another word, picture or noise; the robot executes the unchanged call. `docs/eff
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.jsonable import Document, Number
 from vla_attention.schemas.limit_checks import check_at_most
 from vla_attention.schemas.limits import AXIS, CONDITIONS, EFFECT_ENTRIES, REPLANS
 
@@ -26,8 +26,7 @@ EffectItems = Literal["text", "cameras", "objects", "tokens"]
 EffectReaders = Literal["all", "action", "pictures", "text"]
 
 
-@dataclass(frozen=True)
-class EffectsRecorded:
+class EffectsRecorded(Document, frozen=True):
     """Which effects a run measures.
 
     `every`: at every so many replans, from the first on. `denoise_steps`: network evaluations of a changed call.
@@ -50,8 +49,7 @@ class EffectsRecorded:
             raise BadArgument(f"The seed of effects is {self.seed}; expected 0 or more.")
 
 
-@dataclass(frozen=True)
-class EpisodeEffects:
+class EpisodeEffects(Document, frozen=True):
     """The effects of one episode: what its arrays `effects/change` and `SITE/cut` are of.
 
     Entry i of these arrays is of replan `replan[i]` under `conditions[condition[i]]`. A replan without an entry of a
@@ -60,7 +58,7 @@ class EpisodeEffects:
     """
 
     conditions: tuple[Interventions, ...]
-    units: tuple[float, ...]
+    units: tuple[Number, ...]
     replan: tuple[int, ...]
     condition: tuple[int, ...]
 

@@ -6,9 +6,8 @@ a simulator of ours ran the episode; `docs/store.md` has the arrays.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.jsonable import Document
 from vla_attention.schemas.limit_checks import check_at_most
 from vla_attention.schemas.limits import BODIES, GOALS, REPLANS
 from vla_attention.schemas.safe_text import check_free_text, check_name, check_text
@@ -25,8 +24,7 @@ HAND = "hand"
 POSE = 7
 
 
-@dataclass(frozen=True)
-class TaskGoal:
+class TaskGoal(Document, frozen=True):
     """The goal of a task that shares the scene.
 
     `conditions`: what holds when it is reached, each as the simulator's words; a goal whose conditions are among
@@ -52,8 +50,7 @@ class TaskGoal:
         return set(self.conditions) <= set(other.conditions)
 
 
-@dataclass(frozen=True)
-class EpisodeSteps:
+class EpisodeSteps(Document, frozen=True):
     """What the arrays `steps/...` of an episode are of, and what they were looked at for.
 
     `bodies`: whose poses are stored: `HAND`, then objects of the episode. `first_touch`: the moment at whose end the

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Literal
 
+from msgspec import field
+
 from vla_attention.schemas.errors import BadArgument, listing
+from vla_attention.schemas.jsonable import Document
 from vla_attention.schemas.safe_text import check_name, check_text, visible
 
 Queries = Literal["action", "all", "prefix"]
@@ -34,8 +36,7 @@ def queries_suffix(queries: Queries, query_selector: str = "") -> str:
     return f"_queries_{queries}" + (f"_of_{query_selector}" if query_selector else "")
 
 
-@dataclass(frozen=True)
-class KeyKnockout:
+class KeyKnockout(Document, frozen=True):
     """Keys whose attention is taken away: log(1 - w) is added to the logits of a key of weight w.
 
     A weight of 1 gives a probability of exactly 0, and the other keys share what is left.
@@ -92,8 +93,7 @@ class KeyKnockout:
         )
 
 
-@dataclass(frozen=True)
-class AttentionScale:
+class AttentionScale(Document, frozen=True, tag_field="kind", tag="scale"):
     """A group's weights before normalising are multiplied by a factor; 0 is a knockout.
 
     A key of weight w in the group is multiplied by 1 - w + w · factor. Other fields as in `KeyKnockout`.
@@ -119,8 +119,7 @@ class AttentionScale:
         return f"attention to '{self.selector}' times {self.factor:g}{_describe_readers(self.queries)}{places}"
 
 
-@dataclass(frozen=True)
-class AttentionUniform:
+class AttentionUniform(Document, frozen=True, tag_field="kind", tag="uniform"):
     """Inside of a group, the weights before normalising are replaced by their mean; the group keeps its sum.
 
     With fractional weights w, the part w of each key is taken out and the sum of the parts is dealt out in proportion
@@ -144,8 +143,7 @@ class AttentionUniform:
         return f"attention made uniform inside '{self.selector}'{_describe_readers(self.queries)}{places}"
 
 
-@dataclass(frozen=True)
-class PromptChange:
+class PromptChange(Document, frozen=True):
     """Another instruction than the task's.
 
     `empty`: none. `shuffled`: its words in another order, drawn from `seed`. `task`: that of the suite's task
@@ -178,8 +176,7 @@ class PromptChange:
         }[self.kind]
 
 
-@dataclass(frozen=True)
-class ImageChange:
+class ImageChange(Document, frozen=True):
     """Another picture of one camera of the policy, in the model's picture.
 
     `blank`: grey. `noise`: uniform noise, drawn from `seed`. `rotated`: by half a turn. `shifted`: by `rows` patches
@@ -216,8 +213,7 @@ class ImageChange:
         return f"camera '{self.camera}' {how}{detail}"
 
 
-@dataclass(frozen=True)
-class NoiseChange:
+class NoiseChange(Document, frozen=True):
     """Another initial noise on the same inputs: `seed` is used in place of the run's."""
 
     seed: int
@@ -231,8 +227,7 @@ class NoiseChange:
         return f"the noise of seed {self.seed}"
 
 
-@dataclass(frozen=True)
-class Interventions:
+class Interventions(Document, frozen=True):
     """Everything that a run changes; without arguments, nothing.
 
     name: a short name of the condition, for instance `without_visual`. `keys` come first, then `attention`, each in
@@ -274,8 +269,7 @@ class Interventions:
         return "; ".join(parts) if parts else "none"
 
 
-@dataclass(frozen=True)
-class RerunSource:
+class RerunSource(Document, frozen=True):
     """The store whose policy calls a rerun repeats.
 
     `run` is the digest of its run's configuration (`run_digest`) and `name` the name of its folder. Episodes and

@@ -8,14 +8,15 @@ into the prompt; they are stored beside the rows.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Literal
 
 import numpy as np
+from msgspec.structs import force_setattr, replace
 from numpy.typing import NDArray
 
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
+from vla_attention.schemas.jsonable import Document, Number
 from vla_attention.schemas.limit_checks import check_at_most
 from vla_attention.schemas.limits import AXIS, KEYS, PICTURE_PIXELS, PICTURE_SIDE, QUERIES, SPANS, TEXT_CHARACTERS
 from vla_attention.schemas.safe_text import check_free_text, check_name
@@ -108,8 +109,7 @@ def find_role(label: str) -> Role:
     raise unknown_name("role", label, [role.label for role in Role])
 
 
-@dataclass(frozen=True)
-class PatchGrid:
+class PatchGrid(Document, frozen=True):
     """How an image span's keys tile a camera's picture, or a part of it: row-major from the top left corner.
 
     `image_height`, `image_width`: pixels of the camera's whole picture. `part`: (top, left, height, width) of what the
@@ -120,7 +120,7 @@ class PatchGrid:
     columns: int
     image_height: int
     image_width: int
-    part: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+    part: tuple[Number, Number, Number, Number] = (0.0, 0.0, 1.0, 1.0)
 
     def __post_init__(self) -> None:
         """Check that the grid and the picture have a size, and that the part lies in the picture."""
@@ -140,7 +140,7 @@ class PatchGrid:
         inside = min(part) >= 0 and max(top + height, left + width) <= 1 + _ROUNDING
         if not (inside and height * self.image_height >= 1 and width * self.image_width >= 1):
             raise wrong
-        object.__setattr__(self, "part", part)  # a list or whole numbers are the same part
+        force_setattr(self, "part", part)  # a list or whole numbers are the same part
 
     @property
     def num_patches(self) -> int:
@@ -184,8 +184,7 @@ def _shares(patches: int, first: float, length: float, cells: int) -> NDArray[np
     return shares
 
 
-@dataclass(frozen=True)
-class Span:
+class Span(Document, frozen=True):
     """A run of neighbouring keys [start, stop) of one kind.
 
     `camera`: all spans that name a camera are the camera: tiles, a thumbnail, frames of other times, and keys without
@@ -222,8 +221,7 @@ class Span:
         return self.stop - self.start
 
 
-@dataclass(frozen=True)
-class SiteLayout:
+class SiteLayout(Document, frozen=True):
     """The spans of one softmax family, in key order, without gaps.
 
     `layers`: the blocks that have this site; empty where all recorded blocks have it. `heads`: its number of heads, and
@@ -401,8 +399,7 @@ def picture_size(sites: Sequence[SiteLayout], camera: str) -> tuple[int, int]:
     return grids[0].image_height, grids[0].image_width
 
 
-@dataclass(frozen=True)
-class Piece:
+class Piece(Document, frozen=True):
     """One prompt token: its key, its text, and the characters [start, stop) of the prompt that it covers."""
 
     key: int
@@ -411,8 +408,7 @@ class Piece:
     stop: int
 
 
-@dataclass(frozen=True)
-class Prompt:
+class Prompt(Document, frozen=True):
     """The text given to the policy at a replan, as pieces, and where the instruction stands in it.
 
     `instruction` is the character range [start, stop) of the instruction inside `text`. Pieces that have no characters

@@ -15,6 +15,7 @@ from typing import Literal
 from urllib.parse import unquote
 
 from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.jsonable import Document
 from vla_attention.schemas.safe_text import file_part
 
 RESULTS_PREFIX = "attention_ratio_results_"
@@ -55,8 +56,7 @@ class FrameProxy:
         }
 
 
-@dataclass(frozen=True)
-class StepRatio:
+class StepRatio(Document, frozen=True):
     """One replan. `step` is the environment step index, waiting steps included; masses and fractions are without unit.
 
     `total_mass` is what the fractions are of: the sum of all groups' masses (for a ratio of latent frames, of the two
@@ -83,8 +83,7 @@ class StepRatio:
     text_frame: str | None = None
 
 
-@dataclass(frozen=True)
-class RatioSummary:
+class RatioSummary(Document, frozen=True):
     """Ratio over the replans of an episode: finite ones only, ddof 0; `num_nonfinite` counts the others."""
 
     mean: float | None
@@ -95,16 +94,14 @@ class RatioSummary:
     num_nonfinite: int
 
 
-@dataclass(frozen=True)
-class MeanStd:
+class MeanStd(Document, frozen=True):
     """Mean and standard deviation (ddof 0) over the replans of an episode."""
 
     mean: float | None
     std: float | None
 
 
-@dataclass(frozen=True)
-class LayerSummary:
+class LayerSummary(Document, frozen=True):
     """One layer of one episode. `num_steps` is the number of replans that are summarized."""
 
     visual_linguistic_ratio: RatioSummary
@@ -117,8 +114,7 @@ class LayerSummary:
     action_fraction: MeanStd | None = None
 
 
-@dataclass(frozen=True)
-class EpisodeResult:
+class EpisodeResult(Document, frozen=True):
     """One episode. Keys of `summary` and `per_step_ratios`: `layer_N` for every layer, and `layers_avg`.
 
     `num_steps` is the counter of the published scripts' loop when it stops (`loop_counter`); `num_steps_definition`

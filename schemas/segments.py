@@ -7,16 +7,15 @@ computed without reading a row. A grouping that takes part of a segment (a word,
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.schemas.jsonable import Document
 from vla_attention.schemas.layout import Role, SiteLayout
 
 
-@dataclass(frozen=True)
-class Segment:
+class Segment(Document, frozen=True):
     """All keys of one span that have one role at a replan."""
 
     span: str

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.selected import SelectedEpisode
@@ -159,7 +160,7 @@ def _noise_pairs(episode: StoredEpisode, actions: Array) -> list[tuple[Array, Ar
 
 def changes_noise_alone(interventions: Interventions) -> bool:
     """Whether another noise seed is all that was changed."""
-    return interventions.noise is not None and replace(interventions, name="", noise=None).is_none
+    return interventions.noise is not None and structs.replace(interventions, name="", noise=None).is_none
 
 
 def actions_of(store: Store, episode: StoredEpisode) -> Array:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from vla_attention.analyze.stores.contents import read_one_by_one
@@ -43,10 +43,9 @@ class SelectedEpisode:
         """
         if isinstance(episode.folder, StoreUrl):
             return cls(store, episode, tokens)
-        kept, attributes = replace(episode), copy(episode.attributes)
-        number, site = len(attributes.prompts), tokens.layout.name
-        object.__setattr__(attributes, "prompts", _Prompts(replace(episode), number) if number else ())
-        vars(kept)["attributes"] = attributes
+        kept, number, site = replace(episode), len(episode.attributes.prompts), tokens.layout.name
+        brief = _Prompts(replace(episode), number) if number else ()
+        vars(kept)["attributes"] = structs.replace(episode.attributes, prompts=brief)
         prompts = _Prompts(replace(episode), number, store.attributes, site) if tokens.prompts else ()
         return cls(store, kept, replace(tokens, prompts=prompts)).fresh()
 

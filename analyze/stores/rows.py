@@ -6,9 +6,10 @@ Every row that is read is held against its stored sum: a chunk of another episod
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from vla_attention.analyze.stores.selection import Selection

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from vla_attention.schemas.errors import listing, plural
 from vla_attention.schemas.layout import Prompt

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
+
+from msgspec.structs import replace
 
 from vla_attention.capture.effects.arguments import EffectSettings
 from vla_attention.capture.interventions.condition_name import condition_name, knockout_of_group

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 from typing import Protocol as Interface
+
+from msgspec.structs import replace
 
 from vla_attention.capture.effects.arguments import EffectSettings, effect_settings
 from vla_attention.capture.engine.progress import say

@@ -13,12 +13,13 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import Any
 from typing import Protocol as Interface
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from vla_attention.capture.engine.call import Caller, PolicyCall
@@ -391,7 +392,9 @@ class SimulatedEpisode(Episode):
             return None
         touched = np.stack([moment.touched for moment in self._moments])
         held = np.stack([moment.held for moment in self._moments])
-        goals = [replace(goal, first_held=_first(when)) for goal, when in zip(self.begun.goals, held.T, strict=True)]
+        goals = [
+            structs.replace(goal, first_held=_first(when)) for goal, when in zip(self.begun.goals, held.T, strict=True)
+        ]
         return RecordedSteps(
             EpisodeSteps(self.begun.bodies, tuple(map(_first, touched.T)), tuple(goals)),
             poses=np.stack([moment.poses for moment in self._moments]),

@@ -14,15 +14,16 @@ import re
 import warnings
 from collections.abc import Mapping, Set
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
+from msgspec.structs import replace
+
 from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import Note, listing, plural, shortened
-from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
+from vla_attention.schemas.jsonable import Document, MalformedDocument, from_json, to_json
 from vla_attention.schemas.limit_checks import check_at_most
 from vla_attention.schemas.limits import JOB_FILES, LOGS_BYTES, PLANNED_EPISODES
 from vla_attention.schemas.regular_files import read_regular
@@ -36,8 +37,7 @@ LOG_SUFFIX = ".log"
 REASON_CHARACTERS = 1000
 
 
-@dataclass(frozen=True)
-class PlannedTask:
+class PlannedTask(Document, frozen=True):
     """A task and its planned episodes: so many, with these `indices`, or from 0 on where none are given."""
 
     task_id: int
@@ -70,8 +70,7 @@ class PlannedTask:
         return PlannedTask.of_episodes(self.task_id, self.name, self.instruction, self.wanted | other.wanted)
 
 
-@dataclass(frozen=True)
-class Drop:
+class Drop(Document, frozen=True):
     """An episode that a worker left out after a fault, the time (ISO 8601, UTC), and the sentence of the fault."""
 
     episode: str
@@ -79,8 +78,7 @@ class Drop:
     reason: str
 
 
-@dataclass(frozen=True)
-class WorkerRecord:
+class WorkerRecord(Document, frozen=True):
     """What a worker has logged.
 
     store: `store_identity` of its store, which differs from that of a later store with the same name.

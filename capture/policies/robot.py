@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing, unknown_name
+from vla_attention.schemas.jsonable import Document
 
 #: What stands for "no column" on the command line.
 NONE = "none"
@@ -39,8 +40,7 @@ def read_camera_choices(words: Sequence[str], existing: Iterable[str]) -> dict[s
     return chosen
 
 
-@dataclass(frozen=True)
-class Robot:
+class Robot(Document, frozen=True):
     """What a policy reads of a robot.
 
     cameras: policy camera -> column of pictures; the policy's other cameras are black and masked. state, actions:

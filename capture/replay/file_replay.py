@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from msgspec import structs
 from numpy.typing import NDArray
 
 from vla_attention.capture.engine.plan import recording_settings
@@ -133,7 +134,7 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
     if settings.queries not in ("mean", "all"):
         raise BadArgument(f"Cannot use --queries {settings.queries} with --policy FILE.py; expected mean or all.")
     interventions = read_interventions(arguments)
-    of_attention = replace(interventions, noise=None)  # the noise is drawn here
+    of_attention = structs.replace(interventions, noise=None)  # the noise is drawn here
     base = _base_of(arguments, interventions)
     run = record(
         plan.store,
@@ -155,7 +156,7 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
         resume=plan.mode == "resume",
         overwrite=plan.mode == "overwrite",
     )
-    run.attributes = replace(
+    run.attributes = structs.replace(
         run.attributes,
         protocol=plan.protocol(every),
         data_set=plan.source(columns_of(cameras, state, actions)),
@@ -183,7 +184,7 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
 
 def interventions_for_store(given: Interventions, recorded: Interventions) -> Interventions:
     """Return what the store says was changed: what the recorder changed, and the noise."""
-    return recorded if given.noise is None else replace(recorded, name=given.name, noise=given.noise)
+    return recorded if given.noise is None else structs.replace(recorded, name=given.name, noise=given.noise)
 
 
 def _base_of(arguments: argparse.Namespace, interventions: Interventions) -> tuple[RootAttributes, str] | None:

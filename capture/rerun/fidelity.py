@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from vla_attention.capture.engine.call import Caller
@@ -83,7 +84,7 @@ def check_fidelity(
         InputsDiffer: the prompt or the roles of the keys are other ones.
     """
     # Contributions are recorded beside the calls, and do not change them.
-    caller = replace(unchanged, recording=replace(recording, contributions=False))
+    caller = replace(unchanged, recording=structs.replace(recording, contributions=False))
     num_replans = min(num_replans, calls.num_replans)
     actions, largest, changed, count = [], 0.0, 0, 0
     for replan in range(num_replans):

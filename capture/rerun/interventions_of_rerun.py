@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
+from msgspec.structs import replace
 
 from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.interventions.changed_inputs import CallContext, object_patches

@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from vla_attention.capture.effects.conditions import describe_effects
@@ -153,7 +154,7 @@ class Rerun:
 
         Its changes of prompt, pictures and noise are in what the calls were given.
         """
-        of_attention = replace(self.base.attributes.interventions, prompt=None, images=(), noise=None)
+        of_attention = structs.replace(self.base.attributes.interventions, prompt=None, images=(), noise=None)
         return self._caller(of_attention, allow_empty=True)
 
     def _caller(self, interventions: Interventions, *, allow_empty: bool) -> Caller:

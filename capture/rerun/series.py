@@ -8,10 +8,11 @@ from __future__ import annotations
 import argparse
 import copy
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from vla_attention.capture.effects.arguments import NO_EFFECTS

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Literal
 
+from msgspec import field
+
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
+from vla_attention.schemas.jsonable import Document, Number
 from vla_attention.schemas.layout import (
     ROLES_OF_KIND,
     Role,
@@ -37,8 +39,7 @@ class LayoutForAnotherVersion(UserError, RuntimeError):
     """A layout that was written for other versions of the libraries than those that are installed."""
 
 
-@dataclass(frozen=True)
-class CallRule:
+class CallRule(Document, frozen=True):
     """What the attention calls of some modules are. Of a layout's rules, the first that fits a call names it.
 
     Attributes:
@@ -111,8 +112,7 @@ class CallRule:
         return f"{self.modules}{conditions}: {what}"
 
 
-@dataclass(frozen=True)
-class RecordedSite:
+class RecordedSite(Document, frozen=True):
     r"""One family of softmaxes: its keys, its action queries, and where contributions go.
 
     Attributes:
@@ -204,8 +204,7 @@ class RecordedSite:
         return _MASKED_ROLE.get(span.kind, Role.ABSENT)
 
 
-@dataclass(frozen=True)
-class CameraPicture:
+class CameraPicture(Document, frozen=True):
     """A camera of the policy, and how its picture becomes the model's input image.
 
     fit: `stretch` (sides resized one by one), `pad` (resized, padded evenly on two sides) or `pad_left_top` (padded on
@@ -220,8 +219,7 @@ class CameraPicture:
         check_name("camera", self.name)
 
 
-@dataclass(frozen=True)
-class PromptText:
+class PromptText(Document, frozen=True):
     """Where the prompt's token ids are seen, and which keys they are.
 
     Attributes:
@@ -242,8 +240,7 @@ class PromptText:
     state_between: tuple[str, str] | None = None
 
 
-@dataclass(frozen=True)
-class PolicyLayout:
+class PolicyLayout(Document, frozen=True):
     """What a policy's attention calls are. All of it is plain data (`schemas.jsonable`).
 
     Attributes:
@@ -275,7 +272,7 @@ class PolicyLayout:
     num_layers: int
     num_heads: int
     num_denoise_steps: int = 1
-    denoise_times: tuple[float, ...] = ()
+    denoise_times: tuple[Number, ...] = ()
     cameras: tuple[CameraPicture, ...] = ()
     text: PromptText | None = None
     action_horizon: int = 0

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
+
+from msgspec.structs import replace
 
 from vla_attention.capture.effects.arguments import EffectSettings
 from vla_attention.capture.effects.conditions import refuse_both

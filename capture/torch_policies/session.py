@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from vla_attention.capture.interventions.changed_inputs import CallContext
@@ -155,9 +156,9 @@ class RecordedRun:
     def _decide(self, *, contributions: bool, because: str = "") -> None:
         """Note whether contributions are recorded; because: for the store."""
         self._undecided = False
-        self.attributes = replace(
+        self.attributes = structs.replace(
             self.attributes,
-            recording=replace(self.attributes.recording, contributions=contributions),
+            recording=structs.replace(self.attributes.recording, contributions=contributions),
             provenance={**self.attributes.provenance, **({"contributions": because} if because else {})},
         )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -12,7 +12,7 @@ from vla_attention.schemas.documents import decode_toml
 from vla_attention.schemas.errors import BadArgument, UserError, did_you_mean, listing, shortened
 from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
 from vla_attention.schemas.groupings.selectors import SelectorError
-from vla_attention.schemas.jsonable import MalformedDocument, from_json
+from vla_attention.schemas.jsonable import Document, MalformedDocument, from_json
 from vla_attention.schemas.limits import GROUPS, NAME_CHARACTERS, WRITTEN_FILE_BYTES
 from vla_attention.schemas.regular_files import read_regular
 from vla_attention.schemas.safe_text import check_text, visible
@@ -34,16 +34,14 @@ class GroupingNotFound(GroupingError, FileNotFoundError):
     """Neither a built-in grouping nor a readable TOML file."""
 
 
-@dataclass(frozen=True)
-class Ratio:
+class Ratio(Document, frozen=True):
     """Which groups' masses make the numerator and the denominator of the ratio."""
 
     numerator: tuple[str, ...]
     denominator: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class GroupingFile:
+class GroupingFile(Document, frozen=True):
     """A grouping as written in a TOML file: group name to one selector or a list of selectors (their union)."""
 
     groups: dict[str, str | list[str]]
@@ -51,7 +49,7 @@ class GroupingFile:
     description: str = ""
     ratio: Ratio | None = None
     overlap: bool = False
-    allow_empty: list[str] = field(default_factory=list)
+    allow_empty: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -145,7 +143,7 @@ def read_grouping_file(path: Path) -> Grouping:
             groups=groups,
             ratio=content.ratio or conventional_ratio(groups),
             overlap=content.overlap,
-            allow_empty=tuple(content.allow_empty),
+            allow_empty=content.allow_empty,
             description=content.description,
         )
     except (MalformedDocument, GroupingError, SelectorError) as error:

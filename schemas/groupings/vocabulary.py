@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from vla_attention.schemas.cached_property import cached_property
 from vla_attention.schemas.errors import BadArgument, listing, shortened
 from vla_attention.schemas.groupings.words import Word, words_of
+from vla_attention.schemas.jsonable import Document
 from vla_attention.schemas.layout import INVALID_ROLES, Prompt, Role, SiteLayout
 from vla_attention.schemas.safe_text import check_name, visible
 
@@ -29,8 +30,7 @@ NO_COVERAGE = (
 )
 
 
-@dataclass(frozen=True)
-class SceneObject:
+class SceneObject(Document, frozen=True):
     """One thing a pixel can belong to, named as in the task files (`akita_black_bowl_1`).
 
     `of_interest`: whether the task itself names it as its subject.

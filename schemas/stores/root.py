@@ -225,15 +225,13 @@ def decode_root(attributes: dict[str, Any], path: object) -> RootAttributes:
         raise StoreError(f"{path} {given}; expected {STORE_VERSION}.")
     if version > STORE_VERSION:
         raise FormatTooNew(
-            f"{path} is a store of version {_short(version)}, and this program reads version {STORE_VERSION}; install "
+            f"{path} is a store of version {version}, and this program reads version {STORE_VERSION}; install "
             "a newer version of it."
         )
     return from_json(RootAttributes, attributes)
 
 
 def _short(value: object) -> str:
-    """A value of a document as text; a number of thousands of digits cannot be printed."""
-    if isinstance(value, int) and value.bit_length() > 64:
-        return "with more than 19 digits"
+    """A value of a document as text of at most about 40 characters."""
     text = repr(value)
     return text if len(text) <= 40 else f"{text[:40]}..."

@@ -6,10 +6,10 @@ It is part of the store format, as `store_format.py` is: nothing here changes wi
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from typing import Any
 
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.jsonable import Document
 from vla_attention.schemas.limit_checks import check_at_most
 from vla_attention.schemas.limits import EPISODE_FILES
 from vla_attention.schemas.safe_text import check_inner_path
@@ -17,8 +17,7 @@ from vla_attention.schemas.safe_text import check_inner_path
 _CHECKSUMS = re.compile(r"([0-9a-f]{8})*")
 
 
-@dataclass(frozen=True)
-class FileRecord:
+class FileRecord(Document, frozen=True):
     """Size in bytes and sha256 of a file of an episode.
 
     Of a shard, from which parts are read: `index` is the sha256 of the index at its end, with the index's checksum, and
@@ -39,8 +38,7 @@ class FileRecord:
             raise BadArgument("the checksums of the chunks of a file are not 8 hexadecimal digits each")
 
 
-@dataclass(frozen=True)
-class EpisodeSeal:
+class EpisodeSeal(Document, frozen=True):
     """What binds every file of an episode to the episode's name and to its run.
 
     `episode` is the name of the episode's group, `run` the digest of the run's configuration (`run_digest`), `files`

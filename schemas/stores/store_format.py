@@ -29,14 +29,16 @@ NAME.zarr/                            attributes: `RootAttributes`
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
+
+from msgspec.structs import replace
 
 from vla_attention.schemas.effects import EffectsRecorded, EpisodeEffects
 from vla_attention.schemas.episode_steps import EpisodeSteps
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import Interventions, RerunSource
+from vla_attention.schemas.jsonable import Document, Number
 from vla_attention.schemas.layout import Prompt, SiteLayout
 from vla_attention.schemas.limit_checks import check_at_most
 from vla_attention.schemas.limits import (
@@ -120,8 +122,7 @@ class Problem(NamedTuple):
     file: str | None = None
 
 
-@dataclass(frozen=True)
-class Recording:
+class Recording(Document, frozen=True):
     """What of the attention is recorded.
 
     `layers` are block indices; `layer_labels` are the numbers that the user typed for them (the same unless the
@@ -203,8 +204,7 @@ OTHER_LOOPS = ("recorded", "dataset")
 CALLERS_MODULES = "torch modules of the caller"
 
 
-@dataclass(frozen=True)
-class Protocol:
+class Protocol(Document, frozen=True):
     """How episodes are run. It is the same for all episodes of a run.
 
     `name` is the published evaluation that is followed (openpi, lerobot or cosmos): it decides how resets are seeded.
@@ -232,8 +232,7 @@ class Protocol:
         return self.name in OTHER_LOOPS
 
 
-@dataclass(frozen=True)
-class PolicyCameraView:
+class PolicyCameraView(Document, frozen=True):
     """How a policy camera's picture came from the simulator's.
 
     The simulators give the bottom row first. `upright`: rows were reversed, so that row 0 of the stored frame is the
@@ -245,7 +244,7 @@ class PolicyCameraView:
     source: str
     upright: bool
     mirrored: bool
-    visible: float = 1.0
+    visible: Number = 1.0
 
     def __post_init__(self) -> None:
         """Check the names."""
@@ -253,8 +252,7 @@ class PolicyCameraView:
         check_name("camera", self.source)
 
 
-@dataclass(frozen=True)
-class PolicyIdentity:
+class PolicyIdentity(Document, frozen=True):
     """Which policy ran. `digest` is over the weights; `config` has what else distinguishes policies of its family."""
 
     name: str
@@ -278,8 +276,7 @@ class PolicyIdentity:
             check_at_most(f"The policy's {name}", getattr(self, name), AXIS)
 
 
-@dataclass(frozen=True)
-class DataSetSource:
+class DataSetSource(Document, frozen=True):
     """The data set on whose frames a run called its policy.
 
     `name`: of its folder, or ORG/NAME of the hub. `version`: of its format. `fps`: frames per second. `digest`: over
@@ -288,7 +285,7 @@ class DataSetSource:
 
     name: str
     version: str
-    fps: float
+    fps: Number
     robot_type: str
     digest: str
     columns: dict[str, str]
@@ -307,8 +304,7 @@ class DataSetSource:
         )
 
 
-@dataclass(frozen=True)
-class RootAttributes:
+class RootAttributes(Document, frozen=True):
     """Attributes of the store's root group: the run's identity. The same for every process that adds episodes.
 
     All of it is the run's configuration, except the fields in `JOB_RECORDS`. `interventions` says what the run changed
@@ -324,10 +320,10 @@ class RootAttributes:
     recording: Recording
     sites: tuple[SiteLayout, ...]
     provenance: dict[str, str]
-    interventions: Interventions = field(default_factory=Interventions)
+    interventions: Interventions = Interventions()
     rerun_of: RerunSource | None = None
     data_set: DataSetSource | None = None
-    digest: str = field(default="", compare=False)
+    digest: str = ""
 
     def __post_init__(self) -> None:
         """Check that sites have different names, and that something of each is recorded."""
@@ -361,16 +357,14 @@ class RootAttributes:
 JOB_RECORDS = (("provenance",), ("policy", "checkpoint"), ("digest",))
 
 
-@dataclass(frozen=True)
-class ArrayRecord:
+class ArrayRecord(Document, frozen=True):
     """Shape of an array and sha256 of its values (C order, little endian), with which `verify` compares it."""
 
     shape: tuple[int, ...]
     sha256: str
 
 
-@dataclass(frozen=True)
-class EpisodeAttributes:
+class EpisodeAttributes(Document, frozen=True):
     """Attributes of one episode's group.
 
     `success` is None where nobody knows it. `num_steps` is the number of actions executed after the waiting steps, with
@@ -404,7 +398,7 @@ class EpisodeAttributes:
     prompt_index: tuple[int, ...] = ()
     noise_seed: tuple[int, ...] = ()
     dataset_action_count: tuple[int, ...] = ()
-    denoise_time: tuple[float, ...] = ()
+    denoise_time: tuple[Number, ...] = ()
     task_family: str = ""
     effects: EpisodeEffects | None = None
     steps: EpisodeSteps | None = None

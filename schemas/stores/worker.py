@@ -10,12 +10,12 @@ from __future__ import annotations
 import os
 import socket
 import uuid
-from dataclasses import dataclass
 from pathlib import Path
 
+from vla_attention.schemas.jsonable import Document
 
-@dataclass(frozen=True)
-class Worker:
+
+class Worker(Document, frozen=True):
     """A process that captures. Unknown values are empty strings and 0.
 
     tag: unique among all processes of all machines.

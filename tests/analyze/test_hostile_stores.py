@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import structs
 
 from tests.kit.planted_effects import planted_effects
 from tests.kit.site_stores import SiteStoreSpec, write_site_store
@@ -226,10 +227,14 @@ class HostileSites(SiteStoreSpec):
     @property
     def sites(self) -> tuple[SiteLayout, ...]:
         def named(span: Span) -> Span:
-            return span if span.camera is None else replace(span, name=MARKUP + span.name, camera=MARKUP + span.name)
+            return (
+                span
+                if span.camera is None
+                else structs.replace(span, name=MARKUP + span.name, camera=MARKUP + span.name)
+            )
 
         made = zip((FORMULA, MARKUP), super().sites, strict=True)
-        return tuple(replace(site, name=name, spans=tuple(map(named, site.spans))) for name, site in made)
+        return tuple(structs.replace(site, name=name, spans=tuple(map(named, site.spans))) for name, site in made)
 
 
 @pytest.mark.thorough

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import polars as pl
+from msgspec.structs import replace
 
 from vla_attention.analyze.core.behaviour import SCHEMA, row_of
 from vla_attention.schemas.episode_steps import HAND, EpisodeSteps, TaskGoal

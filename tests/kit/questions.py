@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from msgspec import structs
+
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.schemas.groupings.grouping import Grouping
@@ -33,6 +35,6 @@ def with_attributes(episode: StoredEpisode, **changes: Any) -> StoredEpisode:
     """An episode whose attributes say something else than its files."""
 
     class Changed(StoredEpisode):
-        attributes = property(lambda self: replace(StoredEpisode.attributes.func(self), **changes))
+        attributes = property(lambda self: structs.replace(StoredEpisode.attributes.func(self), **changes))
 
     return Changed(episode.folder, episode.name, episode.run)

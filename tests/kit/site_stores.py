@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from tests.kit.tokens import INSTRUCTIONS
@@ -90,7 +91,11 @@ class SiteStoreSpec:
                 SiteLayout("image", _spans(picture), layers=odd, num_action_queries=6),
             )
         *known, generated = _spans([*picture, *prompt, ("generated", "action", GROWING_KEYS, None)])
-        return (SiteLayout("joint", (*known, replace(generated, growing=True)), num_action_queries=GROWING_KEYS + 1),)
+        return (
+            SiteLayout(
+                "joint", (*known, structs.replace(generated, growing=True)), num_action_queries=GROWING_KEYS + 1
+            ),
+        )
 
 
 _Part = tuple[str, Any, int, PatchGrid | None]

@@ -15,7 +15,7 @@ from vla_attention.schemas.documents import decode_json, decode_toml
 #: Texts with what looks like structure.
 TEXTS = st.text("ab[]{}\"'\\,:.#=\n é\U0001f600", max_size=8)
 VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | TEXTS,
+    st.none() | st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats(allow_nan=False) | TEXTS,
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(TEXTS, inner, max_size=3),
     max_leaves=12,
 )
@@ -41,7 +41,9 @@ def test_toml_is_read_as_by_python(keys, values):
         (b"[1, ", "Expecting value"),
         (b'"\xff"', "no text in UTF-8"),
         (b'["\\ud83d"]', "surrogate"),
-        (b"[" + b"9" * 5000 + b"]", "more than 4,000 digits"),
+        (b"[" + b"9" * 5000 + b"]", "64 bits"),
+        (b'{"a": 1, "b": -9223372036854775809}', "64 bits"),
+        (b"9223372036854775808", "64 bits"),
         (b"[" + b"[]," * 20 + b"1]", "more than 10 lists and objects"),
         (b" " * 200 + b"1", "it has 201 bytes; expected at most 200"),
     ],

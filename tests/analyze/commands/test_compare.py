@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 import pytest
+from msgspec import structs
 from scipy import stats
 
 from tests.kit.archives import example_store
@@ -157,19 +158,21 @@ def test_layers_named_in_two_ways_are_one_block(tmp_path):
 
 
 CHANGES = {
-    "suite": lambda root: replace(root, protocol=replace(root.protocol, suite="other")),
-    "seed": lambda root: replace(root, protocol=replace(root.protocol, seed=9)),
-    "protocol": lambda root: replace(root, protocol=replace(root.protocol, name="lerobot")),
-    "image_size": lambda root: replace(root, protocol=replace(root.protocol, image_size=360)),
-    "wait_steps": lambda root: replace(root, protocol=replace(root.protocol, wait_steps=11)),
-    "replan_steps": lambda root: replace(root, protocol=replace(root.protocol, replan_steps=4)),
-    "max_steps": lambda root: replace(root, protocol=replace(root.protocol, max_steps=77)),
-    "family": lambda root: replace(root, policy=replace(root.policy, family="another")),
-    "depth": lambda root: replace(root, policy=replace(root.policy, num_heads=5)),
-    "queries": lambda root: replace(root, recording=replace(root.recording, num_action_queries=4)),
-    "processing": lambda root: replace(root, policy=replace(root.policy, config={"normalisation": "other"})),
-    "cameras": lambda root: replace(root, policy=replace(root.policy, cameras=root.policy.cameras[:1])),
-    "simulator": lambda root: replace(root, provenance={"mujoco": "1.2"}),
+    "suite": lambda root: structs.replace(root, protocol=structs.replace(root.protocol, suite="other")),
+    "seed": lambda root: structs.replace(root, protocol=structs.replace(root.protocol, seed=9)),
+    "protocol": lambda root: structs.replace(root, protocol=structs.replace(root.protocol, name="lerobot")),
+    "image_size": lambda root: structs.replace(root, protocol=structs.replace(root.protocol, image_size=360)),
+    "wait_steps": lambda root: structs.replace(root, protocol=structs.replace(root.protocol, wait_steps=11)),
+    "replan_steps": lambda root: structs.replace(root, protocol=structs.replace(root.protocol, replan_steps=4)),
+    "max_steps": lambda root: structs.replace(root, protocol=structs.replace(root.protocol, max_steps=77)),
+    "family": lambda root: structs.replace(root, policy=structs.replace(root.policy, family="another")),
+    "depth": lambda root: structs.replace(root, policy=structs.replace(root.policy, num_heads=5)),
+    "queries": lambda root: structs.replace(root, recording=structs.replace(root.recording, num_action_queries=4)),
+    "processing": lambda root: structs.replace(
+        root, policy=structs.replace(root.policy, config={"normalisation": "other"})
+    ),
+    "cameras": lambda root: structs.replace(root, policy=structs.replace(root.policy, cameras=root.policy.cameras[:1])),
+    "simulator": lambda root: structs.replace(root, provenance={"mujoco": "1.2"}),
 }
 
 
@@ -252,9 +255,13 @@ def test_success_is_that_of_pairs_and_says_what_they_could_have_shown(stores, mo
     for run, outcomes in zip(runs, (first, other), strict=True):
         episodes = run.question.selected[:8]
         for item, solved in zip(episodes, outcomes, strict=True):
-            monkeypatch.setitem(item.episode.__dict__, "attributes", replace(item.episode.attributes, success=solved))
+            monkeypatch.setitem(
+                item.episode.__dict__, "attributes", structs.replace(item.episode.attributes, success=solved)
+            )
         for item in run.question.selected[8:]:
-            monkeypatch.setitem(item.episode.__dict__, "attributes", replace(item.episode.attributes, success=None))
+            monkeypatch.setitem(
+                item.episode.__dict__, "attributes", structs.replace(item.episode.attributes, success=None)
+            )
     found = compare(runs)
     (finding,) = (finding for finding in found.findings if "better" in finding.asks)
     assert verdict in finding.sentence

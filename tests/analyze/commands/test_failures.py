@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 
 import vla_attention as va
 from tests.kit.archives import example_store
@@ -113,7 +114,7 @@ def test_what_it_did_instead():
 
 def touching_nothing(spec, task, episode, steps):
     made = small_steps(spec, task, episode, steps)
-    untouched = replace(made.attributes, first_touch=(None,) * len(made.attributes.bodies))
+    untouched = structs.replace(made.attributes, first_touch=(None,) * len(made.attributes.bodies))
     return replace(made, attributes=untouched)
 
 

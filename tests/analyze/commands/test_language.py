@@ -11,6 +11,7 @@ import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from benchmarks.null_stores import says_it_listens
 from tests.kit.archives import example_store, unpacked
@@ -115,7 +116,7 @@ def test_sentences_that_name_no_goal_are_no_test():
 
 def test_scenes_are_shuffled_apart():
     """In each scene one goal is always reached; only all together it would look like listening."""
-    other = [goal.__class__(**{**vars(goal), "conditions": (f"elsewhere_{goal.task_id}",)}) for goal in COLOURS]
+    other = [replace(goal, conditions=(f"elsewhere_{goal.task_id}",)) for goal in COLOURS]
     here = did([(0, {0: 9})] * 6 + [(1, {0: 9})] * 2)
     there = did([(1, {1: 9})] * 6 + [(0, {1: 9})] * 2, other, suite="other")
     assert listens(with_choices(pl.concat([here, there]))).numbers["p"] == 1.0

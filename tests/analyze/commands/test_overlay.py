@@ -4,13 +4,13 @@ input.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
 import zarr
+from msgspec.structs import replace
 
 import tests.kit.stores as kit
 from tests.kit.questions import question_about

@@ -144,7 +144,7 @@ def test_several_stores_are_analysed_as_one_when_they_fit(tmp_path):
 
 
 def test_call_numbers_are_translated_and_kept_as_labels():
-    from dataclasses import replace
+    from msgspec.structs import replace
 
     root = root_attributes(StoreSpec(layers=(7,), layer_labels=(25,), num_layers=18))
     root = replace(root, policy=replace(root.policy, family="pi05"))

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from tests.kit.reruns import BASE, PLANTED, base_actions, changed_actions, knockout, write_with
 from tests.kit.stores import rerun_source, write_store
@@ -54,7 +55,7 @@ def another_picture(camera):
 
 
 def another_prompt(record):
-    return replace(record, prompt=replace(record.prompt, text=record.prompt.text + " "))
+    return replace(record, prompt=structs.replace(record.prompt, text=record.prompt.text + " "))
 
 
 def another_state(record):

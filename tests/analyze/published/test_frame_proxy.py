@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
+from msgspec.structs import replace
 
 from tests.kit.stores import StoreSpec, root_attributes
 from vla_attention.analyze.published.results_writer import frame_proxy

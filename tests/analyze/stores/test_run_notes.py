@@ -6,6 +6,7 @@ import shutil
 from dataclasses import replace
 
 import pytest
+from msgspec import structs
 
 from tests.kit.planted_effects import planted_effects
 from tests.kit.stores import StoreSpec, write_store
@@ -43,7 +44,7 @@ COMMANDS = {
 
 def cut(tokens):
     """The tokens with prompts that go on behind their last piece."""
-    prompts = [replace(prompt, text=f"{prompt.text} and then the drawer") for prompt in tokens.prompts]
+    prompts = [structs.replace(prompt, text=f"{prompt.text} and then the drawer") for prompt in tokens.prompts]
     return replace(tokens, prompts=tuple(prompts))
 
 
@@ -52,7 +53,9 @@ def told(tokens):
     made = []
     for prompt in tokens.prompts:
         first, last = prompt.instruction
-        made.append(replace(prompt, text=prompt.text[:first] + prompt.text[first:last][::-1] + prompt.text[last:]))
+        made.append(
+            structs.replace(prompt, text=prompt.text[:first] + prompt.text[first:last][::-1] + prompt.text[last:])
+        )
     return replace(tokens, prompts=tuple(made))
 
 

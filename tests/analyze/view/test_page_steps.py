@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from msgspec import structs
+
 from tests.analyze.view.page_answers import PageQuestion, needs_node, page_answers
 from tests.kit.http_ranges import serve
 from tests.kit.stores import StoreSpec, small_steps, write_store
@@ -25,9 +27,9 @@ def reaching_the_other(spec: StoreSpec, task: int, episode: int, steps: int) -> 
     """The goal of the other task is reached at step 3, and a third one held before the first step."""
     made = small_steps(spec, task, episode, steps)
     own, other = sorted(made.attributes.goals, key=lambda goal: goal.task_id != task)
-    standing = replace(other, task_id=9, task_name="nine", instruction="leave it there", first_held=0)
-    goals = (own, replace(other, instruction="push the plate\u202e", first_held=3), standing)
-    return replace(made, attributes=replace(made.attributes, goals=goals))
+    standing = structs.replace(other, task_id=9, task_name="nine", instruction="leave it there", first_held=0)
+    goals = (own, structs.replace(other, instruction="push the plate\u202e", first_held=3), standing)
+    return replace(made, attributes=structs.replace(made.attributes, goals=goals))
 
 
 def test_what_happened_first_is_said(tmp_path):

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from tests.kit.stores import StoreSpec, write_store
 from tests.kit.tokens import INSTRUCTIONS

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from tests.kit.spoiled_policy import spoil_actions
 from vla_attention.capture.__main__ import main
@@ -49,7 +50,7 @@ def test_a_store_is_made_again_to_the_bit(family, request, tmp_path, capsys):
     assert [episode.name for episode in again.episodes] == [episode.name for episode in base.episodes]
     for old, new in zip(base.episodes, again.episodes, strict=True):
         assert new.attributes.arrays == old.attributes.arrays  # shapes and digests of all values
-        assert replace(new.attributes, provenance={}) == replace(old.attributes, provenance={})
+        assert structs.replace(new.attributes, provenance={}) == structs.replace(old.attributes, provenance={})
         assert new.attributes.steps is not None
         assert new.attributes.steps.touched == ("cube",)
         np.testing.assert_array_equal(new.read("steps/actions")[:4], old.read("actions")[0, :4].astype(np.float32))

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from tests.kit.stores import StoreSpec, commit, denoise_times, episode_records, root_attributes
 from tests.kit.thorough import thorough_except
@@ -82,7 +83,7 @@ def without_contribution(record: ReplanRecord) -> ReplanRecord:
 
 
 def instruction_beyond_the_text(record: ReplanRecord) -> ReplanRecord:
-    return replace(record, prompt=replace(record.prompt, instruction=(0, 999)))
+    return replace(record, prompt=structs.replace(record.prompt, instruction=(0, 999)))
 
 
 #: Name, change, what the writer says. They can be stored: `verify` must find them, too.

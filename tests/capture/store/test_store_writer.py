@@ -15,6 +15,7 @@ import xarray
 import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from msgspec import structs
 
 from tests.kit.attacks import files_of
 from tests.kit.examples import examples
@@ -44,7 +45,7 @@ def check_equals_spec(path: Path, spec: StoreSpec) -> None:
     store = open_store(path)
     assert verify_store(store) == []
     assert [(e.attributes.task_id, e.attributes.episode_index) for e in store.episodes] == spec.names
-    assert store.attributes == root_attributes(spec)
+    assert structs.replace(store.attributes, digest="") == root_attributes(spec)
     for stored, (task, episode) in zip(store.episodes, spec.names, strict=True):
         start, records = episode_records(spec, task, episode)
         attributes = stored.attributes

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from tests.kit.site_stores import SiteStoreSpec, site_records, site_root, write_site_store
 from vla_attention.capture.store.episode_writer import ReplanRefused
@@ -116,7 +117,7 @@ def test_pieces_of_the_prompt_are_at_the_same_places_of_every_sites_text(tmp_pat
     of_self, of_cross = (episode.tokens(store.attributes, site) for site in ("self", "cross"))
     assert of_self.prompts == of_cross.prompts
     text = store.attributes.sites[1].spans[2]
-    moved = SiteLayout("text", (replace(text, start=0, stop=text.num_keys),))
+    moved = SiteLayout("text", (structs.replace(text, start=0, stop=text.num_keys),))
     sites = (store.attributes.sites[0], moved)
     (first, *_), (shifted, *_) = of_self.prompts, tuple(prompt_at(sites, moved, prompt) for prompt in of_self.prompts)
     assert [piece.key for piece in shifted.pieces] == [piece.key - 16 for piece in first.pieces]

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
+from msgspec.structs import replace
 
 import vla_attention as va
 from tests.kit.small_torch_policy import PROMPT, WIDTH, SmallPolicy, given, small_layout

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from msgspec import structs
 
 import vla_attention as va
 from tests.capture.torch_policies.cached_torch_policies import (
@@ -141,9 +141,11 @@ class GuidedPolicy:
 
 def guided_layout():
     layout = small_layout()
-    site = replace(layout.sites[0], projection="network.blocks.{block}.attention.out")
-    rules = tuple(replace(rule, modules=rf"network\.{rule.modules}") for rule in layout.rules)
-    return replace(layout, sites=(site,), rules=rules, text=replace(layout.text, embedding="network.words"))
+    site = structs.replace(layout.sites[0], projection="network.blocks.{block}.attention.out")
+    rules = tuple(structs.replace(rule, modules=rf"network\.{rule.modules}") for rule in layout.rules)
+    return structs.replace(
+        layout, sites=(site,), rules=rules, text=structs.replace(layout.text, embedding="network.words")
+    )
 
 
 @pytest.mark.parametrize("knockout", [None, "word:bowl"])

@@ -2,9 +2,9 @@
 
 import json
 import re
-from dataclasses import replace
 
 import pytest
+from msgspec.structs import replace
 
 from tests.kit.paths import ROOT
 from vla_attention.capture.torch_policies.policy_layout import (

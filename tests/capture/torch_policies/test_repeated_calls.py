@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import random
 import warnings
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from msgspec.structs import replace
 from torch import nn
 
 import vla_attention as va

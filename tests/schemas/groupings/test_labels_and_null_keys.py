@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from tests.kit.tokens import small_tokens
 from vla_attention.schemas.groupings.builtin_groupings import BUILTIN_GROUPINGS, find_grouping
@@ -28,7 +29,7 @@ def text_tokens(role: Role, pieces: bool) -> EpisodeTokens:
         for key, word in enumerate(INSTRUCTION.split()):
             found.append(Piece(key, word, position, position + len(word)))
             position += len(word) + 1
-        prompt = replace(prompt, pieces=tuple(found))
+        prompt = structs.replace(prompt, pieces=tuple(found))
     return EpisodeTokens(CROSS, roles, (prompt,), np.array([0]))
 
 

@@ -6,10 +6,10 @@ import os
 import subprocess
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from vla_attention.schemas.stores import locks
 from vla_attention.schemas.stores.locks import Held, Holder, Locks, episode_locks, store_locks

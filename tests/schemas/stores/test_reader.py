@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
+from msgspec.structs import replace
 from zarr.codecs import BloscCodec, Crc32cCodec
 
 from tests.kit.attacks import exchange, files_of
@@ -45,7 +46,7 @@ def path(original, tmp_path) -> Path:
 
 def test_a_store_lists_its_run_and_its_episodes_in_order(original):
     store = open_store(original)
-    assert store.attributes == root_attributes(SPEC)
+    assert replace(store.attributes, digest="") == root_attributes(SPEC)
     assert store.suite == "made_up"
     assert store.task_ids == (1, 12)
     assert [episode.name for episode in store.episodes] == [
@@ -164,8 +165,8 @@ def change_root(path: Path, **changes: object) -> None:
     ("changes", "message"),
     [
         ({"format": "something else"}, "not a store of this tool"),
-        ({"policy": "pi0.5"}, r"\$\.policy is str; expected dict"),
-        ({"protocol": {}}, r"\$\.protocol lacks the field 'name'"),
+        ({"policy": "pi0.5"}, r"\$\.policy: .*'str'"),
+        ({"protocol": {}}, r"\$\.protocol: .*'name'"),
         (
             {"sites": [{"name": "joint", "spans": [{"name": "a", "kind": "image", "start": 3, "stop": 5}]}]},
             "gap or overlap",

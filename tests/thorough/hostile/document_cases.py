@@ -68,10 +68,7 @@ RESULTS_CASES = [
     Case("results: a device", _device, "it is a device and no regular file", RESULTS),
     Case("results: a terabyte", _sparse, "it has 1,000,000,000,000 bytes; expected at most", RESULTS),
     Case("results: deep lists", _text("[" * 10**6), NO_RESULTS + ".*nested more than 64 deep", RESULTS),
-    Case("results: 5,000 digits", _digits("task_id", "9" * 5000), NO_RESULTS + ".*4,000 digits", RESULTS),
-    Case(
-        "results: a ratio of 400 digits", _with_step(visual_linguistic_ratio=10**400), "more than 300 digits", RESULTS
-    ),
+    Case("results: 5,000 digits", _digits("task_id", "9" * 5000), NO_RESULTS + ".*64 bits", RESULTS),
     Case("results: a mass below 0", _with_step(visual_mass=-1e308), "expected a number from 0", RESULTS),
     Case("results: an infinite mass", _with_step(visual_mass=float("inf")), "expected a finite mass", RESULTS),
     Case("results: half a surrogate", _results(task_description="\udc00"), NO_RESULTS + ".*surrogate", RESULTS),

@@ -137,9 +137,11 @@ EPISODE_CASES = [
     Case(
         "attributes: deep lists", _raw('"prompts": [', '"x": ' + "[" * 10_000 + '], "prompts": ['), "nested more than"
     ),
-    Case("attributes: 5,000 digits", _raw('"num_steps": ', '"num_steps": ' + "9" * 5000), DAMAGED + "4,000 digits"),
+    Case("attributes: 5,000 digits", _raw('"num_steps": ', '"num_steps": ' + "9" * 5000), DAMAGED + "64 bits"),
     Case("attributes: 10^15 replans", _set(num_replans=10**15), DAMAGED + "The number of replans is 1,000,000,000,000"),
-    Case("attributes: an infinite time", _raw('"denoise_time": [', '"denoise_time": [1e999, '), DAMAGED + "finite"),
+    Case(
+        "attributes: an infinite time", _raw('"denoise_time": [', '"denoise_time": [1e999, '), DAMAGED + "denoise_time"
+    ),
     Case("attributes: half a surrogate", _raw('"instruction": "', r'"instruction": "\udc00'), DAMAGED + "surrogate"),
     Case("attributes: pieces over one another", _overlapping, "The pieces of a prompt overlap: 10000 touch the 10000"),
     Case(
