@@ -152,8 +152,10 @@ def _array_document(text: str) -> Callable[[Path], None]:
 
 
 ARRAY_CASES = [
-    Case("array: no JSON", _array_document("["), ATOMS + r"its zarr\.json is damaged"),
-    Case("array: deep JSON", _array_document("[" * 10**6), ATOMS + r"its zarr\.json is damaged .*nested more than 64"),
+    Case("array: no JSON", _array_document("["), "joint/atoms/zarr.json does not say what its seal repeats", VERIFY, 1),
+    Case(
+        "array: deep JSON", _array_document("[" * 10**6), "joint/atoms/zarr.json does not say what its seal", VERIFY, 1
+    ),
     Case("array: 40 MB", _array_document(f'{{"x": "{"y" * 40_000_000}"}}'), r"expected at most 32,000,000"),
     Case("array: no codecs", _codecs([]), ATOMS + "it has no codecs"),
     Case(

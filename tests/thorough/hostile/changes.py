@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from vla_attention.schemas.stores.digest import bytes_digest, run_digest, seal_d
 
 #: The words of an analysis that reads roles, sums, masses and the rows of one word.
 WORDS = ("STORE", "--group", "noun=word:bowl", "--output", "OUT", "--no-cache")
-VERIFY = ("store", "verify", "STORE")
+VERIFY = ("store", "verify", "STORE", "--values")
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,9 @@ def seal_again(store: Path, change: Callable[[dict[str, Any]], object] = lambda 
         if file.is_file() and file.stat().st_size < 10**9:
             content = file.read_bytes()
             record |= {"size": len(content), "sha256": bytes_digest(content)}
+            if name in seal["documents"]:
+                with suppress(ValueError, RecursionError):  # the seal repeats what is a document
+                    seal["documents"][name] = json.loads(content)
     root = json.loads((store / "zarr.json").read_bytes())["attributes"]
     seal["run"] = run_digest(root)
     change(seal["files"])
