@@ -12,7 +12,6 @@ from typing import Any
 
 from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import UserError
-from vla_attention.schemas.limits import WHOLE_NUMBER
 from vla_attention.schemas.regular_files import NotRegular, open_regular, read_regular
 
 #: What makes an error of a sentence: mostly a class of errors.
@@ -111,16 +110,4 @@ def read_object(path: Path, refuse: Refuse, *, inside: Path | None = None) -> di
         raise refuse(f"'{path}' is not valid JSON ({error}).") from error
     if not isinstance(content, dict):
         raise refuse(f"'{path}' should hold a JSON object, but holds a {type(content).__name__}.")
-    if _has_longer_number(content):
-        raise refuse(f"'{path}' has a whole number that 64 bits do not hold.")
     return content
-
-
-def _has_longer_number(content: Any) -> bool:
-    level: list[Any] = [content]
-    while level:
-        inner = [value for outer in level for value in (outer.values() if isinstance(outer, dict) else outer)]
-        if any(isinstance(value, int) and not -WHOLE_NUMBER <= value < WHOLE_NUMBER for value in inner):
-            return True
-        level = [value for value in inner if isinstance(value, (dict, list))]
-    return False
