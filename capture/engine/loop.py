@@ -90,9 +90,8 @@ class EpisodeLoop:
     """Records the missing episodes of a store. Other processes may fill the same store at the same time.
 
     plan: for the log of this worker. unit: what is counted of an episode. With steps, the line of every episode says
-    how it ended; where no environment runs, that was known before. caller: makes the policy calls; None where the
-    source makes them. policy_batch: most calls that are made as one batch; what is ready is taken, without waiting for
-    more.
+    how it ended; where no environment runs, that was known before. policy_batch: most calls that are made as one batch;
+    what is ready is taken, without waiting for more.
     """
 
     store: RunStore
@@ -100,7 +99,6 @@ class EpisodeLoop:
     termination: Termination
     unit: Unit
     source: Source
-    caller: Caller | None
     policy_batch: int = 1
     log: WorkerLog = field(init=False)
     results: list[EpisodeResult] = field(default_factory=list, init=False)
@@ -186,8 +184,9 @@ class EpisodeLoop:
                 self._note_written()
                 # Before the policy computes: simulators reset and step meanwhile.
                 self._begin(elsewhere)
-                self._poll()
-                self._call_policy()
+                if self._running or self._committing:
+                    self._poll()
+                    self._call_policy()
         self.termination.check()
         return elsewhere
 
@@ -213,7 +212,8 @@ class EpisodeLoop:
         if self._has(job):
             self.progress.skip(job.name)
             return False
-        if self.caller is None and not self.store.path.exists():  # `va.record` makes the store with its first call
+        # `va.record`, which calls for such a source, makes the store with its first call.
+        if self.source.caller is None and not self.store.path.exists():
             return True
         holder = self.store.locks.acquire(job.name)
         if holder is not None:
@@ -281,10 +281,11 @@ class EpisodeLoop:
         """Make the next policy calls, and let their episodes go on before the calls are stored."""
         if not self._ready:
             return
-        assert self.caller is not None, "this source makes its own calls"
+        caller = self.source.caller
+        assert caller is not None, "this source makes its own calls"
         batch = [self._ready.popleft() for _ in range(min(self.policy_batch, len(self._ready)))]
         calls = [running.call for running in batch if running.call is not None]
-        made = self.caller.make(calls)
+        made = caller.make(calls)
         recorded: list[tuple[_Running, PolicyCall, RecordedCall]] = []
         for running, call, result in zip(batch, calls, made, strict=True):
             running.call = None
@@ -295,22 +296,21 @@ class EpisodeLoop:
                 running.episode.advance(result.actions)
                 recorded.append((running, call, result))
         for running, call, result in recorded:
-            self._keep(running, call, result)
+            self._keep(caller, running, call, result)
 
-    def _keep(self, running: _Running, call: PolicyCall, made: RecordedCall) -> None:
+    def _keep(self, caller: Caller, running: _Running, call: PolicyCall, made: RecordedCall) -> None:
         """Store a policy call that has been made, with its effects. A simulator elsewhere goes on meanwhile."""
-        assert self.caller is not None
         assert running.episode is not None
         if running.writer is None:
             running.writer = self._thread.episode(
-                self.store, running.episode.start, self.caller.denoise_times(), running.episode.max_replans
+                self.store, running.episode.start, caller.denoise_times(), running.episode.max_replans
             )
-            running.effects = None if self.caller.effects is None else self.caller.effects.begin()
+            running.effects = None if caller.effects is None else caller.effects.begin()
         effects = None
         if running.effects is not None:
             effects = running.effects.measure(call.policy_input, call.noise_seed, made.actions, call.context)
         running.num_replans += 1
-        running.writer.append(self.caller.record(call, made, effects))
+        running.writer.append(caller.record(call, made, effects))
 
     @contextmanager
     def _dropping_faults(self, running: _Running) -> Iterator[None]:

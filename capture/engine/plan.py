@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 #: The denoise steps that are recorded unless others are asked for.
 DEFAULT_STEPS = ("first", "last")
+_QUERIES = {"mean": "the mean over", "steps": "the action steps' means over", "all": "each of"}
 
 
 @dataclass(frozen=True)
@@ -170,9 +171,6 @@ def root_attributes(
         rerun_of=rerun_of,
         data_set=data_set,
     )
-
-
-_QUERIES = {"mean": "the mean over", "steps": "the action steps' means over", "all": "each of"}
 
 
 def announce(

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.engine.call import PolicyCall
+from vla_attention.capture.engine.call import Caller, PolicyCall
 from vla_attention.capture.engine.progress import say
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.worker_log import PlannedTask
@@ -119,9 +119,9 @@ class Episode(ABC):
             SimulationFailed, and other faults of this episode alone (`faults.py`).
         """
 
-    @abstractmethod
     def advance(self, actions: NDArray[np.float64]) -> None:
-        """Take what the last policy call gave, (horizon, action dim)."""
+        """Take what the last policy call gave, (horizon, action dim); where nothing is executed, it is only counted."""
+        self.done += 1
 
     def overdue(self) -> str | None:
         """Return how it hangs, in the words of `SourceLost`; None while it does not."""
@@ -132,8 +132,15 @@ class Episode(ABC):
 
 
 class Source(ABC):
-    """Begins episodes, of which up to `capacity` run at a time. say: prints a line for the person at the terminal."""
+    """Begins episodes.
 
+    Attributes:
+        caller: makes their policy calls; None where the source makes them itself.
+        capacity: episodes that run at a time, at most.
+        say: prints a line for the person at the terminal.
+    """
+
+    caller: Caller | None
     capacity: int = 1
     say: Callable[[str], None] = staticmethod(say)
 

@@ -144,21 +144,17 @@ class WorkerLog:
             return
         self.file.parent.mkdir(exist_ok=True)
         self._began = None
-        if (
-            self.file.exists()
-        ):  # of an earlier process with the same number, which may have been killed inside of a line
-            with self.file.open("a", encoding="utf-8") as file:
-                file.write("\n")
-        self._write(began)
+        # An earlier process with the same number may have been killed inside of a line.
+        self._write(began, before="\n")
 
     def _add(self, event: Mapping[str, Any]) -> None:
         self._begin()
         if self._began is None:
             self._write(event)
 
-    def _write(self, event: Mapping[str, Any]) -> None:
+    def _write(self, event: Mapping[str, Any], before: str = "") -> None:
         with self.file.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(event) + "\n")
+            file.write(f"{before}{json.dumps(event)}\n")
 
 
 def log_folder(store: Path) -> Path:

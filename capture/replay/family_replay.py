@@ -115,10 +115,6 @@ class FramesOfEpisode(Episode):
             dataset_actions=None if actions is None else actions[frame.index : frame.index + policy.action_horizon],
         )
 
-    def advance(self, actions: NDArray[np.float64]) -> None:
-        """Go to the next frame, whatever the actions are."""
-        self.done += 1
-
 
 def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: str) -> int:
     """Build the policy for the robot of the data set, and record its calls; returns the number of new episodes."""
@@ -149,7 +145,7 @@ def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: 
     effects = measurement_of(recording.effects, policy, [], say, pictures)
     caller = Caller(policy, recording, effects=effects)
     source = Frames(policy, caller, plan, every, attributes.provenance)
-    return record_episodes(plan, store, todo, every, source, caller)
+    return record_episodes(plan, store, todo, every, source)
 
 
 def _picture_sizes(data: LeRobotDataset, policy: RobotPolicy) -> list[int]:

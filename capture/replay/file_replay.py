@@ -8,10 +8,8 @@ from collections.abc import Generator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 from msgspec import structs
-from numpy.typing import NDArray
 
 from vla_attention.capture.engine.plan import recording_settings
 from vla_attention.capture.engine.progress import say
@@ -55,6 +53,7 @@ class FramesForFile(Source):
     cameras: dict[str, str]
     state: tuple[str, ...]
     actions: tuple[str, ...]
+    caller: None = None
 
     def open(self, job: EpisodeJob) -> RecordedByRun:
         """Open an episode."""
@@ -113,10 +112,6 @@ class RecordedByRun(Episode):
         self.done += 1
         return None
 
-    def advance(self, actions: NDArray[np.float64]) -> None:
-        """Never called: it gives no calls away."""
-        raise NotImplementedError
-
     def close(self, error: Exception | None = None) -> None:
         """Drop what was not committed."""
         self.calls.close()
@@ -172,7 +167,7 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
         todo = announce_replay(plan, run.attributes, layout.action_horizon, sizes)
         seed = plan.seed if interventions.noise is None else interventions.noise.seed
         source = FramesForFile(given, run, plan, every, seed, cameras, state, actions)
-        added = record_episodes(plan, store, todo, every, source, None)
+        added = record_episodes(plan, store, todo, every, source)
     if run.num_dropped:
         say(f"In {run.num_dropped} policy calls no attention ran; they are not in the store.")
     if added:

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.engine.call import Caller
 from vla_attention.capture.engine.faults import Faults
 from vla_attention.capture.engine.loop import EpisodeLoop
 from vla_attention.capture.engine.plan import announce
@@ -189,12 +188,8 @@ def announce_replay(
     return todo
 
 
-def record_episodes(
-    plan: ReplayPlan, store: RunStore, todo: Sequence[int], every: int, source: Source, caller: Caller | None
-) -> int:
+def record_episodes(plan: ReplayPlan, store: RunStore, todo: Sequence[int], every: int, source: Source) -> int:
     """Make the calls of the episodes; returns how many were added. The plan notes those that a fault left out.
-
-    caller: makes the calls; None where the source makes them.
 
     Raises:
         Terminated: SIGTERM was received; the episode in progress was dropped.
@@ -206,7 +201,7 @@ def record_episodes(
         for index in todo:
             jobs.append(plan.job(index, every))
             advance(1)
-    loop = EpisodeLoop(store, plan_of(jobs), plan.termination, "call", source, caller)
+    loop = EpisodeLoop(store, plan_of(jobs), plan.termination, "call", source)
     results = loop.record_all(jobs)
     plan.faults.dropped.update(loop.faults.dropped)
     return len(results)

@@ -9,9 +9,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
 from msgspec import structs
-from numpy.typing import NDArray
 
 from vla_attention.capture.effects.conditions import describe_effects
 from vla_attention.capture.effects.mean_pictures import MeanPictures
@@ -109,10 +107,6 @@ class EpisodeAgain(Episode):
             if self.done == self.calls.num_replans:
                 return Outcome(attributes.success, attributes.num_steps, self.calls.steps)
             return self.calls.again(self.caller, self.done, keep_actions=self.keep_actions)
-
-    def advance(self, actions: NDArray[np.float64]) -> None:
-        """Go to the next call, whatever the actions are."""
-        self.done += 1
 
 
 @contextmanager
@@ -225,7 +219,7 @@ class Rerun:
             say(describe_effects(self.recording.effects))
         caller = replace(caller, effects=effects)
         source = StoredEpisodes(caller, store, episodes, self.machine)
-        loop = EpisodeLoop(store, plan_of(jobs), self.termination, "call", source, caller)
+        loop = EpisodeLoop(store, plan_of(jobs), self.termination, "call", source)
         try:
             loop.record_all(todo)
         finally:

@@ -167,7 +167,7 @@ def _record_missing(
     source = Simulators(
         settings.suite, environment_settings, store, caller, machine, termination.check, max(1, num_envs)
     )
-    loop = EpisodeLoop(store, plan, termination, "step", source, caller, batch)
+    loop = EpisodeLoop(store, plan, termination, "step", source, batch)
     results = loop.record_all(todo)
     if (empty := changes.describe_empty()) is not None:
         say(empty)

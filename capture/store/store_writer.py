@@ -89,9 +89,10 @@ def open_run(path: Path, attributes: RootAttributes, mode: WriteMode, *, durable
         existing = read_existing_root(path) if path.exists() else create_root(path, attributes, durable)
         check_same_run(path, existing, attributes)
         (path / NAMES_FILE).unlink(missing_ok=True)  # of a copy: it would lack what is recorded now
-        for locks in (episode_locks(path), store_locks(path)):
+        store = RunStore(path, existing, durable)
+        for locks in (store.locks, store_locks(path)):
             locks.sweep()
-    return RunStore(path, existing, durable)
+    return store
 
 
 def make_way(path: Path, mode: WriteMode) -> Path:

@@ -44,15 +44,14 @@ class MadeUpEpisode(Episode):
         folder = write_episode(self.source.store, SPEC, self.job.task.task_id, self.job.episode_index)
         return Committed(Outcome(True, 4), 1, folder)
 
-    def advance(self, actions: object) -> None:
-        raise NotImplementedError
-
     def close(self, error: Exception | None = None) -> None:
         self.source.tried.append(f"{self.job.name} closed")
 
 
 class MadeUpSource(Source):
     """Writes made-up episodes. before: called before each is written, with its name."""
+
+    caller = None
 
     def __init__(self, store: RunStore, before: Callable[[str], object] = lambda name: None) -> None:
         self.store, self.before = store, before
@@ -74,7 +73,7 @@ def store(tmp_path: Path) -> RunStore:
 
 
 def loop_of(store: RunStore, source: MadeUpSource, unit: Unit = "step") -> EpisodeLoop:
-    return EpisodeLoop(store, plan_of(JOBS), Termination(), unit, source, None)
+    return EpisodeLoop(store, plan_of(JOBS), Termination(), unit, source)
 
 
 def test_every_episode_is_recorded_and_noted(store: RunStore, capsys: pytest.CaptureFixture[str]) -> None:
