@@ -56,11 +56,15 @@ class Items:
     absent: Literal["left out", "zero"] = "left out"
 
     def with_totals(self, item: SelectedEpisode) -> NDArray[np.float32]:
-        """The weights, then those of `whole` and of all valid keys; keys that were taken out are in none."""
+        """The weights, then those of `whole` and of all valid keys; keys that were taken out are in none.
+
+        (replan or 1, key, item): once where they are the same at all replans, which makes one product of many.
+        """
         totals = [self.whole if isinstance(self.whole, np.ndarray) else item.valid, item.valid]
-        replans = max(len(self.weights), *map(len, totals))
         parts = [self.weights, *(part[:, :, None].astype(np.float32) for part in totals)]
-        weights = np.concatenate([np.broadcast_to(part, (replans, *part.shape[1:])) for part in parts], axis=2)
+        each = [part[:1] if (part[1:] == part[:-1]).all() else part for part in parts]
+        replans = max(map(len, each))
+        weights = np.concatenate([np.broadcast_to(part, (replans, *part.shape[1:])) for part in each], axis=2)
         weights[:, list(item.without)] = 0.0
         return weights
 

@@ -52,24 +52,24 @@ def layer_rows(
         CorruptEpisode: a chunk is not the one that was sealed, or rows do not add up to their stored sums.
     """
     name, recording = f"{site}/rows", root.recording_of(site)
-    sums = episode.read(f"{site}/row_sum")
+    sums = episode.read(f"{site}/row_sum")  # (replan, layer, denoise, head, query)
     # A slice where it can be one: picking heads by their numbers copies every row.
     replans, *_, stored, queries, keys = episode.shape_of(name)
     heads = slice(None) if selection.heads == tuple(range(stored)) else list(selection.heads)
     apart = selection.per_head if per_head is None else per_head
+    of_mean = queries if apart else queries * len(selection.heads)
+    share = np.full((1, of_mean), 1 / of_mean, np.float32)
     # Means too are written into memory that stays: new memory for each would be asked of the system again and again.
-    of_queries = np.empty((replans, len(selection.heads), keys), np.float32) if queries > 1 else None
-    of_heads = None if apart else np.empty((replans, keys), np.float32)
+    mean = np.empty((replans, len(selection.heads) if apart else 1, 1, keys), np.float32) if of_mean > 1 else None
     cells = [(i, j) for i in range(len(selection.layers)) for j in range(len(selection.denoise))]
     places = [(selection.layers[i], selection.denoise[j]) for i, j in cells]
     for (i, j), (layer, step), whole in zip(cells, places, episode.read_layers(name, places), strict=True):
         if not add_up(whole, sums[:, layer, step], recording.mantissa_bits):
             here = replace(recording, layers=(recording.layers[layer],), denoise_steps=(recording.denoise_steps[step],))
             _refuse(episode, name, whole, sums[:, layer, step], here)
-        rows = whole[:, heads]
-        rows = rows[:, :, 0] if of_queries is None else _mean_into(of_queries, rows, 2)
-        if of_heads is not None:
-            rows = _mean_into(of_heads, rows, 1)[:, None]
+        # (replan, head or 1, of which the mean is taken, key): a product with the shares, which is a BLAS call.
+        parts = whole[:, heads].reshape(replans, -1, of_mean, keys)
+        rows = (parts if mean is None else np.matmul(share, parts, out=mean))[:, :, 0]
         yield LayerRows(i, j, rows)
 
 
@@ -83,9 +83,3 @@ def _refuse(
     episode.refuse_missing(name, rows)
     for problem in row_problems(name, rows[:, None, None], sums[:, None, None], recording, recording.mantissa_bits):
         raise CorruptEpisode(f"Episode {episode.name} is damaged: {problem}.")
-
-
-def _mean_into(memory: NDArray[np.float32], values: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
-    """The mean over one axis: to the last bit that of `values.mean`, which divides in float64 and is slower."""
-    np.add.reduce(values, axis=axis, out=memory)
-    return np.divide(memory, np.float32(values.shape[axis]), out=memory)

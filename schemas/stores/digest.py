@@ -70,14 +70,14 @@ def run_digest(attributes: Mapping[str, Any]) -> str:
     return bytes_digest(_canonical(run_configuration(attributes)))
 
 
-def seal_digest(attributes: Mapping[str, Any]) -> str:
-    """The digest of a seal or a root over all its fields but `digest`; `attributes` are those in its `zarr.json`."""
+def root_digest(attributes: Mapping[str, Any]) -> str:
+    """The digest of a root over all its fields but `digest`; `attributes` are those in its `zarr.json`."""
     return bytes_digest(_canonical({name: value for name, value in attributes.items() if name != "digest"}))
 
 
 def with_digest(attributes: Mapping[str, Any]) -> dict[str, Any]:
     """Attributes with their own digest as the last field, in place of the one that they have."""
-    return {**attributes, "digest": seal_digest(attributes)}
+    return {**attributes, "digest": root_digest(attributes)}
 
 
 def _canonical(document: object) -> bytes:

@@ -11,7 +11,9 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from msgspec.structs import replace
 
@@ -19,7 +21,7 @@ from vla_attention.schemas.jsonable import from_json, to_json
 from vla_attention.schemas.limits import DOCUMENT_BYTES
 from vla_attention.schemas.stores.array_metadata import chunks_of_a_shard
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder
-from vla_attention.schemas.stores.digest import CHECKSUM_BYTES, bytes_digest, seal_digest
+from vla_attention.schemas.stores.digest import CHECKSUM_BYTES, bytes_digest
 from vla_attention.schemas.stores.root import group_attributes
 from vla_attention.schemas.stores.seal_content import EpisodeSeal, FileRecord
 from vla_attention.schemas.stores.shards import index_size, read_index
@@ -47,11 +49,18 @@ def seal_episode(folder: Path, name: str, run: str, copied_from: str = "") -> Ep
         records[file.relative_to(folder).as_posix()] = _file_record(file, chunks)
     repeated = {file.relative_to(folder).as_posix(): document for file, document in documents.items()}
     seal = EpisodeSeal(name, run, records, repeated, digest="", copied_from=copied_from)
-    seal = replace(seal, digest=seal_digest(to_json(seal)))
+    content = seal_document(to_json(seal))
     (folder / SEAL_GROUP).mkdir(exist_ok=True)
-    group = {"zarr_format": 3, "node_type": "group", "attributes": to_json(seal)}
-    (folder / SEAL_FILE).write_text(json.dumps(group, separators=(",", ":")), encoding="utf-8")
-    return seal
+    (folder / SEAL_FILE).write_bytes(content)
+    return from_json(EpisodeSeal, group_attributes(content))
+
+
+def seal_document(attributes: Mapping[str, Any]) -> bytes:
+    """The bytes of the file of a seal: its attributes, after a digest that fits."""
+    first = {"digest": "", **{name: value for name, value in attributes.items() if name != "digest"}}
+    group = {"zarr_format": 3, "node_type": "group", "attributes": first}
+    content = json.dumps(group, separators=(",", ":")).encode()
+    return content.replace(b'"digest":""', b'"digest":"%s"' % bytes_digest(content).encode(), 1)
 
 
 def read_seal(place: Path | ByteSource) -> EpisodeSeal:
@@ -62,8 +71,10 @@ def read_seal(place: Path | ByteSource) -> EpisodeSeal:
         ValueError: it is no seal, or its own digest does not fit.
     """
     source = Folder(place) if isinstance(place, Path) else place
-    attributes = group_attributes(source.whole(SEAL_FILE, most=DOCUMENT_BYTES))
-    if attributes.get("digest") != seal_digest(attributes):
+    content = source.whole(SEAL_FILE, most=DOCUMENT_BYTES)
+    attributes = group_attributes(content)
+    digest = str(attributes.get("digest"))
+    if bytes_digest(content.replace(digest.encode(), b"", 1)) != digest:
         raise ValueError("its own digest does not fit")
     return from_json(EpisodeSeal, attributes)
 

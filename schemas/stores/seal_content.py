@@ -44,7 +44,7 @@ class EpisodeSeal(Document, frozen=True):
     `episode` is the name of the episode's group, `run` the digest of the run's configuration (`run_digest`), `files`
     every file of the episode but the seal itself, by its path. `documents` repeats what each `zarr.json` among them
     says, so that one small file opens an episode. `copied_from` is the digest of the captured episode's seal, in a copy
-    that leaves something out. `digest` is the sha256 of the other fields (`seal_digest`).
+    that leaves something out. `digest` is the sha256 of the seal's file without the 64 digits of this digest.
     """
 
     episode: str

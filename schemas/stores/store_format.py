@@ -309,7 +309,7 @@ class RootAttributes(Document, frozen=True):
 
     All of it is the run's configuration, except the fields in `JOB_RECORDS`. `interventions` says what the run changed
     in the policy and its input, `rerun_of` which store's policy calls it repeated. `data_set` is the one that was
-    replayed; None for every other run. `digest` is the sha256 of the other attributes (`seal_digest`), which is made
+    replayed; None for every other run. `digest` is the sha256 of the other attributes (`root_digest`), which is made
     when the root is written: `verify` compares it.
     """
 

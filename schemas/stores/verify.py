@@ -13,7 +13,7 @@ from typing import Literal
 from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.limits import ROOT_BYTES
-from vla_attention.schemas.stores.digest import seal_digest
+from vla_attention.schemas.stores.digest import root_digest
 from vla_attention.schemas.stores.episode_checks import content_problems, form_problems
 from vla_attention.schemas.stores.episode_files import check_presence, foreign_in_episode
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
@@ -108,7 +108,7 @@ def _group_problems(store: Store, file: str) -> Iterator[str]:
             yield "it has attributes, and the group of episodes has none"
     elif not store.attributes.digest:
         yield "it has lost its own digest"
-    elif store.attributes.digest != seal_digest(attributes):
+    elif store.attributes.digest != root_digest(attributes):
         yield "it was changed: its own digest does not fit"
 
 

@@ -22,7 +22,8 @@ from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.published.parse_results import main as parse
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.schemas.layout import SiteLayout, Span
-from vla_attention.schemas.stores.digest import bytes_digest, seal_digest
+from vla_attention.schemas.stores.digest import bytes_digest
+from vla_attention.schemas.stores.seal import SEAL_FILE, seal_document
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=2, contributions=True)
 #: Clears a screen, moves the cursor, reverses the direction of writing, begins a line, is markup, and is a formula.
@@ -348,11 +349,9 @@ def test_a_seal_that_lists_files_outside_of_its_episode_copies_none(store, tmp_p
     folder = store / "episodes" / "task000_episode000"
     outside = "../../../../secret"
 
-    def list_outside(seal: dict[str, Any]) -> None:
-        seal["files"][outside] = {"size": 6, "sha256": bytes_digest(b"secret"), "index": "", "chunks": ""}
-        seal["digest"] = seal_digest(seal)
-
-    change(folder / "seal" / "zarr.json", list_outside)
+    seal = json.loads((folder / SEAL_FILE).read_text())["attributes"]
+    seal["files"][outside] = {"size": 6, "sha256": bytes_digest(b"secret"), "index": "", "chunks": ""}
+    (folder / SEAL_FILE).write_bytes(seal_document(seal))
     assert analyze(["store", "copy", str(store), str(tmp_path / "deep" / "er" / "copy.zarr")]) == 2
     assert "its seal is damaged" in check_output(capsys)
     assert list(tmp_path.rglob("secret")) == [tmp_path / "secret"]

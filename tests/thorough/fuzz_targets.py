@@ -34,10 +34,11 @@ from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vo
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.stores.array_metadata import ArrayMetadata, describe_array
 from vla_attention.schemas.stores.byte_source import Memory, copy_into
-from vla_attention.schemas.stores.digest import bytes_digest, crc32c, seal_digest
+from vla_attention.schemas.stores.digest import bytes_digest, crc32c
 from vla_attention.schemas.stores.episode_checks import content_problems
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
-from vla_attention.schemas.stores.seal import SEAL_FILE, read_seal
+from vla_attention.schemas.stores.root import attributes_in
+from vla_attention.schemas.stores.seal import SEAL_FILE, read_seal, seal_document
 from vla_attention.schemas.stores.seal_content import FileRecord
 from vla_attention.schemas.stores.shards import SealedShard, ShardedLayers, index_size
 
@@ -142,10 +143,7 @@ def roots(content: bytes) -> None:
 def seals(content: bytes) -> None:
     """A seal, under its right digest if it is JSON."""
     with suppress(ValueError, RecursionError):
-        document = json.loads(content)
-        attributes = document.get("attributes") if isinstance(document, dict) else None
-        if isinstance(attributes, dict):
-            content = json.dumps({**document, "attributes": {**attributes, "digest": seal_digest(attributes)}}).encode()
+        content = seal_document(attributes_in(json.loads(content)))
     _read("seals", SEAL_FILE, content)
 
 
@@ -183,10 +181,7 @@ def _read(name: str, file: str, content: bytes) -> None:
     (folder / file).write_bytes(content)
     if file != SEAL_FILE:
         record = {**seal["files"][file], "size": len(content), "sha256": bytes_digest(content)}
-        seal = {**seal, "files": {**seal["files"], file: record}}
-        seal["digest"] = seal_digest(seal)
-        document = {"zarr_format": 3, "node_type": "group", "attributes": seal}
-        (folder / SEAL_FILE).write_text(json.dumps(document))
+        (folder / SEAL_FILE).write_bytes(seal_document({**seal, "files": {**seal["files"], file: record}}))
     store = open_store(_store(name))
     found = replace(store.episodes[0], name=episode.name)
     list(content_problems(store.attributes, found))

@@ -14,8 +14,8 @@ import pytest
 from tests.kit.attacks import FIRST, forge_chunk
 from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main as analyze
-from vla_attention.schemas.stores.digest import seal_digest
 from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.seal import seal_document
 from vla_attention.schemas.stores.shards import index_size
 
 #: Two layers and two denoise steps: four chunks of 39 keys.
@@ -83,13 +83,11 @@ def test_bits_that_keep_the_checksum_are_refused(path, tmp_path, capsys):
 
 def test_a_seal_that_repeats_something_else_is_named(path, capsys):
     file = path / "episodes" / FIRST / "seal/zarr.json"
-    document = json.loads(file.read_text())
-    document["attributes"]["documents"]["joint/zarr.json"]["attributes"]["layer"] = [7, 8]
-    document["attributes"]["digest"] = seal_digest(document["attributes"])
-    file.write_text(json.dumps(document))
+    seal = json.loads(file.read_text())["attributes"]
+    seal["documents"]["joint/zarr.json"]["attributes"]["layer"] = [7, 8]
+    file.write_bytes(seal_document(seal))
     assert "joint/zarr.json does not say what its seal repeats" in refused_by(["store", "verify", str(path)], capsys)
-    del document["attributes"]["documents"]["joint/rows/zarr.json"]
-    document["attributes"]["digest"] = seal_digest(document["attributes"])
-    file.write_text(json.dumps(document))
+    del seal["documents"]["joint/rows/zarr.json"]
+    file.write_bytes(seal_document(seal))
     assert "its seal does not list its joint/rows/zarr.json" in refused_by([str(path), "--group", CORNER], capsys)
     assert open_store(path).episodes[1].read("joint/rows").shape[0] == 9

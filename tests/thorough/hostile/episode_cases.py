@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.kit.attacks import files_of
-from tests.thorough.hostile.changes import VERIFY, Case, edit, edit_array, edit_episode, episode_of, seal_again
-from vla_attention.schemas.stores.digest import seal_digest
+from tests.thorough.hostile.changes import VERIFY, Case, edit_array, edit_episode, episode_of, seal_again
+from vla_attention.schemas.stores.seal import SEAL_FILE, seal_document
 
 DAMAGED = "Episode task000_episode000 cannot be read: its attributes are damaged .*"
 SEAL = "Episode task000_episode000 cannot be read: its seal is damaged .*"
@@ -37,11 +37,13 @@ def _raw(replaced: str, by: str) -> Callable[[Path], None]:
 def _seal(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
     """A change of the seal, with its right digest."""
 
-    def seal(attributes: dict[str, Any]) -> None:
+    def seal(store: Path) -> None:
+        file = episode_of(store) / SEAL_FILE
+        attributes = json.loads(file.read_bytes())["attributes"]
         change(attributes)
-        attributes["digest"] = seal_digest(attributes)
+        file.write_bytes(seal_document(attributes))
 
-    return lambda store: edit(episode_of(store) / "seal" / "zarr.json", seal)
+    return seal
 
 
 def _record(**fields: Any) -> Callable[[Path], None]:
