@@ -19,6 +19,7 @@ measures goes to docs/benchmarks/analysis_speed.json; nothing is asserted. The p
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import re
 import shutil
@@ -96,15 +97,10 @@ def decode_only(store: Path, threads: int) -> Callable[[], None]:
     from vla_attention.schemas.stores.digest import crc32c
 
     def positions(episode: StoredEpisode) -> tuple[Path, list[tuple[int, int]], int]:
-        name = next(file for file in episode.files.records if file.startswith("joint/rows/c"))
-        replans, layers, steps, heads, queries, keys = episode.shape_of("joint/rows")
-        shard = episode.files.shard(name, layers * steps)
-        block = -(-replans // 8) * 8
-        return (
-            episode.folder / name,
-            [(int(at), int(size) - 4) for at, size in shard.index],
-            block * heads * queries * keys,
-        )
+        about = episode.array("joint/rows").metadata
+        path = episode.folder / "joint/rows" / about.file
+        index = np.frombuffer(path.read_bytes()[-16 * about.shard_chunks - 4 : -4], "<u8").reshape(-1, 2)
+        return path, [(at, size - 4) for at, size in index.tolist()], math.prod(about.chunk_shape)
 
     def decode(of_episode: tuple[Path, list[tuple[int, int]], int]) -> None:
         from numcodecs import blosc

@@ -281,7 +281,7 @@ def copy_episode(
         seal_episode(folder, episode.name, run, copied_from=_captured(episode))
     else:
         seal.parent.mkdir()
-        seal.write_bytes(without_other_fields(episode.source.whole(SEAL_FILE)))
+        seal.write_bytes(episode.source.whole(SEAL_FILE))
     return copied + seal.stat().st_size, left, shared
 
 

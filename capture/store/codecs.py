@@ -1,9 +1,8 @@
 """The codec chain of every array of a store, and its chunks and shards.
 
 Only core codecs of Zarr v3 are used (bytes, blosc, crc32c, sharding_indexed), so that any Zarr v3 reader opens the
-store, and every chunk has a checksum. `docs/store.md` gives the reasons and measurements. Without zarr,
-`schemas/stores/shards.py` reads the layouts of `create_rows` and `write_whole`; after a change here it must know the
-new layout, or zarr reads it, more slowly.
+store, and every chunk has a checksum. `docs/store.md` gives the reasons and measurements.
+`schemas/stores/array_metadata.py` says what else than the layouts of `create_rows` and `write_whole` is refused.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ import numpy as np
 import zarr
 from numpy.typing import DTypeLike, NDArray
 
-from vla_attention.capture.store.codecs import CHUNK_KEYS, create_rows, encode_row_chunk, replans_per_block
+from vla_attention.capture.store.codecs import create_rows, encode_row_chunk, replans_per_block
 from vla_attention.capture.store.replan_records import RecordedRows
 from vla_attention.schemas.groupings.key_counts import uniform_of_roles
 from vla_attention.schemas.jsonable import to_json
@@ -49,7 +49,7 @@ class ShardWriter:
     def __init__(self, folder: Path, cells: tuple[int, ...], block: int) -> None:
         """Begin the file in the array's folder; `cells` are its axes (layer, ...), `block` the replans of a chunk."""
         folder.mkdir()
-        self.file = folder / chunk_file(CHUNK_KEYS, (0,) * (1 + len(cells)))
+        self.file = folder / chunk_file(1 + len(cells))
         self.cells = cells
         self.block = block
         self.num_replans = 0

@@ -88,15 +88,15 @@ def _guarded(check: Iterator[str]) -> Iterator[Problem]:
 
 def _array_problems(root: RootAttributes, episode: StoredEpisode, name: str, sha256: str) -> Iterator[str]:
     """One pass over an array: its digest, and the rules for the numbers of rows, segments' masses and contributions."""
-    array = episode.array(name)
+    shape = episode.shape_of(name)
     site_name, _, kind = name.rpartition("/")
     site = next((site for site in root.sites if site.name == site_name), None)
     recording = root.recording if site is None else root.recording.of_site(site)
-    sums = _row_sums(episode, name, array.shape[:-1]) if kind in ("rows", "atoms") else None
+    sums = _row_sums(episode, name, shape[:-1]) if kind in ("rows", "atoms") else None
     uniform = _uniform(episode, site_name) if kind == "rows" else None
     digest, problems = ArrayDigest(), list[str]()
     step = episode.reading_step(name)
-    for first in range(0, array.shape[0], step):
+    for first in range(0, shape[0], step):
         values = episode.read(name, slice(first, first + step))
         digest.update(values)
         if problems:
@@ -177,11 +177,11 @@ def _camera_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[s
     for name in episode.attributes.arrays:
         group, _, camera = name.partition("/")
         if group == "frames":
-            array = episode.array(name)
-            yield from picture_problems(root.sites, camera, array.shape[1:], array.dtype)
+            about = episode.array(name).metadata
+            yield from picture_problems(root.sites, camera, about.shape[1:], about.dtype)
         elif group == "camera_frames":
-            array = episode.array(name)
-            yield from camera_picture_problems(root.sites, camera, array.shape[1:], array.dtype)
+            about = episode.array(name).metadata
+            yield from camera_picture_problems(root.sites, camera, about.shape[1:], about.dtype)
         elif group == "objects":
             yield from coverage_problems(root.sites, camera, episode.read(name), len(episode.attributes.objects))
 

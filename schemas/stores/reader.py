@@ -1,7 +1,6 @@
 """Reading stores: the run, its episodes, what their keys are, and their arrays.
 
-Both stages read with this module: analysis, and capture before it publishes an episode. zarr is imported when an array
-is opened.
+Both stages read with this module: analysis, and capture before it publishes an episode.
 """
 
 from __future__ import annotations
@@ -9,11 +8,9 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from copy import deepcopy
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,13 +37,10 @@ from vla_attention.schemas.stores.store_format import (
     episode_name,
     parse_episode_name,
 )
-from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl, store_place
+from vla_attention.schemas.stores.store_url import StorePlace, store_place
 
 if TYPE_CHECKING:
-    import zarr
-
-    from vla_attention.schemas.stores.array_metadata import ArrayMetadata
-    from vla_attention.schemas.stores.shards import ShardedLayers, SingleChunk
+    from vla_attention.schemas.stores.stored_array import StoredArray
 
 Read = TypeVar("Read")
 
@@ -129,98 +123,64 @@ class StoredEpisode:
             raise CorruptEpisode(f"Episode {self.name} is damaged: {error}.", error.file) from None
 
     @cached_property
-    def _kept(self) -> dict[tuple[Callable[..., Any], str], Any]:
-        """What was made of arrays, by what makes it and the array's name."""
+    def _arrays(self) -> dict[str, StoredArray]:
         return {}
-
-    def _once(self, make: Callable[[StoredEpisode, str], Read], name: str) -> Read:
-        if (make, name) not in self._kept:
-            self._kept[make, name] = make(self, name)
-        kept: Read = self._kept[make, name]
-        return kept
 
     def has(self, name: str) -> bool:
         """Whether the episode has an array of that name, or numbers of that name in its attributes."""
         return name in self.attributes.arrays or bool(self._numbers_of(name))
 
-    def array(self, name: str) -> zarr.Array[Any]:
-        """Open one array with zarr-python, which gets the array's files through the seal.
+    def array(self, name: str) -> StoredArray:
+        """One array, whose `zarr.json` was checked against the format, the attributes and the seal.
 
         Raises:
-            CorruptEpisode: it has another shape than in the attributes, or its metadata are damaged.
+            CorruptEpisode: the attributes do not list it, or its metadata are damaged.
         """
-        return self._once(StoredEpisode._open, name)
+        if name not in self._arrays:
+            from vla_attention.schemas.stores.array_metadata import array_metadata
+            from vla_attention.schemas.stores.stored_array import StoredArray
 
-    def _open(self, name: str) -> zarr.Array[Any]:
-        import zarr
-        from zarr.storage import StorePath
-
-        from vla_attention.schemas.stores.sealed_zarr import SealedArrayStore
-
-        metadata = self._metadata(name)
-        try:
-            # Opened from the bytes that were checked against the seal: zarr does not read the file a second time.
-            place = StorePath(SealedArrayStore(self.files, name, metadata))
-            document = cast(Any, deepcopy(metadata.document))
-            array: zarr.Array[Any] = zarr.Array(zarr.AsyncArray(metadata=document, store_path=place))
-        except Exception as error:  # zarr has errors of its own for what a zarr.json may say
-            raise CorruptEpisode(f"Episode {self.name} lacks the array {name} ({error}).") from None
-        return array
-
-    def _metadata(self, name: str) -> ArrayMetadata:
-        """What an array's `zarr.json` says, checked against the attributes, the seal and the format."""
-        return self._once(StoredEpisode._described, name)
-
-    def _described(self, name: str) -> ArrayMetadata:
-        from vla_attention.schemas.stores.array_metadata import array_metadata
-
-        recorded = self.attributes.arrays.get(name)
-        if recorded is None:
-            raise CorruptEpisode(f"Episode {self.name} lacks the array {name}: its attributes do not list it.")
-        document = self.document(f"{name}/zarr.json")
-        return self._readable(name, lambda: array_metadata(document, tuple(recorded.shape), name, self.files.records))
+            recorded = self.attributes.arrays.get(name)
+            if recorded is None:
+                raise CorruptEpisode(f"Episode {self.name} lacks the array {name}: its attributes do not list it.")
+            document = self.document(f"{name}/zarr.json")
+            metadata = self._readable(name, lambda: array_metadata(document))
+            if metadata.shape != tuple(recorded.shape):
+                raise CorruptEpisode(
+                    f"Array {name} of episode {self.name} cannot be read: it has another shape than its attributes say."
+                )
+            self._arrays[name] = StoredArray(name, metadata, self.files)
+        return self._arrays[name]
 
     def reading_step(self, name: str) -> int:
         """Indices along the first axis of an array that are read at once without more memory than is stored for them.
 
-        They are those of a file. Large files that are here, and files of which each chunk holds nothing but one number,
-        are read chunk by chunk. Elsewhere a file is one request.
+        They are all, or those of a chunk: of large arrays, and where each chunk holds nothing but one number.
         """
-        metadata = self._metadata(name)
-        step = max(1, metadata.file_shape[0])
-        decoded = metadata.dtype.itemsize * math.prod((min(step, metadata.shape[0]), *metadata.shape[1:]))
-        if decoded > READ_AT_ONCE_BYTES and not isinstance(self.folder, StoreUrl):
-            return metadata.chunk_shape[0]
-        try:
-            metadata.check_reading((min(step, metadata.shape[0]), *metadata.shape[1:]))
-        except CorruptEpisode:
-            return metadata.chunk_shape[0]
+        array = self.array(name)
+        shape, step = array.metadata.shape, array.metadata.chunk_shape[0]
+        decoded = array.metadata.dtype.itemsize * math.prod(shape)
+        if decoded <= READ_AT_ONCE_BYTES:
+            return max(1, shape[0])
         return step
 
-    def read(self, name: str, index: Any = ...) -> NDArray[Any]:
+    def read(self, name: str, index: int | slice = slice(None)) -> NDArray[Any]:
         """Values of one array, or numbers of the attributes (`NUMBERS`) as one.
+
+        index: along the first axis, one or neighbours; all unless given.
 
         Raises:
             CorruptEpisode: it is not there, or a chunk of it is missing or not the one that was sealed.
         """
-        stored = self._numbers_as_array(name)
-        if stored is None:
-            stored = self._once(StoredEpisode._single_chunk, name)
-            if stored is None:
-                metadata = self._metadata(name)
-                # A view of one number in the array's shape takes no memory, and shows what the index takes.
-                shape = np.broadcast_to(np.empty((), metadata.dtype), metadata.shape)[index].shape
-                self._readable(name, partial(metadata.check_reading, shape))
-                stored = self.array(name)
-        try:
-            values = np.asarray(stored[index])
-        except (IndexError, RemoteFailure):
-            raise  # the caller's mistake; a network that fails is no damage
-        except Exception as error:  # damaged bytes can make codecs raise anything
-            problem, file = str(error).rstrip("."), getattr(error, "file", None)
-            raise CorruptEpisode(f"Array {name} of episode {self.name} cannot be read: {problem}.", file) from error
+        numbers = self._numbers_as_array(name)
+        if numbers is not None:
+            return np.asarray(numbers[index])
+        array = self.array(name)
+        indices = range(array.metadata.shape[0])
+        chosen = indices[index] if isinstance(index, slice) else range(indices[index], indices[index] + 1)
+        values = self._readable(name, lambda: array.read(chosen.start, max(chosen.start, chosen.stop)))
         self.refuse_missing(name, values)
-        return values
+        return values[0] if isinstance(index, int) else values
 
     def _numbers_of(self, name: str) -> tuple[float, ...]:
         return getattr(self.attributes, name) if name in NUMBERS else ()
@@ -238,14 +198,9 @@ class StoredEpisode:
                 )
         return np.array(numbers, dtype=kind)
 
-    def _single_chunk(self, name: str) -> SingleChunk | None:
-        from vla_attention.schemas.stores.shards import SingleChunk
-
-        return SingleChunk.of(self._metadata(name), self.files.whole, name)
-
     def shape_of(self, name: str) -> tuple[int, ...]:
         """Shape of one array; raises `CorruptEpisode` for one that its files cannot have."""
-        return self._metadata(name).shape
+        return self.array(name).metadata.shape
 
     def read_layer(self, name: str, layer: int, denoise: int) -> NDArray[np.float32]:
         """One layer and denoise step (positions) of an array (replan, layer, denoise, ...), without those two axes."""
@@ -259,20 +214,9 @@ class StoredEpisode:
         Each is gone when the next one is asked for. They are not searched for missing values: give `refuse_missing`
         what is made of them, which has far fewer numbers.
         """
-        layers = self._once(StoredEpisode._sharded, name)
-        memory = None if layers is None else self._readable(name, layers.memory)
-        for layer, denoise in places:
-            if layers is None:
-                yield self.read(name, (slice(None), layer, denoise))
-            else:
-                yield self._readable(name, partial(layers.read, layer, denoise, memory))
-
-    def _sharded(self, name: str) -> ShardedLayers | None:
-        from vla_attention.schemas.stores.shards import ShardedLayers
-
-        files = self.files
-        metadata = self._metadata(name)
-        return ShardedLayers.of(metadata, lambda file: files.shard(f"{name}/{file}", metadata.shard_chunks or 0))
+        layers = self.array(name).layers(places)
+        while (values := self._readable(name, lambda: next(layers, None))) is not None:
+            yield values
 
     def _readable(self, name: str, read: Callable[[], Read]) -> Read:
         try:

@@ -19,13 +19,13 @@ from msgspec.structs import replace
 
 from vla_attention.schemas.jsonable import from_json, to_json
 from vla_attention.schemas.limits import DOCUMENT_BYTES
-from vla_attention.schemas.stores.array_metadata import chunks_of_a_shard
+from vla_attention.schemas.stores.array_metadata import array_metadata
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder
 from vla_attention.schemas.stores.digest import CHECKSUM_BYTES, bytes_digest
 from vla_attention.schemas.stores.root import group_attributes
 from vla_attention.schemas.stores.seal_content import EpisodeSeal, FileRecord
 from vla_attention.schemas.stores.shards import index_size, read_index
-from vla_attention.schemas.stores.store_format import SEAL_GROUP
+from vla_attention.schemas.stores.store_format import SEAL_GROUP, CorruptEpisode
 
 SEAL_FILE = f"{SEAL_GROUP}/zarr.json"
 
@@ -42,7 +42,7 @@ def seal_episode(folder: Path, name: str, run: str, copied_from: str = "") -> Ep
     (folder / SEAL_FILE).unlink(missing_ok=True)
     files = sorted(file for file in folder.rglob("*") if file.is_file())
     documents = {file: json.loads(file.read_bytes()) for file in files if file.name == "zarr.json"}
-    shards = {file.parent: chunks for file, document in documents.items() if (chunks := chunks_of_a_shard(document))}
+    shards = {file.parent: chunks for file, document in documents.items() if (chunks := _chunks_in_shard(document))}
     records: dict[str, FileRecord] = {}
     for file in files:
         chunks = None if file.name == "zarr.json" else next((shards[at] for at in file.parents if at in shards), None)
@@ -89,6 +89,14 @@ def identity_problem(seal: EpisodeSeal, name: str, run: str) -> str | None:
             "protocol, recording, sites): one of them was changed, or the episode is of another store"
         )
     return None
+
+
+def _chunks_in_shard(document: Any) -> int | None:
+    """Number of chunks in the file of an array whose `zarr.json` this is; None for anything else."""
+    try:
+        return array_metadata(document).shard_chunks
+    except CorruptEpisode:
+        return None
 
 
 def _file_record(path: Path, chunks: int | None) -> FileRecord:

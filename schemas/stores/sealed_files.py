@@ -36,7 +36,7 @@ class SealedFiles:
         Raises:
             CorruptEpisode: the file is missing, not in the seal, or not the one that was sealed.
         """
-        record = self._record(file)
+        record = self.record(file)
         if most is None:
             most = DOCUMENT_BYTES if file.endswith("zarr.json") else record.size
         if record.size > most:
@@ -61,7 +61,7 @@ class SealedFiles:
 
         What has been written when the error is raised is of no use.
         """
-        record = self._record(file)
+        record = self.record(file)
         with path.open("wb") as copied:
             for offset, part in self._parts(file):
                 copied.seek(offset)
@@ -70,7 +70,7 @@ class SealedFiles:
 
     def _parts(self, file: str) -> Iterator[tuple[int, bytes]]:
         """Offset and bytes of each part of a file; they are those of the seal when all of them have been taken."""
-        record = self._record(file)
+        record = self.record(file)
         if record.size <= PART_BYTES:
             yield 0, self.whole(file)
             return
@@ -94,11 +94,11 @@ class SealedFiles:
         if digest.hexdigest() != record.sha256:
             raise CorruptEpisode(_differs(file), file)
 
-    def shard(self, file: str, chunks: int) -> SealedShard:
-        """The shard of so many chunks in a file, of which single chunks can be read."""
+    def shard(self, file: str, chunks: int, most: int) -> SealedShard:
+        """The shard in a file, of which single chunks can be read; see `SealedShard.open`."""
         if file not in self._shards:
             try:
-                self._shards[file] = SealedShard.open(self.source, file, self._record(file), chunks)
+                self._shards[file] = SealedShard.open(self.source, file, self.record(file), chunks, most)
             except RemoteFailure:
                 raise
             except OSError as error:
@@ -120,7 +120,8 @@ class SealedFiles:
                 wrong[file] = f"its {file} has {size} bytes; its seal says {record.size}"
         return wrong
 
-    def _record(self, file: str) -> FileRecord:
+    def record(self, file: str) -> FileRecord:
+        """What the seal says of a file; `CorruptEpisode` where it does not list it."""
         record = self.records.get(file)
         if record is None:
             raise CorruptEpisode(f"its {file} does not agree with its seal, which does not list it", file)

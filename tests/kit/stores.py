@@ -15,9 +15,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import zarr
 from numpy.typing import NDArray
+from zarr.codecs import BloscCodec, Crc32cCodec
 
 from tests.kit.tokens import INSTRUCTIONS, random_rows, small_layout, small_tokens
+from vla_attention.capture.store.codecs import CHUNK_KEYS
 from vla_attention.capture.store.episode_writer import EpisodeWriter
 from vla_attention.capture.store.replan_records import (
     EpisodeStart,
@@ -172,6 +175,25 @@ def solved(spec: StoreSpec, task: int, episode: int) -> bool:
 def num_steps(spec: StoreSpec, episode: int) -> int:
     """Environment steps of an episode."""
     return 5 * spec.num_replans - episode % 2
+
+
+def write_array(folder: Path, values: NDArray[Any], **settings: Any) -> None:
+    """Write an array as zarr-python does in the format's layout; settings: chunks, shards, or what a test changes."""
+    compressors = (BloscCodec(cname="lz4", clevel=5, shuffle="bitshuffle", typesize=values.itemsize), Crc32cCodec())
+    array = zarr.create_array(
+        folder,
+        shape=values.shape,
+        dtype=values.dtype,
+        **{
+            "compressors": compressors,
+            "fill_value": float("nan") if values.dtype.kind == "f" else 0,
+            "chunk_key_encoding": CHUNK_KEYS,
+            "dimension_names": [f"axis{i}" for i in range(values.ndim)],
+            "config": {"write_empty_chunks": True},
+            **settings,
+        },
+    )
+    array[...] = values
 
 
 def reseal(folder: Path) -> None:

@@ -92,7 +92,7 @@ def test_a_store_gives_them_back(path):
         expected = expected_arrays(spec, attributes.task_id, attributes.episode_index)
         for name in ("steps/poses", "steps/gripper", "steps/actions"):
             np.testing.assert_array_equal(episode.read(name), expected[name])
-        assert episode.array("steps/poses").metadata.dimension_names == ("moment", "body", "pose")
+        assert episode.array("steps/poses").metadata.axes == ("moment", "body", "pose")
 
 
 def _solved(attributes: dict[str, Any]) -> None:

@@ -32,7 +32,7 @@ from vla_attention.schemas.groupings.resolve import check_names, resolve
 from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vocabulary
 from vla_attention.schemas.jsonable import to_json
-from vla_attention.schemas.stores.array_metadata import ArrayMetadata, describe_array
+from vla_attention.schemas.stores.array_metadata import ArrayMetadata, array_metadata
 from vla_attention.schemas.stores.byte_source import Memory, copy_into
 from vla_attention.schemas.stores.digest import bytes_digest, crc32c
 from vla_attention.schemas.stores.episode_checks import content_problems
@@ -40,7 +40,9 @@ from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.root import attributes_in
 from vla_attention.schemas.stores.seal import SEAL_FILE, read_seal, seal_document
 from vla_attention.schemas.stores.seal_content import FileRecord
-from vla_attention.schemas.stores.shards import SealedShard, ShardedLayers, index_size
+from vla_attention.schemas.stores.sealed_files import SealedFiles
+from vla_attention.schemas.stores.shards import index_size
+from vla_attention.schemas.stores.stored_array import StoredArray
 
 SPEC = StoreSpec(
     tasks=(0,),
@@ -193,11 +195,11 @@ def _read(name: str, file: str, content: bytes) -> None:
 @cache
 def _rows_metadata() -> ArrayMetadata:
     folder = _store("shards") / "episodes" / _original("shards").name
-    return describe_array(json.loads((folder / _ROWS / "zarr.json").read_bytes()))
+    return array_metadata(json.loads((folder / _ROWS / "zarr.json").read_bytes()))
 
 
 def shards(content: bytes) -> None:
-    """A shard of rows, with the checksums that belong to its bytes, read with the fast reader."""
+    """A shard of rows, with the checksums that belong to its bytes, read by layers."""
     metadata = _rows_metadata()
     count = metadata.shard_chunks
     assert count is not None
@@ -215,15 +217,13 @@ def shards(content: bytes) -> None:
     index = with_checksum(stored)
     content = bytes(chunks) + index
     record = FileRecord(len(content), bytes_digest(content), bytes_digest(index), b"".join(checksums).hex())
-    shard = SealedShard.open(InMemory(content), "c.0", record, count)
-    layers = ShardedLayers.of(metadata, lambda file: shard)
-    assert layers is not None
-    for layer in range(layers.shape[1]):
-        for denoise in range(layers.shape[2]):
-            memory = layers.memory()
-            memory.values.view(np.uint32)[...] = _UNTOUCHED
+    array = StoredArray(_ROWS, metadata, SealedFiles(InMemory(content), {f"{_ROWS}/{metadata.file}": record}))
+    for layer in range(metadata.shape[1]):
+        for denoise in range(metadata.shape[2]):
             with suppress(UserError):
-                found = layers.read(layer, denoise, memory)
+                memory = array.layer_memory()
+                memory.view(np.uint32)[...] = _UNTOUCHED
+                found = next(array.layers([(layer, denoise)], memory))
                 if (found.view(np.uint32) == _UNTOUCHED).any():
                     raise AssertionError("a chunk that was not decoded passed for attention")
 

@@ -8,12 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
 from numcodecs import blosc
-from zarr.codecs import BloscCodec, Crc32cCodec
 
 from tests.kit.attacks import files_of, with_checksum
-from tests.kit.stores import reseal
+from tests.kit.stores import reseal, write_array
 from tests.thorough.hostile.changes import (
     VERIFY,
     Case,
@@ -30,6 +28,8 @@ from vla_attention.schemas.stores.digest import bytes_digest
 ROWS = "Array joint/rows of episode task000_episode000 cannot be read: "
 ATOMS = "Array joint/atoms of episode task000_episode000 cannot be read: "
 UNIFORM = r"joint/uniform has the shape \(.*\); expected \(2, 2, 2, "
+#: What is said of another layout, before the place in the zarr.json.
+FORM = r"its zarr.json is not that of an array of this format: \$\.codecs"
 STATE = "Array state of episode task000_episode000 cannot be read: "
 #: Zeros that take some kilobytes of a file.
 BOMB = 96_000_000
@@ -91,20 +91,7 @@ def _large_pictures(store: Path) -> None:
     """Pictures of zeros that take 96 MB, in chunks of 3 MB, which only a reading of all would need at once."""
     folder = episode_of(store) / "frames" / "base_0_rgb"
     shape = (32, 1000, 1000, 3)
-    settings: dict[str, Any] = {"chunks": (1, 1000, 1000, 3), "shards": shape, "fill_value": 0}
-    compressors = (BloscCodec(cname="zstd", clevel=3, shuffle="shuffle", typesize=1), Crc32cCodec())
-    keys: dict[str, Any] = {"name": "default", "configuration": {"separator": "."}}
-    array = zarr.create_array(
-        folder,
-        shape=shape,
-        dtype="uint8",
-        compressors=compressors,
-        chunk_key_encoding=keys,
-        overwrite=True,
-        config={"write_empty_chunks": True},
-        **settings,
-    )
-    array[...] = np.zeros(shape, np.uint8)
+    write_array(folder, np.zeros(shape, np.uint8), chunks=(1, 1000, 1000, 3), shards=shape, overwrite=True)
     reseal(episode_of(store))
     edit_episode(store, lambda attributes: attributes["arrays"]["frames/base_0_rgb"].update(shape=list(shape)))
 
@@ -157,34 +144,34 @@ ARRAY_CASES = [
         "array: deep JSON", _array_document("[" * 10**6), "joint/atoms/zarr.json does not say what its seal", VERIFY, 1
     ),
     Case("array: 40 MB", _array_document(f'{{"x": "{"y" * 40_000_000}"}}'), r"expected at most 32,000,000"),
-    Case("array: no codecs", _codecs([]), ATOMS + "it has no codecs"),
-    Case(
-        "array: the codec zstd", _codecs([CHUNK, {"name": "zstd"}]), ATOMS + "it has the codec 'zstd'; expected one o"
-    ),
-    Case("array: the codec pickle", _codecs([{"name": "numcodecs.pickle"}]), ATOMS + "it has the codec 'numcodecs.pi"),
+    Case("array: no codecs", _codecs([]), ATOMS + FORM),
+    Case("array: the codec zstd", _codecs([CHUNK, {"name": "zstd"}]), ATOMS + FORM + ".*'zstd'"),
+    Case("array: the codec pickle", _codecs([{"name": "numcodecs.pickle"}]), ATOMS + FORM + ".*'numcodecs.pickle'"),
     Case(
         "array: compressed by snappy",
         _codecs([CHUNK, {"name": "blosc", "configuration": BLOSC | {"cname": "snappy"}}, {"name": "crc32c"}]),
-        ATOMS + "it is compressed by 'snappy'; expected one of lz4, zstd",
+        ATOMS + FORM + ".*'snappy'",
     ),
-    Case("array: chunks of nothing", _atoms(lambda c: _chunks(c).__setitem__(0, 0)), ATOMS + "its chunks have the ext"),
+    Case("array: chunks of nothing", _atoms(lambda c: _chunks(c).__setitem__(0, 0)), ATOMS + ".*chunk_shape"),
     Case(
         "array: chunks of 10^12", _atoms(lambda c: _chunks(c).__setitem__(0, 10**12)), ATOMS + "a chunk of it would ta"
     ),
-    Case("array: 10^8 chunks", _state(lambda c: None, [2, 10**8]), STATE + ".*files of chunks, and", VERIFY, 1),
+    Case("array: 10^8 chunks", _state(lambda c: None, [2, 10**8]), STATE + "its file holds", VERIFY, 1),
     Case("array: a petabyte", _state(lambda c: None, [2, 10**15]), STATE + "its shape is .*bytes", VERIFY, 1),
     Case(
         "array: masses of another shape", _atoms(lambda c: None, [2, 2, 2, 2, 1, 8]), r"expected \(2, 2, 2, 2, 1, 9\)"
     ),
     Case(
-        "rows: chunks of nothing", _rows(lambda c: _inner(c)["chunk_shape"].__setitem__(0, 0)), ROWS + "its chunks have"
+        "rows: chunks of nothing",
+        _rows(lambda c: _inner(c)["chunk_shape"].__setitem__(0, 0)),
+        ROWS + FORM + ".*chunk_shape",
     ),
     Case(
         "rows: a shard in a shard",
         _rows(lambda c: _inner(c).update(codecs=deepcopy(c["codecs"]))),
-        ROWS + "it has the codecs shar",
+        ROWS + FORM + ".*codecs",
     ),
-    Case("rows: chunks without checksums", _rows(lambda c: _inner(c)["codecs"].pop()), ROWS + ".*without checksums"),
+    Case("rows: chunks without checksums", _rows(lambda c: _inner(c)["codecs"].pop()), ROWS + FORM + ".*codecs"),
     Case(
         "uniform: not listed",
         lambda store: edit_episode(store, lambda attributes: attributes["arrays"].pop("joint/uniform")),
@@ -197,7 +184,7 @@ ARRAY_CASES = [
         "shard: two chunks at one place", _offsets(lambda index: index[[0, 0, 2, 3]]), ROWS + ".*overlap or lie outside"
     ),
     Case("shard: a chunk of 100 GB", _sparse_shard, ROWS + "its index names a chunk of 100000000000 bytes"),
-    Case("bomb: zstd", _blosc_bomb(b"zstd"), STATE + "a chunk of it would take 96,000,000 bytes", VERIFY, 1),
+    Case("bomb: zstd", _blosc_bomb(b"zstd"), STATE + "it would take 96,000,000 bytes", VERIFY, 1),
     Case("bomb: a header of 2 GB", _lying_frame, ATOMS + ".*its header says 2000000000 decoded bytes; expected"),
     Case("bomb: pictures in many chunks", _large_pictures, "frames/base_0_rgb", VERIFY, 1),
 ]

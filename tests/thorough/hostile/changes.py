@@ -13,6 +13,7 @@ import numpy as np
 
 from tests.kit.attacks import FIRST, files_of, with_checksum
 from vla_attention.schemas.stores.digest import bytes_digest, run_digest
+from vla_attention.schemas.stores.seal import seal_document
 
 #: The words of an analysis that reads roles, sums, masses and the rows of one word.
 WORDS = ("STORE", "--group", "noun=word:bowl", "--output", "OUT", "--no-cache")
