@@ -125,7 +125,9 @@ def measure(
     check([one.keys for one in described])
     each = partial(_measured, items_of=items_of, selection=selection, site=question.site, denoise="denoise" in keep)
     arguments, digests = {"denoise": "denoise" in keep}, [one.digest for one in described]
-    arrays = measured_once("items", chosen, selection, question.site, each, arguments, digests)
+    arrays = measured_once(
+        "items", chosen, selection, question.site, each, arguments, digests, lambda i: (chosen[i].fresh(), described[i])
+    )
 
     def made(i: int, content: dict[str, NDArray[Any]]) -> Measured:
         about = described[i]
@@ -136,10 +138,16 @@ def measure(
 
 @dataclass(frozen=True)
 class _Described:
-    """What is known of an episode's items before they are measured: for `check`, and for the key of the cache."""
+    """What is known of an episode's items before they are measured: for `check`, and for the key of the cache.
+
+    whole: `Items.whole` where it is a number. weights: those `with_totals`, unless they change in the episode; they are
+    then made again where they are needed, of thousands of episodes they would fill the disk.
+    """
 
     labels: Mapping[str, pl.Series]
     absent: str
+    whole: int | None
+    weights: NDArray[np.float32] | None
     keys: Array
     digest: str
 
@@ -150,19 +158,20 @@ def _described(item: SelectedEpisode, items_of: Callable[[SelectedEpisode], Item
     digest = hashlib.sha256(f"{weights.shape}".encode())
     digest.update(np.ascontiguousarray(weights).data)
     keys = counted_keys(weights, item.tokens.existing)[:, :-2].max(axis=0, keepdims=True)
-    return _Described(items.labels, items.absent, keys, digest.hexdigest())
+    whole, kept = items.whole if isinstance(items.whole, int) else None, weights if len(weights) == 1 else None
+    return _Described(items.labels, items.absent, whole, kept, keys, digest.hexdigest())
 
 
 def _measured(
-    item: SelectedEpisode,
+    given: tuple[SelectedEpisode, _Described],
     items_of: Callable[[SelectedEpisode], Items],
     selection: Selection,
     site: str,
     denoise: bool,
 ) -> dict[str, NDArray[Any]]:
     """The arrays of a `Measured` by name."""
-    items = items_of(item)
-    weights = items.with_totals(item)
+    item, about = given
+    weights = items_of(item).with_totals(item) if about.weights is None else about.weights
     replans, steps = item.tokens.num_replans, len(selection.denoise)
     heads = len(selection.heads) if selection.per_head else 1
     of_segments = _segment_weights(item, weights, site)
@@ -182,7 +191,7 @@ def _measured(
     row_sum = (row_sum if selection.per_head else row_sum.mean(axis=-1, keepdims=True)).astype(np.float64)
     arrays = {
         "mass": mass[..., :-2],
-        "whole": mass[..., : items.whole].sum(axis=-1) if isinstance(items.whole, int) else mass[..., -2],
+        "whole": mass[..., -2] if about.whole is None else mass[..., : about.whole].sum(axis=-1),
         "valid": mass[..., -1],
         "keys": counted_keys(weights, item.tokens.existing)[:, :-2],
         "uniform": uniform[..., :-2],

@@ -26,9 +26,10 @@ def measured_once(
     selected: Sequence[SelectedEpisode],
     selection: Selection,
     site: str,
-    measure: Callable[[SelectedEpisode], dict[str, NDArray[Any]]],
+    measure: Callable[[Any], dict[str, NDArray[Any]]],
     arguments: Mapping[str, Any],
     of_episodes: Sequence[Any] | None = None,
+    given: Callable[[int], Any] | None = None,
 ) -> Iterator[dict[str, NDArray[Any]]]:
     """The arrays of every episode, in order: from the cache, or measured now and kept. A terminal sees the progress.
 
@@ -41,6 +42,7 @@ def measured_once(
         arguments: what the numbers depend on besides the episode, the selection, the site and the keys that were taken
             out of the episode; JSON values.
         of_episodes: the same that differs between episodes.
+        given: what `measure` is called with for the episode at a position; the episode, unread, unless given.
     """
     axes = {"layers": selection.layers, "denoise": selection.denoise, "heads": selection.heads}
     question = CachedQuestion(what, {**arguments, **axes, "per_head": selection.per_head, "site": site})
@@ -49,7 +51,7 @@ def measured_once(
     with progress_bar(len(selected), "episodes") as advance:
 
         def scan(positions: Sequence[int]) -> Iterator[dict[str, NDArray[Any]]]:
-            return each_episode(measure, (selected[i].fresh() for i in positions), advance)
+            return each_episode(measure, (given(i) if given else selected[i].fresh() for i in positions), advance)
 
         yield from remembered(question, [item.episode for item in selected], scan, extra, advance)
 

@@ -47,7 +47,7 @@ class SelectedEpisode:
         brief = _Prompts(replace(episode), number) if number else ()
         vars(kept)["attributes"] = structs.replace(episode.attributes, prompts=brief)
         prompts = _Prompts(replace(episode), number, store.attributes, site) if tokens.prompts else ()
-        return cls(store, kept, replace(tokens, prompts=prompts))._of(kept)
+        return cls(store, kept, replace(tokens, prompts=prompts)).fresh()
 
     def fresh(self) -> SelectedEpisode:
         """The same, with nothing that was read of it since it was selected."""
@@ -55,12 +55,6 @@ class SelectedEpisode:
             return self
         episode = replace(self.episode)
         vars(episode)["attributes"] = self.episode.attributes
-        prompts = self.tokens.prompts
-        if isinstance(prompts, _Prompts):
-            prompts = replace(prompts, episode=episode, keeps_seal=True)
-        return replace(self, tokens=replace(self.tokens, prompts=prompts))._of(episode)
-
-    def _of(self, episode: StoredEpisode) -> SelectedEpisode:
         coverage = episode.coverage(self.store.attributes, self.tokens.layout.name)
         return replace(self, episode=episode, tokens=replace(self.tokens, coverage=coverage))
 
@@ -118,24 +112,18 @@ class SelectedEpisode:
 
 @dataclass(frozen=True)
 class _Prompts(Sequence[Prompt]):
-    """The prompts of an episode, as the keys of a site if one is given: read whenever one is asked for.
-
-    keeps_seal: the episode keeps the seal, in which they are, for what is read of it next.
-    """
+    """The prompts of an episode, as the keys of a site if one is given: read whenever one is asked for."""
 
     episode: StoredEpisode
     number: int
     root: RootAttributes | None = None
     site: str = ""
-    keeps_seal: bool = False
 
     def __len__(self) -> int:
         return self.number
 
     def __iter__(self) -> Iterator[Prompt]:
         episode = replace(self.episode)
-        if self.keeps_seal:
-            vars(episode)["seal"] = self.episode.seal
         return iter(episode.attributes.prompts if self.root is None else episode.prompts(self.root, self.site))
 
     def __getitem__(self, index: Any) -> Any:
