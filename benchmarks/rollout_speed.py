@@ -37,7 +37,7 @@ from vla_attention.capture.engine.call import Caller  # noqa: E402
 from vla_attention.capture.engine.simulation import Simulation  # noqa: E402
 from vla_attention.capture.engine.simulators import SimulatedEpisode, SimulatorProcess  # noqa: E402
 from vla_attention.capture.engine.writing import EpisodeInBackground, WritingThread  # noqa: E402
-from vla_attention.capture.machine.device import load_torch  # noqa: E402
+from vla_attention.capture.machine import load_torch  # noqa: E402
 from vla_attention.capture.policies.policy import Policy  # noqa: E402
 from vla_attention.capture.run import capture_run  # noqa: E402
 from vla_attention.capture.run.run_settings import run_settings  # noqa: E402

@@ -45,10 +45,6 @@ class TaskGoal(Document, frozen=True):
             check_text("goal's condition", condition)
         _check_moment(f"The goal of task {self.task_id}", self.first_held)
 
-    def is_part_of(self, other: TaskGoal) -> bool:
-        """Whether whoever reaches the other goal has reached this one, too."""
-        return set(self.conditions) <= set(other.conditions)
-
 
 class EpisodeSteps(Document, frozen=True):
     """What the arrays `steps/...` of an episode are of, and what they were looked at for.

@@ -12,8 +12,7 @@ from typing import Any
 from vla_attention.schemas.groupings.grouping import GroupingFile
 from vla_attention.schemas.jsonable import json_schema
 from vla_attention.schemas.results import EpisodeResult
-from vla_attention.schemas.stores.seal_content import EpisodeSeal
-from vla_attention.schemas.stores.store_format import EpisodeAttributes, RootAttributes
+from vla_attention.schemas.stores.store_format import EpisodeAttributes, EpisodeSeal, RootAttributes
 
 FOLDER = Path(__file__).parent / "json"
 

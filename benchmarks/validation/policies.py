@@ -72,7 +72,7 @@ def load_policy(store: Path) -> Any:
     """The policy of a store, rebuilt as `vla-attention capture rerun` does it."""
     import argparse
 
-    from vla_attention.capture.machine.device import load_torch
+    from vla_attention.capture.machine import load_torch
     from vla_attention.capture.rerun.arguments import add_rerun_arguments
 
     parser = argparse.ArgumentParser()

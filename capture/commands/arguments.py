@@ -21,7 +21,7 @@ from vla_attention.schemas.command_line import OneSentenceParser
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.options import add_capture_output, add_task
 from vla_attention.schemas.stores import verify_command
-from vla_attention.schemas.stores.repair_command import VERIFY_HELP
+from vla_attention.schemas.stores.verify_command import VERIFY_HELP
 
 _FURTHER_EXAMPLES = """\
   vla-attention capture status runs/libero_10.zarr                     what is there, what is missing, who is writing

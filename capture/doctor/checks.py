@@ -15,7 +15,7 @@ from vla_attention.capture.environments.drawing import check_drawing
 from vla_attention.capture.environments.libero_installation import find_assets, package_folder
 from vla_attention.capture.environments.robosuite_installation import DEFAULT_GL, find_robosuite
 from vla_attention.capture.environments.suites import list_tasks
-from vla_attention.capture.machine.memory import memory_limits
+from vla_attention.capture.machine import memory_limits
 from vla_attention.capture.run.run_settings import RunSettings
 from vla_attention.capture.store.store_root import read_existing_root
 from vla_attention.schemas.command_line import format_bytes

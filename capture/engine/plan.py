@@ -20,7 +20,6 @@ from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.layers import select_layers
 from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.precision import DEFAULT_MANTISSA_BITS, parse_precision
-from vla_attention.schemas.stores.damaged_episodes import DamagedEpisode
 from vla_attention.schemas.stores.store_format import (
     FORMAT_NAME,
     STORE_VERSION,
@@ -30,6 +29,7 @@ from vla_attention.schemas.stores.store_format import (
     Recording,
     RootAttributes,
 )
+from vla_attention.schemas.stores.verify import DamagedEpisode
 
 if TYPE_CHECKING:
     from vla_attention.capture.policies.policy import Policy

@@ -14,11 +14,11 @@ from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, listing, plural, shortened
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.safe_text import visible
-from vla_attention.schemas.stores.damaged_episodes import DamagedEpisode, look_at
 from vla_attention.schemas.stores.locks import Holder, episode_locks
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import is_episode_name, parse_episode_name
 from vla_attention.schemas.stores.store_url import local_path
+from vla_attention.schemas.stores.verify import DamagedEpisode, look_at
 
 
 @dataclass(frozen=True)

@@ -187,9 +187,9 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], threads: Threa
 
     from vla_attention.capture.engine.faults import EpisodesMissing
     from vla_attention.capture.engine.progress import say
-    from vla_attention.capture.machine.device import load_torch
+    from vla_attention.capture.machine import load_torch
     from vla_attention.capture.run.capture_run import run_capture
-    from vla_attention.schemas.stores.damaged_episodes import DamagedEpisodesLeft
+    from vla_attention.schemas.stores.verify import DamagedEpisodesLeft
 
     say(threads.describe())
     device = load_torch(arguments.device, threads.number)

@@ -20,7 +20,7 @@ from vla_attention.capture.engine.plan import plan_recording, recording_settings
 from vla_attention.capture.engine.progress import say
 from vla_attention.capture.engine.source import Episode, EpisodeJob, Outcome, Source, episode_start
 from vla_attention.capture.interventions.changed_inputs import CallContext
-from vla_attention.capture.machine.provenance import describe_machine
+from vla_attention.capture.machine import describe_machine
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.identity import downloads_of
 from vla_attention.capture.policies.policy import Policy, PolicyInput

@@ -27,7 +27,6 @@ from vla_attention.capture.store.store_writer import RunStore, WriteMode, refuse
 from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.safe_text import file_part
-from vla_attention.schemas.stores.damaged_episodes import find_damaged
 from vla_attention.schemas.stores.root import episode_folders
 from vla_attention.schemas.stores.store_format import (
     STORE_SUFFIX,
@@ -37,6 +36,7 @@ from vla_attention.schemas.stores.store_format import (
     parse_episode_name,
 )
 from vla_attention.schemas.stores.store_place import check_place, check_writable
+from vla_attention.schemas.stores.verify import find_damaged
 
 #: The column that says of every frame whether the task is solved, where a data set has it.
 SUCCESS_COLUMN = "next.success"

@@ -7,13 +7,12 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from vla_attention.capture.machine.provenance import POLICY_BATCH
+from vla_attention.capture.machine import POLICY_BATCH
 from vla_attention.capture.rerun.stored_calls import StoreWithoutInputs
 from vla_attention.schemas.errors import BadArgument, UserError, listing
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.options import resolve_tasks
-from vla_attention.schemas.stores.damaged_episodes import look_at
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.store_format import (
     CorruptEpisode,
@@ -22,6 +21,7 @@ from vla_attention.schemas.stores.store_format import (
     StoreError,
     parse_episode_name,
 )
+from vla_attention.schemas.stores.verify import look_at
 
 
 def open_base(path: Path, chosen: Sequence[int | str] | None = None, num_episodes: int | None = None) -> Store:

@@ -12,8 +12,7 @@ from vla_attention.capture.engine.plan import plan_recording, recording_settings
 from vla_attention.capture.engine.progress import say
 from vla_attention.capture.interventions.resolution import check_not_compiled, check_places, interventions_for
 from vla_attention.capture.jobs.termination import Termination
-from vla_attention.capture.machine.device import load_torch
-from vla_attention.capture.machine.provenance import describe_machine
+from vla_attention.capture.machine import describe_machine, load_torch
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.identity import downloads_of
 from vla_attention.capture.rerun.base_store import check_may_change, check_same_policy, open_base

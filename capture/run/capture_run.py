@@ -23,7 +23,7 @@ from vla_attention.capture.interventions.resolution import check_not_compiled, i
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.jobs.worker_log import PlannedTask, planned_tasks, read_logs
-from vla_attention.capture.machine.provenance import POLICY_BATCH, describe_machine
+from vla_attention.capture.machine import POLICY_BATCH, describe_machine
 from vla_attention.capture.policies.families import family_of_kind
 from vla_attention.capture.policies.identity import downloads_of
 from vla_attention.capture.policies.policy import BatchPolicy, Policy, is_compiled, stored_picture_sizes
@@ -31,12 +31,12 @@ from vla_attention.capture.run.run_settings import RunSettings, default_num_envs
 from vla_attention.capture.store.disk_estimate import estimate_disk
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument, listing, plural
-from vla_attention.schemas.stores.damaged_episodes import DamagedEpisodesLeft, find_damaged, what_to_do
 from vla_attention.schemas.stores.store_format import (
     PolicyIdentity,
     Protocol,
     RootAttributes,
 )
+from vla_attention.schemas.stores.verify import DamagedEpisodesLeft, find_damaged, what_to_do
 
 
 def plan_protocol(settings: RunSettings, evaluation: EvaluationProtocol, policy: Policy) -> Protocol:

@@ -34,7 +34,7 @@ def run_capture_of_family(arguments: argparse.Namespace, termination: Terminatio
     check_simulator(settings.suite, settings.libero_assets)
 
     from vla_attention.capture.engine.progress import say
-    from vla_attention.capture.machine.device import load_torch
+    from vla_attention.capture.machine import load_torch
     from vla_attention.capture.run.capture_run import run_capture
 
     say(threads.describe())

@@ -16,7 +16,7 @@ from vla_attention.capture.environments.base import Suite, check_task_id
 from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
 from vla_attention.capture.environments.suites import find_suite, list_tasks
 from vla_attention.capture.interventions.arguments import read_interventions
-from vla_attention.capture.machine.memory import memory_left
+from vla_attention.capture.machine import memory_left
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from vla_attention.capture.effects.arguments import EffectSettings
 from vla_attention.capture.effects.conditions import refuse_both
 from vla_attention.capture.engine.plan import RecordingSettings, recording_of, root_attributes
-from vla_attention.capture.machine.provenance import describe_machine
+from vla_attention.capture.machine import describe_machine
 from vla_attention.capture.torch_policies.batch_rows import rows_apart
 from vla_attention.capture.torch_policies.knockouts import SessionKnockouts, interventions_of, with_name
 from vla_attention.capture.torch_policies.own_setting import difference_to_own_setting

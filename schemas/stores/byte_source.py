@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol, TypeAlias
@@ -39,8 +38,8 @@ class ByteSource(Protocol):
     def whole(self, file: str, *, most: int = WHOLE_FILE_BYTES) -> bytes:
         """All bytes of a file, which must not have more than `most`."""
 
-    def parts(self, file: str, offset: int, lengths: Sequence[int]) -> list[bytes]:
-        """Neighbouring parts of a file, the first at `offset`; they are shorter where the file ends."""
+    def part(self, file: str, offset: int, length: int) -> bytes:
+        """So many bytes of a file from `offset` on; fewer where the file ends."""
 
     def read_into(self, memory: Memory, file: str, offset: int) -> int:
         """Fill memory with the bytes of a file from `offset` on; returns how many there were, fewer at its end."""
@@ -76,16 +75,12 @@ class Folder:
         finally:
             os.close(handle)
 
-    def parts(self, file: str, offset: int, lengths: Sequence[int]) -> list[bytes]:
+    def part(self, file: str, offset: int, length: int) -> bytes:
         """See `ByteSource`."""
         handle, size = self._open(file)
         try:
-            pieces = []
-            for length in lengths:
-                # Memory is taken for as many bytes as are asked for. One more than there are shows a file that grows.
-                pieces.append(os.pread(handle, min(length, max(0, size - offset) + 1), offset))
-                offset += length
-            return pieces
+            # Memory is taken for as many bytes as are asked for. One more than there are shows a file that grows.
+            return os.pread(handle, min(length, max(0, size - offset) + 1), offset)
         finally:
             os.close(handle)
 
@@ -162,18 +157,3 @@ class Folder:
                 check_not_sparse(self.path / file, handle, size)
         finally:
             os.close(handle)
-
-
-def copy_into(memory: Memory, content: bytes) -> int:
-    """`ByteSource.read_into` from bytes that are there."""
-    memory[: len(content)] = np.frombuffer(content, np.uint8)
-    return len(content)
-
-
-def split(content: bytes, lengths: Sequence[int]) -> list[bytes]:
-    """Neighbouring parts of some bytes."""
-    pieces, at = [], 0
-    for length in lengths:
-        pieces.append(content[at : at + length])
-        at += length
-    return pieces

@@ -26,13 +26,13 @@ from vla_attention.schemas.stores.episode_shapes import misfits
 from vla_attention.schemas.stores.remote_source import RemoteFailure, at_commit, source_of
 from vla_attention.schemas.stores.root import attributes_in, list_episodes, read_run
 from vla_attention.schemas.stores.seal import identity_problem, read_seal
-from vla_attention.schemas.stores.seal_content import EpisodeSeal
 from vla_attention.schemas.stores.sealed_files import SealedFiles
 from vla_attention.schemas.stores.store_format import (
     EPISODES_GROUP,
     NUMBERS,
     CorruptEpisode,
     EpisodeAttributes,
+    EpisodeSeal,
     RootAttributes,
     episode_name,
     parse_episode_name,

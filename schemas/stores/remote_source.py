@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from threading import Thread
 from typing import Any
+
+import numpy as np
 
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.limits import (
@@ -27,7 +28,7 @@ from vla_attention.schemas.limits import (
     SLOWEST_BYTES_A_SECOND,
     WHOLE_FILE_BYTES,
 )
-from vla_attention.schemas.stores.byte_source import ByteSource, Folder, Memory, copy_into, split
+from vla_attention.schemas.stores.byte_source import ByteSource, Folder, Memory
 from vla_attention.schemas.stores.store_url import HUB_PROTOCOL, HubAddress, StorePlace, StoreUrl, stated_commit
 
 #: Protocols whose addresses may be `//name:password@host`; elsewhere @ stands before a revision.
@@ -113,14 +114,15 @@ class RemoteFolder:
         """See `ByteSource`."""
         return self._fetch(file, None, None, most)
 
-    def parts(self, file: str, offset: int, lengths: Sequence[int]) -> list[bytes]:
+    def part(self, file: str, offset: int, length: int) -> bytes:
         """See `ByteSource`; one request."""
-        length = sum(lengths)
-        return split(self._fetch(file, offset, offset + length, length) if length else b"", lengths)
+        return self._fetch(file, offset, offset + length, length)
 
     def read_into(self, memory: Memory, file: str, offset: int) -> int:
         """See `ByteSource`; one request."""
-        return copy_into(memory, self.parts(file, offset, (len(memory),))[0])
+        content = self.part(file, offset, len(memory))
+        memory[: len(content)] = np.frombuffer(content, np.uint8)
+        return len(content)
 
     def size(self, file: str) -> int:
         """See `ByteSource`."""

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from vla_attention.schemas.stores.damaged_episodes import DamagedEpisode, look_at
 from vla_attention.schemas.stores.durable_files import publish_file
 from vla_attention.schemas.stores.locks import Holder, Locks, episode_locks, no_link
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
@@ -21,7 +20,7 @@ from vla_attention.schemas.stores.root import group_document, refuse_linked_grou
 from vla_attention.schemas.stores.seal import read_seal
 from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, StoreError
 from vla_attention.schemas.stores.store_url import local_path
-from vla_attention.schemas.stores.verify import store_faults
+from vla_attention.schemas.stores.verify import DamagedEpisode, look_at, store_faults
 
 #: Ending of the folder beside the store with the episodes that were moved aside. It may be deleted at any time.
 DAMAGED_SUFFIX = ".damaged"

@@ -23,9 +23,8 @@ from vla_attention.schemas.stores.array_metadata import array_metadata
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder
 from vla_attention.schemas.stores.digest import CHECKSUM_BYTES, bytes_digest
 from vla_attention.schemas.stores.root import group_attributes
-from vla_attention.schemas.stores.seal_content import EpisodeSeal, FileRecord
 from vla_attention.schemas.stores.shards import index_size, read_index
-from vla_attention.schemas.stores.store_format import SEAL_GROUP, CorruptEpisode
+from vla_attention.schemas.stores.store_format import SEAL_GROUP, CorruptEpisode, EpisodeSeal, FileRecord
 
 SEAL_FILE = f"{SEAL_GROUP}/zarr.json"
 

@@ -12,9 +12,8 @@ from vla_attention.schemas.regular_files import NotRegular
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder
 from vla_attention.schemas.stores.digest import bytes_digest
 from vla_attention.schemas.stores.remote_source import RemoteFailure
-from vla_attention.schemas.stores.seal_content import FileRecord
 from vla_attention.schemas.stores.shards import SealedShard
-from vla_attention.schemas.stores.store_format import CorruptEpisode
+from vla_attention.schemas.stores.store_format import CorruptEpisode, FileRecord
 
 #: Bytes of a file that are in memory at once where no more than its digest is wanted.
 PART_BYTES = 16_000_000
@@ -82,8 +81,8 @@ class SealedFiles:
                 length = min(PART_BYTES, record.size - offset)
                 # One byte more at the end: a file that has grown is not the one that was sealed.
                 last = offset + length == record.size
-                part, more = self.source.parts(file, offset, (length, 1 if last else 0))
-                if len(part) != length or more:
+                part = self.source.part(file, offset, length + last)
+                if len(part) != length:
                     break
                 digest.update(part)
                 yield offset, part

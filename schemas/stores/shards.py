@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from vla_attention.schemas.stores.byte_source import ByteSource, Memory
 from vla_attention.schemas.stores.digest import CHECKSUM_BYTES, bytes_digest, crc32c
 from vla_attention.schemas.stores.remote_source import RemoteFailure
-from vla_attention.schemas.stores.seal_content import FileRecord
-from vla_attention.schemas.stores.store_format import CorruptEpisode
+from vla_attention.schemas.stores.store_format import CorruptEpisode, FileRecord
 
 _ABSENT = np.uint64(2**64 - 1)
 
@@ -72,8 +71,8 @@ class SealedShard:
         if record.size < size:
             raise CorruptEpisode(f"its {file} has {record.size} bytes in the seal, and an index of {size}", file)
         # One byte more: a file that has grown is not the one that was sealed.
-        stored, more = source.parts(file, max(0, record.size - size), (size, 1))
-        if len(stored) != size or more:
+        stored = source.part(file, record.size - size, size + 1)
+        if len(stored) != size:
             raise CorruptEpisode(f"its {file} does not agree with its seal: it has another size", file)
         if bytes_digest(stored) != record.index:
             raise CorruptEpisode(f"its {file} does not agree with its seal: its index was changed", file)

@@ -23,7 +23,7 @@ NAME.zarr/                            attributes: `RootAttributes`
     steps/poses                       (moment, body, pose) float32; only where a simulator of ours ran the episode
     steps/gripper                     (moment, finger) float32
     steps/actions                     (step, action_dim) float32, those that were executed
-    seal/                             attributes: `EpisodeSeal` (`seal_content.py`), which binds all of the above
+    seal/                             attributes: `EpisodeSeal`, which binds all of the above
 """
 
 from __future__ import annotations
@@ -341,11 +341,6 @@ class RootAttributes(Document, frozen=True):
                 return site
         raise unknown_name("site", name, [site.name for site in self.sites])
 
-    def size_of(self, site: str) -> tuple[int, int]:
-        """How many blocks of the policy have a site, and how many heads they have there."""
-        layout = self.site(site)
-        return len(layout.layers) or self.policy.num_layers, layout.heads or self.policy.num_heads
-
     def recording_of(self, site: str) -> Recording:
         """What is recorded of a site, see `Recording.of_site`."""
         return self.recording.of_site(self.site(site))
@@ -442,3 +437,50 @@ def is_episode_name(name: str) -> bool:
         return name == episode_name(*parse_episode_name(name))
     except ValueError:
         return False
+
+
+_CHECKSUMS = re.compile(r"([0-9a-f]{8})*")
+
+
+class FileRecord(Document, frozen=True):
+    """Size in bytes and sha256 of a file of an episode.
+
+    Of a shard, from which parts are read: `index` is the sha256 of the index at its end, with the index's checksum, and
+    `chunks` has the crc32c of every chunk, the 4 bytes at the chunk's end, in the index's order: 8 hexadecimal digits
+    each, `00000000` for a chunk that was not written. A file of another episode may have an index of the same bytes.
+    """
+
+    size: int
+    sha256: str
+    index: str = ""
+    chunks: str = ""
+
+    def __post_init__(self) -> None:
+        """Check the size and the form of the checksums."""
+        if self.size < 0:
+            raise BadArgument(f"a file of {self.size} bytes")
+        if not _CHECKSUMS.fullmatch(self.chunks):
+            raise BadArgument("the checksums of the chunks of a file are not 8 hexadecimal digits each")
+
+
+class EpisodeSeal(Document, frozen=True):
+    """What binds every file of an episode to the episode's name and to its run.
+
+    `episode` is the name of the episode's group, `run` the digest of the run's configuration (`run_digest`), `files`
+    every file of the episode but the seal itself, by its path. `documents` repeats what each `zarr.json` among them
+    says, so that one small file opens an episode. `copied_from` is the digest of the captured episode's seal, in a copy
+    that leaves something out. `digest` is the sha256 of the seal's file without the 64 digits of this digest.
+    """
+
+    episode: str
+    run: str
+    files: dict[str, FileRecord]
+    documents: dict[str, Any]
+    digest: str
+    copied_from: str = ""
+
+    def __post_init__(self) -> None:
+        """Check the paths: a seal lists files inside of its episode's folder."""
+        check_at_most("The number of files", len(self.files), EPISODE_FILES)
+        for path in self.files:
+            check_inner_path(path)

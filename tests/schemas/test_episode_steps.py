@@ -51,13 +51,6 @@ def test_what_was_touched_is_in_the_order_of_the_touches(moments):
     assert from_json(EpisodeSteps, json.loads(json.dumps(to_json(steps)))) == steps
 
 
-def test_a_goal_is_part_of_one_with_more_conditions():
-    both = replace(GOAL, conditions=("up bowl", "open drawer"))
-    assert GOAL.is_part_of(both)
-    assert GOAL.is_part_of(replace(GOAL, task_id=5))
-    assert not both.is_part_of(GOAL)
-
-
 def test_poses_are_finite_and_turns_have_length_one():
     poses = np.zeros((3, 2, 7), np.float32)
     poses[..., 3] = 1

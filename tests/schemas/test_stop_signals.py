@@ -105,7 +105,7 @@ STOPPED = "complete episodes are kept, continue with --resume."
     ("moment", "times"),
     [
         pytest.param(at_import("torch.nn"), 2, marks=pytest.mark.thorough),
-        (after_call("vla_attention.capture.machine.device", "", "load_torch"), 1),
+        (after_call("vla_attention.capture.machine", "", "load_torch"), 1),
     ],
     ids=["twice", "loading"],
 )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import struct
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
@@ -33,15 +33,15 @@ from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_sele
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, collect_vocabulary
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.stores.array_metadata import ArrayMetadata, array_metadata
-from vla_attention.schemas.stores.byte_source import Memory, copy_into
+from vla_attention.schemas.stores.byte_source import Memory
 from vla_attention.schemas.stores.digest import bytes_digest, crc32c
 from vla_attention.schemas.stores.episode_checks import content_problems
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
 from vla_attention.schemas.stores.root import attributes_in
 from vla_attention.schemas.stores.seal import SEAL_FILE, read_seal, seal_document
-from vla_attention.schemas.stores.seal_content import FileRecord
 from vla_attention.schemas.stores.sealed_files import SealedFiles
 from vla_attention.schemas.stores.shards import index_size
+from vla_attention.schemas.stores.store_format import FileRecord
 from vla_attention.schemas.stores.stored_array import StoredArray
 
 SPEC = StoreSpec(
@@ -69,15 +69,13 @@ class InMemory:
     def whole(self, file: str) -> bytes:
         return self.content
 
-    def parts(self, file: str, offset: int, lengths: Sequence[int]) -> list[bytes]:
-        found = []
-        for length in lengths:
-            found.append(self.content[offset : offset + length])
-            offset += length
-        return found
+    def part(self, file: str, offset: int, length: int) -> bytes:
+        return self.content[offset : offset + length]
 
     def read_into(self, memory: Memory, file: str, offset: int) -> int:
-        return copy_into(memory, self.content[offset : offset + len(memory)])
+        content = self.part(file, offset, len(memory))
+        memory[: len(content)] = np.frombuffer(content, np.uint8)
+        return len(content)
 
     def size(self, file: str) -> int:
         return len(self.content)

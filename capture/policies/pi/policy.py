@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vla_attention.capture.environments.base import Observation
-from vla_attention.capture.machine.device import memory_left_on
+from vla_attention.capture.machine import memory_left_on
 from vla_attention.capture.policies.identity import PolicySource, describe_policy
 from vla_attention.capture.policies.noise import initial_noise, noise_seed
 from vla_attention.capture.policies.pi.call_variants import ModelCall, call_bytes, most_calls, sample_variants

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from vla_attention.capture.machine import memory
-from vla_attention.capture.machine.memory import memory_left, memory_limits
+from vla_attention.capture import machine
+from vla_attention.capture.machine import memory_left, memory_limits
 
 GB = 2**30
 
@@ -59,5 +59,5 @@ def test_a_control_group_leaves_what_is_neither_taken_nor_given_back(root):
 def test_the_least_counts(root, monkeypatch):
     monkeypatch.setenv("SLURM_MEM_PER_NODE", "5120")
     limits = memory_limits(root)
-    monkeypatch.setattr(memory, "memory_limits", lambda: limits)
+    monkeypatch.setattr(machine, "memory_limits", lambda: limits)
     assert memory_left() == 4 * GB
