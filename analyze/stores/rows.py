@@ -64,12 +64,12 @@ def layer_rows(
     cells = [(i, j) for i in range(len(selection.layers)) for j in range(len(selection.denoise))]
     places = [(selection.layers[i], selection.denoise[j]) for i, j in cells]
     for (i, j), (layer, step), whole in zip(cells, places, episode.read_layers(name, places), strict=True):
-        if not add_up(whole, sums[:, layer, step], recording.mantissa_bits):
-            here = replace(recording, layers=(recording.layers[layer],), denoise_steps=(recording.denoise_steps[step],))
-            _refuse(episode, name, whole, sums[:, layer, step], here)
         # (replan, head or 1, of which the mean is taken, key): a product with the shares, which is a BLAS call.
         parts = whole[:, heads].reshape(replans, -1, of_mean, keys)
         rows = (parts if mean is None else np.matmul(share, parts, out=mean))[:, :, 0]
+        if not add_up(whole, sums[:, layer, step], recording.mantissa_bits):
+            here = replace(recording, layers=(recording.layers[layer],), denoise_steps=(recording.denoise_steps[step],))
+            _refuse(episode, name, whole, sums[:, layer, step], here)
         yield LayerRows(i, j, rows)
 
 
