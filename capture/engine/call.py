@@ -1,6 +1,7 @@
 """Policy calls of a run: changed by its interventions, recorded, held to be finite, with their effects.
 
-All that makes calls does it here: captures, reruns and replays. `va.record`, in which the user makes them, does not.
+Captures, reruns and replays make their calls here. In `va.record` the user makes them; what is stored of them is made
+here, too.
 """
 
 from __future__ import annotations
@@ -12,14 +13,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vla_attention.capture.effects.measurement import EffectMeasurement
+from vla_attention.capture.effects.measurement import EffectMeasurement, EpisodeEffectsMeasured
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.policies.policy import BatchPolicy, GivenInputs, Policy, PolicyInput
 from vla_attention.capture.recording.attention import AttentionEditor
-from vla_attention.capture.recording.finite_numbers import NumbersNotFinite, all_finite, describe_origin
+from vla_attention.capture.recording.finite_numbers import NumbersNotFinite, all_finite, describe_origin, not_finite
 from vla_attention.capture.recording.recorder import make_recorders
-from vla_attention.capture.store.replan_records import RecordedRows, ReplanEffects, ReplanRecord
+from vla_attention.capture.store.replan_records import RecordedRows, ReplanRecord
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.stores.store_format import Recording
@@ -119,25 +120,39 @@ class Caller:
         except NumbersNotFinite as error:
             return error
 
-    def record(self, call: PolicyCall, made: RecordedCall, effects: ReplanEffects | None) -> ReplanRecord:
-        """Return what is stored of a call."""
-        policy_input, frames = call.policy_input, self.recording.frames
-        return ReplanRecord(
-            env_step=call.env_step,
-            noise_seed=call.noise_seed,
-            rows=made.rows,
-            key_role=policy_input.key_role,
-            prompt=policy_input.prompt,
-            state=policy_input.state,
-            actions=made.actions,
-            frames=policy_input.frames if frames else {},
-            camera_frames=policy_input.camera_frames if frames else {},
-            coverage=call.context.coverage,
-            dataset_actions=call.dataset_actions,
-            base_actions=call.base_actions,
-            constant_cameras=call.constant_cameras,
-            effects=effects,
-        )
+
+def record_of(
+    call: PolicyCall,
+    rows: Mapping[str, RecordedRows],
+    actions: NDArray[np.float64] | None,
+    recording: Recording,
+    effects: EpisodeEffectsMeasured | None,
+    noise_seed: int | None,
+) -> ReplanRecord:
+    """Return what is stored of a call that was made, with its effects.
+
+    rows, actions: what it gave. effects: what measures its effects, None for none. noise_seed: the stored one.
+    """
+    given = call.policy_input
+    measured = None
+    if effects is not None and actions is not None:
+        measured = effects.measure(given, call.noise_seed, actions, call.context)
+    return ReplanRecord(
+        env_step=call.env_step,
+        noise_seed=noise_seed,
+        rows=rows,
+        key_role={site: given.key_role[site] for site in rows},
+        prompt=given.prompt,
+        state=given.state if given.state.size else None,
+        actions=actions,
+        frames=given.frames if recording.frames else {},
+        camera_frames=given.camera_frames if recording.frames else {},
+        coverage=call.context.coverage,
+        dataset_actions=call.dataset_actions,
+        base_actions=call.base_actions,
+        constant_cameras=call.constant_cameras,
+        effects=measured,
+    )
 
 
 def record_call(
@@ -177,11 +192,8 @@ def _not_finite(
             lambda watch: policy.act(policy_input, seed, watch, editors),
             tuple(site.name for site in policy.sites),
         )
-    sentence = f"The policy's numbers turned NaN or infinite at {where}. {origin}. Nothing of this episode was kept"
     if passing:
-        return NumbersNotFinite(f"{sentence}.", passing=True)
+        return not_finite(where, origin, "")
     dtype = policy.identity().config.get("dtype")
     remedy = "use another checkpoint" if dtype == "float32" else "use --dtype float32, or another checkpoint"
-    return NumbersNotFinite(
-        f"{sentence}, and the episodes before it are unharmed; {remedy}, and a new --output, if it comes again."
-    )
+    return not_finite(where, origin, f"{remedy}, and a new --output, if it comes again")

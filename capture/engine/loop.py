@@ -24,7 +24,7 @@ from pathlib import Path
 import torch
 
 from vla_attention.capture.effects.measurement import EpisodeEffectsMeasured
-from vla_attention.capture.engine.call import Caller, PolicyCall, RecordedCall
+from vla_attention.capture.engine.call import Caller, PolicyCall, RecordedCall, record_of
 from vla_attention.capture.engine.faults import EPISODE_FAULTS, Faults, MachineBroken, SimulatorDied
 from vla_attention.capture.engine.progress import EpisodeProgress, Progress, Unit
 from vla_attention.capture.engine.source import Committed, Episode, EpisodeJob, Outcome, Source, SourceLost
@@ -302,15 +302,11 @@ class EpisodeLoop:
         """Store a policy call that has been made, with its effects. A simulator elsewhere goes on meanwhile."""
         assert running.episode is not None
         if running.writer is None:
-            running.writer = self._thread.episode(
-                self.store, running.episode.start, caller.denoise_times(), running.episode.max_replans
-            )
+            running.writer = self._thread.episode(self.store, running.episode.start, caller.denoise_times())
             running.effects = None if caller.effects is None else caller.effects.begin()
-        effects = None
-        if running.effects is not None:
-            effects = running.effects.measure(call.policy_input, call.noise_seed, made.actions, call.context)
         running.num_replans += 1
-        running.writer.append(caller.record(call, made, effects))
+        recording, effects = caller.recording, running.effects
+        running.writer.append(record_of(call, made.rows, made.actions, recording, effects, call.noise_seed))
 
     @contextmanager
     def _dropping_faults(self, running: _Running) -> Iterator[None]:

@@ -291,7 +291,6 @@ class SimulatedEpisode(Episode):
     def __post_init__(self) -> None:
         """Take the connection of the simulator."""
         self.connection = self.simulator.connection
-        self.max_replans = max_replans(self.source.protocol)
 
     @property
     def title(self) -> str:

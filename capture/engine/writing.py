@@ -37,7 +37,6 @@ class EpisodeInBackground:
     store: RunStore
     start: EpisodeStart
     denoise_times: NDArray[np.float64]
-    max_replans: int
     #: (its folder, its bytes) of a committed episode.
     committed: tuple[Path, int] | None = field(default=None, init=False)
     #: What ended the writing. What was given afterwards is skipped.
@@ -83,9 +82,7 @@ class EpisodeInBackground:
 
     def _append(self, record: ReplanRecord) -> None:
         if self._writer is None:
-            self._writer = self._open.enter_context(
-                self.store.episode(self.start, self.denoise_times, self.max_replans)
-            )
+            self._writer = self._open.enter_context(self.store.episode(self.start, self.denoise_times))
         self._writer.append(record)
 
     def _commit(self, outcome: Outcome) -> None:
@@ -126,11 +123,9 @@ class WritingThread:
         for episode in self._episodes:
             episode.close()
 
-    def episode(
-        self, store: RunStore, start: EpisodeStart, denoise_times: NDArray[np.float64], max_replans: int
-    ) -> EpisodeInBackground:
+    def episode(self, store: RunStore, start: EpisodeStart, denoise_times: NDArray[np.float64]) -> EpisodeInBackground:
         """Begin an episode; its folder is made with its first replan."""
-        episode = EpisodeInBackground(self, store, start, denoise_times, max_replans)
+        episode = EpisodeInBackground(self, store, start, denoise_times)
         self._episodes = [known for known in self._episodes if known.committed is None and known.error is None]
         self._episodes.append(episode)
         return episode

@@ -90,7 +90,6 @@ class EpisodeWriter:
         folder: Path,
         start: EpisodeStart,
         denoise_times: NDArray[np.float64],
-        max_replans: int,
         locks: Locks,
         durable: bool,
     ) -> None:
@@ -106,7 +105,7 @@ class EpisodeWriter:
         self.group = zarr.create_group(folder, zarr_format=3)
         self.digests: dict[str, ArrayRecord] = {}
         self.sites = {
-            site.name: SiteWriter(self.group, folder, self.write, site, run.recording.of_site(site), max_replans)
+            site.name: SiteWriter(self.group, folder, self.write, site, run.recording.of_site(site))
             for site in run.sites
         }
         self.prompts: dict[Prompt, int] = {}

@@ -100,7 +100,6 @@ class SiteWriter:
         write: WriteArray,
         layout: SiteLayout,
         recording: Recording,
-        max_replans: int,
     ) -> None:
         """Begin the site's group in the episode's `group`, whose folder it is; `recording` is what is of the site."""
         self.group = group
@@ -111,7 +110,7 @@ class SiteWriter:
         self.bits = recording.mantissa_bits
         self.shape = (len(recording.layers), len(recording.denoise_steps), len(recording.heads), recording.num_queries)
         self.bytes_per_replan = 4 * self.shape[2] * self.shape[3] * layout.num_keys
-        self.block = replans_per_block(self.bytes_per_replan, max_replans)
+        self.block = replans_per_block(self.bytes_per_replan)
         self.rows: ShardWriter | None = None
         self.rows_digest = ArrayDigest()
         self.pending: list[NDArray[np.float32]] = []
@@ -180,7 +179,7 @@ class SiteWriter:
         rows = np.stack(self.pending)
         self.pending.clear()
         if self.rows is None:
-            block = replans_per_block(self.bytes_per_replan, min(len(rows), self.block))
+            block = replans_per_block(self.bytes_per_replan, len(rows))
             self.rows = ShardWriter(self.folder / self.layout.name / "rows", rows.shape[1:], block)
         self.rows.append(rows)
         self.rows_digest.update(rows)

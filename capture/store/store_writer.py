@@ -57,9 +57,7 @@ class RunStore:
         return (self.path / EPISODES_GROUP / episode_name(task_id, episode_index)).is_dir()
 
     @contextmanager
-    def episode(
-        self, start: EpisodeStart, denoise_times: NDArray[np.float64], max_replans: int
-    ) -> Iterator[EpisodeWriter]:
+    def episode(self, start: EpisodeStart, denoise_times: NDArray[np.float64]) -> Iterator[EpisodeWriter]:
         """Write one episode, which is locked meanwhile; leaving the block without `commit` drops it.
 
         Raises:
@@ -70,7 +68,7 @@ class RunStore:
             with naming_the_failure(f"episode {name} of {self.path}", self.path):
                 folder = stack.enter_context(self.locks.part(name))
                 writer = EpisodeWriter(
-                    self.path, self.attributes, folder, start, denoise_times, max_replans, self.locks, self.durable
+                    self.path, self.attributes, folder, start, denoise_times, self.locks, self.durable
                 )
             yield writer
 

@@ -15,7 +15,7 @@ from vla_attention.capture.effects.conditions import refuse_both
 from vla_attention.capture.engine.plan import RecordingSettings, recording_of, root_attributes
 from vla_attention.capture.machine.provenance import describe_machine
 from vla_attention.capture.torch_policies.batch_rows import rows_apart
-from vla_attention.capture.torch_policies.knockouts import SessionKnockouts, interventions_of, with_name
+from vla_attention.capture.torch_policies.knockouts import interventions_of, with_name
 from vla_attention.capture.torch_policies.own_setting import difference_to_own_setting
 from vla_attention.capture.torch_policies.policy_layout import (
     LayoutForAnotherVersion,
@@ -190,7 +190,7 @@ def record(
         layout,
         attributes,
         "resume" if resume else "overwrite" if overwrite else "new",
-        knockouts=SessionKnockouts(changes, allow_empty),
+        allow_empty=allow_empty,
         tokenizer=None if tokenizer is None else TokenText(tokenizer),
         projections=projections,
         undecided=undecided and recording.contributions,

@@ -426,6 +426,6 @@ def test_numbers_that_are_not_finite_are_refused(tmp_path, policy, where):
         inputs["states"] = torch.full((1, 2), torch.nan)
     with (
         start(tmp_path, policy) as run,
-        pytest.raises(UserError, match=r"turned NaN or infinite before or at denoise step 0, block 0"),
+        pytest.raises(UserError, match=r"infinite at replan 0 \(environment step 0\) .* at denoise step 0, block 0"),
     ):
         one_call(run, policy, inputs)
