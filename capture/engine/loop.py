@@ -104,8 +104,6 @@ class EpisodeLoop:
     results: list[EpisodeResult] = field(default_factory=list, init=False)
     faults: Faults = field(default_factory=Faults, init=False)
     progress: Progress = field(init=False)
-    #: The episodes in progress and their units, for the message after SIGTERM.
-    positions: dict[str, int] = field(default_factory=dict, init=False)
     #: Episodes that are to be recorded and have not begun.
     _left: list[EpisodeJob] = field(default_factory=list, init=False)
     _running: list[_Running] = field(default_factory=list, init=False)
@@ -228,7 +226,6 @@ class EpisodeLoop:
         return self.store.has(job.task.task_id, job.episode_index)
 
     def _open(self, running: _Running) -> None:
-        self.positions[running.job.name] = 0
         with self._dropping_faults(running):
             running.episode = self.source.open(running.job)
 
@@ -263,8 +260,7 @@ class EpisodeLoop:
             case None:
                 if (how := running.episode.overdue()) is not None:
                     raise SourceLost(how)
-        if (done := running.episode.done) != self.positions[running.job.name]:
-            self.positions[running.job.name] = done
+        if (done := running.episode.done) != running.progress.done:
             running.progress.update(done, running.num_replans)
 
     def _commit(self, running: _Running, outcome: Outcome) -> None:
@@ -333,49 +329,39 @@ class EpisodeLoop:
         self._open(running)
 
     def _fail(self, running: _Running, error: Exception) -> None:
-        """Drop an episode after a fault. If it shall be tried again, it is the next one to begin."""
-        for kept in (self._running, self._ready, self._committing):
-            if running in kept:
-                kept.remove(running)
-        running.close(error)
-        self.store.locks.release(running.job.name)
-        if self._refused(running, error) if isinstance(error, StoreExists) else self._noted(running, error):
-            self._left.insert(0, running.job)
-
-    def _noted(self, running: _Running, error: Exception) -> bool:
-        """Note a fault; returns whether the episode shall be tried again.
+        """Drop an episode after a fault, or because another process has it. Tried again, it is the next one to begin.
 
         Raises:
             MachineBroken: episode after episode met the same fault.
         """
+        for kept in (self._running, self._ready, self._committing):
+            if running in kept:
+                kept.remove(running)
+        running.close(error)
         name = running.job.name
-        self.positions.pop(name, None)
+        self.store.locks.release(name)
+        if isinstance(error, StoreExists):
+            # It is looked at again where the other process has not committed it yet.
+            again = isinstance(error, (EpisodeTaken, Held)) and not self._has(running.job)
+            said = f"{error} This process's copy was dropped."
+        else:
+            again = self._noted(name, error)
+            what_next = "The episode begins again." if again else "The episode is left out, and the run goes on."
+            said = f"{name}: {error} {what_next}"
+        self.progress.end(running.progress, again=again)
+        self.progress.say(said)
+        if again:
+            self._left.insert(0, running.job)
+
+    def _noted(self, name: str, error: Exception) -> bool:
+        """Note a fault; returns whether the episode shall be tried again."""
         try:
             again = self.faults.note(name, error)
         except MachineBroken:
             self.log.add_drop(name, str(error))
             raise
-        if again:
-            running.progress.put_back()
-        else:
-            running.progress.drop()
+        if not again:
             self.log.add_drop(name, str(error))
-        what_next = "The episode begins again." if again else "The episode is left out, and the run goes on."
-        self.progress.say(f"{name}: {error} {what_next}")
-        return again
-
-    def _refused(self, running: _Running, error: StoreExists) -> bool:
-        """Note that another process has committed or taken an episode while this one recorded it.
-
-        Returns whether it is to be looked at again: the other process has not committed it yet.
-        """
-        self.positions.pop(running.job.name, None)
-        self.progress.say(f"{error} This process's copy was dropped.")
-        again = isinstance(error, (EpisodeTaken, Held)) and not self._has(running.job)
-        if again:
-            running.progress.put_back()
-        else:
-            running.progress.drop()
         return again
 
     def _note_written(self) -> None:
@@ -404,7 +390,6 @@ class EpisodeLoop:
         result = EpisodeResult(
             job.task.task_id, job.episode_index, outcome.success, outcome.num_steps, running.num_replans, folder
         )
-        self.positions.pop(job.name, None)
         self.results.append(result)
         self.log.add_commit(job.name)
         self.faults.note_recorded()
@@ -415,12 +400,13 @@ class EpisodeLoop:
         """Show that an episode is committed, and after the first one what the others will take."""
         job, seconds, share = running.job, running.progress.seconds, 1.0
         if self.unit == "call":
-            running.progress.drop()
+            self.progress.end(running.progress)
         else:
             share = min(1.0, max(1, result.num_steps) / job.size)
             ended = "success" if result.success else "no success"
             size = f"{result.num_replans} replans, {format_bytes(num_bytes)}"
-            running.progress.end(f"{ended} after {result.num_steps} steps, {size}", job.task.instruction)
+            took = f"{seconds:.0f} s ({job.task.instruction})"
+            self.progress.end(running.progress, f"{ended} after {result.num_steps} steps, {size}, {took}")
         if len(self.results) == 1:
             room = room_at(self.store.path).bytes
             self.progress.say_rest(seconds, num_bytes, share, self.source.capacity, room)
@@ -428,7 +414,8 @@ class EpisodeLoop:
     def _describe_stop(self, missing: Sequence[EpisodeJob]) -> str:
         committed = listing([result.folder.name for result in self.results], 40)
         left = sum(not self._has(job) for job in missing)
-        running = [f"{name} at {self.unit} {done}" for name, done in sorted(self.positions.items())]
+        left_at = {one.job.name: one.progress.done for one in (*self._running, *self._committing)}
+        running = [f"{name} at {self.unit} {done}" for name, done in sorted(left_at.items())]
         dropped = f"dropped {listing(running, 40)}" if running else "no episode was in progress"
         return (
             f"Stopped by SIGTERM: {dropped}; committed {plural(len(self.results), 'episode')} ({committed}); "

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from vla_attention.capture.interventions.attention_edits import (
@@ -167,11 +166,6 @@ def _log_of(edits: Sequence[SiteEdit], factors: Sequence[NDArray[np.float64]], s
         chosen = slice(None) if edit.heads is None else list(edit.heads)
         total[chosen] += np.where(of_edit == 0, -np.inf, log_factors(of_edit)).astype(np.float32)
     return total
-
-
-def with_name(interventions: Interventions, name: str) -> Interventions:
-    """Return the interventions with the name of their condition."""
-    return replace(interventions, name=name) if name else interventions
 
 
 @dataclass

@@ -281,7 +281,6 @@ class RecordedRun:
     @contextmanager
     def _replan(self, rows: Sequence[RowOfCall], *, batch: int = 1, count: int | None = None) -> Iterator[Replan]:
         """Record one policy call. count: of the environments that it gives actions; None: one."""
-        assert self.store
         for one in rows:
             if one.episode._ended:
                 raise RecordingStopped(
