@@ -19,9 +19,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
-from pathlib import Path
-
-import torch
 
 from vla_attention.capture.effects.measurement import EpisodeEffectsMeasured
 from vla_attention.capture.engine.call import Caller, PolicyCall, RecordedCall, record_of
@@ -50,21 +47,9 @@ MOST_RESTARTS = 2
 _WHY_KILLED = "Signal 9 mostly means that the memory was full; a smaller --num-envs needs less. "
 
 
-@dataclass(frozen=True)
-class EpisodeResult:
-    """How an episode ended, and its folder in the store. success: None where it is not known."""
-
-    task_id: int
-    episode_index: int
-    success: bool | None
-    num_steps: int
-    num_replans: int
-    folder: Path
-
-
 @dataclass(eq=False)
 class _Running:
-    """An episode that is under way, or whose commit waits for the thread (`outcome`)."""
+    """An episode that is under way, or whose commit waits for the thread."""
 
     job: EpisodeJob
     progress: EpisodeProgress
@@ -72,7 +57,6 @@ class _Running:
     writer: EpisodeInBackground | None = None
     effects: EpisodeEffectsMeasured | None = None
     call: PolicyCall | None = None
-    outcome: Outcome | None = None
     num_replans: int = 0
     begun_times: int = 1
 
@@ -101,7 +85,7 @@ class EpisodeLoop:
     source: Source
     policy_batch: int = 1
     log: WorkerLog = field(init=False)
-    results: list[EpisodeResult] = field(default_factory=list, init=False)
+    results: list[Committed] = field(default_factory=list, init=False)
     faults: Faults = field(default_factory=Faults, init=False)
     progress: Progress = field(init=False)
     #: Episodes that are to be recorded and have not begun.
@@ -113,10 +97,10 @@ class EpisodeLoop:
 
     def __post_init__(self) -> None:
         """Begin the log of this worker."""
-        self.log = WorkerLog(self.store.path, self.store.locks.worker, self.plan, torch.get_num_threads())
+        self.log = WorkerLog(self.store.path, self.store.locks.worker, self.plan)
 
-    def record_all(self, missing: Sequence[EpisodeJob]) -> list[EpisodeResult]:
-        """Record the missing episodes, and return those that this process committed.
+    def record_all(self, missing: Sequence[EpisodeJob]) -> list[Committed]:
+        """Record the missing episodes, and return what this process committed.
 
         After the return the store holds every episode of `missing` but those that `faults` names as dropped: the loop
         waits for an episode that another process is writing, and takes it over if that process dies.
@@ -251,11 +235,10 @@ class EpisodeLoop:
             case Outcome() as outcome:
                 self._commit(running, outcome)
                 return
-            case Committed(outcome, num_replans, folder):
-                running.num_replans, running.outcome = num_replans, outcome
+            case Committed() as committed:
                 self._running.remove(running)
                 running.close()
-                self._note_commit(running, folder, bytes_of(folder))
+                self._note_commit(running, committed, bytes_of(committed.folder))
                 return
             case None:
                 if (how := running.episode.overdue()) is not None:
@@ -268,7 +251,6 @@ class EpisodeLoop:
             raise ValueError("an episode without replans cannot be committed")
         self._running.remove(running)
         self._committing.append(running)
-        running.outcome = outcome
         running.episode.close()
         running.episode = None
         running.writer.commit(outcome)
@@ -382,31 +364,28 @@ class EpisodeLoop:
         for running in list(self._committing):
             if running.writer is not None and running.writer.committed is not None:
                 self._committing.remove(running)
-                self._note_commit(running, *running.writer.committed)
+                outcome, folder, num_bytes = running.writer.committed
+                self._note_commit(running, Committed(outcome, running.num_replans, folder), num_bytes)
 
-    def _note_commit(self, running: _Running, folder: Path, num_bytes: int) -> None:
-        job, outcome = running.job, running.outcome
-        assert outcome is not None
-        result = EpisodeResult(
-            job.task.task_id, job.episode_index, outcome.success, outcome.num_steps, running.num_replans, folder
-        )
+    def _note_commit(self, running: _Running, result: Committed, num_bytes: int) -> None:
         self.results.append(result)
-        self.log.add_commit(job.name)
+        self.log.add_commit(running.job.name)
         self.faults.note_recorded()
         self._show_end(running, result, num_bytes)
-        self.store.locks.release(job.name)
+        self.store.locks.release(running.job.name)
 
-    def _show_end(self, running: _Running, result: EpisodeResult, num_bytes: int) -> None:
+    def _show_end(self, running: _Running, result: Committed, num_bytes: int) -> None:
         """Show that an episode is committed, and after the first one what the others will take."""
         job, seconds, share = running.job, running.progress.seconds, 1.0
         if self.unit == "call":
             self.progress.end(running.progress)
         else:
-            share = min(1.0, max(1, result.num_steps) / job.size)
-            ended = "success" if result.success else "no success"
+            num_steps = result.outcome.num_steps
+            share = min(1.0, max(1, num_steps) / job.size)
+            ended = "success" if result.outcome.success else "no success"
             size = f"{result.num_replans} replans, {format_bytes(num_bytes)}"
             took = f"{seconds:.0f} s ({job.task.instruction})"
-            self.progress.end(running.progress, f"{ended} after {result.num_steps} steps, {size}, {took}")
+            self.progress.end(running.progress, f"{ended} after {num_steps} steps, {size}, {took}")
         if len(self.results) == 1:
             room = room_at(self.store.path).bytes
             self.progress.say_rest(seconds, num_bytes, share, self.source.capacity, room)

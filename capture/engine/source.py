@@ -88,7 +88,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Committed:
-    """An episode that its source has recorded and committed itself, with so many replans."""
+    """An episode that is in the store, with so many replans. A source without a `Caller` commits episodes itself."""
 
     outcome: Outcome
     num_replans: int

@@ -37,8 +37,8 @@ class EpisodeInBackground:
     store: RunStore
     start: EpisodeStart
     denoise_times: NDArray[np.float64]
-    #: (its folder, its bytes) of a committed episode.
-    committed: tuple[Path, int] | None = field(default=None, init=False)
+    #: Of a committed episode how it ended, its folder, and its bytes.
+    committed: tuple[Outcome, Path, int] | None = field(default=None, init=False)
     #: What ended the writing. What was given afterwards is skipped.
     error: BaseException | None = field(default=None, init=False)
     #: Of the thread alone: the episode's open writer, and what closes it.
@@ -90,7 +90,7 @@ class EpisodeInBackground:
             raise ValueError("an episode without replans cannot be committed")
         folder = self._writer.commit(outcome.success, outcome.num_steps, outcome.steps)
         self.close()
-        self.committed = folder, bytes_of(folder)
+        self.committed = outcome, folder, bytes_of(folder)
 
 
 def bytes_of(folder: Path) -> int:

@@ -26,7 +26,6 @@ from vla_attention.schemas.stores.content_rules import (
     cut_problems,
     effect_problems,
     picture_problems,
-    piece_role_problems,
     prompt_problems,
     sites_with_text,
 )
@@ -141,10 +140,8 @@ class EpisodeWriter:
         yield from self._misfits(record)
         only_site = len(sites_with_text(sites)) == 1
         for name, site in self.sites.items():
-            yield from site.problems(record.rows[name], record.key_role[name], replan)
             prompt = prompt_at(sites, site.layout, record.prompt)
-            yield from piece_role_problems(site.layout, record.key_role[name], prompt, replan, only_site=only_site)
-            yield from site.unseen_problems(record.rows[name], record.key_role[name], replan)
+            yield from site.problems(record.rows[name], record.key_role[name], prompt, replan, only_site=only_site)
         if record.prompt not in self.prompts:
             yield from prompt_problems(sites, record.prompt)
         for camera, frame in record.frames.items():
