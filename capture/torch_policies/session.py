@@ -189,11 +189,8 @@ class RecordedRun:
         )
         with ExitStack() as stack:
             episode = self._begin(stack, facts)
-            try:
+            with _committing([episode]):
                 yield episode
-            finally:
-                episode._ended = True
-            episode._commit()
 
     @contextmanager
     def episodes(
@@ -220,13 +217,8 @@ class RecordedRun:
             joined = EpisodeBatch(self, stack, chosen, size)
             for facts in episodes:
                 joined._episodes.append(joined._begin(facts))
-            try:
+            with _committing(joined):
                 yield joined
-            finally:
-                for episode in joined:
-                    episode._ended = True
-            for episode in joined:
-                episode._commit()
 
     def _check_weights(self) -> None:
         """Raise `WeightsChanged` if the policy has other weights than when the run began."""
@@ -335,3 +327,15 @@ class RecordedRun:
             Note,
             stacklevel=2,
         )
+
+
+@contextmanager
+def _committing(episodes: Sequence[Episode]) -> Iterator[None]:
+    """End episodes with the block, and store them if no exception ended it."""
+    try:
+        yield
+    finally:
+        for episode in episodes:
+            episode._ended = True
+    for episode in episodes:
+        episode._commit()
