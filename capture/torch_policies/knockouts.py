@@ -23,9 +23,9 @@ from vla_attention.capture.torch_policies.attention_calls import CallShape
 from vla_attention.capture.torch_policies.call_order import CallPlace
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
+from vla_attention.capture.torch_policies.replan_inputs import EpisodeFacts
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
-from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import AttentionScale, Interventions, KeyKnockout
 from vla_attention.schemas.layout import SiteLayout
 
@@ -103,14 +103,9 @@ def _check(interventions: Interventions) -> None:
 
 
 def changes_of_episode(
-    interventions: Interventions,
-    instruction: str,
-    *,
-    allow_empty: bool,
-    sites: Sequence[SiteLayout],
-    objects: Sequence[SceneObject],
+    interventions: Interventions, sites: Sequence[SiteLayout], facts: EpisodeFacts, *, allow_empty: bool
 ) -> RunChanges:
-    """Return what changes the calls of an episode. allow_empty: a group without a key changes nothing.
+    """Return what changes the calls of an episode. sites: of the store. allow_empty: a group without a key changes nothing.
 
     Raises:
         SelectorError: a name exists neither in the instruction nor in the scene.
@@ -119,9 +114,9 @@ def changes_of_episode(
     if allow_empty:  # words that the instruction lacks are no mistake
         atoms = (atom for text in selectors_of(interventions) for atom in atoms_of(parse_selector(text)))
         words = [atom.argument for atom in atoms if atom.kind == "word"]
-    changes = RunChanges(interventions, dict(enumerate([instruction, *words])), allow_empty)
+    changes = RunChanges(interventions, dict(enumerate([facts.instruction, *words])), allow_empty)
     if interventions.changes_attention:
-        changes.check_names(sites, objects)
+        changes.check_names(sites, facts.objects)
     return changes
 
 

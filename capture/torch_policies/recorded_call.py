@@ -179,7 +179,9 @@ class WatchedCall:
             key_role[site.name] = roles = text.roles(one.row, site, prompt, of_site.present, of_site.valid)
             stored[site.name] = replace(of_site.rows, contribution=final_contribution(site, of_site, roles))
         if not all_finite(actions, stored):
-            raise not_finite(one.where, "Its actions or its contributions are, its rows are not", self.recorder.remedy)
+            raise not_finite(
+                one.where, "Its rows are finite, its actions or contributions are not", self.recorder.remedy
+            )
         data = inputs.dataset_actions
         if data is not None and actions is not None:
             data = data[: len(actions)]  # beyond the policy's chunk there is nothing to compare

@@ -239,13 +239,8 @@ class RecordedRun:
                 f"{name} is in {self.path} already; skip it with run.has(task_id, episode_index), or record into "
                 "another store."
             )
-        changes = changes_of_episode(
-            self.attributes.interventions,
-            facts.instruction,
-            allow_empty=self._allow_empty,
-            sites=self.attributes.sites,
-            objects=facts.objects,
-        )
+        interventions, sites = self.attributes.interventions, self.attributes.sites
+        changes = changes_of_episode(interventions, sites, facts, allow_empty=self._allow_empty)
         self._names_unknown = True
         episode = Episode(self, facts, changes, _stack=stack)
         if self._repeats is not None:

@@ -426,7 +426,7 @@ def test_numbers_that_are_not_finite_are_refused(tmp_path, policy, where):
     elif where == "input":
         inputs["states"] = torch.full((1, 2), torch.nan)
     else:
-        origin = "Its actions"
+        origin = "its actions"
     with (
         start(tmp_path, policy) as run,
         pytest.raises(NumbersNotFinite, match=rf"infinite at replan 0 \(environment step 3\) of task0.*{origin}"),
