@@ -105,7 +105,9 @@ def _check(interventions: Interventions) -> None:
 def changes_of_episode(
     interventions: Interventions, sites: Sequence[SiteLayout], facts: EpisodeFacts, *, allow_empty: bool
 ) -> RunChanges:
-    """Return what changes the calls of an episode. sites: of the store. allow_empty: a group without a key changes nothing.
+    """Return what changes the calls of an episode.
+
+    sites: of the store. allow_empty: a group without a key changes nothing.
 
     Raises:
         SelectorError: a name exists neither in the instruction nor in the scene.
