@@ -7,7 +7,7 @@ The policies are pi0.5 with seeded random weights and the key axis of openpi's p
 text slots, 10 actions; ten denoise steps; 18 blocks, 8 heads). small: the policy `untrained`, an expert of width 96.
 mid: an expert of width 512. full: the sizes of pi05_libero (3.35 billion parameters, for a GPU).
 
-A policy call is `act`, from prepared tensors to the robot's actions; recording it is `record_call`, from the plan of
+A policy call is `act`, from prepared tensors to the robot's actions; recording it is `Caller.make`, from the plan of
 the recording to arrays that the store writer takes. All kinds take turns within a round. The actions of every kind are
 compared with the plain call's, and must be bit-equal.
 
@@ -133,10 +133,17 @@ def usual_way(kept: list[Any]) -> Iterator[None]:
         yield
 
 
+def record_call(policy: Any, given: Any, recording: Any) -> Any:
+    """Make a call with the seed 0 and record it; returns its actions and rows."""
+    from vla_attention.capture.engine.call import Caller, PolicyCall
+    from vla_attention.capture.interventions.changed_inputs import CallContext
+
+    (made,) = Caller(policy, recording).make([PolicyCall(given, 0, CallContext(0, 0, 0), 0, "the benchmark")])
+    return made
+
+
 def calls_of(policy: Any, synchronise: Callable[[], None] = lambda: None) -> dict[str, Callable[[], Any]]:
     """Return the kinds of calls, each of which returns the actions; `plain` is the first."""
-    from vla_attention.capture.engine.call import record_call
-
     given = prepared_input(policy)
 
     def plain() -> Any:
@@ -148,7 +155,7 @@ def calls_of(policy: Any, synchronise: Callable[[], None] = lambda: None) -> dic
         recording = recording_of(policy, **KINDS[kind])
 
         def call() -> Any:
-            actions = record_call(policy, given, 0, recording, kind).actions
+            actions = record_call(policy, given, recording).actions
             synchronise()
             return actions
 

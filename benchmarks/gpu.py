@@ -23,7 +23,7 @@ from typing import Any
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1]), str(Path(__file__).resolve().parent)]
 
-from capture_overhead import calls_of, make_policy, prepared_input, recording_of  # noqa: E402
+from capture_overhead import calls_of, make_policy, prepared_input, record_call, recording_of  # noqa: E402
 from measurement import Table, measured, ratios, take_turns, write_rows  # noqa: E402
 
 COLUMNS = {"call": "call", "ms": "ms", "times": "times the plain call", "gb": "most memory, GB"}
@@ -72,10 +72,8 @@ def parity_table(policy: Any, wide: Any) -> Table:
     """Compare a call in bfloat16 with one in float32 on the same weights."""
     import numpy as np
 
-    from vla_attention.capture.engine.call import record_call
-
     recording = recording_of(policy, tuple(range(10)), True)
-    found, expected = (record_call(each, prepared_input(each), 0, recording, "here") for each in (policy, wide))
+    found, expected = (record_call(each, prepared_input(each), recording) for each in (policy, wide))
     rows, wanted = found.rows["joint"].rows, expected.rows["joint"].rows
     shares = [
         {"what": "rows, largest difference", "value": float(np.abs(rows - wanted).max())},

@@ -86,7 +86,7 @@ class NotWritten(EpisodeInBackground):
 
     def commit(self, outcome: Any) -> None:
         name = f"task{self.start.task_id:03d}_episode{self.start.episode_index:03d}"
-        self.committed = Path(tempfile.gettempdir()) / name, 0
+        self.committed = outcome, Path(tempfile.gettempdir()) / name, 0
         self.thread.put(lambda: None)
 
 

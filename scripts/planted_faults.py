@@ -140,7 +140,7 @@ FAULTS = (
         "swallowed exception: an episode that fails is left out",
         "capture/engine/loop.py",
         "(StoreExists, *EPISODE_FAULTS) as error:\n            self._fail(running, error)",
-        "Exception as error:\n            self._refused(running, error)",
+        "Exception as error:\n            self._fail(running, StoreExists(str(error)))",
         ("tests/capture/engine", "tests/capture/rerun"),
     ),
     Fault(

@@ -1,6 +1,7 @@
 """Policy calls of a run: changed by its interventions, recorded, held to be finite, with their effects.
 
-All that makes calls does it here: captures, reruns and replays. `va.record`, in which the user makes them, does not.
+Captures, reruns and replays make their calls here. In `va.record` the user makes them; what is stored of them is made
+here, too.
 """
 
 from __future__ import annotations
@@ -12,14 +13,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from vla_attention.capture.effects.measurement import EffectMeasurement
+from vla_attention.capture.effects.measurement import EffectMeasurement, EpisodeEffectsMeasured
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.policies.policy import BatchPolicy, GivenInputs, Policy, PolicyInput
 from vla_attention.capture.recording.attention import AttentionEditor
-from vla_attention.capture.recording.finite_numbers import NumbersNotFinite, all_finite, describe_origin
-from vla_attention.capture.recording.recorder import make_recorders
-from vla_attention.capture.store.replan_records import RecordedRows, ReplanEffects, ReplanRecord
+from vla_attention.capture.recording.finite_numbers import NumbersNotFinite, all_finite, describe_origin, not_finite
+from vla_attention.capture.recording.recorder import AttentionRecorder, make_recorders
+from vla_attention.capture.store.replan_records import RecordedRows, ReplanRecord
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.stores.store_format import Recording
@@ -90,98 +91,86 @@ class Caller:
     def make(self, calls: Sequence[PolicyCall]) -> list[RecordedCall | NumbersNotFinite]:
         """Make calls as one batch if the policy can, else one after the other.
 
-        One call, and calls whose attention is changed, are made as `record_call` makes them, to the bit. In the place
-        of a call whose actions or rows are NaN or infinite is the error: the others of a batch are not its fault.
+        A batch changes last bits. Calls whose attention is changed are made one by one. In the place of a call whose
+        actions or rows are NaN or infinite is the error: the others of a batch are not its fault.
         """
-        policy, recording = self.policy, self.recording
+        policy = self.policy
         editors = [self.changes.editors(policy.sites, call.policy_input, call.context) for call in calls]
-        if len(calls) == 1 or any(editors) or not isinstance(policy, BatchPolicy):
-            return [self._made_alone(call, of_call) for call, of_call in zip(calls, editors, strict=True)]
-        pools = policy.query_pools() if recording.queries == "steps" else None
-        recorders = [make_recorders(recording, policy.sites, call.policy_input.key_role, pools) for call in calls]
-        together = policy.act_batch(
-            [call.policy_input for call in calls], [call.noise_seed for call in calls], recorders
-        )
-        made: list[RecordedCall | NumbersNotFinite] = []
-        for call, actions, recorders_of_call in zip(calls, together, recorders, strict=True):
-            rows = {site: recorder.finish() for site, recorder in recorders_of_call.items()}
-            if all_finite(actions, rows):
-                made.append(RecordedCall(actions, rows))
-            else:
-                made.append(_not_finite(policy, call.policy_input, call.noise_seed, call.where, None))
+        if len(calls) > 1 and not any(editors) and isinstance(policy, BatchPolicy):
+            inputs, seeds = [call.policy_input for call in calls], [call.noise_seed for call in calls]
+            recorders = [self._recorders(call) for call in calls]
+            actions = policy.act_batch(inputs, seeds, recorders)
+            together = zip(calls, actions, recorders, strict=True)
+            return [self._made(call, of_call, own, None) for call, of_call, own in together]
+        made = []
+        for call, of_call in zip(calls, editors, strict=True):
+            own = self._recorders(call)
+            made.append(self._made(call, policy.act(call.policy_input, call.noise_seed, own, of_call), own, of_call))
         return made
 
-    def _made_alone(
-        self, call: PolicyCall, editors: Mapping[str, AttentionEditor] | None
+    def _recorders(self, call: PolicyCall) -> dict[str, AttentionRecorder]:
+        policy, recording = self.policy, self.recording
+        pools = policy.query_pools() if recording.queries == "steps" else None
+        return make_recorders(recording, policy.sites, call.policy_input.key_role, pools)
+
+    def _made(
+        self,
+        call: PolicyCall,
+        actions: NDArray[np.float64],
+        recorders: Mapping[str, AttentionRecorder],
+        editors: Mapping[str, AttentionEditor] | None,
     ) -> RecordedCall | NumbersNotFinite:
-        try:
-            return record_call(self.policy, call.policy_input, call.noise_seed, self.recording, call.where, editors)
-        except NumbersNotFinite as error:
-            return error
+        rows = {site: recorder.finish() for site, recorder in recorders.items()}
+        return RecordedCall(actions, rows) if all_finite(actions, rows) else self._not_finite(call, editors)
 
-    def record(self, call: PolicyCall, made: RecordedCall, effects: ReplanEffects | None) -> ReplanRecord:
-        """Return what is stored of a call."""
-        policy_input, frames = call.policy_input, self.recording.frames
-        return ReplanRecord(
-            env_step=call.env_step,
-            noise_seed=call.noise_seed,
-            rows=made.rows,
-            key_role=policy_input.key_role,
-            prompt=policy_input.prompt,
-            state=policy_input.state,
-            actions=made.actions,
-            frames=policy_input.frames if frames else {},
-            camera_frames=policy_input.camera_frames if frames else {},
-            coverage=call.context.coverage,
-            dataset_actions=call.dataset_actions,
-            base_actions=call.base_actions,
-            constant_cameras=call.constant_cameras,
-            effects=effects,
-        )
+    def _not_finite(self, call: PolicyCall, editors: Mapping[str, AttentionEditor] | None) -> NumbersNotFinite:
+        """Return the error of a call whose results are not finite; it repeats the call to find where that began."""
+        policy, policy_input = self.policy, call.policy_input
+        wrong_inputs = [name for name, values in policy_input.tensors.items() if not torch.isfinite(values).all()]
+        if wrong_inputs:
+            origin, passing = f"The policy's input is not finite already: {listing(wrong_inputs)}", False
+        else:
+            origin, passing = describe_origin(
+                policy.model,
+                lambda watch: policy.act(policy_input, call.noise_seed, watch, editors),
+                tuple(site.name for site in policy.sites),
+            )
+        if passing:
+            return not_finite(call.where, origin, "")
+        dtype = policy.identity().config.get("dtype")
+        remedy = "use another checkpoint" if dtype == "float32" else "use --dtype float32, or another checkpoint"
+        return not_finite(call.where, origin, f"{remedy}, and a new --output, if it comes again")
 
 
-def record_call(
-    policy: Policy,
-    policy_input: PolicyInput,
-    noise_seed: int,
+def record_of(
+    call: PolicyCall,
+    rows: Mapping[str, RecordedRows],
+    actions: NDArray[np.float64] | None,
     recording: Recording,
-    where: str,
-    editors: Mapping[str, AttentionEditor] | None = None,
-) -> RecordedCall:
-    """Call the policy once, and record what `recording` says.
+    effects: EpisodeEffectsMeasured | None,
+    noise_seed: int | None,
+) -> ReplanRecord:
+    """Return what is stored of a call that was made, with its effects.
 
-    editors: the editor of each site whose attention changes; the rows are the changed ones.
-
-    Raises:
-        NumbersNotFinite: actions or rows are NaN or infinite; `where` names the replan in the sentence.
+    rows, actions: what it gave. effects: what measures its effects, None for none. noise_seed: the stored one.
     """
-    pools = policy.query_pools() if recording.queries == "steps" else None
-    recorders = make_recorders(recording, policy.sites, policy_input.key_role, pools)
-    actions = policy.act(policy_input, noise_seed, recorders, editors)
-    rows = {site: recorder.finish() for site, recorder in recorders.items()}
-    if not all_finite(actions, rows):
-        raise _not_finite(policy, policy_input, noise_seed, where, editors)
-    return RecordedCall(actions, rows)
-
-
-def _not_finite(
-    policy: Policy, policy_input: PolicyInput, seed: int, where: str, editors: Mapping[str, AttentionEditor] | None
-) -> NumbersNotFinite:
-    """Return the error of a policy call whose results are not finite; it repeats the call to find where that began."""
-    wrong_inputs = [name for name, values in policy_input.tensors.items() if not torch.isfinite(values).all()]
-    if wrong_inputs:
-        origin, passing = f"The policy's input is not finite already: {listing(wrong_inputs)}", False
-    else:
-        origin, passing = describe_origin(
-            policy.model,
-            lambda watch: policy.act(policy_input, seed, watch, editors),
-            tuple(site.name for site in policy.sites),
-        )
-    sentence = f"The policy's numbers turned NaN or infinite at {where}. {origin}. Nothing of this episode was kept"
-    if passing:
-        return NumbersNotFinite(f"{sentence}.", passing=True)
-    dtype = policy.identity().config.get("dtype")
-    remedy = "use another checkpoint" if dtype == "float32" else "use --dtype float32, or another checkpoint"
-    return NumbersNotFinite(
-        f"{sentence}, and the episodes before it are unharmed; {remedy}, and a new --output, if it comes again."
+    given = call.policy_input
+    measured = None
+    if effects is not None and actions is not None:
+        measured = effects.measure(given, call.noise_seed, actions, call.context)
+    return ReplanRecord(
+        env_step=call.env_step,
+        noise_seed=noise_seed,
+        rows=rows,
+        key_role={site: given.key_role[site] for site in rows},
+        prompt=given.prompt,
+        state=given.state if given.state.size else None,
+        actions=actions,
+        frames=given.frames if recording.frames else {},
+        camera_frames=given.camera_frames if recording.frames else {},
+        coverage=call.context.coverage,
+        dataset_actions=call.dataset_actions,
+        base_actions=call.base_actions,
+        constant_cameras=call.constant_cameras,
+        effects=measured,
     )

@@ -19,12 +19,9 @@ from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
-from pathlib import Path
-
-import torch
 
 from vla_attention.capture.effects.measurement import EpisodeEffectsMeasured
-from vla_attention.capture.engine.call import Caller, PolicyCall, RecordedCall
+from vla_attention.capture.engine.call import Caller, PolicyCall, RecordedCall, record_of
 from vla_attention.capture.engine.faults import EPISODE_FAULTS, Faults, MachineBroken, SimulatorDied
 from vla_attention.capture.engine.progress import EpisodeProgress, Progress, Unit
 from vla_attention.capture.engine.source import Committed, Episode, EpisodeJob, Outcome, Source, SourceLost
@@ -50,21 +47,9 @@ MOST_RESTARTS = 2
 _WHY_KILLED = "Signal 9 mostly means that the memory was full; a smaller --num-envs needs less. "
 
 
-@dataclass(frozen=True)
-class EpisodeResult:
-    """How an episode ended, and its folder in the store. success: None where it is not known."""
-
-    task_id: int
-    episode_index: int
-    success: bool | None
-    num_steps: int
-    num_replans: int
-    folder: Path
-
-
 @dataclass(eq=False)
 class _Running:
-    """An episode that is under way, or whose commit waits for the thread (`outcome`)."""
+    """An episode that is under way, or whose commit waits for the thread."""
 
     job: EpisodeJob
     progress: EpisodeProgress
@@ -72,7 +57,6 @@ class _Running:
     writer: EpisodeInBackground | None = None
     effects: EpisodeEffectsMeasured | None = None
     call: PolicyCall | None = None
-    outcome: Outcome | None = None
     num_replans: int = 0
     begun_times: int = 1
 
@@ -101,11 +85,9 @@ class EpisodeLoop:
     source: Source
     policy_batch: int = 1
     log: WorkerLog = field(init=False)
-    results: list[EpisodeResult] = field(default_factory=list, init=False)
+    results: list[Committed] = field(default_factory=list, init=False)
     faults: Faults = field(default_factory=Faults, init=False)
     progress: Progress = field(init=False)
-    #: The episodes in progress and their units, for the message after SIGTERM.
-    positions: dict[str, int] = field(default_factory=dict, init=False)
     #: Episodes that are to be recorded and have not begun.
     _left: list[EpisodeJob] = field(default_factory=list, init=False)
     _running: list[_Running] = field(default_factory=list, init=False)
@@ -115,10 +97,10 @@ class EpisodeLoop:
 
     def __post_init__(self) -> None:
         """Begin the log of this worker."""
-        self.log = WorkerLog(self.store.path, self.store.locks.worker, self.plan, torch.get_num_threads())
+        self.log = WorkerLog(self.store.path, self.store.locks.worker, self.plan)
 
-    def record_all(self, missing: Sequence[EpisodeJob]) -> list[EpisodeResult]:
-        """Record the missing episodes, and return those that this process committed.
+    def record_all(self, missing: Sequence[EpisodeJob]) -> list[Committed]:
+        """Record the missing episodes, and return what this process committed.
 
         After the return the store holds every episode of `missing` but those that `faults` names as dropped: the loop
         waits for an episode that another process is writing, and takes it over if that process dies.
@@ -228,7 +210,6 @@ class EpisodeLoop:
         return self.store.has(job.task.task_id, job.episode_index)
 
     def _open(self, running: _Running) -> None:
-        self.positions[running.job.name] = 0
         with self._dropping_faults(running):
             running.episode = self.source.open(running.job)
 
@@ -254,17 +235,15 @@ class EpisodeLoop:
             case Outcome() as outcome:
                 self._commit(running, outcome)
                 return
-            case Committed(outcome, num_replans, folder):
-                running.num_replans, running.outcome = num_replans, outcome
+            case Committed() as committed:
                 self._running.remove(running)
                 running.close()
-                self._note_commit(running, folder, bytes_of(folder))
+                self._note_commit(running, committed, bytes_of(committed.folder))
                 return
             case None:
                 if (how := running.episode.overdue()) is not None:
                     raise SourceLost(how)
-        if (done := running.episode.done) != self.positions[running.job.name]:
-            self.positions[running.job.name] = done
+        if (done := running.episode.done) != running.progress.done:
             running.progress.update(done, running.num_replans)
 
     def _commit(self, running: _Running, outcome: Outcome) -> None:
@@ -272,7 +251,6 @@ class EpisodeLoop:
             raise ValueError("an episode without replans cannot be committed")
         self._running.remove(running)
         self._committing.append(running)
-        running.outcome = outcome
         running.episode.close()
         running.episode = None
         running.writer.commit(outcome)
@@ -302,15 +280,11 @@ class EpisodeLoop:
         """Store a policy call that has been made, with its effects. A simulator elsewhere goes on meanwhile."""
         assert running.episode is not None
         if running.writer is None:
-            running.writer = self._thread.episode(
-                self.store, running.episode.start, caller.denoise_times(), running.episode.max_replans
-            )
+            running.writer = self._thread.episode(self.store, running.episode.start, caller.denoise_times())
             running.effects = None if caller.effects is None else caller.effects.begin()
-        effects = None
-        if running.effects is not None:
-            effects = running.effects.measure(call.policy_input, call.noise_seed, made.actions, call.context)
         running.num_replans += 1
-        running.writer.append(caller.record(call, made, effects))
+        recording, effects = caller.recording, running.effects
+        running.writer.append(record_of(call, made.rows, made.actions, recording, effects, call.noise_seed))
 
     @contextmanager
     def _dropping_faults(self, running: _Running) -> Iterator[None]:
@@ -337,49 +311,39 @@ class EpisodeLoop:
         self._open(running)
 
     def _fail(self, running: _Running, error: Exception) -> None:
-        """Drop an episode after a fault. If it shall be tried again, it is the next one to begin."""
-        for kept in (self._running, self._ready, self._committing):
-            if running in kept:
-                kept.remove(running)
-        running.close(error)
-        self.store.locks.release(running.job.name)
-        if self._refused(running, error) if isinstance(error, StoreExists) else self._noted(running, error):
-            self._left.insert(0, running.job)
-
-    def _noted(self, running: _Running, error: Exception) -> bool:
-        """Note a fault; returns whether the episode shall be tried again.
+        """Drop an episode after a fault, or because another process has it. Tried again, it is the next one to begin.
 
         Raises:
             MachineBroken: episode after episode met the same fault.
         """
+        for kept in (self._running, self._ready, self._committing):
+            if running in kept:
+                kept.remove(running)
+        running.close(error)
         name = running.job.name
-        self.positions.pop(name, None)
+        self.store.locks.release(name)
+        if isinstance(error, StoreExists):
+            # It is looked at again where the other process has not committed it yet.
+            again = isinstance(error, (EpisodeTaken, Held)) and not self._has(running.job)
+            said = f"{error} This process's copy was dropped."
+        else:
+            again = self._noted(name, error)
+            what_next = "The episode begins again." if again else "The episode is left out, and the run goes on."
+            said = f"{name}: {error} {what_next}"
+        self.progress.end(running.progress, again=again)
+        self.progress.say(said)
+        if again:
+            self._left.insert(0, running.job)
+
+    def _noted(self, name: str, error: Exception) -> bool:
+        """Note a fault; returns whether the episode shall be tried again."""
         try:
             again = self.faults.note(name, error)
         except MachineBroken:
             self.log.add_drop(name, str(error))
             raise
-        if again:
-            running.progress.put_back()
-        else:
-            running.progress.drop()
+        if not again:
             self.log.add_drop(name, str(error))
-        what_next = "The episode begins again." if again else "The episode is left out, and the run goes on."
-        self.progress.say(f"{name}: {error} {what_next}")
-        return again
-
-    def _refused(self, running: _Running, error: StoreExists) -> bool:
-        """Note that another process has committed or taken an episode while this one recorded it.
-
-        Returns whether it is to be looked at again: the other process has not committed it yet.
-        """
-        self.positions.pop(running.job.name, None)
-        self.progress.say(f"{error} This process's copy was dropped.")
-        again = isinstance(error, (EpisodeTaken, Held)) and not self._has(running.job)
-        if again:
-            running.progress.put_back()
-        else:
-            running.progress.drop()
         return again
 
     def _note_written(self) -> None:
@@ -400,31 +364,28 @@ class EpisodeLoop:
         for running in list(self._committing):
             if running.writer is not None and running.writer.committed is not None:
                 self._committing.remove(running)
-                self._note_commit(running, *running.writer.committed)
+                outcome, folder, num_bytes = running.writer.committed
+                self._note_commit(running, Committed(outcome, running.num_replans, folder), num_bytes)
 
-    def _note_commit(self, running: _Running, folder: Path, num_bytes: int) -> None:
-        job, outcome = running.job, running.outcome
-        assert outcome is not None
-        result = EpisodeResult(
-            job.task.task_id, job.episode_index, outcome.success, outcome.num_steps, running.num_replans, folder
-        )
-        self.positions.pop(job.name, None)
+    def _note_commit(self, running: _Running, result: Committed, num_bytes: int) -> None:
         self.results.append(result)
-        self.log.add_commit(job.name)
+        self.log.add_commit(running.job.name)
         self.faults.note_recorded()
         self._show_end(running, result, num_bytes)
-        self.store.locks.release(job.name)
+        self.store.locks.release(running.job.name)
 
-    def _show_end(self, running: _Running, result: EpisodeResult, num_bytes: int) -> None:
+    def _show_end(self, running: _Running, result: Committed, num_bytes: int) -> None:
         """Show that an episode is committed, and after the first one what the others will take."""
         job, seconds, share = running.job, running.progress.seconds, 1.0
         if self.unit == "call":
-            running.progress.drop()
+            self.progress.end(running.progress)
         else:
-            share = min(1.0, max(1, result.num_steps) / job.size)
-            ended = "success" if result.success else "no success"
+            num_steps = result.outcome.num_steps
+            share = min(1.0, max(1, num_steps) / job.size)
+            ended = "success" if result.outcome.success else "no success"
             size = f"{result.num_replans} replans, {format_bytes(num_bytes)}"
-            running.progress.end(f"{ended} after {result.num_steps} steps, {size}", job.task.instruction)
+            took = f"{seconds:.0f} s ({job.task.instruction})"
+            self.progress.end(running.progress, f"{ended} after {num_steps} steps, {size}, {took}")
         if len(self.results) == 1:
             room = room_at(self.store.path).bytes
             self.progress.say_rest(seconds, num_bytes, share, self.source.capacity, room)
@@ -432,7 +393,8 @@ class EpisodeLoop:
     def _describe_stop(self, missing: Sequence[EpisodeJob]) -> str:
         committed = listing([result.folder.name for result in self.results], 40)
         left = sum(not self._has(job) for job in missing)
-        running = [f"{name} at {self.unit} {done}" for name, done in sorted(self.positions.items())]
+        left_at = {one.job.name: one.progress.done for one in (*self._running, *self._committing)}
+        running = [f"{name} at {self.unit} {done}" for name, done in sorted(left_at.items())]
         dropped = f"dropped {listing(running, 40)}" if running else "no episode was in progress"
         return (
             f"Stopped by SIGTERM: {dropped}; committed {plural(len(self.results), 'episode')} ({committed}); "

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
-from typing import Protocol as Interface
 
 from msgspec.structs import replace
 
@@ -32,7 +31,7 @@ from vla_attention.schemas.stores.store_format import (
 from vla_attention.schemas.stores.verify import DamagedEpisode
 
 if TYPE_CHECKING:
-    from vla_attention.capture.policies.policy import Policy
+    from vla_attention.capture.policies.policy import ModelSizes, Policy
 
 #: The denoise steps that are recorded unless others are asked for.
 DEFAULT_STEPS = ("first", "last")
@@ -65,26 +64,6 @@ def recording_settings(arguments: argparse.Namespace) -> RecordingSettings:
         contributions=arguments.contributions,
         effects=effect_settings(arguments),
     )
-
-
-class ModelSizes(Interface):
-    """How many layers, heads and denoise steps there are to record from; a policy or a layout."""
-
-    @property
-    def family(self) -> str:
-        """The policy's family, which decides how layers are numbered."""
-
-    @property
-    def num_layers(self) -> int:
-        """Number of blocks."""
-
-    @property
-    def num_heads(self) -> int:
-        """Number of heads of a block."""
-
-    @property
-    def num_denoise_steps(self) -> int:
-        """Number of denoise steps of a policy call."""
 
 
 def plan_recording(settings: RecordingSettings, policy: Policy, seed: int) -> tuple[Recording, str | None]:

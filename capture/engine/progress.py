@@ -100,18 +100,6 @@ class EpisodeProgress:
         """Seconds since it was begun."""
         return time.monotonic() - self.begun_at
 
-    def end(self, result: str, instruction: str) -> None:
-        """Show how the episode ended."""
-        self.progress.end(self, f"{result}, {self.seconds:.0f} s ({instruction})")
-
-    def drop(self) -> None:
-        """Show the episode no more: another process was faster, or this one stops."""
-        self.progress.drop(self)
-
-    def put_back(self) -> None:
-        """Show the episode no more: it will begin again."""
-        self.progress.put_back(self)
-
     def describe(self, unit: Unit, now: float) -> str:
         """Return what is done as text for a log file."""
         done = f"step {self.done} of at most {self.size}, {self.replans} replans"
@@ -157,24 +145,17 @@ class Progress:
             more = len(self._running) - len(shown)
             say("; ".join(shown) + (f"; {more} more episodes" if more else ""))
 
-    def end(self, episode: EpisodeProgress, result: str) -> None:
-        """Show how an episode ended."""
-        self.drop(episode)
-        self.say(f"{episode.position} {episode.name}: {result}")
-
-    def drop(self, episode: EpisodeProgress) -> None:
-        """Count an episode as done, and show it no more."""
+    def end(self, episode: EpisodeProgress, result: str = "", *, again: bool = False) -> None:
+        """Show an episode no more, and how it ended. again: it will begin again, and counts as not begun."""
         self._running.remove(episode)
-        self._done += episode.size
+        if again:
+            self._num_begun -= 1
+        else:
+            self._done += episode.size
         self._update_bar()
         self._describe_bar()
-
-    def put_back(self, episode: EpisodeProgress) -> None:
-        """Show an episode no more, and count it as not begun."""
-        self._running.remove(episode)
-        self._num_begun -= 1
-        self._update_bar()
-        self._describe_bar()
+        if result:
+            self.say(f"{episode.position} {episode.name}: {result}")
 
     def skip(self, name: str) -> None:
         """Show that another process has committed an episode."""

@@ -27,7 +27,14 @@ from typing import Protocol as Interface
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.engine.simulation import CameraPatches, Simulation, SimulationFailed, StopCheck, failure
+from vla_attention.capture.engine.simulation import (
+    CameraPatches,
+    Simulation,
+    SimulationFailed,
+    StopCheck,
+    failure,
+    naming_the_simulator,
+)
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, SharesResets, Suite
 from vla_attention.capture.environments.suites import make_environment
 from vla_attention.schemas.errors import UserError
@@ -146,20 +153,17 @@ class SimulatorProcess:
                 env=os.environ | one_thread | {"TMPDIR": self._temporary.name},
                 process_group=0,
             )
-        self._send(setup)
+        self.ask(setup)
 
     @property
     def number(self) -> int:
         """The number of the process."""
         return self._process.pid
 
-    def begin(self, request: BeginEpisode) -> None:
-        """Let it begin an episode: it answers `Begun` and, after the waiting steps, `Advanced`."""
-        self._send(request)
-
-    def execute(self, request: Execute) -> None:
-        """Let it execute actions: it answers `Advanced`."""
-        self._send(request)
+    def ask(self, message: Any) -> None:
+        """Send what it answers: to `BeginEpisode` with `Begun` and, after the waiting steps, `Advanced`."""
+        with contextlib.suppress(OSError):  # it has died, and reading says so
+            self.connection.send(message)
 
     def has_answer(self) -> bool:
         """Whether it has answered, or has ended."""
@@ -171,10 +175,6 @@ class SimulatorProcess:
     def receive(self) -> Any:
         """Return its next answer; `EOFError` or `OSError` when it has ended."""
         return self.connection.recv()
-
-    def _send(self, message: Any) -> None:
-        with contextlib.suppress(OSError):  # it has died, and reading says so
-            self.connection.send(message)
 
     def how_it_ended(self) -> str:
         """Wait for the end of a process whose connection has closed, and describe it."""
@@ -213,8 +213,15 @@ class SimulatorServer:
         self.environment: Environment | None = None
         self.task_id: int | None = None
 
-    def begin(self, request: BeginEpisode) -> None:
-        """Begin an episode, with its waiting steps."""
+    def answer(self, request: BeginEpisode | Execute) -> None:
+        """Begin an episode, with its waiting steps, or execute actions."""
+        if isinstance(request, Execute):
+            self.send(self.simulation.advance(request.actions, request.observe))
+            return
+        with naming_the_simulator(request.title):
+            self._begin(request)
+
+    def _begin(self, request: BeginEpisode) -> None:
         environment, seed = self._environment_of(request.task_id), self.setup.protocol.seed
         shared = environment if isinstance(environment, SharesResets) else None
         if shared is not None and request.resets is not None:
@@ -228,10 +235,6 @@ class SimulatorServer:
             self.send(KnownResets(shared.known_resets(seed)))
         self.send(begun)
         self.send(self.simulation.wait())
-
-    def execute(self, request: Execute) -> None:
-        """Execute actions."""
-        self.send(self.simulation.advance(request.actions, request.observe))
 
     def close(self) -> None:
         """Close the environment."""
@@ -253,21 +256,16 @@ class SimulatorServer:
 class _ProcessServer(SimulatorServer):
     """Simulates for a policy at the other end of a connection."""
 
+    title = "an episode"  # an episode's own errors have its title
+
     def __init__(self, connection: Connection, setup: SimulatorSetup) -> None:
         super().__init__(connection.send, setup)
         self.connection = connection
-        #: The title of the episode, for messages.
-        self.title = "an episode"
 
     def serve(self) -> None:
         """Answer until the other end closes."""
         while True:
-            message = self.connection.recv()
-            if isinstance(message, BeginEpisode):
-                self.title = message.title
-                self.begin(message)
-            else:
-                self.execute(message)
+            self.answer(self.connection.recv())
 
     def made(self, task_id: int) -> Environment:
         """Make the environment of a task.

@@ -14,9 +14,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
-from typing import Any
-from typing import Protocol as Interface
+from typing import TypeAlias
 
 import numpy as np
 from msgspec import structs
@@ -31,7 +29,6 @@ from vla_attention.capture.engine.simulation import (
     Seen,
     SimulationFailed,
     StopCheck,
-    naming_the_simulator,
 )
 from vla_attention.capture.engine.simulator_process import (
     BeginEpisode,
@@ -81,34 +78,8 @@ def check_protocol(protocol: Protocol, policy: Policy) -> None:
         )
 
 
-class Simulator(Interface):
-    """One simulator: a `SimulatorProcess`, or a `LocalSimulator`."""
-
-    @property
-    def connection(self) -> Connection | None:
-        """Where its answers come; None where it has answered when `begin` and `execute` return."""
-
-    def begin(self, request: BeginEpisode) -> None:
-        """Let it begin an episode: it answers `Begun` and, after the waiting steps, `Advanced`."""
-
-    def execute(self, request: Execute) -> None:
-        """Let it execute actions: it answers `Advanced`."""
-
-    def has_answer(self) -> bool:
-        """Whether `receive` has something to return, or to raise."""
-
-    def receive(self) -> Any:
-        """Return the next answer; `EOFError` or `OSError` when it has ended."""
-
-    def how_it_ended(self) -> str:
-        """Describe its end."""
-
-    def close(self) -> None:
-        """End it."""
-
-
 class LocalSimulator:
-    """A simulator in this process, which does at once what it is asked for."""
+    """A simulator in this process, which has answered when `ask` returns; otherwise as a `SimulatorProcess`."""
 
     connection = None
 
@@ -117,15 +88,10 @@ class LocalSimulator:
         self._answers: deque[object] = deque()
         self._server = SimulatorServer(self._answer, source.setup, source.check)
 
-    def begin(self, request: BeginEpisode) -> None:
-        """Reset, and make the waiting steps."""
+    def ask(self, request: BeginEpisode | Execute) -> None:
+        """Do what is asked for."""
         self._answers.clear()
-        with naming_the_simulator(request.title):
-            self._server.begin(request)
-
-    def execute(self, request: Execute) -> None:
-        """Execute actions."""
-        self._server.execute(request)
+        self._server.answer(request)
 
     def has_answer(self) -> bool:
         """Whether there is an answer."""
@@ -149,6 +115,9 @@ class LocalSimulator:
             self._source.tell_resets(answer)  # before they are made
         else:
             self._answers.append(answer)
+
+
+Simulator: TypeAlias = SimulatorProcess | LocalSimulator
 
 
 @dataclass
@@ -221,7 +190,7 @@ class Simulators(Source):
         episode = SimulatedEpisode(self, job, simulator)
         self._episodes.append(episode)
         try:
-            simulator.begin(BeginEpisode(task_id, job.episode_index, episode.title, self._resets.get(task_id)))
+            simulator.ask(BeginEpisode(task_id, job.episode_index, episode.title, self._resets.get(task_id)))
         except Exception as error:
             episode.close(error)
             raise
@@ -291,7 +260,6 @@ class SimulatedEpisode(Episode):
     def __post_init__(self) -> None:
         """Take the connection of the simulator."""
         self.connection = self.simulator.connection
-        self.max_replans = max_replans(self.source.protocol)
 
     @property
     def title(self) -> str:
@@ -329,7 +297,7 @@ class SimulatedEpisode(Episode):
         self._executed += list(chosen)
         self._replan += 1
         self._asked_at = time.monotonic()
-        self.simulator.execute(Execute(chosen, self.done + len(chosen) < protocol.max_steps))
+        self.simulator.ask(Execute(chosen, self.done + len(chosen) < protocol.max_steps))
 
     def overdue(self) -> str | None:
         """Return how the simulator hangs, if it has owed an answer for too long."""

@@ -88,7 +88,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Committed:
-    """An episode that its source has recorded and committed itself, with so many replans."""
+    """An episode that is in the store, with so many replans. A source without a `Caller` commits episodes itself."""
 
     outcome: Outcome
     num_replans: int
@@ -100,13 +100,11 @@ class Episode(ABC):
 
     Attributes:
         start: what the store says of it; known with its first policy call.
-        max_replans: policy calls that it can have, at most.
         done: steps or calls so far.
         connection: where it hears of what it waits for; None for one that never waits.
     """
 
     start: EpisodeStart
-    max_replans: int
     done: int = 0
     connection: Connection | None = None
 

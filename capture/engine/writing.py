@@ -37,9 +37,8 @@ class EpisodeInBackground:
     store: RunStore
     start: EpisodeStart
     denoise_times: NDArray[np.float64]
-    max_replans: int
-    #: (its folder, its bytes) of a committed episode.
-    committed: tuple[Path, int] | None = field(default=None, init=False)
+    #: Of a committed episode how it ended, its folder, and its bytes.
+    committed: tuple[Outcome, Path, int] | None = field(default=None, init=False)
     #: What ended the writing. What was given afterwards is skipped.
     error: BaseException | None = field(default=None, init=False)
     #: Of the thread alone: the episode's open writer, and what closes it.
@@ -83,9 +82,7 @@ class EpisodeInBackground:
 
     def _append(self, record: ReplanRecord) -> None:
         if self._writer is None:
-            self._writer = self._open.enter_context(
-                self.store.episode(self.start, self.denoise_times, self.max_replans)
-            )
+            self._writer = self._open.enter_context(self.store.episode(self.start, self.denoise_times))
         self._writer.append(record)
 
     def _commit(self, outcome: Outcome) -> None:
@@ -93,7 +90,7 @@ class EpisodeInBackground:
             raise ValueError("an episode without replans cannot be committed")
         folder = self._writer.commit(outcome.success, outcome.num_steps, outcome.steps)
         self.close()
-        self.committed = folder, bytes_of(folder)
+        self.committed = outcome, folder, bytes_of(folder)
 
 
 def bytes_of(folder: Path) -> int:
@@ -126,11 +123,9 @@ class WritingThread:
         for episode in self._episodes:
             episode.close()
 
-    def episode(
-        self, store: RunStore, start: EpisodeStart, denoise_times: NDArray[np.float64], max_replans: int
-    ) -> EpisodeInBackground:
+    def episode(self, store: RunStore, start: EpisodeStart, denoise_times: NDArray[np.float64]) -> EpisodeInBackground:
         """Begin an episode; its folder is made with its first replan."""
-        episode = EpisodeInBackground(self, store, start, denoise_times, max_replans)
+        episode = EpisodeInBackground(self, store, start, denoise_times)
         self._episodes = [known for known in self._episodes if known.committed is None and known.error is None]
         self._episodes.append(episode)
         return episode

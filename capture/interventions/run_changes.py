@@ -47,15 +47,16 @@ class RunChanges:
     num_replans: int = field(default=0, init=False)
     num_empty: int = field(default=0, init=False)
 
-    def check_names(self, sites: Sequence[SiteLayout]) -> None:
-        """Raise `SelectorError` for what is known to be wrong before the run: everything but names of objects."""
+    def check_names(self, sites: Sequence[SiteLayout], objects: Sequence[SceneObject] | None = None) -> None:
+        """Raise `SelectorError` for what is wrong whatever the call: names of objects only where these are known."""
         prompt, instructions = self.interventions.prompt, self.instructions
         changed = [
             changed_instruction(text, prompt, task_id=task_id, episode_index=0, instructions=instructions)
             for task_id, text in instructions.items()
             if prompt is not None
         ]
-        check_selectors(self.interventions, self._vocabularies(sites, self._named_objects(), *changed))
+        known = self._named_objects() if objects is None else objects
+        check_selectors(self.interventions, self._vocabularies(sites, known, *changed))
 
     def editors(
         self, sites: Sequence[SiteLayout], policy_input: PolicyInput, context: CallContext

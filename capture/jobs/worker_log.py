@@ -83,14 +83,12 @@ class WorkerRecord(Document, frozen=True):
 
     store: `store_identity` of its store, which differs from that of a later store with the same name.
     began: time (ISO 8601, UTC). committed: episode -> time. dropped: in their order.
-    threads: number of processor threads that its policy computes with.
     """
 
     store: str
     worker: Worker
     plan: tuple[PlannedTask, ...]
     began: str
-    threads: int = 0
     state: str = "running"
     committed: tuple[tuple[str, str], ...] = ()
     dropped: tuple[Drop, ...] = ()
@@ -110,17 +108,12 @@ class WorkerRecord(Document, frozen=True):
 class WorkerLog:
     """Writes the log of this worker, from the first event on at which the store exists."""
 
-    def __init__(self, store: Path, worker: Worker, plan: tuple[PlannedTask, ...], threads: int = 0) -> None:
+    def __init__(self, store: Path, worker: Worker, plan: tuple[PlannedTask, ...]) -> None:
         job = re.sub(r"[^0-9A-Za-z_]", "_", worker.job_name)
         self.file = log_folder(store) / f"{worker.host}-{job or 'none'}-{worker.process}.jsonl"
         self.worker = worker
         self._store = store
-        self._began: dict[str, Any] | None = {
-            "worker": to_json(worker),
-            "plan": to_json(plan),
-            "began": now(),
-            "threads": threads,
-        }
+        self._began: dict[str, Any] | None = {"worker": to_json(worker), "plan": to_json(plan), "began": now()}
         self._begin()
 
     def add_commit(self, episode: str) -> None:

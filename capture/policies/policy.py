@@ -62,24 +62,12 @@ class GivenInputs:
     instruction: str
 
 
-class Policy(Protocol):
-    """A policy whose attention can be recorded."""
-
-    @property
-    def name(self) -> str:
-        """Short name, for the store and the first lines of a run."""
+class ModelSizes(Protocol):
+    """How many layers, heads and denoise steps there are to record from; a policy or a layout."""
 
     @property
     def family(self) -> str:
         """Kind of model, as the store names it; it decides which layer numbers are accepted."""
-
-    @property
-    def model(self) -> nn.Module:
-        """The network. Its modules are looked at when a policy call gives numbers that are not finite."""
-
-    @property
-    def sites(self) -> tuple[SiteLayout, ...]:
-        """The sites whose rows can be recorded, with the layout of their keys."""
 
     @property
     def num_layers(self) -> int:
@@ -92,6 +80,22 @@ class Policy(Protocol):
     @property
     def num_denoise_steps(self) -> int:
         """Network evaluations of one replan."""
+
+
+class Policy(ModelSizes, Protocol):
+    """A policy whose attention can be recorded."""
+
+    @property
+    def name(self) -> str:
+        """Short name, for the store and the first lines of a run."""
+
+    @property
+    def model(self) -> nn.Module:
+        """The network. Its modules are looked at when a policy call gives numbers that are not finite."""
+
+    @property
+    def sites(self) -> tuple[SiteLayout, ...]:
+        """The sites whose rows can be recorded, with the layout of their keys."""
 
     @property
     def action_horizon(self) -> int:

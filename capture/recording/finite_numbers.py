@@ -29,9 +29,21 @@ class NumbersNotFinite(UserError, ArithmeticError):
         self.passing = passing
 
 
-def all_finite(actions: NDArray[np.floating], recorded: Mapping[str, RecordedRows]) -> bool:
+def not_finite(where: str, origin: str, remedy: str) -> NumbersNotFinite:
+    """Return the error of a policy call.
+
+    where: the replan. origin: a sentence about where it began. remedy: what to do; "" for what passes by itself.
+    """
+    rest = f", and the episodes before it are unharmed; {remedy}" if remedy else ""
+    return NumbersNotFinite(
+        f"The policy's numbers turned NaN or infinite at {where}. {origin}. Nothing of this episode was kept{rest}.",
+        passing=not remedy,
+    )
+
+
+def all_finite(actions: NDArray[np.floating] | None, recorded: Mapping[str, RecordedRows]) -> bool:
     """Whether the results of a policy call are finite: actions, row sums (NaN where a row holds one), contributions."""
-    results = [actions]
+    results = [] if actions is None else [actions]
     for site in recorded.values():
         results += [site.row_sum] if site.contribution is None else [site.row_sum, site.contribution]
     return all(bool(np.isfinite(values).all()) for values in results)

@@ -76,7 +76,7 @@ class Frames(Source):
         digest = hashlib.sha256(np.ascontiguousarray(state[0]).tobytes()).hexdigest()
         start = episode_start(job, self.machine, state_digest=digest)
         frames = episode.frames(self.every, tuple(robot.cameras.values()))
-        return FramesOfEpisode(self, job, episode, start, job.size, frames, state, actions)
+        return FramesOfEpisode(self, job, episode, start, frames, state, actions)
 
 
 @dataclass
@@ -92,7 +92,6 @@ class FramesOfEpisode(Episode):
     job: EpisodeJob
     episode: DataSetEpisode
     start: EpisodeStart
-    max_replans: int
     frames: Iterator[DataSetFrame]
     state: NDArray[np.float64]
     actions: NDArray[np.float64] | None

@@ -28,7 +28,6 @@ from vla_attention.capture.replay.replay_plan import (
     success_of,
 )
 from vla_attention.capture.replay.video import decoder_version
-from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.session import RecordedRun
 from vla_attention.schemas.errors import BadArgument
@@ -161,13 +160,11 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
     if base is not None:
         _check_base(arguments.rerun_of, base[0], run.attributes)
     sizes = [math.prod(picture_size(run.attributes.sites, camera)) * 3 for camera in cameras]
-    store = RunStore(plan.store, run.attributes)
-    run.locks = store.locks
     with run:
         todo = announce_replay(plan, run.attributes, layout.action_horizon, sizes)
         seed = plan.seed if interventions.noise is None else interventions.noise.seed
         source = FramesForFile(given, run, plan, every, seed, cameras, state, actions)
-        added = record_episodes(plan, store, todo, every, source)
+        added = record_episodes(plan, run.store, todo, every, source)
     if run.num_dropped:
         say(f"In {run.num_dropped} policy calls no attention ran; they are not in the store.")
     if added:

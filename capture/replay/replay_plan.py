@@ -23,7 +23,7 @@ from vla_attention.capture.replay.data_set_files import INDEX_COLUMNS
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, LeRobotDataset, open_dataset
 from vla_attention.capture.replay.video import import_av
 from vla_attention.capture.store.disk_estimate import estimate_disk
-from vla_attention.capture.store.store_writer import RunStore, WriteMode, refuse_recorded
+from vla_attention.capture.store.store_writer import RunStore, WriteMode, check_target
 from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.safe_text import file_part
@@ -35,7 +35,7 @@ from vla_attention.schemas.stores.store_format import (
     RootAttributes,
     parse_episode_name,
 )
-from vla_attention.schemas.stores.store_place import check_place, check_writable
+from vla_attention.schemas.stores.store_place import check_place
 from vla_attention.schemas.stores.verify import find_damaged
 
 #: The column that says of every frame whether the task is solved, where a data set has it.
@@ -113,9 +113,7 @@ def plan_replay(arguments: argparse.Namespace, termination: Termination) -> Repl
     check_place(store, "write a store at")
     mode: WriteMode = "overwrite" if arguments.overwrite else "resume" if arguments.resume else "new"
     # An existing store or an unwritable place is an error now, before the minutes for loading a model.
-    if mode == "new":
-        refuse_recorded(store)
-    check_writable(store.parent, "--output")
+    check_target(store, mode)
     return ReplayPlan(
         data=data,
         wanted=wanted,

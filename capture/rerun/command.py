@@ -20,13 +20,12 @@ from vla_attention.capture.rerun.interventions_of_rerun import check_on_store, r
 from vla_attention.capture.rerun.rerun_store import Rerun
 from vla_attention.capture.rerun.series import SeriesRun
 from vla_attention.capture.rerun.stored_calls import check_has_inputs
-from vla_attention.capture.store.store_writer import WriteMode, refuse_recorded
+from vla_attention.capture.store.store_writer import WriteMode, check_target
 from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.reader import Store
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX
-from vla_attention.schemas.stores.store_place import check_writable
 from vla_attention.schemas.stores.store_url import local_path
 from vla_attention.schemas.threads import Threads
 
@@ -55,9 +54,7 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
     target = _target(arguments, base, interventions)
     mode: WriteMode = "overwrite" if arguments.overwrite else "resume" if arguments.resume else "new"
     if target is not None:
-        if mode == "new":
-            refuse_recorded(target)
-        check_writable(target.parent, "--output")
+        check_target(target, mode)
     for line in nothing_changes:
         say(line)
     if arguments.effects != NO_EFFECTS:

@@ -83,7 +83,7 @@ class StoredEpisodes(Source):
             state_index=attributes.initial_state_index,
         )
         keep_actions = not self.store.attributes.interventions.is_none
-        return EpisodeAgain(self.caller, calls, start, calls.num_replans, keep_actions=keep_actions)
+        return EpisodeAgain(self.caller, calls, start, keep_actions=keep_actions)
 
 
 @dataclass
@@ -96,7 +96,6 @@ class EpisodeAgain(Episode):
     caller: Caller
     calls: StoredCalls
     start: EpisodeStart
-    max_replans: int
     keep_actions: bool
     done: int = 0
 

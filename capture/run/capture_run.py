@@ -10,11 +10,11 @@ from vla_attention.capture.effects.mean_pictures import pictures_of
 from vla_attention.capture.effects.measurement import EffectMeasurement, measurement_of
 from vla_attention.capture.engine.call import Caller
 from vla_attention.capture.engine.faults import EpisodesMissing, Faults, describe_missing
-from vla_attention.capture.engine.loop import EpisodeLoop, EpisodeResult
+from vla_attention.capture.engine.loop import EpisodeLoop
 from vla_attention.capture.engine.plan import announce, plan_recording, root_attributes
 from vla_attention.capture.engine.progress import say
 from vla_attention.capture.engine.simulators import Simulators, check_protocol, max_replans
-from vla_attention.capture.engine.source import EpisodeJob
+from vla_attention.capture.engine.source import Committed, EpisodeJob
 from vla_attention.capture.environments.base import EnvironmentSettings, Task, check_initial_state_index
 from vla_attention.capture.environments.episode_protocol import WAIT_STEPS, EvaluationProtocol
 from vla_attention.capture.environments.suites import list_tasks
@@ -100,7 +100,7 @@ def plan_run(settings: RunSettings, policy: Policy, machine: Mapping[str, str]) 
 
 def run_capture(
     settings: RunSettings, policy: Policy, device: str, termination: Termination | None = None
-) -> list[EpisodeResult]:
+) -> list[Committed]:
     """Record every missing episode of the settings, and print how many; returns the episodes that this process added.
 
     Raises:
@@ -110,7 +110,7 @@ def run_capture(
     """
     results, damaged, faults = _record_missing(settings, policy, device, termination or Termination())
     missing = f", {len(faults.dropped)} missing" if faults.dropped else ""
-    solved = sum(bool(result.success) for result in results)
+    solved = sum(bool(result.outcome.success) for result in results)
     say(f"{plural(len(results), 'episode')} added, {solved} solved{missing}. Store: {settings.store}")
     left = find_damaged(settings.store, damaged, settings.verify) if damaged else []
     if left and faults.dropped:
@@ -123,7 +123,7 @@ def run_capture(
 
 def _record_missing(
     settings: RunSettings, policy: Policy, device: str, termination: Termination
-) -> tuple[list[EpisodeResult], list[str], Faults]:
+) -> tuple[list[Committed], list[str], Faults]:
     """Record what is missing; also returns the names of damaged episodes of the store, and the faults of this run."""
     machine = describe_machine(device) | downloads_of(policy)
     run_plan = plan_run(settings, policy, machine)

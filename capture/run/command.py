@@ -20,15 +20,13 @@ def run_capture_of_family(arguments: argparse.Namespace, termination: Terminatio
 
     from vla_attention.capture.environments.drawing import check_simulator
     from vla_attention.capture.run.run_settings import run_settings
-    from vla_attention.capture.store.store_writer import refuse_recorded
+    from vla_attention.capture.store.store_writer import check_target
     from vla_attention.schemas.stores.store_place import check_writable
 
     settings = run_settings(arguments)
     # An existing store, an unwritable place or a simulator that cannot run is an error now, before the minutes for
     # loading a model and before anything is written.
-    if settings.mode == "new":
-        refuse_recorded(settings.store)
-    check_writable(settings.store.parent, "--output")
+    check_target(settings.store, settings.mode)
     if arguments.output_dir is not None:
         check_writable(arguments.output_dir, "--output-dir")
     check_simulator(settings.suite, settings.libero_assets)

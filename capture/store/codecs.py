@@ -32,14 +32,14 @@ _ROW_ENCODER = Blosc(cname="lz4", clevel=5, shuffle=Blosc.BITSHUFFLE)
 MISSING = {"f": float("nan"), "u": 0}
 
 
-def replans_per_block(bytes_per_replan: int, max_replans: int) -> int:
-    """Replans in one chunk, for one layer and denoise step.
+def replans_per_block(bytes_per_replan: int, count: int | None = None) -> int:
+    """Replans in one chunk, for one layer and denoise step. count: of the episode, where it is known.
 
     The chunk's number of elements is a multiple of 8; Blosc leaves out its bit shuffle when it is not, without a word.
     """
     step = 8 // math.gcd(8, bytes_per_replan // 4)
-    wanted = min(max(1, TARGET_CHUNK_BYTES // max(1, bytes_per_replan)), max(1, max_replans))
-    return step * math.ceil(wanted / step)
+    most = max(1, TARGET_CHUNK_BYTES // max(1, bytes_per_replan))
+    return step * math.ceil(min(most, count or most) / step)
 
 
 def create_rows(

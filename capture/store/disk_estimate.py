@@ -2,7 +2,7 @@
 
 What rows, pictures and coverage compress to depends on the policy and the scene, so no formula says it: at 10 mantissa
 bits a number takes 1.4 to 2.1 bytes, a picture a third of its pixels or a tenth. The bound needs no policy call; a run
-says after its first episode what that took (`rollout/progress.py`).
+says after its first episode what that took (`engine/progress.py`).
 """
 
 from __future__ import annotations

@@ -26,7 +26,6 @@ from vla_attention.schemas.stores.content_rules import (
     cut_problems,
     effect_problems,
     picture_problems,
-    piece_role_problems,
     prompt_problems,
     sites_with_text,
 )
@@ -90,7 +89,6 @@ class EpisodeWriter:
         folder: Path,
         start: EpisodeStart,
         denoise_times: NDArray[np.float64],
-        max_replans: int,
         locks: Locks,
         durable: bool,
     ) -> None:
@@ -106,7 +104,7 @@ class EpisodeWriter:
         self.group = zarr.create_group(folder, zarr_format=3)
         self.digests: dict[str, ArrayRecord] = {}
         self.sites = {
-            site.name: SiteWriter(self.group, folder, self.write, site, run.recording.of_site(site), max_replans)
+            site.name: SiteWriter(self.group, folder, self.write, site, run.recording.of_site(site))
             for site in run.sites
         }
         self.prompts: dict[Prompt, int] = {}
@@ -142,10 +140,8 @@ class EpisodeWriter:
         yield from self._misfits(record)
         only_site = len(sites_with_text(sites)) == 1
         for name, site in self.sites.items():
-            yield from site.problems(record.rows[name], record.key_role[name], replan)
             prompt = prompt_at(sites, site.layout, record.prompt)
-            yield from piece_role_problems(site.layout, record.key_role[name], prompt, replan, only_site=only_site)
-            yield from site.unseen_problems(record.rows[name], record.key_role[name], replan)
+            yield from site.problems(record.rows[name], record.key_role[name], prompt, replan, only_site=only_site)
         if record.prompt not in self.prompts:
             yield from prompt_problems(sites, record.prompt)
         for camera, frame in record.frames.items():
@@ -297,25 +293,21 @@ class EpisodeWriter:
         self.digests[name] = ArrayRecord(values.shape, digest.hexdigest())
 
     def _write_side_arrays(self) -> None:
-        records = self.records
-        states = [record.state for record in records if record.state is not None]
-        if states:
-            self.write("state", np.stack(states), ("replan", "state_dim"))
-        for name in ("actions", "base_actions"):
-            actions = [given for record in records if (given := getattr(record, name)) is not None]
-            if actions:
-                self.write(name, np.stack(actions), ("replan", "horizon", "action_dim"))
+        records, action_axes = self.records, ("replan", "horizon", "action_dim")
+        for name, axes in (("state", ("replan", "state_dim")), ("actions", action_axes), ("base_actions", action_axes)):
+            known = [values for record in records if (values := getattr(record, name)) is not None]
+            if known:
+                self.write(name, np.stack(known), axes)
         self._write_effects()
         self._write_dataset_actions([r.dataset_actions for r in records if r.dataset_actions is not None])
-        for camera in records[0].frames:
-            frames = np.stack([record.frames[camera] for record in records])
-            self.write(f"frames/{camera}", frames, ("replan", "row", "column", "channel"))
-        for camera in records[0].camera_frames:
-            frames = np.stack([record.camera_frames[camera] for record in records])
-            self.write(f"camera_frames/{camera}", frames, ("replan", "row", "column", "channel"))
-        for camera in records[0].coverage:
-            coverage = np.stack([record.coverage[camera] for record in records])
-            self.write(f"objects/{camera}", coverage, ("replan", "patch", "object"))
+        pixels = ("replan", "row", "column", "channel")
+        for what, group, names in (
+            ("frames", "frames", pixels),
+            ("camera_frames", "camera_frames", pixels),
+            ("coverage", "objects", ("replan", "patch", "object")),
+        ):
+            for camera in getattr(records[0], what):
+                self.write(f"{group}/{camera}", np.stack([getattr(record, what)[camera] for record in records]), names)
 
     def _effects(self) -> EpisodeEffects | None:
         """What the arrays of effects are of."""

@@ -20,13 +20,14 @@ from vla_attention.capture.store.codecs import create_rows, encode_row_chunk, re
 from vla_attention.capture.store.replan_records import RecordedRows
 from vla_attention.schemas.groupings.key_counts import uniform_of_roles
 from vla_attention.schemas.jsonable import to_json
-from vla_attention.schemas.layout import ROLE_DTYPE, SiteLayout
+from vla_attention.schemas.layout import ROLE_DTYPE, Prompt, SiteLayout
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, round_mantissa
 from vla_attention.schemas.segments import Segment, merge_segments, segment_masses, segment_members, segments_of
 from vla_attention.schemas.stores.array_metadata import chunk_file
 from vla_attention.schemas.stores.content_rules import (
     absent_problems,
     gram_problems,
+    piece_role_problems,
     role_problems,
     row_problems,
     row_sum_problems,
@@ -100,7 +101,6 @@ class SiteWriter:
         write: WriteArray,
         layout: SiteLayout,
         recording: Recording,
-        max_replans: int,
     ) -> None:
         """Begin the site's group in the episode's `group`, whose folder it is; `recording` is what is of the site."""
         self.group = group
@@ -111,7 +111,7 @@ class SiteWriter:
         self.bits = recording.mantissa_bits
         self.shape = (len(recording.layers), len(recording.denoise_steps), len(recording.heads), recording.num_queries)
         self.bytes_per_replan = 4 * self.shape[2] * self.shape[3] * layout.num_keys
-        self.block = replans_per_block(self.bytes_per_replan, max_replans)
+        self.block = replans_per_block(self.bytes_per_replan)
         self.rows: ShardWriter | None = None
         self.rows_digest = ArrayDigest()
         self.pending: list[NDArray[np.float32]] = []
@@ -123,8 +123,13 @@ class SiteWriter:
         self.segments: tuple[Segment, ...] = ()
         group.create_group(layout.name, attributes=to_json(recording.axis_numbers))
 
-    def problems(self, recorded: RecordedRows, key_role: NDArray[np.uint8], replan: int) -> Iterator[str]:
-        """What forbids adding a replan (its number, for the sentences): shapes, types, and the rules of `verify`."""
+    def problems(
+        self, recorded: RecordedRows, key_role: NDArray[np.uint8], prompt: Prompt, replan: int, *, only_site: bool
+    ) -> Iterator[str]:
+        """What forbids adding a replan: shapes, types, and the rules of `verify`.
+
+        prompt: of the replan, at this site. only_site: no other has text. replan: its number, for the sentences.
+        """
         name, recording = self.layout.name, self.recording
         rows, gram = recorded.rows, recorded.contribution
         wanted = (*self.shape, self.layout.num_keys)
@@ -155,11 +160,8 @@ class SiteWriter:
         yield from uniform_problems(f"{name}/uniform", uniform[None], replan)
         if gram is not None:
             yield from gram_problems(f"{name}/contribution", gram[None], recording, replan)
-
-    def unseen_problems(self, recorded: RecordedRows, key_role: NDArray[np.uint8], replan: int) -> Iterator[str]:
-        """The same of mass on keys that no query sees."""
-        name, uniform = f"{self.layout.name}/rows", _uniform(recorded, key_role)
-        yield from unseen_problems(name, recorded.rows[None], uniform[None], self.recording, replan)
+        yield from piece_role_problems(self.layout, key_role, prompt, replan, only_site=only_site)
+        yield from unseen_problems(f"{name}/rows", rows[None], uniform[None], recording, replan)
 
     def append(self, recorded: RecordedRows, key_role: NDArray[np.uint8]) -> None:
         """Add the next replan, in which `problems` found nothing. Rows as in `RecordedRows`; roles (key,)."""
@@ -180,7 +182,7 @@ class SiteWriter:
         rows = np.stack(self.pending)
         self.pending.clear()
         if self.rows is None:
-            block = replans_per_block(self.bytes_per_replan, min(len(rows), self.block))
+            block = replans_per_block(self.bytes_per_replan, len(rows))
             self.rows = ShardWriter(self.folder / self.layout.name / "rows", rows.shape[1:], block)
         self.rows.append(rows)
         self.rows_digest.update(rows)

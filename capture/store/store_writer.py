@@ -30,7 +30,7 @@ from vla_attention.schemas.stores.store_format import (
     episode_name,
     parse_episode_name,
 )
-from vla_attention.schemas.stores.store_place import check_place, why_refused
+from vla_attention.schemas.stores.store_place import check_place, check_writable, why_refused
 
 WriteMode = Literal["new", "resume", "overwrite"]
 
@@ -57,9 +57,7 @@ class RunStore:
         return (self.path / EPISODES_GROUP / episode_name(task_id, episode_index)).is_dir()
 
     @contextmanager
-    def episode(
-        self, start: EpisodeStart, denoise_times: NDArray[np.float64], max_replans: int
-    ) -> Iterator[EpisodeWriter]:
+    def episode(self, start: EpisodeStart, denoise_times: NDArray[np.float64]) -> Iterator[EpisodeWriter]:
         """Write one episode, which is locked meanwhile; leaving the block without `commit` drops it.
 
         Raises:
@@ -70,7 +68,7 @@ class RunStore:
             with naming_the_failure(f"episode {name} of {self.path}", self.path):
                 folder = stack.enter_context(self.locks.part(name))
                 writer = EpisodeWriter(
-                    self.path, self.attributes, folder, start, denoise_times, max_replans, self.locks, self.durable
+                    self.path, self.attributes, folder, start, denoise_times, self.locks, self.durable
                 )
             yield writer
 
@@ -126,6 +124,18 @@ def _saying_where(path: Path) -> Iterator[None]:
         raise BadArgument(
             f"Cannot write a store at {path}: {why_refused(error, path)}; give another --output."
         ) from None
+
+
+def check_target(path: Path, mode: WriteMode) -> None:
+    """Raise an error where a store cannot be written: before the minutes for loading a model, and before anything is.
+
+    Raises:
+        StoreExists: a store with episodes is at `path`, and the mode is `new`.
+        BadArgument: nothing can be written there.
+    """
+    if mode == "new":
+        refuse_recorded(path)
+    check_writable(path.parent, "--output")
 
 
 def refuse_recorded(path: Path) -> None:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from vla_attention.capture.interventions.attention_edits import (
@@ -17,29 +16,18 @@ from vla_attention.capture.interventions.attention_edits import (
     stays_in_prefix,
 )
 from vla_attention.capture.interventions.resolution import (
-    ReplanPlace,
-    check_selectors,
-    has_empty_group,
-    make_editors,
-    run_vocabularies,
     selectors_of,
-    site_tokens,
 )
+from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.torch_policies.attention_calls import CallShape
 from vla_attention.capture.torch_policies.call_order import CallPlace
+from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
-from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs
-from vla_attention.capture.torch_policies.replan_text import ReplanText
-from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder
+from vla_attention.capture.torch_policies.replan_inputs import EpisodeFacts
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
-from vla_attention.schemas.groupings.vocabulary import SceneObject, Vocabulary
 from vla_attention.schemas.interventions import AttentionScale, Interventions, KeyKnockout
-from vla_attention.schemas.layout import Prompt, SiteLayout
-
-if TYPE_CHECKING:
-    from vla_attention.capture.torch_policies.recorded_episodes import Episode
-    from vla_attention.capture.torch_policies.session import RecordedRun
+from vla_attention.schemas.layout import SiteLayout
 
 
 def interventions_of(
@@ -114,48 +102,24 @@ def _check(interventions: Interventions) -> None:
             )
 
 
-@dataclass(frozen=True)
-class SessionKnockouts:
-    """Makes the edits of every replan of a session. allow_empty: a group without a key changes nothing."""
+def changes_of_episode(
+    interventions: Interventions, sites: Sequence[SiteLayout], facts: EpisodeFacts, *, allow_empty: bool
+) -> RunChanges:
+    """Return what changes the calls of an episode.
 
-    interventions: Interventions
-    allow_empty: bool = False
+    sites: of the store. allow_empty: a group without a key changes nothing.
 
-    @property
-    def any(self) -> bool:
-        """Whether attention is changed at all."""
-        return self.interventions.changes_attention
-
-    def check_names(self, sites: Sequence[SiteLayout], instruction: str, objects: Sequence[SceneObject]) -> None:
-        """Raise `SelectorError` for a selector with a name that does not exist in an episode of this instruction."""
-        if self.any:
-            check_selectors(self.interventions, self._vocabularies(sites, instruction, objects))
-
-    def _vocabularies(
-        self, sites: Sequence[SiteLayout], instruction: str, objects: Sequence[SceneObject]
-    ) -> dict[str, Vocabulary]:
-        """The names of an episode; where groups may be empty, words that its instruction lacks are no mistake."""
-        words: list[str] = []
-        if self.allow_empty:
-            atoms = (atom for text in selectors_of(self.interventions) for atom in atoms_of(parse_selector(text)))
-            words = [atom.argument for atom in atoms if atom.kind == "word"]
-        return run_vocabularies(sites, [instruction, *words], objects)
-
-    def edits(
-        self,
-        sites: Sequence[SiteLayout],
-        key_role: Mapping[str, NDArray[np.uint8]],
-        prompt: Prompt,
-        objects: Sequence[SceneObject],
-        coverage: Mapping[str, NDArray[np.float32]],
-        place: ReplanPlace,
-    ) -> dict[str, Sequence[SiteEdit]]:
-        """Return the edits of one replan by site; errors as `RunChanges.editors`."""
-        tokens = site_tokens(sites, key_role, prompt, objects, coverage)
-        vocabularies = self._vocabularies(sites, prompt.instruction_text, objects)
-        has_empty_group(self.interventions, tokens, vocabularies, place, allow_empty=self.allow_empty)
-        editors = make_editors(self.interventions, tokens, vocabularies, place)
-        return {site: editor.edits for site, editor in editors.items()}
+    Raises:
+        SelectorError: a name exists neither in the instruction nor in the scene.
+    """
+    words: list[str] = []
+    if allow_empty:  # words that the instruction lacks are no mistake
+        atoms = (atom for text in selectors_of(interventions) for atom in atoms_of(parse_selector(text)))
+        words = [atom.argument for atom in atoms if atom.kind == "word"]
+    changes = RunChanges(interventions, dict(enumerate([facts.instruction, *words])), allow_empty)
+    if interventions.changes_attention:
+        changes.check_names(sites, facts.objects)
+    return changes
 
 
 def edits_at(edits: Sequence[SiteEdit], place: CallPlace) -> list[SiteEdit]:
@@ -201,52 +165,53 @@ def _log_of(edits: Sequence[SiteEdit], factors: Sequence[NDArray[np.float64]], s
     return total
 
 
-def with_name(interventions: Interventions, name: str) -> Interventions:
-    """Return the interventions with the name of their condition."""
-    return replace(interventions, name=name) if name else interventions
-
-
 @dataclass
-class ReplanEdits:
-    """What knockouts add to the logits of the calls of one replan; the keys are looked up at its first call."""
+class CallBias:
+    """What edits add to the logits of the attention calls of one row; see `LogitBias`. Without edits, zeros.
 
-    run: RecordedRun
-    episodes: Mapping[int, tuple[Episode, ReplanInputs]]
-    text: ReplanText
-    recorder: ReplanRecorder | None = None
-    _of_row: dict[int, dict[str, Any]] = field(default_factory=dict)
+    edits: by site. present: site -> (key,) bool, the keys that the policy call has.
+    """
+
+    layout: PolicyLayout
+    edits: Mapping[str, Sequence[SiteEdit]]
+    present: Mapping[str, NDArray[np.bool_]]
     _known: dict[tuple[Any, ...], NDArray[np.float32]] = field(default_factory=dict)
 
-    def bias(self, row: int, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
-        """Return what is added to the logits of a call in one row of the batch, (head or 1, query, key).
-
-        Calls to which the same is added get the same array.
-        """
-        if place.site is None:
+    def __call__(self, _row: int, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
+        """Return what is added, (head or 1, query, key). Calls to which the same is added get the same array."""
+        rule = self.layout.rules[place.rule]
+        if place.site is None and not rule.is_prefix:
             return None
-        if row not in self._of_row:
-            self._of_row[row] = self._edits(row)
-        edits = edits_at(self._of_row[row].get(place.site, ()), place)
-        if not edits:
+        edits = self.edits.get(place.site or rule.tokens or "", ())
+        edits = edits_at(edits, place) if place.site else [edit for edit in edits if edit.queries != "action"]
+        if self.edits and not edits:
             return None
-        # Where the keys of calls differ, they differ from token to token.
         token = -1 if place.keys is None else place.step
         sizes = shape.heads, shape.queries, shape.keys, place.queries.start, place.queries.stop, token
-        call = row, place.site, tuple(id(edit) for edit in edits), *sizes
+        call = place.rule, place.site, tuple(id(edit) for edit in edits), *sizes
         if call not in self._known:
-            self._known[call] = logit_bias(edits, place, shape)
+            if place.site is None:
+                self._known[call] = prefix_bias(edits, self._tokens(rule.tokens or "", shape), shape)
+            else:
+                self._known[call] = logit_bias(edits, place, shape, self._own_keys(place.site, shape))
         return self._known[call]
 
-    def _edits(self, row: int) -> dict[str, Any]:
-        episode, inputs = self.episodes[row]
-        prompt = self.text.prompt(row, None)
-        sites = self.run._sites
-        assert self.recorder is not None
-        present = self.recorder.order.present
-        roles = {site.name: self.text.roles(row, site, prompt, present.get(site.name), None) for site in sites}
-        place = ReplanPlace(episode.facts.task_id, episode.facts.episode_index, episode.num_replans)
-        return dict(
-            self.run.knockouts.edits(
-                self.run.attributes.sites, roles, prompt, episode.facts.objects, inputs.coverage, place
+    def _tokens(self, site: str, shape: CallShape) -> NDArray[np.int64]:
+        """The site's keys that are queries and keys of a pass over the prefix."""
+        tokens = np.flatnonzero(self.present[site])[: shape.keys]
+        actions = [span for span in self.layout.site(site).keys.spans if span.kind == "action"]
+        first_action = min((span.start for span in actions), default=self.layout.site(site).keys.num_keys)
+        if shape.queries != shape.keys or len(tokens) < shape.keys or (tokens >= first_action).any():
+            raise ChangeRefused(
+                f"The attention call {shape} is no pass over the first keys of site '{site}', of which {first_action} "
+                "stand before the actions: expected as many queries as keys, and no more than these. Change the rule "
+                "with these tokens in the layout."
             )
-        )
+        return tokens
+
+    def _own_keys(self, site: str, shape: CallShape) -> slice | None:
+        """The keys of the call's own queries, the last ones; None for a site without keys of actions."""
+        spans = self.layout.site(site).keys.spans
+        if shape.keys < shape.queries or not any(span.kind == "action" for span in spans):
+            return None
+        return slice(shape.keys - shape.queries, shape.keys)

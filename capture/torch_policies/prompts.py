@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,14 +21,6 @@ from vla_attention.schemas.safe_text import visible
 
 class PromptDoesNotFit(BadArgument):
     """A prompt whose tokens are not the keys of the layout, or that does not contain the instruction."""
-
-
-@runtime_checkable
-class Tokenizer(Protocol):
-    """What is needed of a tokenizer; those of transformers and sentencepiece have it."""
-
-    def decode(self, ids: list[int]) -> str:
-        """Return the text of token ids."""
 
 
 class TokenText:
@@ -208,7 +200,7 @@ def roles_of_keys(
         if valid is not None:
             roles[keys_of_span][~valid[keys_of_span]] = site.masked_role(span)
         if present is not None:
-            roles[keys_of_span][~present[keys_of_span]] = absent_role(site, span.name)
+            roles[keys_of_span][~present[keys_of_span]] = Role.ABSENT
     return roles
 
 
@@ -224,9 +216,3 @@ def _state_pieces(prompt: Prompt, around: tuple[str, str] | None) -> list[Piece]
     end = prompt.text.find(after, start)
     end = len(prompt.text) if end < 0 else end
     return [piece for piece in prompt.pieces if piece.start < end and piece.stop > start and piece.text.strip()]
-
-
-def absent_role(site: RecordedSite, span: str) -> int:
-    """Return the code of a key that does not exist at this replan."""
-    absent = getattr(Role, "ABSENT", None)
-    return int(site.masked_role(site.keys.span(span)) if absent is None else absent)

@@ -15,7 +15,7 @@ from vla_attention.capture.effects.conditions import refuse_both
 from vla_attention.capture.engine.plan import RecordingSettings, recording_of, root_attributes
 from vla_attention.capture.machine import describe_machine
 from vla_attention.capture.torch_policies.batch_rows import rows_apart
-from vla_attention.capture.torch_policies.knockouts import SessionKnockouts, interventions_of, with_name
+from vla_attention.capture.torch_policies.knockouts import interventions_of
 from vla_attention.capture.torch_policies.own_setting import difference_to_own_setting
 from vla_attention.capture.torch_policies.policy_layout import (
     LayoutForAnotherVersion,
@@ -147,12 +147,10 @@ def record(
         contributions=contributions,
     )
     recording = plan_recording(settings, layout)
-    changes = with_name(
-        interventions_of(
-            knockout, keep, knockout_layers, knockout_heads, knockout_denoise_steps, knockout_weight, layout
-        ),
-        condition,
+    changes = interventions_of(
+        knockout, keep, knockout_layers, knockout_heads, knockout_denoise_steps, knockout_weight, layout
     )
+    changes = replace(changes, name=condition) if condition else changes
     planned = effects_of_layout(effects, layout)
     if planned is not None:
         refuse_both(changes)
@@ -190,7 +188,7 @@ def record(
         layout,
         attributes,
         "resume" if resume else "overwrite" if overwrite else "new",
-        knockouts=SessionKnockouts(changes, allow_empty),
+        allow_empty=allow_empty,
         tokenizer=None if tokenizer is None else TokenText(tokenizer),
         projections=projections,
         undecided=undecided and recording.contributions,

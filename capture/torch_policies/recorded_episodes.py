@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any, Never, SupportsIndex, overload
 import numpy as np
 
 from vla_attention.capture.effects.measurement import EpisodeEffectsMeasured
+from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.store.episode_writer import EpisodeWriter
 from vla_attention.capture.store.replan_records import ReplanRecord
+from vla_attention.capture.torch_policies.recorded_call import RowOfCall
 from vla_attention.capture.torch_policies.replan_inputs import (
     EpisodeFacts,
     RepeatedCall,
@@ -60,6 +62,7 @@ class Episode:
 
     run: RecordedRun
     facts: EpisodeFacts
+    _changes: RunChanges = field(repr=False)
     success: bool | None = None
     num_steps: int | None = None
     num_dropped: int = 0
@@ -140,7 +143,7 @@ class Episode:
             masks=masks, coverage=coverage, dataset_actions=dataset_actions, repeat=repeat, **unknown,
         )  # fmt: skip
         given = read_inputs(self.run.layout, self.facts, env_step, inputs)
-        with self.run._replan([self], [given], batch=1, rows=[0]) as replan:
+        with self.run._replan([RowOfCall(self, given)]) as replan:
             yield replan
 
     def _commit(self) -> None:
@@ -228,21 +231,14 @@ class EpisodeBatch(Sequence[Episode]):
         steps: list[Any] = list(np.asarray(several)) if np.ndim(several) else [several] * count
         for name, values in (("env_step", steps), *(inputs.items())):
             check_length(name, values, count)
-        given = [
-            read_inputs(
-                self._run.layout,
-                self[number].facts,
-                steps[number],
-                {name: None if values is None else values[number] for name, values in inputs.items()},
-            )
-            for number in chosen
-        ]
-        if not chosen:
+        rows = []
+        for number in chosen:
+            of_row = {name: None if values is None else values[number] for name, values in inputs.items()}
+            given = read_inputs(self._run.layout, self[number].facts, steps[number], of_row)
+            rows.append(RowOfCall(self[number], given, self.rows[number], number if count > 1 else None))
+        if not rows:
             raise BadArgument("No row of the batch is active.")
-        rows = [self.rows[number] for number in chosen]
-        with self._run._replan(
-            [self[number] for number in chosen], given, batch=self.batch, rows=rows, places=chosen, count=count
-        ) as replan:
+        with self._run._replan(rows, batch=self.batch, count=count if count > 1 else None) as replan:
             yield replan
 
     def next_episode(self, row: int, **facts: Any) -> Episode:

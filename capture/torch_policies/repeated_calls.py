@@ -17,19 +17,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vla_attention.capture.effects.arguments import EffectSettings, settings_of
-from vla_attention.capture.effects.measurement import MOST_DIFFERENCE, EffectMeasurement, EpisodeEffectsMeasured
+from vla_attention.capture.effects.measurement import MOST_DIFFERENCE, EffectMeasurement
 from vla_attention.capture.interventions.attention_edits import SiteEdit, SiteEditor
-from vla_attention.capture.interventions.changed_inputs import GREY, CallContext
+from vla_attention.capture.interventions.changed_inputs import GREY
 from vla_attention.capture.policies.noise import noise_seed
 from vla_attention.capture.policies.policy import CallVariant, GivenInputs, Policy, PolicyInput, VariantMemory
-from vla_attention.capture.store.replan_records import ReplanEffects
-from vla_attention.capture.torch_policies.call_order import KnownCalls
+from vla_attention.capture.torch_policies.added_updates import OutputWay
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
+from vla_attention.capture.torch_policies.call_order import CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.call_state import CallState
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
+from vla_attention.capture.torch_policies.knockouts import CallBias
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
 from vla_attention.capture.torch_policies.policy_modules import FoundPolicy
-from vla_attention.capture.torch_policies.repeat_watcher import RepeatBias, RepeatWatcher
 from vla_attention.capture.torch_policies.replan_inputs import Repeat, RepeatedCall, read_actions
+from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder
 from vla_attention.capture.torch_policies.watch import watch_attention
 from vla_attention.schemas.effects import EffectsRecorded
 from vla_attention.schemas.errors import BadArgument, Note, UserError
@@ -38,7 +40,7 @@ from vla_attention.schemas.stores.store_format import PolicyIdentity, Recording
 #: Of random keys and of the other noise; a run of `va.record` has the seed 0.
 _SEED = 1
 #: Stands for the noise of the recorded call, whose seed may not be known.
-_OWN_NOISE = -1
+OWN_NOISE = -1
 
 _NO_SIBLINGS = "No word is exchanged: no instruction of run.episode(siblings=[...]) has other words in the same places."
 _TAKES_NO_CALL = (
@@ -92,7 +94,7 @@ class CallInput(PolicyInput):
 
 
 @dataclass(frozen=True)
-class RecordedCall:
+class CallToRepeat:
     """What is known of a recorded call that is to be repeated.
 
     before: the state before it. actions: (horizon, action dim). present: site -> (key,) bool, the keys that its calls
@@ -134,7 +136,7 @@ class RepeatedPolicy:
             no_siblings=_NO_SIBLINGS,
             no_pictures="",
         )
-        self.call: RecordedCall | None = None
+        self.call: CallToRepeat | None = None
         self._found = found
         self._known = known
         self._identity = identity
@@ -143,14 +145,11 @@ class RepeatedPolicy:
         #: the others, and what these round otherwise is seen.
         self._masks = True
 
-    def measure(
-        self, episode: EpisodeEffectsMeasured, call: RecordedCall, context: CallContext
-    ) -> ReplanEffects | None:
-        """Return the effects of a call that was just recorded."""
+    def take(self, call: CallToRepeat) -> None:
+        """Take the call that was just recorded: `measurement` is of it from here on."""
         self.call = call
         if "cameras" in self.measurement.planned.items and call.repeat.takes_call and not call.repeat.given.frames:
             self.measurement.say_once("No picture is exchanged: replan(frames=...) was given none.")
-        return episode.measure(call.given, _OWN_NOISE, call.actions, context)
 
     def identity(self) -> PolicyIdentity:
         """Return the policy's description in the store."""
@@ -199,7 +198,7 @@ class RepeatedPolicy:
             after.again()
 
     @property
-    def _now(self) -> RecordedCall:
+    def _now(self) -> CallToRepeat:
         assert self.call is not None
         return self.call
 
@@ -222,7 +221,7 @@ class RepeatedPolicy:
         if exchanged and any((made.seen[site] != seen).any() for site, seen in unchanged.seen.items()):
             say("A call with an exchanged word is not measured where its prompt has another number of tokens.")
             return None
-        if variant.noise_seed != _OWN_NOISE and np.array_equal(made.actions, unchanged.actions):
+        if variant.noise_seed != OWN_NOISE and np.array_equal(made.actions, unchanged.actions):
             say("The repeated call draws no noise from a generator that is known: another noise is not measured.")
             return None
         return made.actions
@@ -245,10 +244,10 @@ class RepeatedPolicy:
     def _repeated(self, variant: CallVariant) -> _Repeated:
         call, given = self._now, cast(CallInput, variant.policy_input).call
         call.before.again()
-        if variant.noise_seed != _OWN_NOISE:
+        if variant.noise_seed != OWN_NOISE:
             call.before.reseed(variant.noise_seed)
         edits = {site: cast(SiteEditor, editor).edits for site, editor in variant.editors.items()}
-        bias = RepeatBias(self._known.layout, edits, call.present) if edits or self._masks else None
+        bias = CallBias(self._known.layout, edits, call.present) if edits or self._masks else None
         watcher = RepeatWatcher(self._known, self._identity.name, self._recording, bias)
         with watch_attention(self._found, watcher, every_function=call.every_function):
             result = call.repeat.call(given) if call.repeat.takes_call else call.repeat.call()
@@ -286,6 +285,49 @@ class _Repeated:
 
     actions: NDArray[np.float64]
     seen: Mapping[str, NDArray[np.bool_]]
+
+
+class RepeatWatcher(ReplanRecorder):
+    """Changes the calls of a repeat and records none.
+
+    seen: site -> (key,) bool, the keys that the site's first call could see.
+    """
+
+    def __init__(self, known: KnownCalls, policy: str, recording: Recording, bias: CallBias | None) -> None:
+        super().__init__(known, policy, recording, 1, [0], {}, _no_roles, bias)
+        self.seen: dict[str, NDArray[np.bool_]] = {}
+
+    def change(self, shape: CallShape) -> Tensor | None:
+        """See `Watcher`; a call of several rows cannot be changed."""
+        if self.bias is not None and shape.batch != self.batch and self.changed_place(shape) is not None:
+            raise ChangeRefused(
+                f"The attention call {shape} has a batch of {shape.batch}, and effects are of calls of one row."
+            )
+        return super().change(shape)
+
+    def passes(self, shape: CallShape) -> bool:
+        """See `Watcher`; of the first call of each site the mask is looked at."""
+        place = self.order.place(shape)
+        if place is not None and place.site is not None and place.site not in self.seen:
+            return False
+        return super().passes(shape)
+
+    def saw(self, call: AttentionCall) -> OutputWay | None:
+        """See `Watcher`."""
+        place = self.order.place(call.shape)
+        if place is not None and place.site is not None and place.site not in self.seen:
+            allowed = call.allowed(place.queries).any(dim=2).any(dim=1).any(dim=0).cpu().numpy()
+            seen = np.zeros(self.order.known.sites[place.site].keys.num_keys, dtype=bool)
+            seen[slice(None) if place.keys is None else place.keys] = allowed
+            self.seen[place.site] = seen
+        return super().saw(call)
+
+    def _wanted(self, place: CallPlace) -> bool:
+        return False
+
+
+def _no_roles(row: int, site: Any, present: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    raise AssertionError("A repeated call has no contributions.")
 
 
 class _Measurement(EffectMeasurement):

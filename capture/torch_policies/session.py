@@ -5,28 +5,24 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import numpy as np
 from msgspec import structs
-from numpy.typing import NDArray
 
-from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.store.episode_writer import EpisodeWriter
-from vla_attention.capture.store.replan_records import EpisodeStart, ReplanEffects, ReplanRecord
+from vla_attention.capture.store.replan_records import EpisodeStart
 from vla_attention.capture.store.store_root import read_existing_root
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, make_way, open_run
-from vla_attention.capture.torch_policies.batch_rows import BatchRowsMixed, rows_of_module_apart
-from vla_attention.capture.torch_policies.call_order import CallsDoNotFit, KnownCalls
-from vla_attention.capture.torch_policies.call_state import CallState
-from vla_attention.capture.torch_policies.knockouts import ReplanEdits, SessionKnockouts
+from vla_attention.capture.torch_policies.call_order import KnownCalls
+from vla_attention.capture.torch_policies.knockouts import changes_of_episode
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
 from vla_attention.capture.torch_policies.policy_modules import OutputProjection, find_policy
 from vla_attention.capture.torch_policies.policy_weights import policy_digest, weights_state
 from vla_attention.capture.torch_policies.prompts import TokenText
+from vla_attention.capture.torch_policies.recorded_call import RowOfCall, WatchedCall
 from vla_attention.capture.torch_policies.recorded_episodes import (
     Episode,
     EpisodeBatch,
@@ -35,27 +31,12 @@ from vla_attention.capture.torch_policies.recorded_episodes import (
     check_length,
     rows_of_batch,
 )
-from vla_attention.capture.torch_policies.repeated_calls import CallInput, RecordedCall, RepeatedPolicy
-from vla_attention.capture.torch_policies.replan_inputs import (
-    EpisodeFacts,
-    ReplanInputs,
-    read_actions,
-)
-from vla_attention.capture.torch_policies.replan_text import PromptIds, ReplanText, embeddings_of
-from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder, SiteRows, final_contribution
-from vla_attention.capture.torch_policies.watch import watch_attention
+from vla_attention.capture.torch_policies.repeated_calls import RepeatedPolicy
+from vla_attention.capture.torch_policies.replan_inputs import EpisodeFacts
+from vla_attention.capture.torch_policies.replan_text import embeddings_of
+from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder
 from vla_attention.schemas.errors import BadArgument, Note, UserError
-from vla_attention.schemas.stores.locks import Locks
-from vla_attention.schemas.stores.store_format import EPISODES_GROUP, RootAttributes, StoreExists, episode_name
-
-#: More replans than any episode has; the writer collects rows in blocks of two megabytes.
-_MANY_REPLANS = 1_000_000
-
-
-_BY_NAMES = (
-    "This policy call was watched at the names of torch's attention functions only, since all attention of an earlier "
-    "one was called by them. If it is called otherwise here, record again with run.every_function = True."
-)
+from vla_attention.schemas.stores.store_format import RootAttributes, StoreExists, episode_name
 
 
 class WeightsChanged(UserError, RuntimeError):
@@ -92,7 +73,7 @@ class RecordedRun:
         attributes: RootAttributes,
         mode: WriteMode,
         *,
-        knockouts: SessionKnockouts,
+        allow_empty: bool,
         tokenizer: TokenText | None,
         projections: Mapping[tuple[str, int], OutputProjection],
         undecided: bool = False,
@@ -100,7 +81,7 @@ class RecordedRun:
     ) -> None:
         self.path = path
         self.policy = policy
-        self._known_policy = find_policy(policy)
+        self._found = find_policy(policy)
         self._weights = weights_state(policy)
         self._embeddings = embeddings_of(policy, layout)
         self.layout = layout
@@ -108,16 +89,14 @@ class RecordedRun:
         self.attributes = attributes
         self.num_dropped = 0
         self.largest_error = 0.0
-        self.knockouts = knockouts
+        self._allow_empty = allow_empty
         self._mode = mode
         self._tokenizer = tokenizer
         self._projections = projections
         self._undecided = undecided
         self._durable = durable
+        #: Where it is or will be; None outside of the block.
         self._store: RunStore | None = None
-        #: Of whoever records with this run; None: the run has its own.
-        self.locks: Locks | None = None
-        self._entered = False
         self._in_block = False
         self.every_function = False
         #: Whether it is not known yet that names are enough.
@@ -127,15 +106,15 @@ class RecordedRun:
         self._sites = tuple(layout.site(site.name) for site in attributes.sites)
         self._repeats: RepeatedPolicy | None = None
         if attributes.recording.effects is not None:
-            self._repeats = RepeatedPolicy(self._known_policy, self._known, attributes.policy, attributes.recording)
+            self._repeats = RepeatedPolicy(self._found, self._known, attributes.policy, attributes.recording)
 
     def __enter__(self) -> RecordedRun:
-        self._entered = True
         if self._undecided and self._mode == "resume" and self.path.exists():
             # The policy calls that are stored there have shown it.
             self._decide(contributions=read_existing_root(self.path).recording.contributions)
-        if self._undecided:
+        elif self._undecided:
             self.path = make_way(self.path, self._mode)
+            self._store = RunStore(self.path, self.attributes)
             self._mode = "new" if self._mode == "new" else "resume"
         else:
             self._open()
@@ -145,27 +124,34 @@ class RecordedRun:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self._store = None
-        self._entered = False
 
     def _open(self) -> None:
+        planned = self._store
         self._store = open_run(self.path, self.attributes, self._mode, durable=self._durable)
+        if planned is not None:
+            self._store.locks = planned.locks
         self.path = self._store.path
-        if self.locks is not None:
-            self._store.locks = self.locks
 
     def _decide(self, *, contributions: bool, because: str = "") -> None:
-        """Note whether contributions are recorded; because: for the store."""
+        """Make the store, which says whether it has contributions; because: for the store."""
         self._undecided = False
         self.attributes = structs.replace(
             self.attributes,
             recording=structs.replace(self.attributes.recording, contributions=contributions),
             provenance={**self.attributes.provenance, **({"contributions": because} if because else {})},
         )
+        self._open()
+
+    @property
+    def store(self) -> RunStore:
+        """The store that is written to; the first policy call makes it where contributions are not decided before."""
+        if self._store is None:
+            raise RecordingStopped("This run is not open; use it as: with va.record(...) as run.")
+        return self._store
 
     def has(self, task_id: int, episode_index: int) -> bool:
         """Whether an episode is in the store already; a resumed loop skips it."""
-        self._check_entered()
-        return (self.path / EPISODES_GROUP / episode_name(task_id, episode_index)).is_dir()
+        return self.store.has(task_id, episode_index)
 
     @contextmanager
     def episode(
@@ -203,11 +189,8 @@ class RecordedRun:
         )
         with ExitStack() as stack:
             episode = self._begin(stack, facts)
-            try:
+            with _committing([episode]):
                 yield episode
-            finally:
-                episode._ended = True
-            episode._commit()
 
     @contextmanager
     def episodes(
@@ -234,13 +217,8 @@ class RecordedRun:
             joined = EpisodeBatch(self, stack, chosen, size)
             for facts in episodes:
                 joined._episodes.append(joined._begin(facts))
-            try:
+            with _committing(joined):
                 yield joined
-            finally:
-                for episode in joined:
-                    episode._ended = True
-            for episode in joined:
-                episode._commit()
 
     def _check_weights(self) -> None:
         """Raise `WeightsChanged` if the policy has other weights than when the run began."""
@@ -254,10 +232,6 @@ class RecordedRun:
             )
         self._weights = state
 
-    def _check_entered(self) -> None:
-        if not self._entered:
-            raise RecordingStopped("This run is not open; use it as: with va.record(...) as run.")
-
     def _begin(self, stack: ExitStack, facts: EpisodeFacts) -> Episode:
         if self.has(facts.task_id, facts.episode_index):
             name = episode_name(facts.task_id, facts.episode_index)
@@ -265,9 +239,10 @@ class RecordedRun:
                 f"{name} is in {self.path} already; skip it with run.has(task_id, episode_index), or record into "
                 "another store."
             )
-        self.knockouts.check_names(self.attributes.sites, facts.instruction, facts.objects)
+        interventions, sites = self.attributes.interventions, self.attributes.sites
+        changes = changes_of_episode(interventions, sites, facts, allow_empty=self._allow_empty)
         self._names_unknown = True
-        episode = Episode(self, facts, _stack=stack)
+        episode = Episode(self, facts, changes, _stack=stack)
         if self._repeats is not None:
             self._repeats.siblings[facts.task_id] = facts.siblings
             episode._effects = self._repeats.measurement.begin()
@@ -275,7 +250,6 @@ class RecordedRun:
 
     def _writer_of(self, facts: EpisodeFacts) -> AbstractContextManager[EpisodeWriter]:
         """Return the writer of an episode whose first policy call was recorded."""
-        assert self._store is not None
         start = EpisodeStart(
             task_id=facts.task_id,
             task_name=facts.task_name or f"task{facts.task_id}",
@@ -289,175 +263,41 @@ class RecordedRun:
         )
         steps = self.attributes.recording.denoise_steps
         times = self.layout.denoise_times or tuple(float(step) for step in range(self.layout.num_denoise_steps))
-        return self._store.episode(start, np.array([times[step] for step in steps]), _MANY_REPLANS)
+        return self.store.episode(start, np.array([times[step] for step in steps]))
 
     @contextmanager
-    def _replan(
-        self,
-        episodes: Sequence[Episode],
-        given: Sequence[ReplanInputs],
-        *,
-        batch: int,
-        rows: Sequence[int],
-        places: Sequence[int] = (0,),
-        count: int = 1,
-    ) -> Iterator[Replan]:
-        """Record one policy call of some rows of a batch.
-
-        places: where the actions of each episode are among those of all `count` episodes.
-        """
-        self._check_entered()
-        for episode in episodes:
-            if episode._ended:
+    def _replan(self, rows: Sequence[RowOfCall], *, batch: int = 1, count: int | None = None) -> Iterator[Replan]:
+        """Record one policy call. count: of the environments that it gives actions; None: one."""
+        for one in rows:
+            if one.episode._ended:
                 raise RecordingStopped(
-                    f"The block of {episode.name} has ended, and nothing can be added to it; begin another episode."
+                    f"The block of {one.episode.name} has ended, and nothing can be added to it; begin another episode."
                 )
         if self._in_block:
             raise RecordingStopped("A replan block stands inside of another; record one policy call after the other.")
-        ids = PromptIds(self._embeddings, batch)
-        text = ReplanText(self.layout, self._tokenizer, ids, dict(zip(rows, given, strict=True)))
-        edits = ReplanEdits(self, dict(zip(rows, zip(episodes, given, strict=True), strict=True)), text)
-        recorder = ReplanRecorder(
-            self._known,
-            type(self.policy).__name__,
-            self.attributes.recording,
-            batch,
-            rows,
-            self._projections,
-            text.early_roles,
-            edits.bias if self.knockouts.any else None,
-        )
-        edits.recorder = recorder
-        recorder.keeps_module = batch > 1 and not self._asked_of_batch
-        text.present = recorder.order.present
-        replan = Replan()
-        before = self._state_before(episodes[0], given[0])
+        replan, call = Replan(), WatchedCall(self, rows, batch)
         self._in_block = True
         try:
-            every_function = self.every_function or self._names_unknown
-            seen = watch_attention(self._known_policy, recorder, every_function=every_function)
-            with ids.watched(), seen as functions:
+            with call.watched():
                 yield replan
+            if call.recorder.saw_attention:
+                self._store_call(call, rows, replan, count)
+            else:
+                self.num_dropped += 1
+                for one in rows:
+                    one.episode.num_dropped += 1
         finally:
             self._in_block = False
-        if recorder.saw_attention:
-            self._names_unknown = not functions.by_names
-        try:
-            self._store_replan(replan, recorder, text, episodes, given, rows, places, count, before)
-        except CallsDoNotFit as error:
-            # Where there were fewer tokens, nothing was called otherwise.
-            if every_function or recorder.order.fewer_tokens:
-                raise
-            raise CallsDoNotFit(f"{error}\n{_BY_NAMES}") from None
 
-    def _store_replan(
-        self,
-        replan: Replan,
-        recorder: ReplanRecorder,
-        text: ReplanText,
-        episodes: Sequence[Episode],
-        given: Sequence[ReplanInputs],
-        rows: Sequence[int],
-        places: Sequence[int],
-        count: int,
-        before: CallState | None,
-    ) -> None:
-        if not recorder.saw_attention:
-            self.num_dropped += 1
-            for episode in episodes:
-                episode.num_dropped += 1
-            return
-        where = ", ".join(
-            f"replan {episode.num_replans} (environment step {inputs.env_step}) of {episode.name}"
-            for episode, inputs in list(zip(episodes, given, strict=True))[:2]
-        )
-        rows_of_sites = recorder.finish(where)
-        if recorder.keeps_module:
-            self._check_batch(recorder)
-        self._check_contributions(recorder)
-        if self._store is None:
-            self._open()
-        if count > 1:
+    def _store_call(self, call: WatchedCall, rows: Sequence[RowOfCall], replan: Replan, count: int | None) -> None:
+        rows_of_sites = call.finish()
+        self._check_contributions(call.recorder)
+        if count is not None:
             check_length("actions", replan.actions, count)
         replan.recorded = True
-        for position, (row, episode, inputs) in enumerate(zip(rows, episodes, given, strict=True)):
-            episode.largest_error = max(episode.largest_error, recorder.largest_error)
-            actions = replan.actions
-            if actions is not None and count > 1:
-                actions = actions[places[position]]
-            record = self._record(rows_of_sites[position], text, row, inputs, read_actions(actions))
-            if before is not None:
-                record = replace(record, effects=self._effects(episode, inputs, record, recorder, text, before, where))
-            episode._append(record)
-
-    def _state_before(self, episode: Episode, inputs: ReplanInputs) -> CallState | None:
-        """Return the state before a policy call whose effects are measured; None where they are not."""
-        planned = self.attributes.recording.effects
-        if planned is None or episode.num_replans % planned.every:
-            return None
-        if inputs.repeat is None:
-            raise BadArgument(
-                f"Cannot measure effects at environment step {inputs.env_step} of {episode.name}: the call cannot be "
-                "made again. Give episode.replan(repeat=lambda call: ...), which makes it with call.instruction and "
-                "call.frames, or record without effects."
-            )
-        return CallState(self.policy, inputs.repeat.call)
-
-    def _effects(
-        self,
-        episode: Episode,
-        inputs: ReplanInputs,
-        record: ReplanRecord,
-        recorder: ReplanRecorder,
-        text: ReplanText,
-        before: CallState,
-        where: str,
-    ) -> ReplanEffects | None:
-        """Return the effects of the policy call that was just recorded, from calls that are made again."""
-        assert self._repeats is not None
-        assert episode._effects is not None
-        assert inputs.repeat is not None
-        if record.actions is None:
-            raise BadArgument(f"Cannot measure effects at {where}: its actions are not known. Set replan.actions.")
-        present = recorder.order.present
-        # Sites of which no layer is recorded are changed, too.
-        roles = {
-            site.name: text.roles(0, site, record.prompt, present.get(site.name), None) for site in self.layout.sites
-        } | dict(record.key_role)
-        state = np.zeros(0) if record.state is None else record.state
-        given = CallInput(inputs.frames, roles, record.prompt, state, {}, call=inputs.repeat.given)
-        every_function = self.every_function or self._names_unknown
-        call = RecordedCall(inputs.repeat, given, before, record.actions, present, every_function, where)
-        facts = episode.facts
-        context = CallContext(
-            facts.task_id, facts.episode_index, episode.num_replans, {}, facts.objects, inputs.coverage
-        )
-        self._in_block = True
-        try:
-            return self._repeats.measure(episode._effects, call, context)
-        finally:
-            self._in_block = False
-
-    def _check_batch(self, recorder: ReplanRecorder) -> None:
-        """Raise `BatchRowsMixed` if the rows of a batch are not those of the environments; say where nothing tells."""
-        self._asked_of_batch, call = True, recorder.module_call
-        if self.attributes.recording.contributions and recorder.contributions.unknown() is None:
-            return  # the output projections were given the rows in the order of the batch
-        apart = None if call is None else rows_of_module_apart(self._known_policy, call)
-        if apart is None:
-            self._of_batch = (
-                f"the rows of a batch of {recorder.batch} may be mixed, if heads are folded outside of the batch: "
-                "compare them with a call of one row (va.inspect, first_row=...), or record one environment at a time"
-            )
-            if not self.attributes.recording.contributions:
-                warnings.warn(f"It is not known whether rows are those of their episodes: {self._of_batch}.", Note)
-        elif not apart:
-            assert call is not None
-            raise BatchRowsMixed(
-                f"The rows of a batch of {recorder.batch} are not apart in module '{call.shape.module}': called again "
-                "with another first row, it changes the attention of other rows. It folds heads and batch into one "
-                "axis with the heads outside. Record one environment at a time, with run.episode."
-            )
+        for one, of_sites in zip(rows, rows_of_sites, strict=True):
+            one.episode.largest_error = max(one.episode.largest_error, call.recorder.largest_error)
+            one.episode._append(call.record(one, of_sites, replan.actions))
 
     def _check_contributions(self, recorder: ReplanRecorder) -> None:
         """Raise `ContributionsUnknown` if a call's contributions are not known; at the first one, decide about them."""
@@ -483,35 +323,14 @@ class RecordedRun:
             stacklevel=2,
         )
 
-    def _record(
-        self,
-        rows_of_sites: Mapping[str, SiteRows],
-        text: ReplanText,
-        row: int,
-        inputs: ReplanInputs,
-        actions: NDArray[np.float64] | None,
-    ) -> ReplanRecord:
-        for site in self._sites:
-            text.check_places(row, site, rows_of_sites[site.name].present, rows_of_sites[site.name].valid)
-        prompt = text.prompt(row, rows_of_sites)
-        key_role, stored = {}, {}
-        for site in self._sites:
-            site_rows = rows_of_sites[site.name]
-            roles = text.roles(row, site, prompt, site_rows.present, site_rows.valid)
-            stored[site.name] = replace(site_rows.rows, contribution=final_contribution(site, site_rows, roles))
-            key_role[site.name] = roles
-        recorded = inputs.dataset_actions
-        if recorded is not None and actions is not None:
-            recorded = recorded[: len(actions)]  # beyond the policy's chunk there is nothing to compare
-        return ReplanRecord(
-            env_step=inputs.env_step,
-            noise_seed=inputs.noise_seed,
-            rows=stored,
-            key_role=key_role,
-            prompt=prompt,
-            state=inputs.state,
-            actions=actions,
-            frames=inputs.frames if self.attributes.recording.frames else {},
-            coverage=inputs.coverage,
-            dataset_actions=recorded,
-        )
+
+@contextmanager
+def _committing(episodes: Sequence[Episode]) -> Iterator[None]:
+    """End episodes with the block, and store them if no exception ended it."""
+    try:
+        yield
+    finally:
+        for episode in episodes:
+            episode._ended = True
+    for episode in episodes:
+        episode._commit()

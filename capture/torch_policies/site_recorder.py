@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
+from vla_attention.capture.recording.finite_numbers import not_finite
 from vla_attention.capture.store.replan_records import RecordedRows
 from vla_attention.capture.torch_policies.added_updates import OutputWay
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
@@ -80,6 +80,7 @@ class ReplanRecorder:
         projections: (site, block) -> the block's output projection, for contributions.
         early_roles: the roles of keys before the masks are known, for contributions.
         bias: what knockouts add to the logits.
+        where: the replan in words.
     """
 
     def __init__(
@@ -92,6 +93,7 @@ class ReplanRecorder:
         projections: Mapping[tuple[str, int], OutputProjection],
         early_roles: EarlyRoles,
         bias: LogitBias | None = None,
+        where: str = "",
     ) -> None:
         self.layout = layout = known.layout
         self.recordings = {name: chosen for name, chosen in recordings_of(recording, layout).items() if chosen}
@@ -101,6 +103,7 @@ class ReplanRecorder:
         self.contributions = ReplanContributions(self.order, self.rows, projections, early_roles)
         self.output_modules = tuple(projection.module for projection in projections.values())
         self.bias = bias
+        self._where = where
         self.largest_error = 0.0
         #: The first recorded call of a batch, if `keeps_module`.
         self.module_call: ModuleCall | None = None
@@ -213,11 +216,8 @@ class ReplanRecorder:
         rows = call.rows(queries)
         error = call.product_error(rows, queries)
         if not math.isfinite(error) and not bool(torch.isfinite(call.output).all() & torch.isfinite(rows).all()):
-            raise NumbersNotFinite(
-                f"The policy's numbers turned NaN or infinite before or at denoise step {place.step}, block "
-                f"{place.block} of site '{site.name}' (module '{call.shape.module}'). {self._remedy()}. Nothing of "
-                "this episode was kept."
-            )
+            block = f"block {place.block} of site '{site.name}' (module '{call.shape.module}')"
+            raise not_finite(self._where, f"They begin before or at denoise step {place.step}, {block}", self.remedy)
         self.largest_error = max(self.largest_error, error)
         if problem := call.unfit(rows, error):
             raise RowsDoNotMatch(
@@ -258,16 +258,13 @@ class ReplanRecorder:
                 f"that no key has a place of its own: {LOAD_WITH_DYNAMIC_CACHE}"
             ] = None
 
-    def finish(self, where: str) -> list[dict[str, SiteRows]]:
+    def finish(self) -> list[dict[str, SiteRows]]:
         """Return for each recorded row of the batch what its sites gave.
-
-        where: the replan, in words.
 
         Raises:
             CallsDoNotFit: the calls are not those of the layout.
-            NumbersNotFinite: rows hold NaN or infinity.
         """
-        self.order.check(where)
+        self.order.check(self._where)
         unknown = self.contributions.unknown() is not None
         rows_of_sites: list[dict[str, SiteRows]] = [{} for _ in self.rows]
         for name, recording in self.recordings.items():
@@ -279,7 +276,6 @@ class ReplanRecorder:
             for position, row in enumerate(self.rows):
                 rows = np.ascontiguousarray(stacked[:, position])
                 rows = rows.reshape(len(recording.layers), len(recording.denoise_steps), *rows.shape[1:])
-                self._check_finite(rows, recording, site.name, where)
                 contribution = None
                 if recording.contributions and not unknown:
                     gram = self.contributions.grams(name, cells, row)
@@ -317,22 +313,12 @@ class ReplanRecorder:
             return tensors[0].mean(dim=2, keepdim=True)
         return tensors[0]
 
-    def _check_finite(self, rows: NDArray[np.float32], recording: Recording, site: str, where: str) -> None:
-        finite = np.isfinite(rows.sum(axis=-1))
-        if finite.all():
-            return
-        # Denoise step by denoise step, as the model computes.
-        step, layer, head = (int(i) for i in np.argwhere(~finite.swapaxes(0, 1))[0][:3])
-        raise NumbersNotFinite(
-            f"The rows of site '{site}' turned NaN or infinite at {where}, denoise step "
-            f"{recording.denoise_steps[step]}, layer {recording.layers[layer]}, head {recording.heads[head]}. "
-            f"{self._remedy()}. Nothing of this episode was kept."
-        )
-
-    def _remedy(self) -> str:
+    @property
+    def remedy(self) -> str:
+        """What to do where numbers are not finite."""
         if self.bias is None:
-            return "Look at the policy's input and weights, or use float32"
-        return "An intervention may leave a query without any key: take a smaller group, or fewer heads or layers"
+            return "look at the policy's input and weights, or use float32"
+        return "an intervention may leave a query without any key: take a smaller group, or fewer heads or layers"
 
 
 def recordings_of(recording: Recording, layout: PolicyLayout) -> dict[str, Recording | None]:

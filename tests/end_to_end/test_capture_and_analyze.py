@@ -218,7 +218,7 @@ def test_capture_is_interrupted_cleanly(monkeypatch, tmp_path, capsys):
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("vla_attention.capture.engine.simulators.LocalSimulator.begin", interrupt)
+    monkeypatch.setattr("vla_attention.capture.engine.simulators.LocalSimulator.ask", interrupt)
     code = capture(
         [
             "pi",

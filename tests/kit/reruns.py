@@ -109,7 +109,7 @@ def write_with(
     store = open_run(path, root_attributes(spec), "new", durable=False)
     for task, episode in spec.names:
         given, records = episode_records(spec, task, episode)
-        with store.episode(replace(given, **start), denoise_times(spec), len(records)) as writer:  # type: ignore[arg-type]
+        with store.episode(replace(given, **start), denoise_times(spec)) as writer:  # type: ignore[arg-type]
             for replan, record in enumerate(records):
                 writer.append(change(task, episode, replan, record))
             commit(writer, spec, task, episode)

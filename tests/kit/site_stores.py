@@ -155,7 +155,7 @@ def write_site_store(path: Path, spec: SiteStoreSpec | None = None, **changes: A
     store = open_run(path, site_root(spec), "new", durable=False)
     for number, (task, episode) in enumerate((task, e) for task in spec.tasks for e in range(spec.episodes)):
         start, records = site_records(spec, task, episode)
-        with store.episode(start, np.array([1.0, 0.5]), len(records)) as writer:
+        with store.episode(start, np.array([1.0, 0.5])) as writer:
             for record in records:
                 writer.append(record)
             known = spec.outcome == "known" or (spec.outcome == "some" and number % 3 < 2)

@@ -155,7 +155,7 @@ def write_store(
 def write_episode(store: RunStore, spec: StoreSpec, task: int, episode: int) -> Path:
     """Write and commit one episode."""
     start, records = episode_records(spec, task, episode)
-    with store.episode(start, denoise_times(spec), len(records)) as writer:
+    with store.episode(start, denoise_times(spec)) as writer:
         for record in records:
             writer.append(record)
         return commit(writer, spec, task, episode)

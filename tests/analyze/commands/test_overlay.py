@@ -52,7 +52,7 @@ def write_turned_store(path: Path, upright: bool, mirrored: bool) -> Path:
         frame = record.frames[CAMERA]
         frame[:] = 0
         frame[row * 4 : row * 4 + 4, column * 4 : column * 4 + 4] = 255
-    with store.episode(start, kit.denoise_times(spec), len(records)) as writer:
+    with store.episode(start, kit.denoise_times(spec)) as writer:
         for record in records:
             writer.append(record)
         kit.commit(writer, spec, 0, 0)

@@ -41,10 +41,7 @@ class ThreadOfTests:
         self.connection.send(setup)
         self.started.append(self)
 
-    def begin(self, request: simulator_process.BeginEpisode) -> None:
-        self.connection.send(request)
-
-    def execute(self, request: simulator_process.Execute) -> None:
+    def ask(self, request: object) -> None:
         self.connection.send(request)
 
     def has_answer(self) -> bool:

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from vla_attention.capture.engine import simulator_process
-from vla_attention.capture.engine.call import Caller
+from vla_attention.capture.engine.call import Caller, record_of
 from vla_attention.capture.engine.simulation import StopCheck
 from vla_attention.capture.engine.simulators import Simulators, check_protocol, max_replans
 from vla_attention.capture.engine.source import EpisodeJob, Outcome
@@ -129,7 +129,7 @@ def run_episode(
     index: int = 0,
     check: StopCheck = lambda: None,
 ) -> tuple[Outcome, SimpleNamespace]:
-    """Run an episode in this process; also returns the `start`, `max_replans`, and (step, replans) after each call."""
+    """Run an episode in this process; also returns the `start` and (step, replans) after each call."""
     monkeypatch.setattr(simulator_process, "make_environment", lambda suite, task_id, settings: environment)
     caller = Caller(policy or FakePolicy(), store.attributes.recording)
     source = Simulators(None, None, store, caller, {"host": "x"}, check)  # type: ignore[arg-type]
@@ -138,11 +138,11 @@ def run_episode(
     while not isinstance(given := episode.poll(), Outcome):
         assert given is not None
         (made,) = caller.make([given])
-        store.records.append(caller.record(given, made, None))
+        store.records.append(record_of(given, made.rows, made.actions, caller.recording, None, given.noise_seed))
         episode.advance(made.actions)
         done.append(episode.done)
     done.append(episode.done)
-    return given, SimpleNamespace(start=episode.start, max_replans=episode.max_replans, done=done[1:])
+    return given, SimpleNamespace(start=episode.start, done=done[1:])
 
 
 def test_waiting_steps_then_a_policy_call_for_every_chunk(monkeypatch) -> None:
@@ -159,7 +159,6 @@ def test_waiting_steps_then_a_policy_call_for_every_chunk(monkeypatch) -> None:
     assert [record.noise_seed for record in store.records] == [7320, 7321, 7322]
     assert told.done == [3, 6, 8]
     assert outcome == Outcome(False, 8)
-    assert told.max_replans == 3
     assert (told.start.initial_state_index, told.start.initial_state_digest) == (2, "d" * 64)
     assert told.start.provenance == {"host": "x"}
 

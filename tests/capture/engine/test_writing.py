@@ -31,7 +31,7 @@ class MadeUpStore:
         self.refuses: Exception | None = None
 
     @contextmanager
-    def episode(self, start: Any, denoise_times: Any, max_replans: int) -> Iterator[Any]:
+    def episode(self, start: Any, denoise_times: Any) -> Iterator[Any]:
         name = start.name
 
         def append(record: Any) -> None:
@@ -76,7 +76,7 @@ class Writing(WritingThread):
 
 
 def begin(writing: Writing, store: MadeUpStore, name: str) -> Any:
-    return writing.episode(store, SimpleNamespace(name=name), np.ones(1), 9)
+    return writing.episode(store, SimpleNamespace(name=name), np.ones(1))
 
 
 def test_replans_and_commits_are_written_in_order() -> None:
@@ -88,7 +88,7 @@ def test_replans_and_commits_are_written_in_order() -> None:
         one.append(record(1, 1))
         one.commit(Outcome(True, 7))
         writing.wait_until(lambda: one.committed)
-        assert one.committed == (Path("one-that-is-not-there"), 0)
+        assert one.committed == (Outcome(True, 7), Path("one-that-is-not-there"), 0)
         assert other.committed is None
     # The other one is dropped with the end of the block.
     expected = ["one: open", "one: 0", "other: open", "other: 0", "one: 1", "one: commit True 7", "one: close"]

@@ -14,8 +14,6 @@ from tests.kit.stores import (
 )
 from tests.kit.tokens import OBJECTS, small_prompt
 from vla_attention.capture.store.disk_estimate import (
-    EPISODE_OVERHEAD,
-    DiskEstimate,
     estimate_disk,
     format_bytes,
 )
@@ -90,13 +88,6 @@ def test_what_is_asked_for_is_what_is_counted():
     one, two = size([], layers=(0,), **heads), size([], layers=(0, 1), **heads)
     assert size([], layers=(0, 1, 2), **heads) - two == pytest.approx(two - one, abs=2)
     assert size([], queries="all", num_action_queries=10, **heads) > 9 * (two - one)
-
-
-def test_episodes_and_replans_multiply():
-    estimate = DiskEstimate(bytes_per_replan=1000, max_replans=10, num_episodes=3, inodes_per_episode=57)
-    assert estimate.total_bytes == 3 * (10_000 + EPISODE_OVERHEAD)
-    assert estimate.total_inodes == 3 * 57
-    assert DiskEstimate(1000, 10, 0, 57).total_bytes == 0
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,7 @@ def test_a_store_whose_first_episode_is_being_recorded_is_not_taken(tmp_path, un
     store = open_run(path, root_attributes(SPEC), "new")
     start, _ = episode_records(SPEC, 0, 0)
     with (
-        store.episode(start, denoise_times(SPEC), 9),
+        store.episode(start, denoise_times(SPEC)),
         pytest.raises(StoreExists, match=r"no episode yet, and another run is recording its first one.*--overwrite"),
     ):
         open_run(path, other, "new")
@@ -112,13 +112,13 @@ def test_an_episode_is_not_added_to_another_run_that_took_the_place(tmp_path):
     path = tmp_path / "a.zarr"
     store = open_run(path, root_attributes(SPEC), "new")
     start, records = episode_records(SPEC, 0, 0)
-    with store.episode(start, denoise_times(SPEC), 9) as writer:
+    with store.episode(start, denoise_times(SPEC)) as writer:
         writer.append(records[0])
         open_run(path, root_attributes(replace(SPEC, seed=3)), "overwrite")
         with pytest.raises(RunMismatch, match=r"protocol\.seed"):
             writer.commit(False, 5)
         shutil.rmtree(path)
-    with pytest.raises(StoreError, match="has been removed"), store.episode(start, denoise_times(SPEC), 9):
+    with pytest.raises(StoreError, match="has been removed"), store.episode(start, denoise_times(SPEC)):
         pass
 
 

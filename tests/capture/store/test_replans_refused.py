@@ -160,7 +160,7 @@ def test_replans_that_cannot_be_right_are_refused_and_leave_nothing(tmp_path):
     """Each is offered as the second replan of one episode, which is then completed and whole."""
     store = open_run(tmp_path / "a.zarr", root_attributes(SPEC), "new", durable=False)
     start, records = episode_records(SPEC, 0, 0)
-    with store.episode(start, denoise_times(SPEC), 3) as writer:
+    with store.episode(start, denoise_times(SPEC)) as writer:
         writer.append(records[0])
         for name, (change, message) in (STORABLE | UNSTORABLE).items():
             with pytest.raises(ReplanRefused) as caught:
@@ -181,7 +181,7 @@ def test_a_camera_that_the_layout_lacks_is_refused(tmp_path):
     change, message = STORABLE["an unknown camera"]
     store = open_run(tmp_path / "a.zarr", root_attributes(SPEC), "new", durable=False)
     start, records = episode_records(SPEC, 0, 0)
-    with store.episode(start, denoise_times(SPEC), 3) as writer, pytest.raises(ReplanRefused, match=message):
+    with store.episode(start, denoise_times(SPEC)) as writer, pytest.raises(ReplanRefused, match=message):
         writer.append(change(records[0]))
 
 
@@ -200,7 +200,7 @@ def test_verify_reports_what_the_writer_refuses(tmp_path, monkeypatch, name):
     start, records = episode_records(spec, 0, 0)
     alike = name in ("an unknown camera",) or name.startswith(("a picture", "coverage of"))  # to be stacked
     records = [change(record) if alike or i == 1 else record for i, record in enumerate(records)]
-    with store.episode(start, denoise_times(spec), 3) as writer:
+    with store.episode(start, denoise_times(spec)) as writer:
         for record in records:
             writer.append(record)
         commit(writer, spec, 0, 0)
@@ -214,7 +214,7 @@ def test_an_object_out_of_view_and_rounded_rows_are_no_fault(tmp_path):
     unseen = np.zeros_like(records[0].coverage["base_0_rgb"])
     unseen[:, -1] = 1
     store = open_run(tmp_path / "a.zarr", root_attributes(spec), "new", durable=False)
-    with store.episode(start, denoise_times(spec), 3) as writer:
+    with store.episode(start, denoise_times(spec)) as writer:
         for record in records:
             writer.append(replace(record, coverage={camera: unseen[: len(v)] for camera, v in record.coverage.items()}))
         commit(writer, spec, 0, 0)

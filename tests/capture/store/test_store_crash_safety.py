@@ -93,11 +93,11 @@ def test_an_exception_in_the_block_leaves_no_trace(tmp_path, uninterrupted):
     start, records = episode_records(SPEC, 7, 0)
     for stop in (0, 1, len(records)):
         for exception in (RuntimeError, KeyboardInterrupt):
-            with pytest.raises(exception), store.episode(start, denoise_times(SPEC), 9) as writer:  # noqa: PT012
+            with pytest.raises(exception), store.episode(start, denoise_times(SPEC)) as writer:  # noqa: PT012
                 for record in records[:stop]:
                     writer.append(record)
                 raise exception
-    with store.episode(start, denoise_times(SPEC), 9) as writer:
+    with store.episode(start, denoise_times(SPEC)) as writer:
         writer.append(records[0])  # and never committed
     assert store_bytes(path) == uninterrupted
     assert list(tmp_path.iterdir()) == [path]
@@ -156,7 +156,7 @@ def write_same(path: Path, barrier: Barrier, report: Connection) -> None:
     start, records = episode_records(SPEC, 0, 0)
     barrier.wait(60)
     try:
-        with store.episode(start, denoise_times(SPEC), 9) as writer:
+        with store.episode(start, denoise_times(SPEC)) as writer:
             for record in records:
                 writer.append(record)
             commit(writer, SPEC, 0, 0)
@@ -238,7 +238,7 @@ def test_a_holder_that_stood_still_neither_harms_its_successor_nor_publishes_hal
                     write_episode(other, SPEC, 6, 0)
 
             expected = StoreExists if committed else EpisodeTaken
-            with stopped.episode(start, denoise_times(SPEC), 9) as writer, pytest.raises(expected):  # noqa: PT012
+            with stopped.episode(start, denoise_times(SPEC)) as writer, pytest.raises(expected):  # noqa: PT012
                 writer.append(records[0])
                 if moment == "append":
                     take_over()

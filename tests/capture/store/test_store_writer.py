@@ -24,7 +24,6 @@ from tests.kit.stores import (
     denoise_times,
     episode_records,
     root_attributes,
-    write_episode,
     write_store,
 )
 from tests.kit.strategies import episode_tokens
@@ -243,16 +242,6 @@ def test_an_episode_without_replans_is_refused(tmp_path):
     spec = StoreSpec()
     store = open_run(tmp_path / "a.zarr", root_attributes(spec), "new")
     start, _ = episode_records(spec, 0, 0)
-    with store.episode(start, denoise_times(spec), 3) as writer, pytest.raises(ValueError, match="without replans"):
+    with store.episode(start, denoise_times(spec)) as writer, pytest.raises(ValueError, match="without replans"):
         writer.commit(False, 0)
     assert not list(tmp_path.glob("*.partial"))
-
-
-def test_writing_twice_gives_the_same_bytes(tmp_path, written):
-    path, spec = written
-    store = open_run(tmp_path / "b.zarr", root_attributes(spec), "new")
-    for task, episode in reversed(spec.names):
-        write_episode(store, spec, task, episode)
-    first = {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
-    again = {str(file.relative_to(store.path)): file.read_bytes() for file in store.path.rglob("*") if file.is_file()}
-    assert first == again

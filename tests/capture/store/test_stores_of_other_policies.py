@@ -38,7 +38,7 @@ def move_mass(site: str, key: int, query: int | None = None) -> Change:
 def append(path: Path, spec: SiteStoreSpec, changes: dict[int, Change]) -> None:
     store = open_run(path, site_root(spec), "new", durable=False)
     start, records = site_records(spec, 0, 0)
-    with store.episode(start, np.array([1.0, 0.5]), len(records)) as writer:
+    with store.episode(start, np.array([1.0, 0.5])) as writer:
         for replan, record in enumerate(records):
             writer.append(changes[replan](record) if replan in changes else record)
         writer.commit(success=None, num_steps=0)

@@ -22,6 +22,7 @@ from tests.kit.small_torch_policy import (
     given,
     small_layout,
 )
+from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.capture.torch_policies.policy_layout import CallRule, LayoutForAnotherVersion, PromptText
@@ -30,7 +31,7 @@ from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.recorded_episodes import NothingRecorded
 from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
 from vla_attention.capture.torch_policies.watched_block import NotFollowed
-from vla_attention.schemas.errors import BadArgument, UnknownName, UserError
+from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import open_store
@@ -416,16 +417,20 @@ def test_rows_that_do_not_reproduce_the_kernel_are_refused(tmp_path, policy, mon
     assert not run.num_dropped
 
 
-@pytest.mark.parametrize("where", ["weights", "input"])
+@pytest.mark.parametrize("where", ["weights", "input", "actions"])
 def test_numbers_that_are_not_finite_are_refused(tmp_path, policy, where):
-    inputs = given()
+    inputs, origin = given(), "They begin before or at denoise step 0, block 0"
     if where == "weights":
         with torch.no_grad():
             policy.state.weight.fill_(torch.inf)
-    else:
+    elif where == "input":
         inputs["states"] = torch.full((1, 2), torch.nan)
+    else:
+        origin = "its actions"
     with (
         start(tmp_path, policy) as run,
-        pytest.raises(UserError, match=r"turned NaN or infinite before or at denoise step 0, block 0"),
+        pytest.raises(NumbersNotFinite, match=rf"infinite at replan 0 \(environment step 3\) of task0.*{origin}"),
+        run.episode(task_id=0, episode_index=0, instruction="pick the bowl") as episode,
+        episode.replan(env_step=3) as replan,
     ):
-        one_call(run, policy, inputs)
+        replan.actions = policy.act(**inputs) * (torch.nan if where == "actions" else 1)

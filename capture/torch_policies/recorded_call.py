@@ -1,0 +1,238 @@
+"""One policy call of `va.record`: what watches it in its block, and what is stored of it afterwards."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_attention.capture.engine.call import PolicyCall, record_of
+from vla_attention.capture.interventions.changed_inputs import CallContext
+from vla_attention.capture.recording.finite_numbers import all_finite, not_finite
+from vla_attention.capture.store.replan_records import RecordedRows, ReplanRecord
+from vla_attention.capture.torch_policies.attention_calls import CallShape
+from vla_attention.capture.torch_policies.batch_rows import BatchRowsMixed, rows_of_module_apart
+from vla_attention.capture.torch_policies.call_order import CallPlace, CallsDoNotFit
+from vla_attention.capture.torch_policies.call_state import CallState
+from vla_attention.capture.torch_policies.knockouts import CallBias
+from vla_attention.capture.torch_policies.policy_layout import RecordedSite
+from vla_attention.capture.torch_policies.repeated_calls import OWN_NOISE, CallInput, CallToRepeat
+from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs, read_actions
+from vla_attention.capture.torch_policies.replan_text import PromptIds, ReplanText
+from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder, SiteRows, final_contribution
+from vla_attention.capture.torch_policies.watch import watch_attention
+from vla_attention.schemas.errors import BadArgument, Note
+from vla_attention.schemas.layout import Prompt
+
+if TYPE_CHECKING:
+    from vla_attention.capture.torch_policies.recorded_episodes import Episode
+    from vla_attention.capture.torch_policies.session import RecordedRun
+
+_BY_NAMES = (
+    "This policy call was watched at the names of torch's attention functions only, since all attention of an earlier "
+    "one was called by them. If it is called otherwise here, record again with run.every_function = True."
+)
+
+#: Where it is not known.
+NO_STATE = np.zeros(0)
+
+
+@dataclass(frozen=True)
+class RowOfCall:
+    """What is an episode's of a policy call.
+
+    row: of the batch. action_place: of its actions among those of several environments; None: they are its own.
+    """
+
+    episode: Episode
+    inputs: ReplanInputs
+    row: int = 0
+    action_place: int | None = None
+
+    @property
+    def where(self) -> str:
+        """The replan in words, before it is added to its episode."""
+        step, episode = self.inputs.env_step, self.episode
+        return f"replan {episode.num_replans} (environment step {step}) of {episode.name}"
+
+    @property
+    def context(self) -> CallContext:
+        """The call's place and its scene, before it is added to its episode."""
+        facts, replan = self.episode.facts, self.episode.num_replans
+        return CallContext(
+            facts.task_id, facts.episode_index, replan, objects=facts.objects, coverage=self.inputs.coverage
+        )
+
+
+class WatchedCall:
+    """One policy call. rows: those of its batch that are recorded. batch: how many it has.
+
+    Raises:
+        BadArgument: its effects are to be measured, and it cannot be repeated.
+    """
+
+    def __init__(self, run: RecordedRun, rows: Sequence[RowOfCall], batch: int) -> None:
+        self._run, self._rows = run, rows
+        self._where = ", ".join(one.where for one in rows[:2])
+        self._ids = PromptIds(run._embeddings, batch)
+        self._text = ReplanText(run.layout, run._tokenizer, self._ids, {one.row: one.inputs for one in rows})
+        self.recorder = ReplanRecorder(
+            run._known,
+            type(run.policy).__name__,
+            run.attributes.recording,
+            batch,
+            [one.row for one in rows],
+            run._projections,
+            self._text.early_roles,
+            self._bias if run.attributes.interventions.changes_attention else None,
+            self._where,
+        )
+        self.recorder.keeps_module = batch > 1 and not run._asked_of_batch
+        self._present = self._text.present = self.recorder.order.present
+        self._biases: dict[int, CallBias | None] = {}
+        self._before = self._state_before(rows[0])
+        self._every_function = run.every_function or run._names_unknown
+
+    def _state_before(self, one: RowOfCall) -> CallState | None:
+        """Return the state before a policy call whose effects are measured; None where they are not."""
+        planned = self._run.attributes.recording.effects
+        if planned is None or one.episode.num_replans % planned.every:
+            return None
+        if one.inputs.repeat is None:
+            raise BadArgument(
+                f"Cannot measure effects at environment step {one.inputs.env_step} of {one.episode.name}: the call "
+                "cannot be made again. Give episode.replan(repeat=lambda call: ...), which makes it with "
+                "call.instruction and call.frames, or record without effects."
+            )
+        return CallState(self._run.policy, one.inputs.repeat.call)
+
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        """Watch the call that is made within the block."""
+        seen = watch_attention(self._run._found, self.recorder, every_function=self._every_function)
+        with self._ids.watched(), seen as functions:
+            yield
+        if self.recorder.saw_attention:
+            self._run._names_unknown = not functions.by_names
+
+    def finish(self) -> list[dict[str, SiteRows]]:
+        """Return what the sites gave for each row, once the call has ended; errors as `ReplanRecorder.finish`.
+
+        Raises:
+            BatchRowsMixed: the rows of the batch are not those of the environments.
+        """
+        try:
+            rows_of_sites = self.recorder.finish()
+        except CallsDoNotFit as error:
+            # Where there were fewer tokens, nothing was called otherwise.
+            if self._every_function or self.recorder.order.fewer_tokens:
+                raise
+            raise CallsDoNotFit(f"{error}\n{_BY_NAMES}") from None
+        if self.recorder.keeps_module:
+            self._check_batch()
+        return rows_of_sites
+
+    def _check_batch(self) -> None:
+        """Raise `BatchRowsMixed` if the rows of a batch are not those of the environments; say where nothing tells."""
+        run, batch, call = self._run, self.recorder.batch, self.recorder.module_call
+        run._asked_of_batch, contributions = True, run.attributes.recording.contributions
+        if contributions and self.recorder.contributions.unknown() is None:
+            return  # the output projections were given the rows in the order of the batch
+        apart = None if call is None else rows_of_module_apart(run._found, call)
+        if apart is None:
+            run._of_batch = (
+                f"the rows of a batch of {batch} may be mixed, if heads are folded outside of the batch: compare them "
+                "with a call of one row (va.inspect, first_row=...), or record one environment at a time"
+            )
+            if not contributions:
+                warnings.warn(f"It is not known whether rows are those of their episodes: {run._of_batch}.", Note)
+        elif not apart:
+            assert call is not None
+            raise BatchRowsMixed(
+                f"The rows of a batch of {batch} are not apart in module '{call.shape.module}': called again with "
+                "another first row, it changes the attention of other rows. It folds heads and batch into one axis "
+                "with the heads outside. Record one environment at a time, with run.episode."
+            )
+
+    def record(self, one: RowOfCall, rows_of_sites: Mapping[str, SiteRows], given_actions: Any) -> ReplanRecord:
+        """Return what is stored of a row, with its effects. given_actions: those of all environments.
+
+        Raises:
+            NumbersNotFinite: its actions or contributions hold NaN or infinity.
+            BadArgument: its effects are to be measured, and its actions are not known.
+        """
+        run, inputs, text = self._run, one.inputs, self._text
+        several = given_actions is not None and one.action_place is not None
+        actions = read_actions(given_actions[one.action_place] if several else given_actions)
+        for site in run._sites:
+            text.check_places(one.row, site, rows_of_sites[site.name].present, rows_of_sites[site.name].valid)
+        prompt = text.prompt(one.row, rows_of_sites)
+        key_role: dict[str, NDArray[np.uint8]] = {}
+        stored: dict[str, RecordedRows] = {}
+        for site in run._sites:
+            of_site = rows_of_sites[site.name]
+            key_role[site.name] = roles = text.roles(one.row, site, prompt, of_site.present, of_site.valid)
+            stored[site.name] = replace(of_site.rows, contribution=final_contribution(site, of_site, roles))
+        if not all_finite(actions, stored):
+            raise not_finite(
+                one.where, "Its rows are finite, its actions or contributions are not", self.recorder.remedy
+            )
+        data = inputs.dataset_actions
+        if data is not None and actions is not None:
+            data = data[: len(actions)]  # beyond the policy's chunk there is nothing to compare
+        call = PolicyCall(
+            CallInput(inputs.frames, key_role, prompt, NO_STATE if inputs.state is None else inputs.state, {}),
+            OWN_NOISE,
+            one.context,
+            inputs.env_step,
+            one.where,
+            dataset_actions=data,
+        )
+        if self._before is not None:
+            call = self._to_be_repeated(call, one, actions, self._before)
+        effects = one.episode._effects
+        return record_of(call, stored, actions, run.attributes.recording, effects, inputs.noise_seed)
+
+    def _to_be_repeated(
+        self, call: PolicyCall, one: RowOfCall, actions: NDArray[np.float64] | None, before: CallState
+    ) -> PolicyCall:
+        """Return the call as it is repeated, after telling the policy that is repeated."""
+        run, repeat = self._run, one.inputs.repeat
+        assert run._repeats is not None
+        assert repeat is not None
+        if actions is None:
+            raise BadArgument(f"Cannot measure effects at {one.where}: its actions are not known. Set replan.actions.")
+        given = call.policy_input
+        # Sites of which no layer is recorded are changed, too.
+        others = [site for site in run.layout.sites if site.name not in given.key_role]
+        key_role = self._roles(one.row, others, given.prompt) | dict(given.key_role)
+        given = replace(cast(CallInput, given), key_role=key_role, call=repeat.given)
+        every_function = run.every_function or run._names_unknown
+        run._repeats.take(CallToRepeat(repeat, given, before, actions, self._present, every_function, one.where))
+        return replace(call, policy_input=given)
+
+    def _bias(self, row: int, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
+        """Return what knockouts add to the logits of a call, see `LogitBias`: looked up at the row's first call."""
+        if place.site is None:
+            return None
+        if row not in self._biases:
+            self._biases[row] = self._bias_of(next(one for one in self._rows if one.row == row))
+        bias = self._biases[row]
+        return None if bias is None else bias(row, place, shape)
+
+    def _bias_of(self, one: RowOfCall) -> CallBias | None:
+        prompt = self._text.prompt(one.row, None)
+        given = CallInput({}, self._roles(one.row, self._run._sites, prompt), prompt, NO_STATE, {})
+        editors = one.episode._changes.editors(self._run.attributes.sites, given, one.context)
+        edits = {site: editor.edits for site, editor in (editors or {}).items()}
+        return CallBias(self._run.layout, edits, self._present) if edits else None
+
+    def _roles(self, row: int, sites: Sequence[RecordedSite], prompt: Prompt) -> dict[str, NDArray[np.uint8]]:
+        """Return the roles of sites' keys, whatever masks hide."""
+        present = self._present
+        return {site.name: self._text.roles(row, site, prompt, present.get(site.name), None) for site in sites}
