@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import polars as pl
 import pytest
 
 from tests.kit.golden_stores import differences
-from tests.kit.golden_tables import CASES, FOLDER, alike, form_of, link_stores, published_arguments, tables_of
+from tests.kit.golden_tables import (
+    CASES,
+    FOLDER,
+    OF_DIFFERENCES,
+    alike,
+    link_stores,
+    published_arguments,
+    tables_of,
+)
 
 
 @pytest.fixture(scope="module")
@@ -17,16 +27,13 @@ def folder(tmp_path_factory):
 
 
 def hold(case: str, tables: dict[str, pl.DataFrame]) -> None:
+    tables = {name.replace("/", "_"): table for name, table in tables.items()}
     kept = {file.stem: pl.read_parquet(file) for file in sorted((FOLDER / case).glob("*.parquet"))}
     assert kept
-    wrong = []
-    for name, table in kept.items():
-        form = form_of(case, name)
-        if form is None and name not in tables:
-            wrong.append(f"no table {name}")
-            continue
-        lines = differences(tables[name], table, alike) if form is None else form.differences(tables, table)
-        wrong += [f"{name}: {line}" for line in lines]
+    same = partial(alike, absolute=OF_DIFFERENCES) if case.endswith("compare") else alike
+    wrong = [f"no table {name}" for name in kept if name not in tables]
+    for name in kept.keys() & tables.keys():
+        wrong += [f"{name}: {line}" for line in differences(tables[name], kept[name], same)]
     assert not wrong, "\n".join(wrong[:20])
 
 

@@ -1,7 +1,6 @@
-"""Make the golden tables that are missing: python -m tests.golden.make_tables [--column CASE/TABLE:NAME ...]
+"""Make golden tables, or columns of them: python -m tests.golden.make_tables CASE/TABLE[:COLUMN] ...
 
-Tables that are there stay as they are. With --column the named columns are replaced, and no others: a change that means
-to alter numbers names them. The stores in tests/golden/tables/stores were captured once, with one thread:
+What is not named stays as it is: a change that means to alter numbers names them. The stores in tests/golden/tables/stores were captured once, with one thread:
 
     cubes, cubes_one_colour: as scripts/make_example_stores.py has them, but with two threads and without effects
     cubes_reruns: capture rerun cubes.zarr --series (role:image, role:instruction) --num-episodes 1 --no-frames
@@ -27,30 +26,32 @@ import polars as pl
 from tests.kit.golden_tables import CASES, FOLDER, link_stores, published_arguments, tables_of
 
 
-def write(case: str, tables: dict[str, pl.DataFrame], columns: list[str]) -> None:
-    """Write the tables that are missing, and the named columns."""
+def write(case: str, tables: dict[str, pl.DataFrame], named: list[str]) -> None:
+    """Write the named tables and columns of a case."""
     for name, table in tables.items():
-        file = FOLDER / case / f"{name}.parquet"
-        named = [column.split(":")[1] for column in columns if column.split(":")[0] == f"{case}/{name}"]
-        if file.exists():
-            if not named:
-                continue
-            table = pl.read_parquet(file).with_columns(table[column] for column in named)
+        file = FOLDER / case / f"{name.replace('/', '_')}.parquet"
+        columns = [one.partition(":")[2] for one in named if one.partition(":")[0] == f"{case}/{name}"]
+        if not columns:
+            continue
+        if all(columns):
+            table = pl.read_parquet(file).with_columns(table[column] for column in columns)
         file.parent.mkdir(parents=True, exist_ok=True)
         table.write_parquet(file, compression="zstd", compression_level=22, statistics=False)
         print(file.relative_to(FOLDER), table.shape)
 
 
 def main() -> None:
-    """Ask every question."""
+    """Ask the questions of the named tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--column", nargs="+", default=[], metavar="CASE/TABLE:NAME")
-    columns = parser.parse_args().column
+    parser.add_argument("named", nargs="+", metavar="CASE/TABLE[:COLUMN]")
+    named = parser.parse_args().named
+    cases = {one.partition("/")[0] for one in named}
     with tempfile.TemporaryDirectory() as temporary:
         link_stores(Path(temporary))
         for case in CASES:
-            write(case, tables_of(case, Path(temporary)), columns)
-    write("published", {"arguments": published_arguments()}, columns)
+            if case in cases:
+                write(case, tables_of(case, Path(temporary)), named)
+    write("published", {"arguments": published_arguments()}, named)
 
 
 if __name__ == "__main__":
