@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import hashlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.schemas.options import Numbers, add_task, number_range
+from vla_attention.schemas.options import Numbers, add_options, number_range, task_option
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.store_url import store_place
 
@@ -122,9 +123,14 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
     where.add_argument("--scheduler", metavar="ADDRESS", help="or in the workers of a dask scheduler, tcp://HOST:8786")
 
 
+@dataclass(frozen=True)
+class _Tasks:
+    tasks: tuple[int | str, ...] | None = task_option("tasks", dest="tasks")
+
+
 def add_question(parser: argparse.ArgumentParser, names: tuple[str, ...]) -> None:
     """--task, the named options and --skip-corrupt."""
-    add_task(parser, "tasks", "tasks")
+    add_options(parser, _Tasks)
     for name in names:
         parser.add_argument(f"--{name.replace('_', '-')}", **OPTIONS[name])
     damaged = "leave out episodes that are damaged or empty, by name"

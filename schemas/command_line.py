@@ -27,8 +27,8 @@ _HELP_WIDTH = 100
 _MOST_OPTIONS = 6
 _MOST_EXAMPLES = 3
 _MAIN_OPTIONS = {
-    *("--checkpoint", "--task-suite", "--task", "--num-episodes", "--effects", "--knockout", "--series", "--policy"),
-    *("--layers", "--grouping", "--group", "--ratio", "--episode", "--open", "--video"),
+    *("--checkpoint", "--ckpt-path", "--task-suite", "--task", "--num-episodes", "--effects", "--knockout", "--series"),
+    *("--policy", "--layers", "--grouping", "--group", "--ratio", "--episode", "--open", "--video"),
     *("--csv", "--output", "--resume", "--repair", "--tar"),
     *("--without", "--help-all"),
 }

@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from vla_attention.capture.environments.episode_protocol import OPENPI, EvaluationProtocol
+from vla_attention.capture.policies.model_settings import ModelSettings
+from vla_attention.schemas.options import read_options
 
 if TYPE_CHECKING:
     from vla_attention.capture.policies.policy import Policy
@@ -23,21 +25,21 @@ class PublishedScript:
     """The published script whose command line a family keeps, with the defaults of that script.
 
     program: the console script. checkpoint, layers: what it loads and analyses by default. variables: environment
-    variables of its batch script that no other family has, and the option that each one sets.
+    variables of its batch script that no other family has, each of which sets the option of its name.
     """
 
     program: str
     checkpoint: str
     layers: tuple[int, ...]
-    variables: Mapping[str, str] = field(default_factory=dict)
+    variables: tuple[str, ...] = ()
 
 
-def no_arguments(arguments: argparse.Namespace) -> list[str]:
+def no_arguments(settings: ModelSettings) -> list[str]:
     """Return no arguments: the analysis keeps its own defaults."""
     return []
 
 
-def no_files_to_check(arguments: argparse.Namespace) -> None:
+def no_files_to_check(settings: ModelSettings) -> None:
     """Do nothing: only loading tells whether a checkpoint is whole."""
 
 
@@ -58,10 +60,10 @@ class PolicyFamily:
     description: str
     #: lines of examples for the help text, each ending with a newline
     examples: str
-    #: Adds the options of the model, among them `checkpoint`, `device` and `threads` (see `model_arguments.py`).
-    add_arguments: Callable[[argparse.ArgumentParser], None]
-    #: (parsed arguments, device) -> the policy
-    build: Callable[[argparse.Namespace, str], Policy]
+    #: What is asked of the model. The other functions take an object of this class.
+    settings: type[ModelSettings]
+    #: (settings, device) -> the policy
+    build: Callable[[Any, str], Policy]
     #: First part of the names of stores and results folders. Two families on one suite need different ones.
     store_prefix: str
     #: the default of `--replan-steps`, for its help text
@@ -76,16 +78,20 @@ class PolicyFamily:
     built_in: tuple[str, ...] = ()
     #: the default of `--task-suite`: the one that the default checkpoint is for
     default_suite: str = "robosuite"
-    #: parsed arguments -> further arguments of an analysis that follows the capture
-    analysis_arguments: Callable[[argparse.Namespace], list[str]] = no_arguments
+    #: settings -> further arguments of an analysis that follows the capture
+    analysis_arguments: Callable[[Any], list[str]] = no_arguments
     published: PublishedScript | None = None
     #: The suites that checkpoints were trained on and evaluated in, by the names that `--checkpoint` takes.
     trained_on: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    #: Whether `build` takes a `robot_data` among the arguments (`robot.py`), and then gives a policy for data sets.
+    #: Whether the settings have a `robot_data` (`robot.py`), with which `build` gives a policy for data sets.
     reads_data_sets: bool = False
     #: The kinds of its policies, as stores name them (`PolicyIdentity.family`); empty for the family's name alone.
     kinds: tuple[str, ...] = ()
-    #: The identity in a store -> parsed arguments with which `build` makes this policy again.
+    #: The identity in a store -> the settings with which `build` makes this policy again.
     rebuild: Callable[[PolicyIdentity], dict[str, Any]] = stored_checkpoint
-    #: Parsed arguments -> None; raises what `build` would where a local checkpoint lacks files. Loads nothing.
-    check_files: Callable[[argparse.Namespace], None] = no_files_to_check
+    #: Settings -> None; raises what `build` would where a local checkpoint lacks files. Loads nothing.
+    check_files: Callable[[Any], None] = no_files_to_check
+
+    def read(self, given: argparse.Namespace) -> ModelSettings:
+        """Return the settings of the model that parsed arguments say."""
+        return read_options(self.settings, given)

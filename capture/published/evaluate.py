@@ -193,7 +193,7 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], threads: Threa
 
     say(threads.describe())
     device = load_torch(arguments.device, threads.number)
-    policy = arguments.family.build(arguments, device)
+    policy = arguments.family.build(arguments.family.read(arguments), device)
     # A layer that does not exist is an error before the capture, not after it.
     select_layers(arguments.layers, policy.num_layers, policy.family)
     missing = []
@@ -259,25 +259,14 @@ def _publish(source: Path, target: Path) -> None:
         temporary.replace(place)
 
 
-#: Variable -> option, for variables that are passed on unchanged.
-_OPTIONS = {
-    "CONFIG_NAME": "--config-name",
-    "TASK_SUITE": "--task-suite",
-    "OUTPUT_DIR": "--output-dir",
-    "STORE": "--output",
-    "STAGE": "--stage",
+#: Variables that are passed on as the option of their name, and what is expected of those that are numbers.
+_VARIABLES = {
+    **dict.fromkeys(("CONFIG_NAME", "TASK_SUITE", "OUTPUT_DIR", "STORE", "STAGE"), ""),
+    **dict.fromkeys(("NUM_EPISODES", "SEED", "REPLAN_STEPS", "MAX_REQUEUES"), "a whole number"),
+    "TASK_ID": "a whole number, or several separated by spaces",
+    "LAYERS": 'layer numbers separated by spaces, as in LAYERS="25 26 27"',
 }
-_WHOLE_NUMBERS = {
-    "NUM_EPISODES": "--num-episodes",
-    "SEED": "--seed",
-    "REPLAN_STEPS": "--replan-steps",
-    "MAX_REQUEUES": "--max-requeues",
-}
-#: Variable, option, and what is expected.
-_SEVERAL_NUMBERS = (
-    ("TASK_ID", "--task-id", "a whole number, or several separated by spaces"),
-    ("LAYERS", "--layers", 'layer numbers separated by spaces, as in LAYERS="25 26 27"'),
-)
+_SEVERAL = ("TASK_ID", "LAYERS")
 _SWITCH = {"1": True, "true": True, "yes": True, "": False, "0": False, "false": False, "no": False}
 
 
@@ -293,20 +282,12 @@ def arguments_from_environment(environment: Mapping[str, str], family: PolicyFam
     given = {name: value.strip() for name, value in environment.items()}
     get = given.get
     arguments: list[str] = []
-    for name, option in _OPTIONS.items():
-        if get(name):
-            arguments += [option, given[name]]
-    for name, option in _WHOLE_NUMBERS.items():
-        if get(name):
-            if not given[name].isdecimal():
-                raise BadArgument(f"{name} is '{given[name]}'; expected a whole number.")
-            arguments += [option, given[name]]
-    for name, option, described in _SEVERAL_NUMBERS:
-        numbers = given.get(name, "").split()
-        if not all(number.isdecimal() for number in numbers):
-            raise BadArgument(f"{name} is '{given[name]}'; expected {described}.")
-        if numbers:
-            arguments += [option, *numbers]
+    for name, expected in _VARIABLES.items():
+        text = given.get(name, "")
+        words = text.split() if name in _SEVERAL else [text] if text else []
+        if expected and not all(word.isdecimal() for word in words):
+            raise BadArgument(f"{name} is '{text}'; expected {expected}.")
+        arguments += [_option_of(name), *words] if words else []
     arguments += _family_arguments(given, family)
     save_viz = _SWITCH.get(get("SAVE_VIZ", "").lower())
     if save_viz is None:
@@ -343,12 +324,16 @@ def describe_job(environment: Mapping[str, str], host: str) -> str:
 
 def _family_arguments(given: Mapping[str, str], family: PolicyFamily) -> list[str]:
     """Return the options of the family's own variables; `BadArgument` for a variable of another family."""
-    options = family.published.variables if family.published else {}
+    own = family.published.variables if family.published else ()
     for other in policy_families():
-        for name in other.published.variables if other.published else {}:
-            if given.get(name) and name not in options:
+        for name in other.published.variables if other.published else ():
+            if given.get(name) and name not in own:
                 raise BadArgument(f"{name} is for {other.title}, and means nothing to {family.title}; unset it.")
-    return [word for name, option in options.items() if given.get(name) for word in (option, given[name])]
+    return [word for name in own if given.get(name) for word in (_option_of(name), given[name])]
+
+
+def _option_of(variable: str) -> str:
+    return "--output" if variable == "STORE" else f"--{variable.lower().replace('_', '-')}"
 
 
 def _checkpoint(given: Mapping[str, str]) -> str:
