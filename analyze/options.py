@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.schemas.options import Numbers, add_options, number_range, task_option
+from vla_attention.schemas.options import Numbers, add_options, number_range, read_options, task_option
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.store_url import store_place
 
@@ -92,8 +92,6 @@ INSTEAD = {
 _PAGES = {".html", ".htm"}
 #: Endings of files, which no folder of results has.
 _FILES = _PAGES | {".csv", ".json", ".parquet", ".png", ".pdf", ".svg", ".txt", ".md", ".tex", ".gif", ".mp4"}
-#: Settings whose option has another name.
-_OPTION_OF = {"groups": "group"}
 
 
 def output_place(text: str) -> Path:
@@ -157,17 +155,9 @@ def add_output(parser: argparse.ArgumentParser, command: str, page: bool = False
 
 def settings_of(given: argparse.Namespace) -> AnalysisSettings:
     """The settings among the given options; those that a command does not take keep their defaults."""
-    from dataclasses import fields
-
     from vla_attention.analyze.measures.question_settings import AnalysisSettings
 
-    values: dict[str, Any] = {}
-    for field in fields(AnalysisSettings):
-        name = _OPTION_OF.get(field.name, field.name)
-        if hasattr(given, name):
-            value = getattr(given, name)
-            values[field.name] = tuple(value) if isinstance(value, list) else value
-    return AnalysisSettings(**values)
+    return read_options(AnalysisSettings, given)
 
 
 def results_folder(stores: Sequence[StorePlace], command: str, given: argparse.Namespace) -> Path:

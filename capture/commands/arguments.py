@@ -10,7 +10,7 @@ from typing import Literal
 
 from vla_attention.capture.doctor.command import DOCTOR_EXAMPLES, add_doctor_arguments
 from vla_attention.capture.effects.arguments import add_effect_options
-from vla_attention.capture.engine.recording_settings import RecordingSettings
+from vla_attention.capture.engine.settings import RecordingSettings
 from vla_attention.capture.environments.suites import ALL_SUITES, STANDARD_SUITES, SUITES, find_suite, list_tasks
 from vla_attention.capture.interventions.arguments import InterventionSettings
 from vla_attention.capture.jobs.termination import Termination
@@ -112,17 +112,19 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
 
 
 @dataclass(frozen=True)
-class ScriptSettings:
-    """What the published scripts' commands are asked besides: of the cluster, and where options come from."""
+class ClusterSettings:
+    """What the published scripts' commands are asked as jobs of a cluster."""
 
     stage: Literal["capture", "analyze", "both"] | None = option(
         "what to do (default: both; in an array job capture, as all of its tasks fill one store)",
         None,
         group="as a job of a cluster (see docs/cluster.md)",
     )
-    array_index: int | None = option("index in an array job: a task, counted through the suites of 'all'", None)
+    array_index: int | None = option(
+        "index in an array job: a task, counted through the suites of 'all'", None, least=0
+    )
     max_requeues: int = option(
-        "after SIGTERM put the SLURM job back into the queue, at most N times (default: %(default)s)", 0
+        "after SIGTERM put the SLURM job back into the queue, at most N times (default: %(default)s)", 0, least=0
     )
     from_environment: bool = option(
         "also read the variables of scripts/run_attention_ratio*.sh (CHECKPOINT, TASK_SUITE, LAYERS ...); see their "
@@ -140,7 +142,7 @@ def build_evaluate_parser(family: PolicyFamily, script: PublishedScript) -> argp
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     _add_capture_arguments(parser, family, script)
-    add_options(parser, ScriptSettings)
+    add_options(parser, ClusterSettings)
     parser.set_defaults(family=family, checkpoint=script.checkpoint, task_suite="libero_10", resume=True)
     return parser
 

@@ -10,7 +10,7 @@ from typing import Protocol as Interface
 from msgspec.structs import replace
 
 from vla_attention.capture.engine.progress import say
-from vla_attention.capture.engine.recording_settings import RecordingSettings as RecordingSettings
+from vla_attention.capture.engine.settings import RecordingSettings as RecordingSettings
 from vla_attention.capture.policies.identity import announcement
 from vla_attention.capture.store.disk_estimate import DiskEstimate, describe
 from vla_attention.schemas.errors import BadArgument, listing

@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vla_attention.capture.effects.arguments import add_effect_options
-from vla_attention.capture.engine.recording_settings import RecordingSettings
+from vla_attention.capture.engine.settings import RecordingSettings, StoreOutput
 from vla_attention.capture.interventions.arguments import InterventionSettings
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import policy_families
-from vla_attention.capture.policies.family import PolicyFamily
-from vla_attention.capture.policies.model_settings import ModelSettings
+from vla_attention.capture.policies.family import ModelSettings, PolicyFamily
 from vla_attention.capture.policies.robot import NONE
-from vla_attention.capture.store.output import StoreOutput
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.options import add_options, option
 from vla_attention.schemas.threads import use_threads

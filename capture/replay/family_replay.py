@@ -17,7 +17,7 @@ from vla_attention.capture.effects.measurement import measurement_of
 from vla_attention.capture.engine.call import Caller, PolicyCall
 from vla_attention.capture.engine.plan import plan_recording, root_attributes
 from vla_attention.capture.engine.progress import say
-from vla_attention.capture.engine.recording_settings import recording_settings
+from vla_attention.capture.engine.settings import recording_settings
 from vla_attention.capture.engine.source import Episode, EpisodeJob, Outcome, Source, episode_start
 from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.machine.provenance import describe_machine

@@ -12,7 +12,7 @@ import torch
 from msgspec import structs
 
 from vla_attention.capture.engine.progress import say
-from vla_attention.capture.engine.recording_settings import recording_settings
+from vla_attention.capture.engine.settings import recording_settings
 from vla_attention.capture.engine.source import Committed, Episode, EpisodeJob, Outcome, Source
 from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.policies.noise import noise_seed

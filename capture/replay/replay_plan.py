@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from vla_attention.capture.engine.faults import Faults
 from vla_attention.capture.engine.loop import EpisodeLoop
 from vla_attention.capture.engine.plan import announce
+from vla_attention.capture.engine.settings import StoreOutput
 from vla_attention.capture.engine.source import EpisodeJob, Source, plan_of
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Termination
@@ -24,7 +25,6 @@ from vla_attention.capture.replay.data_set_files import INDEX_COLUMNS
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, LeRobotDataset, open_dataset
 from vla_attention.capture.replay.video import import_av
 from vla_attention.capture.store.disk_estimate import estimate_disk
-from vla_attention.capture.store.output import StoreOutput
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, refuse_recorded
 from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.options import read_options

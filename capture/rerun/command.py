@@ -9,7 +9,7 @@ from vla_attention.capture.effects.conditions import refuse_both
 from vla_attention.capture.effects.mean_pictures import pictures_of
 from vla_attention.capture.engine.plan import plan_recording
 from vla_attention.capture.engine.progress import say
-from vla_attention.capture.engine.recording_settings import RecordingSettings, recording_settings
+from vla_attention.capture.engine.settings import RecordingSettings, recording_settings
 from vla_attention.capture.interventions.resolution import check_not_compiled, check_places, interventions_for
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.machine.device import load_torch

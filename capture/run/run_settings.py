@@ -7,14 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from vla_attention.capture.engine.recording_settings import RecordingSettings, recording_settings
+from vla_attention.capture.engine.settings import RecordingSettings, StoreOutput, recording_settings
 from vla_attention.capture.environments.base import Suite, check_task_id
 from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
 from vla_attention.capture.environments.suites import find_suite, list_tasks
 from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.machine.memory import memory_left
 from vla_attention.capture.policies.family import PolicyFamily
-from vla_attention.capture.store.output import StoreOutput
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.options import option, read_options, resolve_tasks, task_option

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vla_attention.capture.environments.episode_protocol import OPENPI
-from vla_attention.capture.policies.family import PolicyFamily
-from vla_attention.capture.policies.model_settings import ModelSettings, checkpoint_option
+from vla_attention.capture.policies.family import ModelSettings, PolicyFamily, checkpoint_option
 from vla_attention.schemas.options import option
 
 

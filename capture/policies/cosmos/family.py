@@ -9,8 +9,13 @@ from typing import TYPE_CHECKING, Any, Literal
 from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
 from vla_attention.capture.environments.suites import STANDARD_SUITES
 from vla_attention.capture.policies.cosmos.config import DEFAULT_CONFIG_NAME, CosmosConfig
-from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
-from vla_attention.capture.policies.model_settings import UNTRAINED_POLICIES, ModelSettings, checkpoint_option
+from vla_attention.capture.policies.family import (
+    UNTRAINED_POLICIES,
+    ModelSettings,
+    PolicyFamily,
+    PublishedScript,
+    checkpoint_option,
+)
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.options import option
 

@@ -30,9 +30,9 @@ from vla_attention.capture.policies.cosmos.t5_pickle import read_embeddings
 from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
 from vla_attention.capture.policies.cosmos.text import PieceTokenizer, PrecomputedText, T5Encoder
 from vla_attention.capture.policies.cosmos.vae import build_encoder, infer_vae_config
+from vla_attention.capture.policies.family import UNTRAINED, UNTRAINED_TINY
 from vla_attention.capture.policies.hub import downloads, hub_version
 from vla_attention.capture.policies.identity import PolicySource
-from vla_attention.capture.policies.model_settings import UNTRAINED, UNTRAINED_TINY
 from vla_attention.capture.policies.weights import DTYPES
 from vla_attention.schemas.errors import BadArgument
 

@@ -8,8 +8,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from vla_attention.capture.environments.episode_protocol import CAMERAS, LEROBOT, OPENPI
 from vla_attention.capture.environments.suites import STANDARD_SUITES
-from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
-from vla_attention.capture.policies.model_settings import UNTRAINED_POLICIES, ModelSettings, checkpoint_option
+from vla_attention.capture.policies.family import (
+    UNTRAINED_POLICIES,
+    ModelSettings,
+    PolicyFamily,
+    PublishedScript,
+    checkpoint_option,
+)
 from vla_attention.capture.policies.pi.formats import CheckpointFormat
 from vla_attention.capture.policies.robot import NONE, Robot, RobotData
 from vla_attention.schemas.jsonable import from_json

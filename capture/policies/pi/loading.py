@@ -10,9 +10,9 @@ import torch
 
 from vla_attention.capture.environments.episode_protocol import CAMERAS
 from vla_attention.capture.policies.checkpoints import UnsupportedCheckpoint
+from vla_attention.capture.policies.family import UNTRAINED, UNTRAINED_TINY
 from vla_attention.capture.policies.hub import downloads, hub_version
 from vla_attention.capture.policies.identity import PolicySource
-from vla_attention.capture.policies.model_settings import UNTRAINED, UNTRAINED_TINY
 from vla_attention.capture.policies.pi.compiled import compile_steps
 from vla_attention.capture.policies.pi.config import (
     CAMERA_SLOTS,

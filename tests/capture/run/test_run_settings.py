@@ -8,16 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from vla_attention.capture.commands.arguments import ScriptSettings
+from vla_attention.capture.commands.arguments import ClusterSettings
 from vla_attention.capture.effects.arguments import EffectSettings
-from vla_attention.capture.engine.recording_settings import RecordingSettings
+from vla_attention.capture.engine.settings import RecordingSettings, StoreOutput
 from vla_attention.capture.interventions.arguments import InterventionSettings
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.replay.arguments import ReplayOutput, ReplaySettings
 from vla_attention.capture.rerun.arguments import RerunOutput, RerunSettings
 from vla_attention.capture.run import run_settings
 from vla_attention.capture.run.run_settings import CaptureOutput, RunSettings
-from vla_attention.capture.store.output import StoreOutput
 from vla_attention.schemas.options import add_options, read_options
 
 
@@ -38,7 +37,7 @@ def test_simulators_fit_into_the_memory(left, expected, monkeypatch):
 #: Every class of settings whose options a command line takes.
 ALL_SETTINGS = [
     *(family.settings for family in policy_families()), RunSettings, CaptureOutput, RecordingSettings, EffectSettings,
-    InterventionSettings, ReplaySettings, ReplayOutput, RerunSettings, RerunOutput, ScriptSettings,
+    InterventionSettings, ReplaySettings, ReplayOutput, RerunSettings, RerunOutput, ClusterSettings,
 ]  # fmt: skip
 
 
