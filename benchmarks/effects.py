@@ -65,7 +65,7 @@ def cost_table(rounds: int, number: int, threads: int) -> Table:
 
     torch.set_num_threads(threads)
     family = default_family()
-    policy = family.build(family.settings(), "cpu")
+    policy = family.settings().build("cpu")
     store = open_store(va.example("cubes"))
     tasks = {episode.attributes.task_id: episode.attributes for episode in store.episodes}
     instructions = {number: task.instruction for number, task in tasks.items()}

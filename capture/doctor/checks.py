@@ -153,7 +153,7 @@ def find_checkpoint(arguments: argparse.Namespace) -> Finding:
     name, path = arguments.checkpoint, Path(arguments.checkpoint).expanduser()
 
     def files() -> str:
-        arguments.family.check_files(arguments.family.read(arguments))
+        arguments.family.read(arguments).check_files()
         if name in arguments.family.built_in:
             return f"{name} comes with the program."
         found = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]

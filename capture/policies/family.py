@@ -7,7 +7,7 @@ does so: torch and the model's code are imported inside `build`.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -43,6 +43,22 @@ class ModelSettings:
         "processor threads of the policy (default: OMP_NUM_THREADS, else the cores that this process may use)", None
     )
 
+    def build(self, device: str) -> Policy:
+        """Load the policy onto a device of torch."""
+        raise NotImplementedError
+
+    def check_files(self) -> None:
+        """Raise what `build` would where a local checkpoint lacks files; loads nothing. Here nothing is known."""
+
+    def analysis_arguments(self) -> list[str]:
+        """Return further arguments of an analysis that follows the capture."""
+        return []
+
+    @staticmethod
+    def of_store(identity: PolicyIdentity) -> dict[str, Any]:
+        """Return the settings with which `build` makes the policy of a store again; the others have their defaults."""
+        return {"checkpoint": identity.checkpoint}
+
 
 @dataclass(frozen=True)
 class PublishedScript:
@@ -58,20 +74,6 @@ class PublishedScript:
     variables: tuple[str, ...] = ()
 
 
-def no_arguments(settings: ModelSettings) -> list[str]:
-    """Return no arguments: the analysis keeps its own defaults."""
-    return []
-
-
-def no_files_to_check(settings: ModelSettings) -> None:
-    """Do nothing: only loading tells whether a checkpoint is whole."""
-
-
-def stored_checkpoint(identity: PolicyIdentity) -> dict[str, Any]:
-    """Return the path of the checkpoint: the family's other options have their defaults."""
-    return {"checkpoint": identity.checkpoint}
-
-
 @dataclass(frozen=True)
 class PolicyFamily:
     """One policy family on the command line."""
@@ -84,10 +86,8 @@ class PolicyFamily:
     description: str
     #: lines of examples for the help text, each ending with a newline
     examples: str
-    #: What is asked of the model. The other functions take an object of this class.
+    #: what is asked of the model, and what builds it
     settings: type[ModelSettings]
-    #: (settings, device) -> the policy
-    build: Callable[[Any, str], Policy]
     #: First part of the names of stores and results folders. Two families on one suite need different ones.
     store_prefix: str
     #: the default of `--replan-steps`, for its help text
@@ -102,8 +102,6 @@ class PolicyFamily:
     built_in: tuple[str, ...] = ()
     #: the default of `--task-suite`: the one that the default checkpoint is for
     default_suite: str = "robosuite"
-    #: settings -> further arguments of an analysis that follows the capture
-    analysis_arguments: Callable[[Any], list[str]] = no_arguments
     published: PublishedScript | None = None
     #: The suites that checkpoints were trained on and evaluated in, by the names that `--checkpoint` takes.
     trained_on: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -111,10 +109,6 @@ class PolicyFamily:
     reads_data_sets: bool = False
     #: The kinds of its policies, as stores name them (`PolicyIdentity.family`); empty for the family's name alone.
     kinds: tuple[str, ...] = ()
-    #: The identity in a store -> the settings with which `build` makes this policy again.
-    rebuild: Callable[[PolicyIdentity], dict[str, Any]] = stored_checkpoint
-    #: Settings -> None; raises what `build` would where a local checkpoint lacks files. Loads nothing.
-    check_files: Callable[[Any], None] = no_files_to_check
 
     def read(self, given: argparse.Namespace) -> ModelSettings:
         """Return the settings of the model that parsed arguments say."""

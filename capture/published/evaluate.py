@@ -198,7 +198,7 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], threads: Threa
 
     say(threads.describe())
     device = load_torch(arguments.device, threads.number)
-    policy = arguments.family.build(arguments.family.read(arguments), device)
+    policy = arguments.family.read(arguments).build(device)
     # A layer that does not exist is an error before the capture, not after it.
     select_layers(arguments.layers, policy.num_layers, policy.family)
     missing = []

@@ -120,7 +120,7 @@ def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: 
     """Build the policy for the robot of the data set, and record its calls; returns the number of new episodes."""
     family: PolicyFamily = arguments.family
     arguments.robot_data = plan.robot_data
-    policy = cast(RobotPolicy, family.build(family.read(arguments), device))
+    policy = cast(RobotPolicy, family.read(arguments).build(device))
     robot = policy.robot
     plan.data.check_files(plan.wanted, tuple(robot.cameras.values()))
     settings = recording_settings(arguments)

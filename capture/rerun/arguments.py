@@ -75,7 +75,7 @@ def add_rerun_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -
         _refuse_own_loop(root)
         family = _family_of(root)
         add_options(parser, family.settings)
-        parser.set_defaults(**family.rebuild(root.policy), family=family)
+        parser.set_defaults(**family.settings.of_store(root.policy), family=family)
     add_options(parser, InterventionSettings)
     add_options(parser, RerunSettings)
     add_options(parser, RecordingSettings, defaults="as in the store")

@@ -125,7 +125,7 @@ def _prepare(
     say(threads.describe())
     device = load_torch(arguments.device, threads.number)
     family: PolicyFamily = arguments.family
-    policy = family.build(family.read(arguments), device)
+    policy = family.read(arguments).build(device)
     identity = policy.identity()
     check_same_policy(base, identity, policy.sites)
     check_has_inputs(base, policy)

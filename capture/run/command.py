@@ -40,7 +40,7 @@ def run_capture_of_family(arguments: argparse.Namespace, termination: Terminatio
     say(threads.describe())
     device = load_torch(arguments.device, threads.number)
     family: PolicyFamily = arguments.family
-    policy = family.build(family.read(arguments), device)
+    policy = family.read(arguments).build(device)
     run_capture(settings, policy, device, termination)
     if arguments.output_dir is None and not arguments.save_viz:
         say(f"Next: vla-attention analyze {settings.store}")
@@ -61,7 +61,7 @@ def run_analysis(arguments: argparse.Namespace, store: Path, output: Path | None
         command += ["--output", str(output)]
     if arguments.save_viz:
         command += ["--save-viz"]
-    process = subprocess.Popen([*command, *family.analysis_arguments(family.read(arguments)), *more])
+    process = subprocess.Popen([*command, *family.read(arguments).analysis_arguments(), *more])
     try:
         return process.wait()
     except KeyboardInterrupt:

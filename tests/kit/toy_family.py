@@ -15,9 +15,11 @@ class ToySettings(ModelSettings):
     checkpoint: str = checkpoint_option("weights", "toy-weights")
     toy_size: int = option("actions of a chunk", 4)
 
+    def build(self, device: str) -> Any:
+        return make_toy_policy(self.checkpoint, self.toy_size)
 
-def _build(settings: ToySettings, device: str) -> Any:
-    return make_toy_policy(settings.checkpoint, settings.toy_size)
+    def analysis_arguments(self) -> list[str]:
+        return ["--group", "seen=camera:view", "--group", "read=role:instruction", "--ratio", "seen/read"]
 
 
 def make_toy_policy(checkpoint: str, size: int) -> Any:
@@ -90,18 +92,12 @@ def make_toy_policy(checkpoint: str, size: int) -> Any:
     return ToyPolicy()
 
 
-def _analysis_arguments(settings: ToySettings) -> list[str]:
-    return ["--group", "seen=camera:view", "--group", "read=role:instruction", "--ratio", "seen/read"]
-
-
 FAMILY = PolicyFamily(
     name="toy",
     title="Toy Policy",
     description="Record a toy policy.",
     examples="  vla-capture toy\n",
     settings=ToySettings,
-    build=_build,
     store_prefix="toy_",
     replan_default="2",
-    analysis_arguments=_analysis_arguments,
 )

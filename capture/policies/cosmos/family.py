@@ -94,66 +94,66 @@ class CosmosSettings(ModelSettings):
         """Return how many actions of a chunk are executed; by default all of them."""
         return config.chunk_size if self.num_open_loop_steps is None else self.num_open_loop_steps
 
+    def build(self, device: str) -> CosmosPolicy:
+        """Load the policy; see `build_cosmos_policy`."""
+        from vla_attention.capture.policies.cosmos.loading import build_cosmos_policy
 
-def _build(settings: CosmosSettings, device: str) -> CosmosPolicy:
-    from vla_attention.capture.policies.cosmos.loading import build_cosmos_policy
+        if self.compile:
+            raise BadArgument("Cannot use --compile with a Cosmos policy: so far only pi models have it; leave it out.")
+        return build_cosmos_policy(self, device)
 
-    if settings.compile:
-        raise BadArgument("Cannot use --compile with a Cosmos policy: so far only pi models have it; leave it out.")
-    return build_cosmos_policy(settings, device)
+    def analysis_arguments(self) -> list[str]:
+        """Return the published scripts' proxy: the mass of one latent frame over that of another, of self-attention.
 
+        The groups carry the frames' names, because the denominator's default frame is a blank picture without language.
+        """
+        above, below = self.visual_frame, self.text_frame
+        groups = ["--group", f"{above}=frame:{above}", "--group", f"{below}=frame:{below}"]
+        return ["--site", "self", *groups, "--ratio", f"{above}/{below}", "--denoise", self.prefer_call]
 
-def _analysis_arguments(settings: CosmosSettings) -> list[str]:
-    """Return the published scripts' proxy: the mass of one latent frame over that of another, of self-attention.
+    @staticmethod
+    def of_store(identity: PolicyIdentity) -> dict[str, Any]:
+        """Return the settings with which `build` makes the policy of a store again."""
+        facts = {
+            "query_frame": identity.config["query_frame"],
+            "num_denoising_steps_action": identity.config["config"]["sampler"]["num_steps"],
+            "chunk_size": identity.action_horizon,
+        }
+        if identity.checkpoint_format == "seeded":
+            return {"checkpoint": identity.name, **facts}
+        return {
+            "checkpoint": identity.checkpoint,
+            "config_name": identity.config["configuration"],
+            "dtype": identity.config["dtype"],
+            **facts,
+        }
 
-    The groups carry the frames' names, because the denominator's default frame is a blank picture without language.
-    """
-    above, below = settings.visual_frame, settings.text_frame
-    groups = ["--group", f"{above}=frame:{above}", "--group", f"{below}=frame:{below}"]
-    return ["--site", "self", *groups, "--ratio", f"{above}/{below}", "--denoise", settings.prefer_call]
+    def check_files(self) -> None:
+        """Raise what `build` would where a local checkpoint lacks files; loads nothing."""
+        from pathlib import Path
 
+        from vla_attention.capture.policies.cosmos.locate import (
+            EMBEDDINGS_NAME,
+            STATISTICS_NAME,
+            find_beside,
+            find_checkpoint,
+            find_vae,
+            find_weights,
+        )
+        from vla_attention.capture.policies.cosmos.preprocess import read_statistics
+        from vla_attention.capture.policies.cosmos.t5_pickle import read_embeddings
+        from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
+        from vla_attention.capture.policies.hub import split_hub_name
 
-def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
-    facts = {
-        "query_frame": identity.config["query_frame"],
-        "num_denoising_steps_action": identity.config["config"]["sampler"]["num_steps"],
-        "chunk_size": identity.action_horizon,
-    }
-    if identity.checkpoint_format == "seeded":
-        return {"checkpoint": identity.name, **facts}
-    return {
-        "checkpoint": identity.checkpoint,
-        "config_name": identity.config["configuration"],
-        "dtype": identity.config["dtype"],
-        **facts,
-    }
-
-
-def _check_files(settings: CosmosSettings) -> None:
-    from pathlib import Path
-
-    from vla_attention.capture.policies.cosmos.locate import (
-        EMBEDDINGS_NAME,
-        STATISTICS_NAME,
-        find_beside,
-        find_checkpoint,
-        find_vae,
-        find_weights,
-    )
-    from vla_attention.capture.policies.cosmos.preprocess import read_statistics
-    from vla_attention.capture.policies.cosmos.t5_pickle import read_embeddings
-    from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
-    from vla_attention.capture.policies.hub import split_hub_name
-
-    name = settings.checkpoint
-    on_hub = split_hub_name(name) is not None and not Path(name).expanduser().exists()
-    if name not in UNTRAINED_POLICIES and not on_hub:
-        folder = find_checkpoint(name)
-        weights = find_weights(folder)
-        read_statistics(find_beside(folder, settings.dataset_stats_path, STATISTICS_NAME))
-        read_embeddings(find_beside(folder, settings.t5_text_embeddings_path, EMBEDDINGS_NAME))
-        for file in (weights, find_vae(folder, settings.vae_path)):
-            read_tensors(file)  # mapped into memory: the numbers are not read
+        name = self.checkpoint
+        on_hub = split_hub_name(name) is not None and not Path(name).expanduser().exists()
+        if name not in UNTRAINED_POLICIES and not on_hub:
+            folder = find_checkpoint(name)
+            weights = find_weights(folder)
+            read_statistics(find_beside(folder, self.dataset_stats_path, STATISTICS_NAME))
+            read_embeddings(find_beside(folder, self.t5_text_embeddings_path, EMBEDDINGS_NAME))
+            for file in (weights, find_vae(folder, self.vae_path)):
+                read_tensors(file)  # mapped into memory: the numbers are not read
 
 
 FAMILY = PolicyFamily(
@@ -162,13 +162,11 @@ FAMILY = PolicyFamily(
     description="Record a Cosmos Policy: self-attention over latent frames, cross-attention over text.",
     examples=_EXAMPLES,
     settings=CosmosSettings,
-    build=_build,
     store_prefix="cosmos_",
     replan_default="--num-open-loop-steps",
     protocols=(COSMOS,),
     seed_of="seed of the noise; the simulator's is 0, as published",
     built_in=UNTRAINED_POLICIES,
-    analysis_arguments=_analysis_arguments,
     published=PublishedScript(
         program="evaluate-attention-ratio-cosmos",
         checkpoint=CHECKPOINT,
@@ -176,6 +174,4 @@ FAMILY = PolicyFamily(
         variables=("QUERY_FRAME", "VISUAL_FRAME", "TEXT_FRAME"),
     ),
     trained_on={CHECKPOINT: STANDARD_SUITES},
-    rebuild=_rebuild,
-    check_files=_check_files,
 )

@@ -92,41 +92,42 @@ class PiSettings(ModelSettings):
         given = {"model_config": self.model_config, "norm_stats": self.norm_stats, "asset_id": self.asset_id}
         return {name: str(value) for name, value in given.items() if value is not None}
 
+    def build(self, device: str) -> PiPolicy:
+        """Load the policy; see `build_pi_policy`."""
+        from vla_attention.capture.policies.pi.loading import build_pi_policy
 
-def _build(settings: PiSettings, device: str) -> PiPolicy:
-    from vla_attention.capture.policies.pi.loading import build_pi_policy
+        return build_pi_policy(self, device)
 
-    return build_pi_policy(settings, device)
+    def check_files(self) -> None:
+        """See `check_pi_files`."""
+        from vla_attention.capture.policies.pi.loading import check_pi_files
 
+        check_pi_files(self)
 
-def _check_files(settings: PiSettings) -> None:
-    from vla_attention.capture.policies.pi.loading import check_pi_files
-
-    check_pi_files(settings)
-
-
-def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
-    facts = identity.config
-    if "robot" in facts:
-        same: dict[str, Any] = {"robot": from_json(Robot, facts["robot"])}
-    else:
-        sources = {camera.name: camera.source for camera in identity.cameras}
-        slots = facts.get("config", {}).get("cameras", ())
-        same = {"camera": [f"{name}={sources.get(name, NONE)}" for name in slots]}
-    same |= {name: Path(facts[name]) for name in ("model_config", "norm_stats") if name in facts}
-    same |= {name: facts[name] for name in ("asset_id",) if name in facts}
-    if "denoise_steps" in facts:
-        same["compile"] = True
-    if identity.checkpoint_format == "seeded":
-        return {"checkpoint": identity.name, **same}
-    settings = {"checkpoint": identity.checkpoint, "dtype": identity.config["dtype"], **same}
-    if identity.checkpoint_format in ("openpi_torch", "openpi_jax", "lerobot"):
-        settings["checkpoint_format"] = identity.checkpoint_format
-    if identity.checkpoint_format.startswith("openpi"):
-        settings["discrete_state_input"] = identity.config["config"].get("discrete_state_input", False)
-    if "config_name" in identity.config:
-        settings["config_name"] = identity.config["config_name"]
-    return settings
+    @staticmethod
+    def of_store(identity: PolicyIdentity) -> dict[str, Any]:
+        """Return the settings with which `build` makes the policy of a store again."""
+        facts = identity.config
+        if "robot" in facts:
+            same: dict[str, Any] = {"robot": from_json(Robot, facts["robot"])}
+        else:
+            sources = {camera.name: camera.source for camera in identity.cameras}
+            slots = facts.get("config", {}).get("cameras", ())
+            same = {"camera": [f"{name}={sources.get(name, NONE)}" for name in slots]}
+        same |= {name: Path(facts[name]) for name in ("model_config", "norm_stats") if name in facts}
+        same |= {name: facts[name] for name in ("asset_id",) if name in facts}
+        if "denoise_steps" in facts:
+            same["compile"] = True
+        if identity.checkpoint_format == "seeded":
+            return {"checkpoint": identity.name, **same}
+        settings = {"checkpoint": identity.checkpoint, "dtype": identity.config["dtype"], **same}
+        if identity.checkpoint_format in ("openpi_torch", "openpi_jax", "lerobot"):
+            settings["checkpoint_format"] = identity.checkpoint_format
+        if identity.checkpoint_format.startswith("openpi"):
+            settings["discrete_state_input"] = identity.config["config"].get("discrete_state_input", False)
+        if "config_name" in identity.config:
+            settings["config_name"] = identity.config["config_name"]
+        return settings
 
 
 FAMILY = PolicyFamily(
@@ -135,7 +136,6 @@ FAMILY = PolicyFamily(
     description="Record a pi0 or pi0.5 policy.",
     examples=_EXAMPLES,
     settings=PiSettings,
-    build=_build,
     store_prefix="",
     replan_default="5 for openpi, n_action_steps for LeRobot",
     protocols=(OPENPI, LEROBOT),
@@ -151,6 +151,4 @@ FAMILY = PolicyFamily(
     trained_on={CUBES_POLICY: ("cubes",)} | dict.fromkeys(_OF_LIBERO, STANDARD_SUITES),
     kinds=("pi0", "pi05"),
     reads_data_sets=True,
-    rebuild=_rebuild,
-    check_files=_check_files,
 )
