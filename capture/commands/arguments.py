@@ -44,7 +44,6 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
         prog=program,
         description="Run a policy in simulation and record the attention rows of its action queries.",
         epilog=f"examples:\n{examples}{_FURTHER_EXAMPLES}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = parser.add_subparsers(required=True, metavar="POLICY", parser_class=OneSentenceParser)
     for family in families:
@@ -53,7 +52,6 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
             help=family.title,
             description=family.description,
             epilog=f"examples:\n{family.examples}{_FURTHER_EXAMPLES}",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         _add_capture_arguments(capture, family)
         capture.set_defaults(command=run_capture_of_family, family=family)
@@ -64,7 +62,6 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
         "simulator, and record its attention into a store like any other, beside the actions that the data set has. "
         "See docs/data-sets.md.",
         epilog=f"examples:\n{REPLAY_EXAMPLES}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_replay_arguments(replay, given if "replay" in given[:1] else ())
     rerun = commands.add_parser(
@@ -74,7 +71,6 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
         "First the calls of one episode are made again unchanged, and their distance from the stored ones is printed. "
         "With interventions, or with --output, the calls of all episodes go into a store like any other.",
         epilog=f"examples:\n{RERUN_EXAMPLES}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_rerun_arguments(rerun, given if "rerun" in given[:1] else ())
     status = commands.add_parser(
@@ -92,7 +88,6 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
         "and assets, drawing, disk, GPU, checkpoint, each with what to do. Loads no policy and runs no simulator. Exit "
         "code 1 when something is missing.",
         epilog=f"examples:\n{DOCTOR_EXAMPLES}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_doctor_arguments(doctor, given[1:] if "doctor" in given[:1] else (), _add_capture_arguments)
     verify = commands.add_parser(
@@ -100,7 +95,6 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
         help="read stores back and check every file, digest and row sum",
         description=verify_command.DESCRIPTION,
         epilog=verify_command.EXAMPLES.replace("NAME", "vla-attention capture"),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     verify_command.add_verify_arguments(verify)
     verify.set_defaults(command=_run_verify)
@@ -139,7 +133,6 @@ def build_evaluate_parser(family: PolicyFamily, script: PublishedScript) -> argp
         prog=script.program,
         description=f"{family.description} Then analyse, with the arguments of the published script. All layers are "
         "recorded, so that other --layers need no second capture; an existing store is continued with what is missing.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     _add_capture_arguments(parser, family, script)
     add_options(parser, ClusterSettings)

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Literal
 from vla_attention.capture.effects.arguments import EffectSettings, effect_settings
 from vla_attention.schemas.options import option, read_options
 from vla_attention.schemas.precision import DEFAULT_MANTISSA_BITS, parse_precision
-from vla_attention.schemas.stores.store_place import check_place
 
 if TYPE_CHECKING:
     from vla_attention.capture.store.store_writer import WriteMode
@@ -80,6 +79,8 @@ class StoreOutput:
 
     def place(self, name: str) -> Path:
         """Return the path of the store: as given, else that name in the folder, or in `runs`."""
+        from vla_attention.schemas.stores.store_place import check_place
+
         store = self.store or (self.output_dir or Path("runs")) / f"{name}.zarr"
         check_place(store, "write a store at")
         return store

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.kit.lazy_imports import help_without_libraries
 from vla_attention.capture.commands.arguments import ClusterSettings
 from vla_attention.capture.effects.arguments import EffectSettings
 from vla_attention.capture.engine.settings import RecordingSettings, StoreOutput
@@ -57,3 +58,8 @@ def test_an_output_is_a_store_or_a_folder():
         output = read_options(StoreOutput, made.parse_args(["--output", "runs/a.zarr", name, "results"]))
         assert output == StoreOutput(Path("runs/a.zarr"), Path("results"))
     assert StoreOutput(output_dir=Path("results")).place("mine") == Path("results/mine.zarr")
+
+
+@pytest.mark.parametrize("command", ["pi", "replay", "rerun"])
+def test_help_imports_no_library(command):
+    assert help_without_libraries("vla_attention.capture", [command, "--help-all"]).startswith("usage:")
