@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import cast, get_args
 
 from vla_attention.schemas.effects import EffectItems, EffectReaders
@@ -71,8 +71,10 @@ def effect_settings(given: argparse.Namespace) -> EffectSettings | None:
     settings = read_options(EffectSettings, given, items=() if words == "none" else _items(words))
     if settings.items:
         return settings
-    if settings != EffectSettings(()):
-        raise BadArgument("Options --effects-... have no effect without --effects; add for instance --effects text.")
+    for one in fields(EffectSettings):
+        if one.name != "items" and getattr(settings, one.name) != one.default:
+            name = one.metadata["name"]
+            raise BadArgument(f"Cannot use --{name} without --effects; add for instance --effects text.")
     return None
 
 

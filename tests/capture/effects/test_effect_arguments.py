@@ -32,7 +32,7 @@ def test_items_and_readers_are_in_a_fixed_order():
     ("words", "sentence"),
     [
         (["--effects", "word"], "no item 'word'; expected text, cameras, objects, tokens"),
-        (["--effects-readers", "all", "text"], "without --effects"),
+        (["--effects-readers", "all", "text"], "--effects-readers without --effects"),
     ],
 )
 def test_what_is_refused(words, sentence):
