@@ -130,7 +130,8 @@ def _refuse_idle(given: InterventionSettings, knocks_out: bool, changes_attentio
     needs = {"random_keys": keys, "knockout_weight": keys, "allow_empty": pictures}
     needs |= dict.fromkeys(("knockout_queries", "knockout_layers", "knockout_heads", "knockout_steps"), attention)
     for name, (used, what) in needs.items():
-        if getattr(given, name) not in (None, False) and not used:
+        value = getattr(given, name)
+        if not used and value is not None and value is not False:  # 0 was given, too
             raise BadArgument(f"--{name.replace('_', '-')} has nothing to act on; give {what} too.")
 
 

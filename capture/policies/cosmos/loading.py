@@ -37,24 +37,24 @@ from vla_attention.capture.policies.weights import DTYPES
 from vla_attention.schemas.errors import BadArgument
 
 
-def load_cosmos_policy(options: CosmosSettings, device: str | torch.device = "cpu") -> CosmosPolicy:
+def load_cosmos_policy(settings: CosmosSettings, device: str | torch.device = "cpu") -> CosmosPolicy:
     """Load a policy from a folder, a file of weights with the rest beside it, or a name on the Hugging Face hub.
 
     Sizes of the networks come from their tensors; frames, noise levels and picture size from the named configuration.
     """
-    checkpoint = options.checkpoint
-    base = options.apply(find_config(options.config_name))  # wrong options are reported before any download
-    base.frames.index(options.query_frame)
+    checkpoint = settings.checkpoint
+    base = settings.apply(find_config(settings.config_name))  # wrong options are reported before any download
+    base.frames.index(settings.query_frame)
     place = find_checkpoint(checkpoint)
     # Small files first: if one is missing, the minutes for loading the weights are saved.
     weights_path = find_weights(place)
-    statistics_path = find_beside(place, options.dataset_stats_path, STATISTICS_NAME)
+    statistics_path = find_beside(place, settings.dataset_stats_path, STATISTICS_NAME)
     statistics = read_statistics(statistics_path, base.action_dim, base.proprio_dim)
-    embeddings_path = find_beside(place, options.t5_text_embeddings_path, EMBEDDINGS_NAME)
+    embeddings_path = find_beside(place, settings.t5_text_embeddings_path, EMBEDDINGS_NAME)
     embeddings = read_embeddings(embeddings_path)
-    encoder = T5Encoder(options.t5_encoder) if options.t5_encoder is not None else None
+    encoder = T5Encoder(settings.t5_encoder) if settings.t5_encoder is not None else None
     # The folder of an encoder also has the tokenizer.
-    tokenizer_path = find_t5_tokenizer(place, options.t5_tokenizer or options.t5_encoder)
+    tokenizer_path = find_t5_tokenizer(place, settings.t5_tokenizer or settings.t5_encoder)
     if tokenizer_path is None:
         print(
             "T5's tokenizer (spiece.model) was not found: the text's positions are recorded, but not the word of each; "
@@ -63,8 +63,8 @@ def load_cosmos_policy(options: CosmosSettings, device: str | torch.device = "cp
             flush=True,
         )
     from_hub = not Path(checkpoint).expanduser().exists()
-    vae_path = find_vae(place, options.vae_path, from_hub=from_hub)
-    dtype = DTYPES[options.dtype or ("bfloat16" if torch.device(device).type == "cuda" else "float32")]
+    vae_path = find_vae(place, settings.vae_path, from_hub=from_hub)
+    dtype = DTYPES[settings.dtype or ("bfloat16" if torch.device(device).type == "cuda" else "float32")]
 
     weights = dit_tensors(read_tensors(weights_path))
     vae_state = read_tensors(vae_path)
@@ -92,7 +92,7 @@ def load_cosmos_policy(options: CosmosSettings, device: str | torch.device = "cp
         checkpoint=str(version or checkpoint),
         checkpoint_format=weights_path.suffix.removeprefix("."),
         untrained=False,
-        configuration=options.config_name,
+        configuration=settings.config_name,
         downloads=downloads(weights_path, vae_path, statistics_path, embeddings_path, tokenizer_path),
     )
     tokenizer = PieceTokenizer(tokenizer_path) if tokenizer_path is not None else None
@@ -101,8 +101,8 @@ def load_cosmos_policy(options: CosmosSettings, device: str | torch.device = "cp
         PrecomputedText(embeddings, tokenizer, encoder),
         statistics,
         source,
-        open_loop_steps=options.open_loop_steps(config),
-        query_frame=options.query_frame,
+        open_loop_steps=settings.open_loop_steps(config),
+        query_frame=settings.query_frame,
     )
 
 
@@ -139,26 +139,26 @@ def build_cosmos_policy(settings: CosmosSettings, device: str) -> CosmosPolicy:
     return policy
 
 
-def _untrained(options: CosmosSettings, device: str) -> CosmosPolicy:
-    name = options.checkpoint
+def _untrained(settings: CosmosSettings, device: str) -> CosmosPolicy:
+    name = settings.checkpoint
     files = (
-        options.dataset_stats_path,
-        options.t5_text_embeddings_path,
-        options.vae_path,
-        options.t5_tokenizer,
-        options.t5_encoder,
+        settings.dataset_stats_path,
+        settings.t5_text_embeddings_path,
+        settings.vae_path,
+        settings.t5_tokenizer,
+        settings.t5_encoder,
     )
-    if any(files) or options.dtype == "bfloat16" or options.config_name != DEFAULT_CONFIG_NAME:
+    if any(files) or settings.dtype == "bfloat16" or settings.config_name != DEFAULT_CONFIG_NAME:
         raise BadArgument(
             f"The policy '{name}' comes with the program, in float32; --config-name, --dataset-stats-path, "
             "--t5-text-embeddings-path, --t5-tokenizer, --t5-encoder, --vae-path and --dtype bfloat16 are for "
             "checkpoints."
         )
-    config = options.apply(_UNTRAINED[name])
+    config = settings.apply(_UNTRAINED[name])
     return random_policy(
         name,
         config,
         device=device,
-        open_loop_steps=options.open_loop_steps(config),
-        query_frame=options.query_frame,
+        open_loop_steps=settings.open_loop_steps(config),
+        query_frame=settings.query_frame,
     )

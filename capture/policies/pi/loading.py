@@ -88,22 +88,22 @@ def load_pi_policy(
     settings: of which `checkpoint` and `device` are not used. config: the model's configuration, for library callers;
     the command line names one in `settings`.
     """
-    folder, options = Path(checkpoint), settings or PiSettings()
-    data, robot = options.robot_data, options.robot
-    chosen_cameras = {} if data is not None else read_camera_choices(options.camera, CAMERAS)
-    given_dtype = None if options.dtype is None else DTYPES[options.dtype]
-    detected = detect_format(folder, options.checkpoint_format)
+    folder, settings = Path(checkpoint), settings or PiSettings()
+    data, robot = settings.robot_data, settings.robot
+    chosen_cameras = {} if data is not None else read_camera_choices(settings.camera, CAMERAS)
+    given_dtype = None if settings.dtype is None else DTYPES[settings.dtype]
+    detected = detect_format(folder, settings.checkpoint_format)
     if config is not None:
         chosen = ChosenConfig(config, "given")
     else:
-        chosen = choose_config(folder, detected, options, of_data_set=bool(data or robot))
+        chosen = choose_config(folder, detected, settings, of_data_set=bool(data or robot))
         config = chosen.config
-    norm_stats = None if detected == "lerobot" else read_norm_stats(folder, options.norm_stats, options.asset_id)
+    norm_stats = None if detected == "lerobot" else read_norm_stats(folder, settings.norm_stats, settings.asset_id)
     if data is not None and norm_stats is None:
         robot = lerobot_robot(folder, data)
     elif data is not None:
         robot = openpi_robot(data, norm_stats, RELATIVE_ACTIONS if chosen.name in _OF_RELATIVE_ACTIONS else 0)
-    if options.discrete_state_input and config is not None:
+    if settings.discrete_state_input and config is not None:
         _check_state_input(config)
     # Small files first: if the tokenizer is missing, the minutes for loading the weights are saved.
     prompt_tokenizer = PromptTokenizer(tokenizer)
@@ -124,7 +124,7 @@ def load_pi_policy(
             cameras = simulator_cameras(slots, CAMERA_OF_SLOT, chosen_cameras)
         dtype = given_dtype or torch.float32
         model, _ = load_pi_model(folder, checkpoint_format=detected, config=config, dtype=dtype, device=device)
-        if options.discrete_state_input:
+        if settings.discrete_state_input:
             _check_state_input(model.config)
             model.config = dataclasses.replace(model.config, discrete_state_input=True)
         pi05 = model.config.pi05
@@ -146,7 +146,7 @@ def load_pi_policy(
         untrained=False,
         configuration=chosen.source,
         config_name=chosen.name if chosen.stated else "",
-        options=options.stored(),
+        options=settings.stored(),
     )
     return PiPolicy(model, prompt_tokenizer, processing, source)
 
@@ -175,41 +175,41 @@ class ChosenConfig:
 
 
 def choose_config(
-    folder: Path, found: CheckpointFormat, options: PiSettings, *, of_data_set: bool = False
+    folder: Path, found: CheckpointFormat, settings: PiSettings, *, of_data_set: bool = False
 ) -> ChosenConfig:
-    """Return the configuration of the options, of a case.json beside the checkpoint, or that the checkpoint implies.
+    """Return the configuration of the settings, of a case.json beside the checkpoint, or that the checkpoint implies.
 
     of_data_set: the policy is for the robot of a data set, which the name of the checkpoint's statistics may tell.
 
     Raises:
-        BadArgument: options contradict each other or the format.
+        BadArgument: settings contradict each other or the format.
         UnsupportedCheckpoint: nothing states the configuration.
     """
-    if options.config_name is not None and options.model_config is not None:
+    if settings.config_name is not None and settings.model_config is not None:
         raise BadArgument("Give --config-name or --model-config, not both.")
-    if found == "lerobot" and (options.config_name is not None or options.discrete_state_input):
+    if found == "lerobot" and (settings.config_name is not None or settings.discrete_state_input):
         raise BadArgument(
             "A LeRobot checkpoint states its configuration in config.json; leave --config-name and "
             "--discrete-state-input out."
         )
-    if options.norm_stats is not None and options.asset_id is not None:
+    if settings.norm_stats is not None and settings.asset_id is not None:
         raise BadArgument("Give --norm-stats or --asset-id, not both.")
-    if found == "lerobot" and (options.norm_stats is not None or options.asset_id is not None):
+    if found == "lerobot" and (settings.norm_stats is not None or settings.asset_id is not None):
         raise BadArgument(
             "A LeRobot checkpoint has its statistics in its saved pipelines (policy_preprocessor.json); leave "
             "--norm-stats and --asset-id out."
         )
-    if options.config_name is not None:
-        return ChosenConfig.named(options.config_name, stated=True)
-    if options.model_config is not None:
-        path = options.model_config.expanduser()
+    if settings.config_name is not None:
+        return ChosenConfig.named(settings.config_name, stated=True)
+    if settings.model_config is not None:
+        path = settings.model_config.expanduser()
         return ChosenConfig(read_config(path), str(path))
     beside = folder.absolute().parent / CASE_FILE
     if beside.is_file():
         return ChosenConfig(read_config(beside), f"{CASE_FILE} beside the checkpoint")
     if found == "openpi_torch" and states_sizes(folder / CONFIG_FILE):
         return ChosenConfig(read_config(folder / CONFIG_FILE), CONFIG_FILE)
-    if of_data_set and found != "lerobot" and (options.asset_id or asset_name(folder)) == DROID_ASSET:
+    if of_data_set and found != "lerobot" and (settings.asset_id or asset_name(folder)) == DROID_ASSET:
         name = _droid_config_name(folder, found)
         return ChosenConfig.named(name, f" (its statistics are those of '{DROID_ASSET}')")
     if found == "openpi_jax":

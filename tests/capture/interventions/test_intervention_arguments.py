@@ -97,7 +97,7 @@ def test_noise():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--random-keys", "3"], "--random-keys has nothing to act on; give --knockout or --keep too"),
+        (["--random-keys", "0"], "--random-keys has nothing to act on; give --knockout or --keep too"),
         (["--allow-empty"], "--allow-empty has nothing to act on"),
         (["--prompt", "task:²"], "'task:²'"),
     ],
