@@ -17,7 +17,7 @@ from vla_attention.analyze.options import (
     settings_of,
 )
 from vla_attention.analyze.registry import COMMANDS, Command
-from vla_attention.schemas.command_line import OneSentenceParser, command_parser
+from vla_attention.schemas.command_line import OneSentenceParser
 from vla_attention.schemas.stores.store_url import store_place
 
 if TYPE_CHECKING:
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 def question_parser(name: str) -> OneSentenceParser:
     """The parser of a question, made from its line in the registry."""
     command = COMMANDS[name]
-    examples = "\n".join(["examples:", *(f"  vla-attention {line}" for line in command.examples)])
+    examples = "".join(f"  vla-attention {line}\n" for line in command.examples)
     answers = f"{command.answers[0].upper()}{command.answers[1:]}."
-    parser = command_parser(f"vla-attention {name}", answers, f"{examples}\n" if command.examples else "")
+    parser = OneSentenceParser(prog=f"vla-attention {name}", description=answers, epilog=f"examples:\n{examples}")
     if command.runs:
         runs = "STORE, or NAME=STORE[,STORE ...] for a run of several stores; two or more"
         parser.add_argument("runs", nargs="+", metavar="RUN", help=runs)

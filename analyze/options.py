@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import hashlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.schemas.options import Numbers, add_task, number_range
+from vla_attention.schemas.options import Numbers, add_options, number_range, read_options, task_option
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.store_url import store_place
 
@@ -91,8 +92,6 @@ INSTEAD = {
 _PAGES = {".html", ".htm"}
 #: Endings of files, which no folder of results has.
 _FILES = _PAGES | {".csv", ".json", ".parquet", ".png", ".pdf", ".svg", ".txt", ".md", ".tex", ".gif", ".mp4"}
-#: Settings whose option has another name.
-_OPTION_OF = {"groups": "group"}
 
 
 def output_place(text: str) -> Path:
@@ -122,9 +121,14 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
     where.add_argument("--scheduler", metavar="ADDRESS", help="or in the workers of a dask scheduler, tcp://HOST:8786")
 
 
+@dataclass(frozen=True)
+class _Tasks:
+    tasks: tuple[int | str, ...] | None = task_option("tasks", dest="tasks")
+
+
 def add_question(parser: argparse.ArgumentParser, names: tuple[str, ...]) -> None:
     """--task, the named options and --skip-corrupt."""
-    add_task(parser, "tasks", "tasks")
+    add_options(parser, _Tasks)
     for name in names:
         parser.add_argument(f"--{name.replace('_', '-')}", **OPTIONS[name])
     damaged = "leave out episodes that are damaged or empty, by name"
@@ -151,17 +155,9 @@ def add_output(parser: argparse.ArgumentParser, command: str, page: bool = False
 
 def settings_of(given: argparse.Namespace) -> AnalysisSettings:
     """The settings among the given options; those that a command does not take keep their defaults."""
-    from dataclasses import fields
-
     from vla_attention.analyze.measures.question_settings import AnalysisSettings
 
-    values: dict[str, Any] = {}
-    for field in fields(AnalysisSettings):
-        name = _OPTION_OF.get(field.name, field.name)
-        if hasattr(given, name):
-            value = getattr(given, name)
-            values[field.name] = tuple(value) if isinstance(value, list) else value
-    return AnalysisSettings(**values)
+    return read_options(AnalysisSettings, given)
 
 
 def results_folder(stores: Sequence[StorePlace], command: str, given: argparse.Namespace) -> Path:

@@ -90,7 +90,7 @@ def main() -> int:
             continue
         case = CASES[name]
         of_policy = options(case)
-        policy = of_policy.family.build(of_policy, "cpu")
+        policy = of_policy.family.read(of_policy).build("cpu")
         for bits in BITS:
             episodes = record(case, policy, bits, arguments.libero_assets)
             replans = sum(episode.replans for episode in episodes)

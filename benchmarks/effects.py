@@ -64,9 +64,8 @@ def cost_table(rounds: int, number: int, threads: int) -> Table:
     from vla_attention.schemas.stores.reader import open_store
 
     torch.set_num_threads(threads)
-    family, options = default_family(), argparse.ArgumentParser()
-    family.add_arguments(options)
-    policy = family.build(options.parse_args([]), "cpu")
+    family = default_family()
+    policy = family.settings().build("cpu")
     store = open_store(va.example("cubes"))
     tasks = {episode.attributes.task_id: episode.attributes for episode in store.episodes}
     instructions = {number: task.instruction for number, task in tasks.items()}

@@ -154,7 +154,7 @@ def main() -> None:
     load_torch("cpu", 1)
     words = ["pi", "--checkpoint", arguments.checkpoint]
     given = build_parser().parse_args(words)
-    policy = given.family.build(given, "cpu")
+    policy = given.family.read(given).build("cpu")
     cores, peak_mb = len(os.sched_getaffinity(0)), list[float]()
     kinds = {"one simulator": (1, True)} | {f"{num} simulators": (num, True) for num in arguments.num_envs}
     several = f"{arguments.num_envs[0]} simulators"

@@ -27,8 +27,8 @@ _HELP_WIDTH = 100
 _MOST_OPTIONS = 6
 _MOST_EXAMPLES = 3
 _MAIN_OPTIONS = {
-    *("--checkpoint", "--task-suite", "--task", "--num-episodes", "--effects", "--knockout", "--series", "--policy"),
-    *("--layers", "--grouping", "--group", "--ratio", "--episode", "--open", "--video"),
+    *("--checkpoint", "--ckpt-path", "--task-suite", "--task", "--num-episodes", "--effects", "--knockout", "--series"),
+    *("--policy", "--layers", "--grouping", "--group", "--ratio", "--episode", "--open", "--video"),
     *("--csv", "--output", "--resume", "--repair", "--tar"),
     *("--without", "--help-all"),
 }
@@ -49,14 +49,18 @@ class _WideHelp(argparse.RawDescriptionHelpFormatter):
 
 
 class OneSentenceParser(argparse.ArgumentParser):
-    """An argument parser whose mistakes read like all the others, and whose help fits a screen."""
+    """An argument parser whose mistakes read like all the others, and whose help fits a screen.
+
+    Its help shows the description wrapped, and below the arguments the epilog as it is.
+    """
 
     shows_all = False
     #: The beginning of an option that other programs have -> what to type here.
     instead: Mapping[str, str] = {}
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
+    def __init__(self, *, description: str = "", **options: Any) -> None:
+        as_is = argparse.RawDescriptionHelpFormatter
+        super().__init__(description=textwrap.fill(description, _HELP_WIDTH), formatter_class=as_is, **options)
         if self.add_help:
             self.add_argument("--help-all", action=_HelpAll, nargs=0, default=argparse.SUPPRESS, help="every option")
 
@@ -134,17 +138,6 @@ def _first_examples(epilog: str | None) -> str | None:
             break
         last += 1
     return "\n".join(lines[first:last])
-
-
-def command_parser(prog: str, description: str, examples: str = "", usage: str | None = None) -> OneSentenceParser:
-    """A parser whose help shows the description, wrapped, and below the arguments the examples as they are."""
-    return OneSentenceParser(
-        prog=prog,
-        usage=usage,
-        description=textwrap.fill(description, _HELP_WIDTH),
-        epilog=examples or None,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
 
 
 def format_bytes(count: float) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -16,7 +16,7 @@ class AnalysisSettings:
     """What a user asks for; None means the default. `vla_attention.analyze.options` reads it from a command line."""
 
     grouping: str | None = None
-    groups: tuple[str, ...] = ()
+    groups: tuple[str, ...] = field(default=(), metadata={"name": "group"})  # of its option
     ratio: str | None = None
     layers: tuple[int, ...] | None = None
     denoise: tuple[str, ...] | None = None

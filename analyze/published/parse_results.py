@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vla_attention.analyze.options import output_place
-from vla_attention.schemas.command_line import command_parser, run_command
+from vla_attention.schemas.command_line import OneSentenceParser, run_command
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stop_signals import end_program
 
@@ -39,7 +39,7 @@ _LOOK = {"log": True, "uniform": "uniform_ratio", "baseline_name": "if spread ev
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `parse-attention-ratio-results`."""
     about = "Summaries and pictures from attention_ratio_results_SUITE.json files, ours or the published scripts'."
-    parser = command_parser(PROGRAM, about, _EXAMPLES)
+    parser = OneSentenceParser(prog=PROGRAM, description=about, epilog=_EXAMPLES)
     files = "results files, folders of them, or patterns for either"
     parser.add_argument("--results", nargs="+", required=True, metavar="PATH", help=files)
     parser.add_argument("--output", type=output_place, metavar="FILE", help="also write the summary into this file")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vla_attention.analyze.options import add_workers
-from vla_attention.schemas.command_line import OneSentenceParser, command_parser, format_bytes
+from vla_attention.schemas.command_line import OneSentenceParser, format_bytes
 from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.stores.store_url import local_path, store_place
 from vla_attention.schemas.stores.verify_command import DESCRIPTION, EXAMPLES, add_verify_arguments, run_verify_command
@@ -44,11 +44,12 @@ of both, and --copy makes files of its own. What comes from elsewhere is always 
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-attention store copy STORE ...` and `vla-attention store verify STORE ...`."""
-    parser = command_parser("vla-attention store", "Keep stores: copies, one store of several, checks.")
+    parser = OneSentenceParser(
+        prog="vla-attention store", description="Keep stores: copies, one store of several, checks."
+    )
     acts = parser.add_subparsers(required=True, metavar="copy|verify", parser_class=OneSentenceParser)
-    as_is = argparse.RawDescriptionHelpFormatter
     what = "a copy: smaller, in tar files, from elsewhere; or one store of several"
-    copy = acts.add_parser("copy", help=what, description=_DESCRIPTION, epilog=_EXAMPLES, formatter_class=as_is)
+    copy = acts.add_parser("copy", help=what, description=_DESCRIPTION, epilog=_EXAMPLES)
     given = "NAME.zarr or addresses; several become one store"
     copy.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help=given)
     where = "where the copy goes, NAME.zarr; of two names without --output the second one is DEST"
@@ -61,7 +62,7 @@ def build_parser() -> argparse.ArgumentParser:
     copy.add_argument("--copy", action="store_true", help=files)
     what = "compare every file with what was sealed; --repair moves damaged episodes aside"
     examples = EXAMPLES.replace("NAME", "vla-attention store")
-    verify = acts.add_parser("verify", help=what, description=DESCRIPTION, epilog=examples, formatter_class=as_is)
+    verify = acts.add_parser("verify", help=what, description=DESCRIPTION, epilog=examples)
     add_verify_arguments(verify)
     for act, answer in ((copy, _run_copy), (verify, _run_verify)):
         act.set_defaults(act=answer)

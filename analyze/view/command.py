@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from vla_attention.schemas.command_line import command_parser
+from vla_attention.schemas.command_line import OneSentenceParser
 from vla_attention.schemas.stores.store_url import store_place
 
 if TYPE_CHECKING:
@@ -32,10 +32,11 @@ def build_parser() -> argparse.ArgumentParser:
     """The parser of `vla-attention view STORE ...`."""
     from pathlib import Path
 
-    parser = command_parser(
-        "vla-attention view",
-        "Explore attention in the browser: episodes, pictures, words, layers and heads, groups, two runs side by side.",
-        _EXAMPLES,
+    parser = OneSentenceParser(
+        prog="vla-attention view",
+        description="Explore attention in the browser: episodes, pictures, words, layers and heads, groups, two runs "
+        "side by side.",
+        epilog=_EXAMPLES,
     )
     parser.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses")
     parser.add_argument("--port", type=int, default=0, metavar="N", help="port of the page (default: any free one)")

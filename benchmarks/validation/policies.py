@@ -78,7 +78,7 @@ def load_policy(store: Path) -> Any:
     parser = argparse.ArgumentParser()
     add_rerun_arguments(parser, [str(store)])
     arguments = parser.parse_args([str(store)])
-    return arguments.family.build(arguments, load_torch(arguments.device, 1))
+    return arguments.family.read(arguments).build(load_torch(arguments.device, 1))
 
 
 def success(store: Store) -> dict[str, int]:

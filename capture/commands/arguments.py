@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from vla_attention.capture.doctor.command import DOCTOR_EXAMPLES, add_doctor_arguments
-from vla_attention.capture.effects.arguments import add_effect_arguments
-from vla_attention.capture.engine.recording_arguments import add_recording_arguments
+from vla_attention.capture.effects.arguments import add_effect_options
+from vla_attention.capture.engine.settings import RecordingSettings
 from vla_attention.capture.environments.suites import ALL_SUITES, STANDARD_SUITES, SUITES, find_suite, list_tasks
-from vla_attention.capture.interventions.arguments import add_intervention_arguments
+from vla_attention.capture.interventions.arguments import InterventionSettings
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
 from vla_attention.capture.replay.arguments import REPLAY_EXAMPLES, add_replay_arguments
 from vla_attention.capture.rerun.arguments import RERUN_EXAMPLES, add_rerun_arguments
 from vla_attention.capture.run.command import run_capture_of_family
+from vla_attention.capture.run.run_settings import CaptureOutput, RunSettings
 from vla_attention.schemas.command_line import OneSentenceParser
 from vla_attention.schemas.errors import BadArgument, listing
-from vla_attention.schemas.options import add_capture_output, add_task
+from vla_attention.schemas.options import add_options, option
 from vla_attention.schemas.stores import verify_command
 from vla_attention.schemas.stores.verify_command import VERIFY_HELP
 
@@ -41,7 +44,6 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
         prog=program,
         description="Run a policy in simulation and record the attention rows of its action queries.",
         epilog=f"examples:\n{examples}{_FURTHER_EXAMPLES}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = parser.add_subparsers(required=True, metavar="POLICY", parser_class=OneSentenceParser)
     for family in families:
@@ -50,7 +52,6 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
             help=family.title,
             description=family.description,
             epilog=f"examples:\n{family.examples}{_FURTHER_EXAMPLES}",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         _add_capture_arguments(capture, family)
         capture.set_defaults(command=run_capture_of_family, family=family)
@@ -61,7 +62,6 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
         "simulator, and record its attention into a store like any other, beside the actions that the data set has. "
         "See docs/data-sets.md.",
         epilog=f"examples:\n{REPLAY_EXAMPLES}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_replay_arguments(replay, given if "replay" in given[:1] else ())
     rerun = commands.add_parser(
@@ -71,7 +71,6 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
         "First the calls of one episode are made again unchanged, and their distance from the stored ones is printed. "
         "With interventions, or with --output, the calls of all episodes go into a store like any other.",
         epilog=f"examples:\n{RERUN_EXAMPLES}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_rerun_arguments(rerun, given if "rerun" in given[:1] else ())
     status = commands.add_parser(
@@ -89,7 +88,6 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
         "and assets, drawing, disk, GPU, checkpoint, each with what to do. Loads no policy and runs no simulator. Exit "
         "code 1 when something is missing.",
         epilog=f"examples:\n{DOCTOR_EXAMPLES}",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add_doctor_arguments(doctor, given[1:] if "doctor" in given[:1] else (), _add_capture_arguments)
     verify = commands.add_parser(
@@ -97,7 +95,6 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
         help="read stores back and check every file, digest and row sum",
         description=verify_command.DESCRIPTION,
         epilog=verify_command.EXAMPLES.replace("NAME", "vla-attention capture"),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     verify_command.add_verify_arguments(verify)
     verify.set_defaults(command=_run_verify)
@@ -108,41 +105,38 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
     return parser
 
 
+@dataclass(frozen=True)
+class ClusterSettings:
+    """What the published scripts' commands are asked as jobs of a cluster."""
+
+    stage: Literal["capture", "analyze", "both"] | None = option(
+        "what to do (default: both; in an array job capture, as all of its tasks fill one store)",
+        None,
+        group="as a job of a cluster (see docs/cluster.md)",
+    )
+    array_index: int | None = option(
+        "index in an array job: a task, counted through the suites of 'all'", None, least=0
+    )
+    max_requeues: int = option(
+        "after SIGTERM put the SLURM job back into the queue, at most N times (default: %(default)s)", 0, least=0
+    )
+    from_environment: bool = option(
+        "also read the variables of scripts/run_attention_ratio*.sh (CHECKPOINT, TASK_SUITE, LAYERS ...); see their "
+        "heads",
+        False,
+    )
+
+
 def build_evaluate_parser(family: PolicyFamily, script: PublishedScript) -> argparse.ArgumentParser:
     """Return the parser of a published script: the family's, with the script's defaults and cluster options."""
     parser = OneSentenceParser(
         prog=script.program,
         description=f"{family.description} Then analyse, with the arguments of the published script. All layers are "
         "recorded, so that other --layers need no second capture; an existing store is continued with what is missing.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     _add_capture_arguments(parser, family, script)
-    job = parser.add_argument_group("as a job of a cluster (see docs/cluster.md)")
-    job.add_argument(
-        "--stage",
-        choices=("capture", "analyze", "both"),
-        help="what to do (default: both; in an array job capture, as all of its tasks fill one store)",
-    )
-    job.add_argument(
-        "--array-index",
-        type=int,
-        metavar="N",
-        help="index in an array job: a task, counted through the suites of 'all'",
-    )
-    job.add_argument(
-        "--max-requeues",
-        type=int,
-        default=0,
-        metavar="N",
-        help="after SIGTERM put the SLURM job back into the queue, at most N times (default: 0)",
-    )
-    job.add_argument(
-        "--from-environment",
-        action="store_true",
-        help="also read the variables of scripts/run_attention_ratio*.sh (CHECKPOINT, TASK_SUITE, LAYERS ...); see "
-        "their heads",
-    )
-    parser.set_defaults(family=family, checkpoint=script.checkpoint, task_suite="libero_10", resume=True, store=None)
+    add_options(parser, ClusterSettings)
+    parser.set_defaults(family=family, checkpoint=script.checkpoint, task_suite="libero_10", resume=True)
     return parser
 
 
@@ -150,91 +144,33 @@ def _add_capture_arguments(
     parser: argparse.ArgumentParser, family: PolicyFamily, script: PublishedScript | None = None
 ) -> None:
     """Add all options of a capture with one policy family; `script`: of a published script instead."""
-    family.add_arguments(parser)
-    _add_evaluation_arguments(parser, family, script)
-    which = "block indices (default: all)"
-    if script:
-        which = f"layers to analyse; all are recorded (default: {' '.join(map(str, script.layers))})"
-    add_recording_arguments(parser, which + family.layers_note)
-    add_effect_arguments(parser)
-    add_intervention_arguments(parser)
-    _add_output_arguments(parser, family, script)
-
-
-def _add_evaluation_arguments(
-    parser: argparse.ArgumentParser, family: PolicyFamily, script: PublishedScript | None
-) -> None:
-    group = parser.add_argument_group("evaluation")
-    names = ", ".join(suite.name for suite in SUITES)
-    which = f"one of {names} (default: {family.default_suite})"
-    if script:
-        which = f"one of {names}, or {ALL_SUITES} for {listing(STANDARD_SUITES)} (default: libero_10)"
-    group.add_argument("--task-suite", default=family.default_suite, metavar="SUITE", help=which)
-    add_task(group, "task_id", "tasks of the suite")
-    group.add_argument("--num-episodes", type=int, default=5, metavar="N", help="episodes per task (default: 5)")
-    if len(family.protocols) > 1:
-        group.add_argument(
-            "--protocol",
-            choices=[protocol.name for protocol in family.protocols],
-            help="the published evaluation to follow: picture size, steps and seeding, see docs/protocol.md (default: "
-            "that of the checkpoint's format)",
-        )
+    names, default = ", ".join(suite.name for suite in SUITES), "a store in runs"
     seeds = ", ".join(f"{protocol.default_seed} for {protocol.name}" for protocol in family.protocols)
-    group.add_argument("--seed", type=int, metavar="N", help=f"{family.seed_of} (default: {seeds})")
-    group.add_argument(
-        "--replan-steps",
-        type=int,
-        metavar="N",
-        help=f"actions executed per policy call (default: {family.replan_default})",
-    )
-    group.add_argument(
-        "--max-steps",
-        type=int,
-        metavar="N",
-        help="steps after waiting (default: the published number of suite and protocol)",
-    )
-    group.add_argument(
-        "--num-envs",
-        type=int,
-        metavar="N",
-        help="simulators that run at a time, each in a process of its own; 1 simulates in the policy's process "
-        "(default: the cores that this process may use, at most 8, and 2 GB of memory each)",
-    )
-    group.add_argument(
-        "--policy-batch",
-        type=int,
-        metavar="N",
-        help="most policy calls of different simulators that are made as one batch; from 2 on, last bits of what is "
-        "computed change (default: 1 on a processor, on a GPU the number of simulators)",
-    )
-    group.add_argument(
-        "--libero-assets", type=Path, metavar="PATH", help="LIBERO asset folder (or set VLA_LIBERO_ASSETS)"
-    )
-
-
-def _add_output_arguments(
-    parser: argparse.ArgumentParser, family: PolicyFamily, script: PublishedScript | None
-) -> None:
-    group = parser.add_argument_group("output")
-    name, default = f"{family.store_prefix}SUITE.zarr", "a store in runs"
+    suites, layers, resumed = f"one of {names}", "block indices (default: all)", ""
     if script:
-        default = f"the folder results/attention_ratio_{family.store_prefix}SUITE"
-    add_capture_output(
-        group,
-        "PATH",
-        f"the store, NAME.zarr, or a folder: for the store {name} and the results of an analysis that runs afterwards; "
-        f"may be given twice, once for each (default: {default})",
+        suites = f"one of {names}, or {ALL_SUITES} for {listing(STANDARD_SUITES)}"
+        layers = f"layers to analyse; all are recorded (default: {' '.join(map(str, script.layers))})"
+        default, resumed = f"the folder results/attention_ratio_{family.store_prefix}SUITE", " (default)"
+    protocols = [protocol.name for protocol in family.protocols]
+    add_options(parser, family.settings)
+    add_options(
+        parser,
+        RunSettings,
+        suite={"help": f"{suites} (default: %(default)s)", "default": family.default_suite},
+        protocol={"choices": protocols, "metavar": None} if len(protocols) > 1 else None,
+        seed=f"{family.seed_of} (default: {seeds})",
+        replan_steps=f"actions executed per policy call (default: {family.replan_default})",
     )
-    group.add_argument("--save-viz", action="store_true", help="analyse afterwards, with pictures of every episode")
-    existing = group.add_mutually_exclusive_group()
-    resume = "continue an existing store with what is missing" + (" (default)" if script else "")
-    existing.add_argument("--resume", action="store_true", help=resume)
-    group.add_argument(
-        "--verify",
-        action="store_true",
-        help="with --resume: read every byte of the episodes that are there, instead of only seals, presence and sizes",
+    add_options(parser, RecordingSettings, layers=layers + family.layers_note)
+    add_effect_options(parser)
+    add_options(parser, InterventionSettings)
+    add_options(
+        parser,
+        CaptureOutput,
+        store=f"the store, NAME.zarr, or a folder: for the store {family.store_prefix}SUITE.zarr and the results of an "
+        f"analysis that runs afterwards; may be given twice, once for each (default: {default})",
+        resume=f"continue an existing store with what is missing{resumed}",
     )
-    existing.add_argument("--overwrite", action="store_true", help="delete an existing store first")
 
 
 def _add_status_arguments(parser: argparse.ArgumentParser) -> None:

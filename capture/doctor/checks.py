@@ -142,7 +142,7 @@ def find_disk(settings: RunSettings) -> Finding:
         return f"{room_at(settings.store).describe()} free for {settings.store}."
 
     finding = checked("disk", place)
-    if finding.status == "ok" and held and settings.mode == "new":
+    if finding.status == "ok" and held and settings.output.mode == "new":
         to_do = "A run there needs --resume, which adds what is missing, or --overwrite, which begins again."
         return Finding("disk", "note", f"{settings.store} holds {plural(held, 'episode')} already.", to_do)
     return finding
@@ -153,7 +153,7 @@ def find_checkpoint(arguments: argparse.Namespace) -> Finding:
     name, path = arguments.checkpoint, Path(arguments.checkpoint).expanduser()
 
     def files() -> str:
-        arguments.family.check_files(arguments)
+        arguments.family.read(arguments).check_files()
         if name in arguments.family.built_in:
             return f"{name} comes with the program."
         found = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]

@@ -1,24 +1,21 @@
-"""What is recorded of each policy call: the settings of the options, the plan for a policy, and a store's root."""
+"""What is recorded of each policy call: the plan for a policy, and a store's root."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from vla_attention.capture.effects.arguments import EffectSettings, effect_settings
 from vla_attention.capture.engine.progress import say
+from vla_attention.capture.engine.settings import RecordingSettings as RecordingSettings
 from vla_attention.capture.policies.identity import announcement
 from vla_attention.capture.store.disk_estimate import DiskEstimate, describe
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.layers import select_layers
 from vla_attention.schemas.layout import SiteLayout
-from vla_attention.schemas.precision import DEFAULT_MANTISSA_BITS, parse_precision
 from vla_attention.schemas.stores.store_format import (
     FORMAT_NAME,
     STORE_VERSION,
@@ -33,37 +30,7 @@ from vla_attention.schemas.stores.verify import DamagedEpisode
 if TYPE_CHECKING:
     from vla_attention.capture.policies.policy import ModelSizes, Policy
 
-#: The denoise steps that are recorded unless others are asked for.
-DEFAULT_STEPS = ("first", "last")
 _QUERIES = {"mean": "the mean over", "steps": "the action steps' means over", "all": "each of"}
-
-
-@dataclass(frozen=True)
-class RecordingSettings:
-    """What is recorded of each policy call; None means everything."""
-
-    layers: tuple[int, ...] | None = None
-    denoise_steps: tuple[int | str, ...] = DEFAULT_STEPS
-    heads: tuple[int, ...] | None = None
-    queries: str = "mean"
-    mantissa_bits: int = DEFAULT_MANTISSA_BITS
-    frames: bool = True
-    contributions: bool = True
-    effects: EffectSettings | None = None
-
-
-def recording_settings(arguments: argparse.Namespace) -> RecordingSettings:
-    """Return what the options of `recording_arguments.py` say."""
-    return RecordingSettings(
-        layers=None if arguments.layers is None else tuple(arguments.layers),
-        denoise_steps=DEFAULT_STEPS if arguments.denoise_steps is None else tuple(arguments.denoise_steps),
-        heads=None if arguments.heads is None else tuple(arguments.heads),
-        queries=arguments.queries,
-        mantissa_bits=DEFAULT_MANTISSA_BITS if arguments.precision is None else parse_precision(arguments.precision),
-        frames=not arguments.no_frames,
-        contributions=arguments.contributions,
-        effects=effect_settings(arguments),
-    )
 
 
 def plan_recording(settings: RecordingSettings, policy: Policy, seed: int) -> tuple[Recording, str | None]:
@@ -73,8 +40,6 @@ def plan_recording(settings: RecordingSettings, policy: Policy, seed: int) -> tu
     """
     if len(set(settings.heads or ())) != len(settings.heads or ()):
         raise BadArgument(f"Heads {listing(settings.heads or ())} name one of them twice.")
-    if settings.queries not in ("mean", "steps", "all"):
-        raise BadArgument(f"Cannot use --queries '{settings.queries}'; expected 'mean', 'steps' or 'all'.")
     num_pools = len(policy.query_pools()) if settings.queries == "steps" else 0
     recording, note = recording_of(settings, policy, policy.num_action_queries, num_pools)
     if settings.effects is None:
@@ -101,7 +66,7 @@ def recording_of(
         layer_labels=tuple(sorted(layers.labels, key=lambda label: (label % model.num_layers, label))),
         denoise_steps=_denoise_steps(settings.denoise_steps, model.num_denoise_steps),
         heads=tuple(sorted(set(heads))),
-        queries=cast(Literal["mean", "steps", "all"], settings.queries),
+        queries=settings.queries,
         num_action_queries=num_action_queries,
         num_pools=num_pools,
         mantissa_bits=settings.mantissa_bits,

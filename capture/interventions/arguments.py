@@ -1,9 +1,10 @@
-"""The options of interventions on the command line. Imports nothing heavy: every `--help` needs them."""
+"""Interventions as they are typed, and what that means. Imports nothing heavy: every `--help` needs it."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from vla_attention.schemas.interventions import (
     NoiseChange,
     PromptChange,
 )
+from vla_attention.schemas.options import option, read_options
 
 #: Who does not read what is knocked out, unless the command line says it.
 DEFAULT_QUERIES = "action"
@@ -25,124 +27,112 @@ _PROMPTS = ("empty", "shuffled", "shuffled:SEED", "task:N", "text:TEXT", "synony
 _IMAGES = ("blank", "noise", "noise:SEED", "rotated", "shifted:ROWS,COLUMNS", "masked:OBJECT", "filled:OBJECT")
 
 
-def add_intervention_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add all options of interventions; `read_interventions` reads them."""
-    group = parser.add_argument_group(
-        "interventions", "what is changed in the policy, stored with the run (docs/interventions.md)"
-    )
-    group.add_argument(
-        "--knockout",
-        action="append",
-        default=[],
-        metavar="SELECTOR",
-        help="keys that are not read: camera:NAME, word:NAME, object:NAME, role:NAME ..., joined by &, | and - as in "
+_WHERE = "in which attention changes, also for --attention (default: all)"
+
+
+@dataclass(frozen=True)
+class InterventionSettings:
+    """What is changed in the policy, as typed; `interventions_of` reads it."""
+
+    knockout: tuple[str, ...] = option(
+        "keys that are not read: camera:NAME, word:NAME, object:NAME, role:NAME ..., joined by &, | and - as in "
         "groupings; may be given several times",
+        (),
+        group="interventions: what is changed in the policy, stored with the run (docs/interventions.md)",
+        action="append",
+        metavar="SELECTOR",
     )
-    group.add_argument("--keep", metavar="SELECTOR", help="knock out all other valid keys, but no action keys")
-    group.add_argument(
-        "--knockout-queries",
+    keep: str | None = option("knock out all other valid keys, but no action keys", None, metavar="SELECTOR")
+    knockout_queries: str | None = option(
+        "who does not read them: action (the action queries, the default but for the words of a series), all (every "
+        "query that could carry the information on), prefix (pi: pictures and prompt only) or prefix:SELECTOR (those "
+        "tokens of it)",
+        None,
         metavar="QUERIES",
-        help="who does not read them: action (the action queries, the default but for the words of a series), all "
-        "(every query that could carry the information on), prefix (pi: pictures and prompt only) or prefix:SELECTOR "
-        "(those tokens of it)",
     )
-    for name, what in (("layers", "layers"), ("heads", "attention heads"), ("steps", "denoise steps")):
-        group.add_argument(
-            f"--knockout-{name}",
-            type=int,
-            nargs="+",
-            metavar="N",
-            help=f"{what} in which attention changes, also for --attention (default: all)",
-        )
-    group.add_argument(
-        "--knockout-weight",
-        type=float,
-        metavar="W",
-        help="share of the attention that is taken away, 0 to 1 (default: 1, exactly all of it)",
+    knockout_layers: tuple[int, ...] | None = option(f"layers {_WHERE}", None)
+    knockout_heads: tuple[int, ...] | None = option(f"attention heads {_WHERE}", None)
+    knockout_steps: tuple[int, ...] | None = option(f"denoise steps {_WHERE}", None)
+    knockout_weight: float | None = option(
+        "share of the attention that is taken away, 0 to 1 (default: 1, exactly all of it)", None, metavar="W"
     )
-    group.add_argument(
-        "--random-keys",
-        type=int,
+    random_keys: int | None = option(
+        "the control: knock out equally many random keys outside of each group, drawn for every replan",
+        None,
         metavar="SEED",
-        help="the control: knock out equally many random keys outside of each group, drawn for every replan",
     )
-    group.add_argument(
-        "--attention",
-        action="append",
-        default=[],
-        metavar="SELECTOR=CHANGE",
-        help="multiply a group's attention before normalising (SELECTOR=0.5), or make it uniform inside the group "
+    attention: tuple[str, ...] = option(
+        "multiply a group's attention before normalising (SELECTOR=0.5), or make it uniform inside the group "
         "(SELECTOR=uniform); may be given several times",
-    )
-    group.add_argument("--prompt", metavar="CHANGE", help=f"another instruction: {listing(_PROMPTS)}")
-    group.add_argument(
-        "--image",
+        (),
         action="append",
-        default=[],
+        metavar="SELECTOR=CHANGE",
+    )
+    prompt: str | None = option(f"another instruction: {listing(_PROMPTS)}", None, metavar="CHANGE")
+    image: tuple[str, ...] = option(
+        f"another picture of a camera: {listing(_IMAGES)}; may be given several times",
+        (),
+        action="append",
         metavar="CAMERA=CHANGE",
-        help=f"another picture of a camera: {listing(_IMAGES)}; may be given several times",
     )
-    group.add_argument("--noise-seed", type=int, metavar="N", help="draw the policy's noise from this seed")
-    group.add_argument(
-        "--allow-empty",
-        action="store_true",
-        help="leave replans unchanged in which a group has no key, instead of stopping there",
-    )
+    noise_seed: int | None = option("draw the policy's noise from this seed", None)
+    allow_empty: bool = option("leave replans unchanged in which a group has no key, instead of stopping there", False)
 
 
-def read_interventions(arguments: argparse.Namespace, name: str = "") -> Interventions:
-    """Return the interventions of parsed arguments, with layer numbers as given; `name` is that of the condition.
+def read_interventions(given: argparse.Namespace) -> Interventions:
+    """Return the interventions of parsed arguments."""
+    return interventions_of(read_options(InterventionSettings, given))
+
+
+def interventions_of(given: InterventionSettings) -> Interventions:
+    """Return what settings say, with layer numbers as given.
 
     Raises:
         BadArgument: an option cannot be read, or has nothing to act on.
     """
-    queries, query_selector = _queries(arguments.knockout_queries or DEFAULT_QUERIES)
+    queries, query_selector = _queries(given.knockout_queries or DEFAULT_QUERIES)
     places = {
-        "layers": _numbers(arguments.knockout_layers),
-        "heads": _numbers(arguments.knockout_heads),
-        "denoise_steps": _numbers(arguments.knockout_steps),
+        "layers": _numbers(given.knockout_layers),
+        "heads": _numbers(given.knockout_heads),
+        "denoise_steps": _numbers(given.knockout_steps),
     }
-    knocked = [(selector, False) for selector in arguments.knockout]
-    knocked += [(arguments.keep, True)] if arguments.keep is not None else []
+    knocked = [(selector, False) for selector in given.knockout]
+    knocked += [(given.keep, True)] if given.keep is not None else []
     keys = tuple(
         KeyKnockout(
             selector,
             keep=keep,
             queries=queries,
             query_selector=query_selector,
-            weight=1.0 if arguments.knockout_weight is None else arguments.knockout_weight,
-            random_seed=arguments.random_keys,
+            weight=1.0 if given.knockout_weight is None else given.knockout_weight,
+            random_seed=given.random_keys,
             **places,
         )
         for selector, keep in knocked
     )
-    if query_selector and arguments.attention:
+    if query_selector and given.attention:
         raise BadArgument("Cannot use --knockout-queries prefix:SELECTOR with --attention; use action, all or prefix.")
-    attention = tuple(_attention(text, {"queries": queries, **places}) for text in arguments.attention)
-    _refuse_idle(arguments, bool(keys), bool(keys or attention))
+    attention = tuple(_attention(text, {"queries": queries, **places}) for text in given.attention)
+    _refuse_idle(given, bool(keys), bool(keys or attention))
     return Interventions(
-        name=name,
         keys=keys,
         attention=attention,
-        prompt=None if arguments.prompt is None else _prompt(arguments.prompt),
-        images=tuple(_image(text) for text in arguments.image),
-        noise=None if arguments.noise_seed is None else NoiseChange(arguments.noise_seed),
+        prompt=None if given.prompt is None else _prompt(given.prompt),
+        images=tuple(_image(text) for text in given.image),
+        noise=None if given.noise_seed is None else NoiseChange(given.noise_seed),
     )
 
 
-def _refuse_idle(arguments: argparse.Namespace, knocks_out: bool, changes_attention: bool) -> None:
+def _refuse_idle(given: InterventionSettings, knocks_out: bool, changes_attention: bool) -> None:
     """Raise `BadArgument` for an option that nothing uses."""
-    for option, given, used, needs in (
-        ("--random-keys", arguments.random_keys is not None, knocks_out, "--knockout or --keep"),
-        ("--knockout-weight", arguments.knockout_weight is not None, knocks_out, "--knockout or --keep"),
-        ("--knockout-queries", arguments.knockout_queries is not None, changes_attention, "--knockout or --attention"),
-        ("--knockout-layers", arguments.knockout_layers is not None, changes_attention, "--knockout or --attention"),
-        ("--knockout-heads", arguments.knockout_heads is not None, changes_attention, "--knockout or --attention"),
-        ("--knockout-steps", arguments.knockout_steps is not None, changes_attention, "--knockout or --attention"),
-        ("--allow-empty", arguments.allow_empty, changes_attention or bool(arguments.image), "--knockout or --image"),
-    ):
-        if given and not used:
-            raise BadArgument(f"{option} has nothing to act on; give {needs} too.")
+    keys, attention = (knocks_out, "--knockout or --keep"), (changes_attention, "--knockout or --attention")
+    pictures = (changes_attention or bool(given.image), "--knockout or --image")
+    needs = {"random_keys": keys, "knockout_weight": keys, "allow_empty": pictures}
+    needs |= dict.fromkeys(("knockout_queries", "knockout_layers", "knockout_heads", "knockout_steps"), attention)
+    for name, (used, what) in needs.items():
+        value = getattr(given, name)
+        if not used and value is not None and value is not False:  # 0 was given, too
+            raise BadArgument(f"--{name.replace('_', '-')} has nothing to act on; give {what} too.")
 
 
 def _numbers(given: Sequence[int] | None) -> tuple[int, ...] | None:

@@ -7,15 +7,57 @@ does so: torch and the model's code are imported inside `build`.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from vla_attention.capture.environments.episode_protocol import OPENPI, EvaluationProtocol
+from vla_attention.schemas.options import option, read_options
 
 if TYPE_CHECKING:
     from vla_attention.capture.policies.policy import Policy
     from vla_attention.schemas.stores.store_format import PolicyIdentity
+
+
+#: The two untrained policies that come with the program: a small one, and a smaller one for tests.
+UNTRAINED = "untrained"
+UNTRAINED_TINY = "untrained-tiny"
+UNTRAINED_POLICIES = (UNTRAINED, UNTRAINED_TINY)
+
+
+def checkpoint_option(text: str, default: str = UNTRAINED, **more: Any) -> Any:
+    """`--checkpoint`, the first field of a family's settings; text: what it takes besides the untrained policies."""
+    untrained = f"'{UNTRAINED}' and '{UNTRAINED_TINY}' have random weights and come along"
+    return option(f"{text}; {untrained} (default: %(default)s)", default, group="model", metavar="PATH", **more)
+
+
+@dataclass(frozen=True)
+class ModelSettings:
+    """Which model is loaded, in which precision and where. A family's own class says what it takes as a checkpoint."""
+
+    checkpoint: str = checkpoint_option("checkpoint folder")
+    config_name: str | None = option("name of the configuration", None)
+    dtype: Literal["float32", "bfloat16"] | None = option("precision", None)
+    device: str = option("auto (default: a GPU if there is one), cpu, cuda, cuda:1 ...", "auto", metavar="DEVICE")
+    threads: int | None = option(
+        "processor threads of the policy (default: OMP_NUM_THREADS, else the cores that this process may use)", None
+    )
+
+    def build(self, device: str) -> Policy:
+        """Load the policy onto a device of torch."""
+        raise NotImplementedError
+
+    def check_files(self) -> None:
+        """Raise what `build` would where a local checkpoint lacks files; loads nothing. Here nothing is known."""
+
+    def analysis_arguments(self) -> list[str]:
+        """Return further arguments of an analysis that follows the capture."""
+        return []
+
+    @staticmethod
+    def of_store(identity: PolicyIdentity) -> dict[str, Any]:
+        """Return the settings with which `build` makes the policy of a store again; the others have their defaults."""
+        return {"checkpoint": identity.checkpoint}
 
 
 @dataclass(frozen=True)
@@ -23,27 +65,13 @@ class PublishedScript:
     """The published script whose command line a family keeps, with the defaults of that script.
 
     program: the console script. checkpoint, layers: what it loads and analyses by default. variables: environment
-    variables of its batch script that no other family has, and the option that each one sets.
+    variables of its batch script that no other family has, each of which sets the option of its name.
     """
 
     program: str
     checkpoint: str
     layers: tuple[int, ...]
-    variables: Mapping[str, str] = field(default_factory=dict)
-
-
-def no_arguments(arguments: argparse.Namespace) -> list[str]:
-    """Return no arguments: the analysis keeps its own defaults."""
-    return []
-
-
-def no_files_to_check(arguments: argparse.Namespace) -> None:
-    """Do nothing: only loading tells whether a checkpoint is whole."""
-
-
-def stored_checkpoint(identity: PolicyIdentity) -> dict[str, Any]:
-    """Return the path of the checkpoint: the family's other options have their defaults."""
-    return {"checkpoint": identity.checkpoint}
+    variables: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -58,10 +86,8 @@ class PolicyFamily:
     description: str
     #: lines of examples for the help text, each ending with a newline
     examples: str
-    #: Adds the options of the model, among them `checkpoint`, `device` and `threads` (see `model_arguments.py`).
-    add_arguments: Callable[[argparse.ArgumentParser], None]
-    #: (parsed arguments, device) -> the policy
-    build: Callable[[argparse.Namespace, str], Policy]
+    #: what is asked of the model, and what builds it
+    settings: type[ModelSettings]
     #: First part of the names of stores and results folders. Two families on one suite need different ones.
     store_prefix: str
     #: the default of `--replan-steps`, for its help text
@@ -76,16 +102,14 @@ class PolicyFamily:
     built_in: tuple[str, ...] = ()
     #: the default of `--task-suite`: the one that the default checkpoint is for
     default_suite: str = "robosuite"
-    #: parsed arguments -> further arguments of an analysis that follows the capture
-    analysis_arguments: Callable[[argparse.Namespace], list[str]] = no_arguments
     published: PublishedScript | None = None
     #: The suites that checkpoints were trained on and evaluated in, by the names that `--checkpoint` takes.
     trained_on: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    #: Whether `build` takes a `robot_data` among the arguments (`robot.py`), and then gives a policy for data sets.
+    #: Whether the settings have a `robot_data` (`robot.py`), with which `build` gives a policy for data sets.
     reads_data_sets: bool = False
     #: The kinds of its policies, as stores name them (`PolicyIdentity.family`); empty for the family's name alone.
     kinds: tuple[str, ...] = ()
-    #: The identity in a store -> parsed arguments with which `build` makes this policy again.
-    rebuild: Callable[[PolicyIdentity], dict[str, Any]] = stored_checkpoint
-    #: Parsed arguments -> None; raises what `build` would where a local checkpoint lacks files. Loads nothing.
-    check_files: Callable[[argparse.Namespace], None] = no_files_to_check
+
+    def read(self, given: argparse.Namespace) -> ModelSettings:
+        """Return the settings of the model that parsed arguments say."""
+        return read_options(self.settings, given)

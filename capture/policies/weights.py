@@ -15,16 +15,9 @@ import torch
 from torch import Tensor, nn
 
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch
-from vla_attention.schemas.errors import BadArgument, UserError, listing
+from vla_attention.schemas.errors import UserError, listing
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-
-
-def find_dtype(name: str) -> torch.dtype:
-    """Return the precision of that name; `BadArgument` lists the names."""
-    if name not in DTYPES:
-        raise BadArgument(f"Cannot use --dtype '{name}'; expected {listing(DTYPES)}.")
-    return DTYPES[name]
 
 
 def dtype_name(dtype: torch.dtype) -> str:

@@ -26,9 +26,11 @@ from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
 from vla_attention.capture.run.command import run_analysis
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.layers import select_layers
+from vla_attention.schemas.options import read_options
 from vla_attention.schemas.threads import Threads, use_threads
 
 if TYPE_CHECKING:
+    from vla_attention.capture.commands.arguments import ClusterSettings
     from vla_attention.capture.run.run_settings import RunSettings
 
 _FROM_ENVIRONMENT = "--from-environment"
@@ -50,11 +52,12 @@ def _main(program: str, argv: Sequence[str] | None) -> int:
     requeues = [0]
 
     def command(termination: Termination) -> int:
-        from vla_attention.capture.commands.arguments import build_evaluate_parser
+        from vla_attention.capture.commands.arguments import ClusterSettings, build_evaluate_parser
 
         arguments = build_evaluate_parser(family, script).parse_args(_with_environment(given, family))
-        requeues[0] = arguments.max_requeues
-        return _evaluate(arguments, script, termination)
+        cluster = read_options(ClusterSettings, arguments)
+        requeues[0] = cluster.max_requeues
+        return _evaluate(arguments, cluster, script, termination)
 
     return run_capture_command(program, command, lambda: requeues[0])
 
@@ -87,13 +90,15 @@ class _Job:
     default_output: bool
 
 
-def _evaluate(arguments: argparse.Namespace, script: PublishedScript, termination: Termination) -> int:
+def _evaluate(
+    arguments: argparse.Namespace, cluster: ClusterSettings, script: PublishedScript, termination: Termination
+) -> int:
     threads = use_threads(arguments.threads)
 
     from vla_attention.schemas.stores.store_place import check_writable
 
-    jobs = _jobs(arguments)
-    stage = arguments.stage or ("both" if arguments.array_index is None else "capture")
+    jobs = _jobs(arguments, cluster.array_index)
+    stage = cluster.stage or ("both" if cluster.array_index is None else "capture")
     if stage != "capture":
         for job in jobs:
             check_writable(job.output, "--output-dir")
@@ -105,7 +110,7 @@ def _evaluate(arguments: argparse.Namespace, script: PublishedScript, terminatio
     return next((code for code in codes if code), 0)
 
 
-def _jobs(arguments: argparse.Namespace) -> list[_Job]:
+def _jobs(arguments: argparse.Namespace, array_index: int | None) -> list[_Job]:
     from vla_attention.capture.environments.suites import ALL_SUITES, STANDARD_SUITES, SUITES
     from vla_attention.capture.jobs.slurm import array_task_ids
     from vla_attention.capture.run.run_settings import run_settings
@@ -122,8 +127,8 @@ def _jobs(arguments: argparse.Namespace) -> list[_Job]:
         )
     task_ids: list[int] | None = arguments.task_id
     of_array: list[tuple[str, int]] = []
-    if arguments.array_index is not None:
-        suite, task_id = _task_of_array_index(arguments, suites)
+    if array_index is not None:
+        suite, task_id = _task_of_array_index(arguments, array_index, suites)
         task_ids = [task_id]
         of_array = [place for index in array_task_ids() if (place := _place(index, suites)) is not None]
         suites = (suite,)
@@ -146,21 +151,21 @@ def _jobs(arguments: argparse.Namespace) -> list[_Job]:
     return jobs
 
 
-def _task_of_array_index(arguments: argparse.Namespace, suites: Sequence[str]) -> tuple[str, int]:
+def _task_of_array_index(arguments: argparse.Namespace, index: int, suites: Sequence[str]) -> tuple[str, int]:
     """Return suite and task of an array job's index; the indices run through the suites in order."""
     from vla_attention.capture.environments.suites import find_suite
 
     if arguments.task_id is not None:
         raise BadArgument(
-            f"Cannot run task {listing(arguments.task_id)} and array index {arguments.array_index}: in an array the "
+            f"Cannot run task {listing(arguments.task_id)} and array index {index}: in an array the "
             "index is the task; give --task-id (TASK_ID) or --array, not both."
         )
-    place = _place(arguments.array_index, suites)
+    place = _place(index, suites)
     if place is not None:
         return place
     total = sum(find_suite(name).num_tasks for name in suites)
     raise BadArgument(
-        f"Array index {arguments.array_index} is beyond the tasks of {arguments.task_suite}, which has {total}; "
+        f"Array index {index} is beyond the tasks of {arguments.task_suite}, which has {total}; "
         f"submit with --array=0-{total - 1}."
     )
 
@@ -193,7 +198,7 @@ def _capture(arguments: argparse.Namespace, jobs: Sequence[_Job], threads: Threa
 
     say(threads.describe())
     device = load_torch(arguments.device, threads.number)
-    policy = arguments.family.build(arguments, device)
+    policy = arguments.family.read(arguments).build(device)
     # A layer that does not exist is an error before the capture, not after it.
     select_layers(arguments.layers, policy.num_layers, policy.family)
     missing = []
@@ -259,25 +264,14 @@ def _publish(source: Path, target: Path) -> None:
         temporary.replace(place)
 
 
-#: Variable -> option, for variables that are passed on unchanged.
-_OPTIONS = {
-    "CONFIG_NAME": "--config-name",
-    "TASK_SUITE": "--task-suite",
-    "OUTPUT_DIR": "--output-dir",
-    "STORE": "--output",
-    "STAGE": "--stage",
+#: Variables that are passed on as the option of their name, and what is expected of those that are numbers.
+_VARIABLES = {
+    **dict.fromkeys(("CONFIG_NAME", "TASK_SUITE", "OUTPUT_DIR", "STORE", "STAGE"), ""),
+    **dict.fromkeys(("NUM_EPISODES", "SEED", "REPLAN_STEPS", "MAX_REQUEUES"), "a whole number"),
+    "TASK_ID": "a whole number, or several separated by spaces",
+    "LAYERS": 'layer numbers separated by spaces, as in LAYERS="25 26 27"',
 }
-_WHOLE_NUMBERS = {
-    "NUM_EPISODES": "--num-episodes",
-    "SEED": "--seed",
-    "REPLAN_STEPS": "--replan-steps",
-    "MAX_REQUEUES": "--max-requeues",
-}
-#: Variable, option, and what is expected.
-_SEVERAL_NUMBERS = (
-    ("TASK_ID", "--task-id", "a whole number, or several separated by spaces"),
-    ("LAYERS", "--layers", 'layer numbers separated by spaces, as in LAYERS="25 26 27"'),
-)
+_SEVERAL = ("TASK_ID", "LAYERS")
 _SWITCH = {"1": True, "true": True, "yes": True, "": False, "0": False, "false": False, "no": False}
 
 
@@ -293,20 +287,12 @@ def arguments_from_environment(environment: Mapping[str, str], family: PolicyFam
     given = {name: value.strip() for name, value in environment.items()}
     get = given.get
     arguments: list[str] = []
-    for name, option in _OPTIONS.items():
-        if get(name):
-            arguments += [option, given[name]]
-    for name, option in _WHOLE_NUMBERS.items():
-        if get(name):
-            if not given[name].isdecimal():
-                raise BadArgument(f"{name} is '{given[name]}'; expected a whole number.")
-            arguments += [option, given[name]]
-    for name, option, described in _SEVERAL_NUMBERS:
-        numbers = given.get(name, "").split()
-        if not all(number.isdecimal() for number in numbers):
-            raise BadArgument(f"{name} is '{given[name]}'; expected {described}.")
-        if numbers:
-            arguments += [option, *numbers]
+    for name, expected in _VARIABLES.items():
+        text = given.get(name, "")
+        words = text.split() if name in _SEVERAL else [text] if text else []
+        if expected and not all(word.isdecimal() for word in words):
+            raise BadArgument(f"{name} is '{text}'; expected {expected}.")
+        arguments += [_option_of(name), *words] if words else []
     arguments += _family_arguments(given, family)
     save_viz = _SWITCH.get(get("SAVE_VIZ", "").lower())
     if save_viz is None:
@@ -343,12 +329,16 @@ def describe_job(environment: Mapping[str, str], host: str) -> str:
 
 def _family_arguments(given: Mapping[str, str], family: PolicyFamily) -> list[str]:
     """Return the options of the family's own variables; `BadArgument` for a variable of another family."""
-    options = family.published.variables if family.published else {}
+    own = family.published.variables if family.published else ()
     for other in policy_families():
-        for name in other.published.variables if other.published else {}:
-            if given.get(name) and name not in options:
+        for name in other.published.variables if other.published else ():
+            if given.get(name) and name not in own:
                 raise BadArgument(f"{name} is for {other.title}, and means nothing to {family.title}; unset it.")
-    return [word for name, option in options.items() if given.get(name) for word in (option, given[name])]
+    return [word for name in own if given.get(name) for word in (_option_of(name), given[name])]
+
+
+def _option_of(variable: str) -> str:
+    return "--output" if variable == "STORE" else f"--{variable.lower().replace('_', '-')}"
 
 
 def _checkpoint(given: Mapping[str, str]) -> str:

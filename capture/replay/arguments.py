@@ -4,26 +4,86 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from vla_attention.capture.effects.arguments import add_effect_arguments
-from vla_attention.capture.engine.recording_arguments import add_recording_arguments
-from vla_attention.capture.interventions.arguments import add_intervention_arguments
+from vla_attention.capture.effects.arguments import add_effect_options
+from vla_attention.capture.engine.settings import RecordingSettings, StoreOutput
+from vla_attention.capture.interventions.arguments import InterventionSettings
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import policy_families
-from vla_attention.capture.policies.family import PolicyFamily
-from vla_attention.capture.policies.model_arguments import POLICY_THREADS
+from vla_attention.capture.policies.family import ModelSettings, PolicyFamily
 from vla_attention.capture.policies.robot import NONE
 from vla_attention.schemas.errors import BadArgument, listing
-from vla_attention.schemas.threads import add_threads, use_threads
+from vla_attention.schemas.options import add_options, option
+from vla_attention.schemas.threads import use_threads
 
 REPLAY_EXAMPLES = """\
-  vla-attention capture replay data/so101_pick --checkpoint my/pi05_so101 --every 15 --episodes 0 1 2-5
+  vla-attention capture replay data/so101_pick --checkpoint my/pi05_so101 --every 15 --episode 0 1 2-5
   vla-attention capture replay lerobot/droid_100 --checkpoint gs://openpi-assets/checkpoints/pi05_droid \\
       --action action.joint_velocity action.gripper_position
   vla-attention capture replay data/so101_pick --policy my_smolvla.py --every 15
   vla-capture replay data/bimanual --checkpoint my/pi0 --camera left_wrist_0_rgb=wrist --camera right_wrist_0_rgb=none
 """
+
+
+@dataclass(frozen=True)
+class ReplaySettings:
+    """Which frames of a data set a policy is called on, and what it reads of them.
+
+    state, action: none where they are found by their usual names. every: None takes the policy's number. instruction:
+    None takes the data set's tasks.
+    """
+
+    camera: tuple[str, ...] = option(
+        f"pictures of one camera of the policy; {NONE} leaves it black and masked (default: the column of the same "
+        "name, or a usual one)",
+        (),
+        group="what the policy reads of the data set",
+        action="append",
+        metavar="POLICY=COLUMN",
+    )
+    state: tuple[str, ...] = option(
+        "columns of numbers that make up the state, in this order (default: observation.state, state, or "
+        "joint_position gripper_position)",
+        (),
+        metavar="COLUMN",
+    )
+    action: tuple[str, ...] = option(
+        f"columns of the recorded actions, which are kept beside the policy's; {NONE} keeps none (default: action or "
+        "actions)",
+        (),
+        metavar="COLUMN",
+    )
+    relative_actions: int | None = option(
+        "the first N numbers of openpi's actions are differences to the state (default: as its configuration says, 6 "
+        "for pi0_libero, else 0)",
+        None,
+    )
+    instruction: str | None = option("what the policy reads instead of the data set's tasks", None, metavar="TEXT")
+    every: int | None = option(
+        "a policy call at frame 0, N, 2N ... of each episode (default: as the file says, else 1)",
+        None,
+        group="which frames",
+        least=1,
+    )
+    episodes: tuple[int, ...] | None = option(
+        "numbers of episodes, and ranges as 3-7 (default: all)", None, name="episode", dest="episodes"
+    )
+    num_episodes: int | None = option("the first N of these (default: all)", None, least=1)
+    seed: int = option("seed of all noise (default: %(default)s)", 7, least=0)
+
+
+@dataclass(frozen=True)
+class ReplayOutput(StoreOutput):
+    """Where the store goes, and which one it is compared with."""
+
+    rerun_of: Path | None = option(
+        "the replay of the same frames without interventions, with which `vla-attention compare` then pairs the calls "
+        "of this one, replan by replan",
+        None,
+        metavar="BASE.zarr",
+    )
 
 
 def add_replay_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -> None:
@@ -38,23 +98,21 @@ def add_replay_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) 
         help=f"{listing(family.name for family in families)}, or a file with a function load(device) that returns any "
         "torch policy as a va.datasets.ReplayPolicy, see docs/data-sets.md (default: %(default)s)",
     )
-    of_file = is_policy_file(_policy_among(given))
-    if of_file:
-        group = parser.add_argument_group("model")
-        group.add_argument("--device", default="auto", help="auto (default: a GPU if there is one), cpu, cuda ...")
-        add_threads(group, POLICY_THREADS)
+    place = "the store, NAME.zarr, or a folder for it (default: runs/DATASET.zarr)"
+    if is_policy_file(_policy_among(given)):
+        add_options(parser, ModelSettings, checkpoint=None, config_name=None, dtype=None)
+        add_options(parser, ReplaySettings, relative_actions=None)
+        add_options(parser, InterventionSettings)
+        add_options(parser, RecordingSettings)
+        add_options(parser, ReplayOutput, store=place)
     else:
-        family.add_arguments(parser)
-        parser.set_defaults(family=family)
-    _add_column_arguments(parser, of_file=of_file)
-    _add_frame_arguments(parser, "as the file says, else 1" if of_file else family.replan_default)
-    if of_file:
-        _add_change_arguments(parser)
-    if not of_file:
-        add_effect_arguments(parser)
-    add_recording_arguments(parser, f"block indices (default: all){'' if of_file else family.layers_note}")
-    _add_output_arguments(parser)
-    parser.set_defaults(command=_run)
+        every = f"a policy call at frame 0, N, 2N ... of each episode (default: {family.replan_default})"
+        add_options(parser, family.settings)
+        add_options(parser, ReplaySettings, camera=None, every=every)  # the family has a --camera
+        add_effect_options(parser)
+        add_options(parser, RecordingSettings, layers=f"block indices (default: all){family.layers_note}")
+        add_options(parser, ReplayOutput, store=place, rerun_of=None)
+    parser.set_defaults(command=_run, family=family)
 
 
 def is_policy_file(name: str) -> bool:
@@ -84,88 +142,6 @@ def check_policy_name(name: str) -> None:
     families = [family.name for family in policy_families() if family.reads_data_sets]
     if name not in families and not is_policy_file(name):
         raise BadArgument(f"Cannot use --policy {name}; expected {listing(families)}, or a file FILE.py.")
-
-
-def _add_column_arguments(parser: argparse.ArgumentParser, *, of_file: bool) -> None:
-    group = parser.add_argument_group("what the policy reads of the data set")
-    if of_file:  # a family has the option itself
-        group.add_argument(
-            "--camera",
-            action="append",
-            default=[],
-            metavar="POLICY=COLUMN",
-            help=f"pictures of one camera of the policy; {NONE} leaves it black and masked (default: the column of "
-            "the same name, or a usual one)",
-        )
-    group.add_argument(
-        "--state",
-        nargs="+",
-        default=[],
-        metavar="COLUMN",
-        help="columns of numbers that make up the state, in this order (default: observation.state, state, or "
-        "joint_position gripper_position)",
-    )
-    group.add_argument(
-        "--action",
-        nargs="+",
-        default=[],
-        metavar="COLUMN",
-        help=f"columns of the recorded actions, which are kept beside the policy's; {NONE} keeps none (default: action "
-        "or actions)",
-    )
-    if not of_file:
-        group.add_argument(
-            "--relative-actions",
-            type=int,
-            metavar="N",
-            help="the first N numbers of openpi's actions are differences to the state (default: as its configuration "
-            "says, 6 for pi0_libero, else 0)",
-        )
-    group.add_argument("--instruction", metavar="TEXT", help="what the policy reads instead of the data set's tasks")
-
-
-def _add_frame_arguments(parser: argparse.ArgumentParser, every: str) -> None:
-    group = parser.add_argument_group("which frames")
-    group.add_argument(
-        "--every",
-        type=int,
-        metavar="N",
-        help=f"a policy call at frame 0, N, 2N ... of each episode (default: {every})",
-    )
-    group.add_argument(
-        "--episode",
-        dest="episodes",
-        nargs="+",
-        metavar="N",
-        help="numbers of episodes, and ranges as 3-7 (default: all)",
-    )
-    group.add_argument("--num-episodes", type=int, metavar="N", help="the first N of these (default: all)")
-    group.add_argument("--seed", type=int, default=7, metavar="N", help="seed of all noise (default: %(default)s)")
-
-
-def _add_change_arguments(parser: argparse.ArgumentParser) -> None:
-    add_intervention_arguments(parser)
-    parser.add_argument(
-        "--rerun-of",
-        type=Path,
-        metavar="BASE.zarr",
-        help="the replay of the same frames without interventions, with which `vla-attention compare` then pairs the "
-        "calls of this one, replan by replan",
-    )
-
-
-def _add_output_arguments(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("output")
-    group.add_argument(
-        "--output",
-        dest="store",
-        type=Path,
-        metavar="NAME.zarr",
-        help="store to write (default: runs/DATASET.zarr)",
-    )
-    existing = group.add_mutually_exclusive_group()
-    existing.add_argument("--resume", action="store_true", help="continue an existing store with what is missing")
-    existing.add_argument("--overwrite", action="store_true", help="delete an existing store first")
 
 
 def _run(arguments: argparse.Namespace, termination: Termination) -> int:

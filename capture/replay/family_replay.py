@@ -12,12 +12,12 @@ from typing import Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.effects.arguments import effect_settings
 from vla_attention.capture.effects.mean_pictures import pictures_of
 from vla_attention.capture.effects.measurement import measurement_of
 from vla_attention.capture.engine.call import Caller, PolicyCall
-from vla_attention.capture.engine.plan import plan_recording, recording_settings, root_attributes
+from vla_attention.capture.engine.plan import plan_recording, root_attributes
 from vla_attention.capture.engine.progress import say
+from vla_attention.capture.engine.settings import recording_settings
 from vla_attention.capture.engine.source import Episode, EpisodeJob, Outcome, Source, episode_start
 from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.machine import describe_machine
@@ -103,11 +103,11 @@ class FramesOfEpisode(Episode):
         if frame is None:
             return Outcome(success_of(self.episode), self.episode.length)
         plan, policy, actions = self.source.plan, self.source.policy, self.actions
-        instruction = frame.instruction if plan.instruction is None else plan.instruction
+        given = plan.settings.instruction
         context = CallContext(self.job.task.task_id, frame.episode, self.done)
         return PolicyCall(
-            policy.prepare_robot(frame.images, self.state[frame.index], instruction),
-            self.source.caller.drawn_seed(plan.seed, context),
+            policy.prepare_robot(frame.images, self.state[frame.index], frame.instruction if given is None else given),
+            self.source.caller.drawn_seed(plan.settings.seed, context),
             context,
             frame.index,
             f"replan {self.done} (frame {frame.index}) of episode {self.job.name} of {plan.store}",
@@ -119,13 +119,14 @@ def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: 
     """Build the policy for the robot of the data set, and record its calls; returns the number of new episodes."""
     family: PolicyFamily = arguments.family
     arguments.robot_data = plan.robot_data
-    policy = cast(RobotPolicy, family.build(arguments, device))
+    policy = cast(RobotPolicy, family.read(arguments).build(device))
     robot = policy.robot
     plan.data.check_files(plan.wanted, tuple(robot.cameras.values()))
-    recording, note = plan_recording(recording_settings(arguments), policy, plan.seed)
+    settings = recording_settings(arguments)
+    recording, note = plan_recording(settings, policy, plan.settings.seed)
     if note:
         say(note)
-    every = plan.every or policy.default_replan_steps
+    every = plan.settings.every or policy.default_replan_steps
     attributes = root_attributes(
         policy.identity(),
         policy.sites,
@@ -140,7 +141,7 @@ def replay_with_family(arguments: argparse.Namespace, plan: ReplayPlan, device: 
     if masked:
         say(f"Black and masked: {listing(masked)}.")
     # A data set knows no families of tasks, so there are no words to exchange.
-    pictures = pictures_of(effect_settings(arguments), policy, attributes.protocol.suite)
+    pictures = pictures_of(settings.effects, policy, attributes.protocol.suite)
     effects = measurement_of(recording.effects, policy, [], say, pictures)
     caller = Caller(policy, recording, effects=effects)
     source = Frames(policy, caller, plan, every, attributes.provenance)

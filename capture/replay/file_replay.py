@@ -11,8 +11,8 @@ from pathlib import Path
 import torch
 from msgspec import structs
 
-from vla_attention.capture.engine.plan import recording_settings
 from vla_attention.capture.engine.progress import say
+from vla_attention.capture.engine.settings import recording_settings
 from vla_attention.capture.engine.source import Committed, Episode, EpisodeJob, Outcome, Source
 from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.policies.noise import noise_seed
@@ -61,7 +61,7 @@ class FramesForFile(Source):
 
     def _calls(self, job: EpisodeJob, episode: DataSetEpisode) -> Generator[None, None, Path]:
         """Make a policy call at a time, and commit all of them; returns the episode's folder in the store."""
-        instruction, task = self.plan.instruction, job.task
+        instruction, task = self.plan.settings.instruction, job.task
         state = joined(episode, self.state) if self.state else None
         actions = joined(episode, self.actions) if self.actions else None
         # What the policy reads is not known of every policy: with no camera in the layout, all columns are decoded.
@@ -123,7 +123,7 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
     cameras = offered.match_cameras(layout.camera_names, {}, ()) if layout.camera_names else {}
     state, actions = _columns(offered, "state"), _columns(offered, "action")
     plan.data.check_files(plan.wanted, tuple(cameras.values()) or plan.data.cameras)
-    every = plan.every or given.every
+    every = plan.settings.every or given.every
     settings = recording_settings(arguments)
     if settings.queries not in ("mean", "all"):
         raise BadArgument(f"Cannot use --queries {settings.queries} with --policy FILE.py; expected mean or all.")
@@ -162,7 +162,7 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
     sizes = [math.prod(picture_size(run.attributes.sites, camera)) * 3 for camera in cameras]
     with run:
         todo = announce_replay(plan, run.attributes, layout.action_horizon, sizes)
-        seed = plan.seed if interventions.noise is None else interventions.noise.seed
+        seed = plan.settings.seed if interventions.noise is None else interventions.noise.seed
         source = FramesForFile(given, run, plan, every, seed, cameras, state, actions)
         added = record_episodes(plan, run.store, todo, every, source)
     if run.num_dropped:

@@ -15,27 +15,28 @@ from numpy.typing import NDArray
 from vla_attention.capture.engine.faults import Faults
 from vla_attention.capture.engine.loop import EpisodeLoop
 from vla_attention.capture.engine.plan import announce
+from vla_attention.capture.engine.settings import StoreOutput
 from vla_attention.capture.engine.source import EpisodeJob, Source, plan_of
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.robot import RobotData, read_camera_choices
+from vla_attention.capture.replay.arguments import ReplaySettings
 from vla_attention.capture.replay.data_set_files import INDEX_COLUMNS
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, LeRobotDataset, open_dataset
 from vla_attention.capture.replay.video import import_av
 from vla_attention.capture.store.disk_estimate import estimate_disk
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, check_target
 from vla_attention.schemas.errors import BadArgument, plural
+from vla_attention.schemas.options import read_options
 from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.root import episode_folders
 from vla_attention.schemas.stores.store_format import (
-    STORE_SUFFIX,
     DataSetSource,
     Protocol,
     RootAttributes,
     parse_episode_name,
 )
-from vla_attention.schemas.stores.store_place import check_place
 from vla_attention.schemas.stores.verify import find_damaged
 
 #: The column that says of every frame whether the task is solved, where a data set has it.
@@ -46,18 +47,14 @@ SUCCESS_COLUMN = "next.success"
 class ReplayPlan:
     """A replay that is to be made.
 
-    wanted: numbers of the episodes. every: a policy call at frame 0, every, 2 · every ...; None: as the policy says.
-    instruction: what the policy reads instead of the data set's tasks; None: the tasks.
-    faults: of episodes that were left out.
+    wanted: numbers of the episodes. faults: of episodes that were left out.
     """
 
+    settings: ReplaySettings
     data: LeRobotDataset
     wanted: tuple[int, ...]
     store: Path
     mode: WriteMode
-    every: int | None
-    seed: int
-    instruction: str | None
     robot_data: RobotData
     termination: Termination
     faults: Faults = field(default_factory=Faults)
@@ -67,7 +64,7 @@ class ReplayPlan:
         return Protocol(
             name="dataset",
             suite=suite_of(self.data),
-            seed=self.seed,
+            seed=self.settings.seed,
             wait_steps=0,
             replan_steps=every,
             max_steps=0,
@@ -83,7 +80,7 @@ class ReplayPlan:
         """Return what is to be recorded of an episode. Its task is that of its first frame."""
         episode = self.data.episode(index)
         task_id = int(episode.task_indices[0])
-        instruction = self.data.tasks[task_id] if self.instruction is None else self.instruction
+        instruction = self.data.tasks[task_id] if self.settings.instruction is None else self.settings.instruction
         name = re.sub(r"\W+", "_", instruction.strip()).strip("_")[:60] or f"task_{task_id}"
         task = Task(suite_of(self.data), task_id, name, instruction, num_initial_states=0)
         return EpisodeJob(task, index, self.calls(index, every), f"episode {index}")
@@ -101,33 +98,18 @@ def plan_replay(arguments: argparse.Namespace, termination: Termination) -> Repl
         BadArgument, UnknownName: an option cannot be used, or names what does not exist.
         StoreExists: a store is there, and is neither to be continued nor to be replaced.
     """
-    if arguments.every is not None and arguments.every < 1:
-        raise BadArgument(f"Cannot use --every {arguments.every}; expected at least 1.")
-    if arguments.seed < 0:
-        raise BadArgument(f"Cannot use --seed {arguments.seed}; expected 0 or more.")
+    settings, output = read_options(ReplaySettings, arguments), read_options(StoreOutput, arguments)
     data = open_dataset(arguments.data_set)
     if any(data.feature(camera).dtype == "video" for camera in data.cameras):
         import_av()  # that PyAV is missing is said now, too
-    wanted = chosen_episodes(data, arguments.episodes, arguments.num_episodes)
-    store = arguments.store or Path("runs") / f"{file_part(suite_of(data))}{STORE_SUFFIX}"
-    check_place(store, "write a store at")
-    mode: WriteMode = "overwrite" if arguments.overwrite else "resume" if arguments.resume else "new"
+    wanted = chosen_episodes(data, settings)
+    store = output.place(file_part(suite_of(data)))
     # An existing store or an unwritable place is an error now, before the minutes for loading a model.
-    check_target(store, mode)
-    return ReplayPlan(
-        data=data,
-        wanted=wanted,
-        store=store,
-        mode=mode,
-        every=arguments.every,
-        seed=arguments.seed,
-        instruction=arguments.instruction,
-        robot_data=robot_data(data, arguments),
-        termination=termination,
-    )
+    check_target(store, output.mode)
+    return ReplayPlan(settings, data, wanted, store, output.mode, robot_data(data, settings), termination)
 
 
-def robot_data(data: LeRobotDataset, arguments: argparse.Namespace) -> RobotData:
+def robot_data(data: LeRobotDataset, settings: ReplaySettings) -> RobotData:
     """Return what the data set offers and what the options choose of it.
 
     Raises:
@@ -142,10 +124,10 @@ def robot_data(data: LeRobotDataset, arguments: argparse.Namespace) -> RobotData
         name=data.name,
         cameras=data.cameras,
         numbers={name: size for name, size in numbers.items() if name not in INDEX_COLUMNS},
-        chosen_cameras=read_camera_choices(arguments.camera, data.cameras),
-        chosen_state=tuple(arguments.state),
-        chosen_actions=tuple(arguments.action),
-        relative_actions=getattr(arguments, "relative_actions", None),
+        chosen_cameras=read_camera_choices(settings.camera, data.cameras),
+        chosen_state=settings.state,
+        chosen_actions=settings.action,
+        relative_actions=settings.relative_actions,
     )
 
 
@@ -205,35 +187,18 @@ def record_episodes(plan: ReplayPlan, store: RunStore, todo: Sequence[int], ever
     return len(results)
 
 
-def chosen_episodes(data: LeRobotDataset, words: Sequence[str] | None, limit: int | None) -> tuple[int, ...]:
-    """Return the numbers of episodes, in their order.
-
-    Args:
-        data: the data set.
-        words: numbers and ranges (`3-7`, both ends included); None for all.
-        limit: so many at most, the first ones; None for all.
+def chosen_episodes(data: LeRobotDataset, settings: ReplaySettings) -> tuple[int, ...]:
+    """Return the numbers of the wanted episodes, in their order.
 
     Raises:
         UnknownName: an episode does not exist.
-        BadArgument: a word is no number and no range, or nothing is left.
+        BadArgument: there are none.
     """
-    chosen: set[int] = set()
-    for word in words if words is not None else ():
-        match = re.fullmatch(r"(\d+)(?:-(\d+))?", word)
-        if match is None or int(match[2] or match[1]) < int(match[1]):
-            raise BadArgument(f"Cannot use --episodes {word}; expected a number, or a range as 3-7.")
-        first, last = int(match[1]), int(match[2] or match[1])
-        data.entry(first)
-        data.entry(last)  # before a long range is counted
-        chosen.update(range(first, last + 1))
-    if words is None:
-        chosen = set(data.info.episodes)
-    if limit is not None and limit < 1:
-        raise BadArgument(f"Cannot use --num-episodes {limit}; expected at least 1.")
-    numbers = tuple(data.entry(index).index for index in sorted(chosen)[:limit])
+    chosen = data.info.episodes if settings.episodes is None else settings.episodes
+    numbers = tuple(data.entry(index).index for index in sorted(set(chosen)))
     if not numbers:
         raise BadArgument(f"The data set '{data.name}' has no episodes.")
-    return numbers
+    return numbers[: settings.num_episodes]
 
 
 def num_calls(length: int, every: int) -> int:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vla_attention.capture.effects.arguments import add_effect_arguments
-from vla_attention.capture.engine.recording_arguments import add_recording_arguments
-from vla_attention.capture.interventions.arguments import add_intervention_arguments
+from vla_attention.capture.effects.arguments import add_effect_options
+from vla_attention.capture.engine.settings import RecordingSettings, StoreOutput
+from vla_attention.capture.interventions.arguments import InterventionSettings
 from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import family_of_kind
 from vla_attention.schemas.errors import BadArgument, UnknownName, UserError
-from vla_attention.schemas.options import add_capture_output, add_task
+from vla_attention.schemas.options import add_options, option, task_option
 from vla_attention.schemas.threads import use_threads
 
 if TYPE_CHECKING:
@@ -30,6 +31,40 @@ RERUN_EXAMPLES = """\
 """
 
 
+@dataclass(frozen=True)
+class RerunSettings:
+    """Which calls of a store are made again, alone or as a series of conditions."""
+
+    series: str | None = option(
+        "for every group of a built-in grouping or TOML file: without it, with it alone, and without as many random "
+        "keys; and once with another noise seed",
+        None,
+        group="a series of reruns, with --knockout-queries and the like for all of them",
+        metavar="GROUPING",
+    )
+    words: bool = option(
+        "with --series: every word of the instructions, too; they are cut for all queries unless --knockout-queries is "
+        "given",
+        False,
+    )
+    objects: bool = option("with --series: every object of the scenes, too", False)
+    tasks: tuple[int | str, ...] | None = task_option("tasks of the store", group="which policy calls")
+    num_episodes: int | None = option("the first N episodes of each task (default: all)", None, least=1)
+    check: int | None = option(
+        "policy calls of the first episode that are made again unchanged before anything else (default: all of them; "
+        "0: none)",
+        None,
+        least=0,
+    )
+
+
+@dataclass(frozen=True)
+class RerunOutput(StoreOutput):
+    """Where the store goes, and what its condition is called."""
+
+    name: str = option("name of the condition, for tables (default: made of the options)", "")
+
+
 def add_rerun_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -> None:
     """Add all options. given: what will be parsed; a store among it decides the model's options and the defaults."""
     parser.add_argument(
@@ -39,16 +74,20 @@ def add_rerun_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -
     if root is not None:
         _refuse_own_loop(root)
         family = _family_of(root)
-        family.add_arguments(parser)
-        parser.set_defaults(**family.rebuild(root.policy), family=family)
-    add_intervention_arguments(parser)
-    _add_series_arguments(parser)
-    _add_selection_arguments(parser)
-    add_recording_arguments(parser, "block indices", rerun=True)
-    add_effect_arguments(parser)
+        add_options(parser, family.settings)
+        parser.set_defaults(**family.settings.of_store(root.policy), family=family)
+    add_options(parser, InterventionSettings)
+    add_options(parser, RerunSettings)
+    add_options(parser, RecordingSettings, defaults="as in the store")
+    add_effect_options(parser)
     if root is not None:
         _take_recording_of(root, parser)
-    _add_output_arguments(parser)
+    place = (
+        "the store to write, NAME.zarr (default: beside the base, with the name of the condition); with --series the "
+        "folder of the stores, one for each condition, of which those that are whole are skipped (default: the base's "
+        "name and _reruns, beside it)"
+    )
+    add_options(parser, RerunOutput, store=place)
     parser.set_defaults(command=_run)
 
 
@@ -101,59 +140,12 @@ def _take_recording_of(root: RootAttributes, parser: argparse.ArgumentParser) ->
     recording = root.recording
     parser.set_defaults(
         layers=list(recording.layer_labels),
-        denoise_steps=[str(step) for step in recording.denoise_steps],
+        denoise=[str(step) for step in recording.denoise_steps],
         heads=list(recording.heads),
         queries=recording.queries,
         precision=str(recording.mantissa_bits),
         contributions=recording.contributions,
     )
-
-
-def _add_series_arguments(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("a series of reruns, with --knockout-queries and the like for all of them")
-    group.add_argument(
-        "--series",
-        metavar="GROUPING",
-        help="for every group of a built-in grouping or TOML file: without it, with it alone, and without as many "
-        "random keys; and once with another noise seed",
-    )
-    group.add_argument(
-        "--words",
-        action="store_true",
-        help="with --series: every word of the instructions, too; they are cut for all queries unless "
-        "--knockout-queries is given",
-    )
-    group.add_argument("--objects", action="store_true", help="with --series: every object of the scenes, too")
-
-
-def _add_selection_arguments(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("which policy calls")
-    add_task(group, "task_id", "tasks of the store")
-    group.add_argument("--num-episodes", type=int, metavar="N", help="the first N episodes of each task (default: all)")
-    group.add_argument(
-        "--check",
-        type=int,
-        metavar="N",
-        help="policy calls of the first episode that are made again unchanged before anything else (default: all of "
-        "them; 0: none)",
-    )
-
-
-def _add_output_arguments(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("output")
-    group.add_argument(
-        "--name", metavar="NAME", default="", help="name of the condition, for tables (default: made of the options)"
-    )
-    add_capture_output(
-        group,
-        "PATH",
-        "the store to write, NAME.zarr (default: beside the base, with the name of the condition); with --series the "
-        "folder of the stores, one for each condition, of which those that are whole are skipped (default: the base's "
-        "name and _reruns, beside it)",
-    )
-    existing = group.add_mutually_exclusive_group()
-    existing.add_argument("--resume", action="store_true", help="continue an existing store with what is missing")
-    existing.add_argument("--overwrite", action="store_true", help="delete an existing store first")
 
 
 def _run(arguments: argparse.Namespace, termination: Termination) -> int:

@@ -35,8 +35,6 @@ def open_base(path: Path, chosen: Sequence[int | str] | None = None, num_episode
         BadArgument: it has no episode of a wanted task.
     """
     store = open_store(path)
-    if num_episodes is not None and num_episodes < 1:
-        raise BadArgument(f"Cannot use --num-episodes {num_episodes}; expected at least 1.")
     task_ids = None
     if chosen is not None:
         named = any(isinstance(task, str) for task in chosen)

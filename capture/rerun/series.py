@@ -6,7 +6,7 @@ All conditions are made in one process, each into a store of its own.
 from __future__ import annotations
 
 import argparse
-import copy
+import dataclasses
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +15,9 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from vla_attention.capture.effects.arguments import NO_EFFECTS
+from vla_attention.capture.effects.arguments import EffectSettings, effect_settings
 from vla_attention.capture.engine.progress import duration, say
-from vla_attention.capture.interventions.arguments import read_interventions
+from vla_attention.capture.interventions.arguments import InterventionSettings, interventions_of
 from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
 from vla_attention.capture.interventions.condition_name import knockout_of_group
 from vla_attention.capture.interventions.resolution import (
@@ -26,6 +26,7 @@ from vla_attention.capture.interventions.resolution import (
     episode_vocabularies,
     interventions_for,
 )
+from vla_attention.capture.rerun.arguments import RerunOutput, RerunSettings
 from vla_attention.capture.rerun.base_store import check_may_change
 from vla_attention.capture.rerun.rerun_store import Rerun
 from vla_attention.schemas.errors import BadArgument, UserError, listing
@@ -35,6 +36,7 @@ from vla_attention.schemas.groupings.selector_weights import selector_weights
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
 from vla_attention.schemas.interventions import Interventions, KeyKnockout, NoiseChange, readers
 from vla_attention.schemas.layout import Role
+from vla_attention.schemas.options import read_options
 from vla_attention.schemas.safe_text import file_part
 from vla_attention.schemas.stores.reader import Store
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX
@@ -215,21 +217,24 @@ class SeriesRun:
     @classmethod
     def planned(cls, arguments: argparse.Namespace, base: Store) -> SeriesRun:
         """Plan the series of the arguments. Needs no policy; errors come before the minutes for loading one."""
-        _refuse_own_interventions(arguments)
-        template = _template(arguments)
+        settings, output = read_options(RerunSettings, arguments), read_options(RerunOutput, arguments)
+        changes = read_options(InterventionSettings, arguments)
+        _refuse_own_interventions(output, changes, effect_settings(arguments))
+        # Any selector: the plan replaces it.
+        template = interventions_of(dataclasses.replace(changes, knockout=("role:image",), noise_seed=None)).keys[0]
         # A word acts through the pictures that have read it: cut for the action queries alone, it seems to do nothing.
-        words = template if arguments.knockout_queries is not None else replace(template, queries="all")
+        words = template if changes.knockout_queries is not None else replace(template, queries="all")
         check_places(Interventions(keys=(template,)), base.attributes.policy)
         series = plan_series(
             base,
-            arguments.series,
+            str(settings.series),
             template,
-            base.attributes.protocol.seed + 1 if arguments.noise_seed is None else arguments.noise_seed,
-            words=words if arguments.words else None,
-            objects=arguments.objects,
+            base.attributes.protocol.seed + 1 if changes.noise_seed is None else changes.noise_seed,
+            words=words if settings.words else None,
+            objects=settings.objects,
         )
         check_may_change(base, series.conditions[0].interventions)
-        folder = arguments.output_dir or local_path(base.path).with_name(f"{base.path.stem}_reruns")
+        folder = output.output_dir or local_path(base.path).with_name(f"{base.path.stem}_reruns")
         check_writable(folder, "--output-dir")
         return cls(base, series, folder)
 
@@ -261,29 +266,23 @@ class SeriesRun:
         rerun.write(target, "resume", changed, lambda episode: episode.name in condition.episodes)
 
 
-def _refuse_own_interventions(arguments: argparse.Namespace) -> None:
+def _refuse_own_interventions(
+    output: RerunOutput, changes: InterventionSettings, effects: EffectSettings | None
+) -> None:
     for option, given in (
-        ("--knockout", arguments.knockout),
-        ("--keep", arguments.keep),
-        ("--attention", arguments.attention),
-        ("--prompt", arguments.prompt),
-        ("--image", arguments.image),
-        ("--allow-empty", arguments.allow_empty),
-        ("--name", arguments.name),
-        ("--output NAME.zarr", arguments.store),
-        ("--overwrite", arguments.overwrite),
-        ("--effects", arguments.effects != NO_EFFECTS),
+        ("--knockout", changes.knockout),
+        ("--keep", changes.keep),
+        ("--attention", changes.attention),
+        ("--prompt", changes.prompt),
+        ("--image", changes.image),
+        ("--allow-empty", changes.allow_empty),
+        ("--name", output.name),
+        ("--output NAME.zarr", output.store),
+        ("--overwrite", output.overwrite),
+        ("--effects", effects),
     ):
         if given:
             raise BadArgument(
                 f"Cannot use {option} with --series, which makes its own interventions and stores; run vla-attention "
                 "capture rerun once more for others."
             )
-
-
-def _template(arguments: argparse.Namespace) -> KeyKnockout:
-    """Return a knockout with the places, queries, weight and seed of the arguments."""
-    words = copy.copy(arguments)
-    words.knockout = ["role:image"]  # any selector: the plan replaces it
-    words.noise_seed = None
-    return read_interventions(words).keys[0]

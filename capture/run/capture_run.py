@@ -112,7 +112,7 @@ def run_capture(
     missing = f", {len(faults.dropped)} missing" if faults.dropped else ""
     solved = sum(bool(result.outcome.success) for result in results)
     say(f"{plural(len(results), 'episode')} added, {solved} solved{missing}. Store: {settings.store}")
-    left = find_damaged(settings.store, damaged, settings.verify) if damaged else []
+    left = find_damaged(settings.store, damaged, settings.output.verify) if damaged else []
     if left and faults.dropped:
         raise EpisodesMissing(f"{describe_missing(faults.dropped)} {what_to_do(settings.store, left)}")
     faults.raise_missing()
@@ -134,7 +134,7 @@ def _record_missing(
     if run_plan.note:
         say(run_plan.note)
     environment_settings = EnvironmentSettings(run_plan.evaluation, settings.libero_assets)
-    store = open_run(settings.store, attributes, settings.mode)
+    store = open_run(settings.store, attributes, settings.output.mode)
     done = store.committed()
     jobs = [
         EpisodeJob(task, episode, attributes.protocol.max_steps, f"task {task.task_id} episode {episode}")
@@ -143,7 +143,7 @@ def _record_missing(
     ]
     todo = [job for job in jobs if (job.task.task_id, job.episode_index) not in done]
     names = {job.name for job in jobs}
-    damaged = find_damaged(store.path, names, settings.verify) if done else []
+    damaged = find_damaged(store.path, names, settings.output.verify) if done else []
     pictures = stored_picture_sizes(policy, attributes.protocol.image_size)
     bound = estimate_disk(attributes.recording, attributes.sites, pictures, max_replans(attributes.protocol), len(todo))
     announce(attributes, list(_lines_on_source(attributes)), bound, store.path, len(names), damaged)

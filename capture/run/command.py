@@ -26,7 +26,7 @@ def run_capture_of_family(arguments: argparse.Namespace, termination: Terminatio
     settings = run_settings(arguments)
     # An existing store, an unwritable place or a simulator that cannot run is an error now, before the minutes for
     # loading a model and before anything is written.
-    check_target(settings.store, settings.mode)
+    check_target(settings.store, settings.output.mode)
     if arguments.output_dir is not None:
         check_writable(arguments.output_dir, "--output-dir")
     check_simulator(settings.suite, settings.libero_assets)
@@ -38,7 +38,7 @@ def run_capture_of_family(arguments: argparse.Namespace, termination: Terminatio
     say(threads.describe())
     device = load_torch(arguments.device, threads.number)
     family: PolicyFamily = arguments.family
-    policy = family.build(arguments, device)
+    policy = family.read(arguments).build(device)
     run_capture(settings, policy, device, termination)
     if arguments.output_dir is None and not arguments.save_viz:
         say(f"Next: vla-attention analyze {settings.store}")
@@ -59,7 +59,7 @@ def run_analysis(arguments: argparse.Namespace, store: Path, output: Path | None
         command += ["--output", str(output)]
     if arguments.save_viz:
         command += ["--save-viz"]
-    process = subprocess.Popen([*command, *family.analysis_arguments(arguments), *more])
+    process = subprocess.Popen([*command, *family.read(arguments).analysis_arguments(), *more])
     try:
         return process.wait()
     except KeyboardInterrupt:

@@ -1,17 +1,13 @@
-"""Settings of a capture, from command-line arguments.
-
-Imports nothing heavy: mistakes in the arguments are reported before torch is loaded.
-"""
+"""Settings of a capture. Imports nothing heavy: every `--help` needs them, and mistakes come before torch is loaded."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from vla_attention.capture.engine.plan import RecordingSettings, recording_settings
+from vla_attention.capture.engine.settings import RecordingSettings, StoreOutput, recording_settings
 from vla_attention.capture.environments.base import Suite, check_task_id
 from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
 from vla_attention.capture.environments.suites import find_suite, list_tasks
@@ -20,14 +16,8 @@ from vla_attention.capture.machine import memory_left
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions
-from vla_attention.schemas.options import resolve_tasks
-from vla_attention.schemas.stores.store_format import STORE_SUFFIX
-from vla_attention.schemas.stores.store_place import check_place
+from vla_attention.schemas.options import option, read_options, resolve_tasks, task_option
 from vla_attention.schemas.threads import available_cores
-
-if TYPE_CHECKING:
-    from vla_attention.capture.store.store_writer import WriteMode
-
 
 #: The largest number of simulators that is taken without being asked for: one policy keeps few more busy.
 MOST_BY_DEFAULT = 8
@@ -36,69 +26,79 @@ SIMULATOR_BYTES = 2e9
 
 
 @dataclass(frozen=True)
+class CaptureOutput(StoreOutput):
+    """Where store and results of a capture go, and what is looked at in a store that is there."""
+
+    save_viz: bool = option("analyse afterwards, with pictures of every episode", False)
+    verify: bool = option(
+        "with --resume: read every byte of the episodes that are there, instead of only seals, presence and sizes",
+        False,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class RunSettings:
     """Which episodes are run, and into which store.
 
     task_ids: None runs all tasks of the suite. protocol: the published evaluation that is followed; None takes that of
-    the policy. seed, replan_steps, max_steps: None takes the protocol's number. array_task_ids: tasks that
-    other processes of the same array job run; the store is expected to hold these too. verify: read every byte of the
-    episodes that an existing store has, before they count as done. interventions: what is changed, with layer
-    numbers as typed. allow_empty: leave a replan unchanged where a group of an intervention has no key. num_envs:
-    simulators that run at a time; None takes as many as there are cores.
+    the policy. seed, replan_steps, max_steps: None takes the protocol's number. array_task_ids: tasks that other
+    processes of the same array job run; the store is expected to hold these too. interventions: what is changed, with
+    layer numbers as typed. allow_empty: leave a replan unchanged where a group of an intervention has no key.
     """
 
-    suite: Suite
-    task_ids: tuple[int, ...] | None
-    num_episodes: int
-    protocol: EvaluationProtocol | None
-    seed: int | None
-    replan_steps: int | None
-    max_steps: int | None
+    suite: Suite = option("name of the suite", group="evaluation", name="task-suite", type=str, metavar="SUITE")
+    task_ids: tuple[int, ...] | None = task_option("tasks of the suite")
+    num_episodes: int = option("episodes per task (default: %(default)s)", 5, least=1)
+    protocol: EvaluationProtocol | None = option(
+        "the published evaluation to follow: picture size, steps and seeding, see docs/protocol.md (default: that of "
+        "the checkpoint's format)",
+        None,
+        type=str,
+    )
+    seed: int | None = option("seed of the simulator and of all noise", None, least=0)
+    replan_steps: int | None = option("actions executed per policy call", None, least=1)
+    max_steps: int | None = option(
+        "steps after waiting (default: the published number of suite and protocol)", None, least=1
+    )
+    num_envs: int | None = option(
+        "simulators that run at a time, each in a process of its own; 1 simulates in the policy's process (default: "
+        f"the cores that this process may use, at most {MOST_BY_DEFAULT}, and 2 GB of memory each)",
+        None,
+        least=1,
+    )
+    policy_batch: int | None = option(
+        "most policy calls of different simulators that are made as one batch; from 2 on, last bits of what is "
+        "computed change (default: 1 on a processor, on a GPU the number of simulators)",
+        None,
+        least=1,
+    )
+    libero_assets: Path | None = option("LIBERO asset folder (or set VLA_LIBERO_ASSETS)", None)
     store: Path
-    mode: WriteMode
-    libero_assets: Path | None
+    output: CaptureOutput
     recording: RecordingSettings
-    array_task_ids: tuple[int, ...] = ()
-    verify: bool = False
-    interventions: Interventions = field(default_factory=Interventions)
+    interventions: Interventions
     allow_empty: bool = False
-    num_envs: int | None = None
-    policy_batch: int | None = None
+    array_task_ids: tuple[int, ...] = ()
 
 
-def run_settings(arguments: argparse.Namespace) -> RunSettings:
+def run_settings(given: argparse.Namespace) -> RunSettings:
     """Return the settings of parsed arguments; checks everything that needs no policy."""
-    suite = find_suite(arguments.task_suite)
-    task_ids = None if arguments.task_id is None else _task_ids(suite, arguments.task_id)
-    if arguments.num_episodes < 1:
-        raise BadArgument(f"Cannot use --num-episodes {arguments.num_episodes}; expected at least 1.")
-    if arguments.num_envs is not None and arguments.num_envs < 1:
-        raise BadArgument(f"Cannot use --num-envs {arguments.num_envs}; expected at least 1.")
-    if arguments.policy_batch is not None and arguments.policy_batch < 1:
-        raise BadArgument(f"Cannot use --policy-batch {arguments.policy_batch}; expected at least 1.")
-    if arguments.seed is not None and arguments.seed < 0:
-        raise BadArgument(f"Cannot use --seed {arguments.seed}; expected 0 or more.")
-    if arguments.verify and not arguments.resume:
+    family: PolicyFamily = given.family
+    output = read_options(CaptureOutput, given)
+    if output.verify and not output.resume:
         raise BadArgument("Cannot use --verify without --resume: a new store has no episodes that could be read.")
-    store = store_path(arguments)
-    check_place(store, "write a store at")
-    return RunSettings(
+    suite = find_suite(given.task_suite)
+    name = getattr(given, "protocol", None)  # a family with a single protocol has no such option
+    return read_options(
+        RunSettings,
+        given,
         suite=suite,
-        task_ids=task_ids,
-        num_episodes=arguments.num_episodes,
-        protocol=_protocol(arguments),
-        seed=arguments.seed,
-        replan_steps=arguments.replan_steps,
-        max_steps=arguments.max_steps,
-        store=store,
-        verify=arguments.verify,
-        mode="overwrite" if arguments.overwrite else "resume" if arguments.resume else "new",
-        libero_assets=arguments.libero_assets,
-        recording=recording_settings(arguments),
-        interventions=read_interventions(arguments),
-        allow_empty=arguments.allow_empty,
-        num_envs=arguments.num_envs,
-        policy_batch=arguments.policy_batch,
+        task_ids=None if given.task_id is None else _task_ids(suite, given.task_id),
+        protocol=next((protocol for protocol in family.protocols if protocol.name == name), None),
+        store=output.place(f"{family.store_prefix}{suite.name}"),
+        output=output,
+        recording=recording_settings(given),
+        interventions=read_interventions(given),
     )
 
 
@@ -110,20 +110,6 @@ def _task_ids(suite: Suite, chosen: Sequence[int | str]) -> tuple[int, ...]:
     for task_id in task_ids:
         check_task_id(suite, task_id)
     return tuple(sorted(task_ids))
-
-
-def _protocol(arguments: argparse.Namespace) -> EvaluationProtocol | None:
-    name = getattr(arguments, "protocol", None)  # a family with a single protocol has no such option
-    return next((protocol for protocol in arguments.family.protocols if protocol.name == name), None)
-
-
-def store_path(arguments: argparse.Namespace) -> Path:
-    """Return the store's path: --output, else the name of family and suite, in its folder or `runs`."""
-    if arguments.store is not None:
-        return Path(arguments.store)
-    family: PolicyFamily = arguments.family
-    name = f"{family.store_prefix}{arguments.task_suite}{STORE_SUFFIX}"
-    return (arguments.output_dir or Path("runs")) / name
 
 
 def default_policy_batch(device: str) -> int | None:

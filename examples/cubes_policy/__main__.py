@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from vla_attention.schemas.command_line import OneSentenceParser, command_parser, run_command
+from vla_attention.schemas.command_line import OneSentenceParser, run_command
 from vla_attention.schemas.stop_signals import end_program, run_until_stopped
 
 PROGRAM = "python -m examples.cubes_policy"
@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(given: list[str]) -> int:
-    parser = command_parser(PROGRAM, "Make the small pi0.5 of the suite cubes.")
+    parser = OneSentenceParser(prog=PROGRAM, description="Make the small pi0.5 of the suite cubes.")
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND", parser_class=OneSentenceParser)
     # Only the chosen command's module is imported, because they need different parts of the installation.
     for name, title in COMMANDS.items():

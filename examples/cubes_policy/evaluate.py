@@ -240,9 +240,10 @@ def _planned(arguments: argparse.Namespace, suite: Suite) -> tuple[Evaluation, l
 
 def _check_policy(evaluation: Evaluation) -> None:
     """Raise a `UserError` if the policy cannot be built, or gives fewer actions than are to be executed."""
+    from vla_attention.capture.policies.pi.family import PiSettings
     from vla_attention.capture.policies.pi.loading import build_pi_policy
 
-    policy = build_pi_policy(evaluation.checkpoint, tokenizer=None, device="cpu")
+    policy = build_pi_policy(PiSettings(evaluation.checkpoint), "cpu")
     if (evaluation.replan_steps or 1) > policy.action_horizon:
         raise BadArgument(
             f"Cannot use --replan-steps {evaluation.replan_steps}: a policy call of '{evaluation.checkpoint}' gives "
@@ -255,11 +256,12 @@ def _evaluating(evaluation: Evaluation, condition: Condition) -> Iterator[Callab
     """Give what runs an episode, in a process of its own."""
     import torch
 
+    from vla_attention.capture.policies.pi.family import PiSettings
     from vla_attention.capture.policies.pi.loading import build_pi_policy
 
     torch.set_num_threads(1)
     is_expert = evaluation.checkpoint == EXPERT
-    policy = None if is_expert else build_pi_policy(evaluation.checkpoint, tokenizer=None, device="cpu")
+    policy = None if is_expert else build_pi_policy(PiSettings(evaluation.checkpoint), "cpu")
     replan_steps = evaluation.replan_steps or (1 if policy is None else policy.default_replan_steps)
     protocol = cubes_protocol(evaluation.suite, evaluation.seed, replan_steps, evaluation.max_steps)
     tasks = list_tasks(find_suite(evaluation.suite))

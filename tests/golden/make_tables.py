@@ -1,6 +1,7 @@
 """Make golden tables, or columns of them: python -m tests.golden.make_tables CASE/TABLE[:COLUMN] ...
 
-What is not named stays as it is: a change that means to alter numbers names them. The stores in tests/golden/tables/stores were captured once, with one thread:
+What is not named stays as it is: a change that means to alter numbers names them. The stores in
+tests/golden/tables/stores were captured once, with one thread:
 
     cubes, cubes_one_colour: as scripts/make_example_stores.py has them, but with two threads and without effects
     cubes_reruns: capture rerun cubes.zarr --series (role:image, role:instruction) --num-episodes 1 --no-frames

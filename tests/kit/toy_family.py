@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from typing import Any
 
 from vla_attention.capture.environments.episode_protocol import OPENPI
-from vla_attention.capture.policies.family import PolicyFamily
-from vla_attention.capture.policies.model_arguments import POLICY_THREADS
-from vla_attention.schemas.threads import add_threads
+from vla_attention.capture.policies.family import ModelSettings, PolicyFamily, checkpoint_option
+from vla_attention.schemas.options import option
 
 
-def _build(arguments: argparse.Namespace, device: str) -> Any:
-    return make_toy_policy(arguments.checkpoint, arguments.toy_size)
+@dataclass(frozen=True)
+class ToySettings(ModelSettings):
+    checkpoint: str = checkpoint_option("weights", "toy-weights")
+    toy_size: int = option("actions of a chunk", 4)
+
+    def build(self, device: str) -> Any:
+        return make_toy_policy(self.checkpoint, self.toy_size)
+
+    def analysis_arguments(self) -> list[str]:
+        return ["--group", "seen=camera:view", "--group", "read=role:instruction", "--ratio", "seen/read"]
 
 
 def make_toy_policy(checkpoint: str, size: int) -> Any:
@@ -85,26 +92,12 @@ def make_toy_policy(checkpoint: str, size: int) -> Any:
     return ToyPolicy()
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("model")
-    group.add_argument("--checkpoint", default="toy-weights")
-    group.add_argument("--device", default="cpu")
-    add_threads(group, POLICY_THREADS)
-    group.add_argument("--toy-size", type=int, default=4, help="actions of a chunk")
-
-
-def _analysis_arguments(arguments: argparse.Namespace) -> list[str]:
-    return ["--group", "seen=camera:view", "--group", "read=role:instruction", "--ratio", "seen/read"]
-
-
 FAMILY = PolicyFamily(
     name="toy",
     title="Toy Policy",
     description="Record a toy policy.",
     examples="  vla-capture toy\n",
-    add_arguments=_add_arguments,
-    build=_build,
+    settings=ToySettings,
     store_prefix="toy_",
     replan_default="2",
-    analysis_arguments=_analysis_arguments,
 )

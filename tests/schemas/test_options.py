@@ -1,42 +1,106 @@
-"""Options of both command lines: published names, ranges, tasks by their words."""
+"""Options from settings: names, types, defaults, least numbers; ranges; tasks by their words."""
 
 from __future__ import annotations
 
 import argparse
 import re
 import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
 
 import pytest
 
 from vla_attention.schemas.errors import BadArgument, Note, UnknownName
 from vla_attention.schemas.layers import select_layers
-from vla_attention.schemas.options import Numbers, add_capture_output, add_task, number_range, resolve_tasks
+from vla_attention.schemas.options import add_options, number_range, option, read_options, resolve_tasks, task_option
 
 INSTRUCTIONS = {0: "lift the red cube", 1: "lift the green cube", 4: "Lift the  red cube"}
 
 
-def parser() -> argparse.ArgumentParser:
+@dataclass(frozen=True)
+class Settings:
+    """A field of each kind."""
+
+    place: str = option("where it goes")  # follows from others where it is not given
+    tasks: tuple[int | str, ...] | None = task_option("tasks")
+    layers: tuple[int, ...] | None = option("layers (default: all)", None, group="what")
+    words: tuple[str, ...] = option("words", ("first", "last"), name="denoise")
+    images: tuple[str, ...] = option("pictures", (), action="append")
+    number: int = option("a number (default: %(default)s)", 5, least=1)
+    seed: int | None = option("a seed (default: 7)", None, least=0)
+    weight: float = option("a share", 0.5)
+    kind: Literal["mean", "all"] | None = option("which", None)
+    folder: Path | None = option("a folder", None, group="where", also="output-dir", dest="output_dir")
+    kept: bool = option("keep it", True)
+    resume: bool = option("go on", False, either="existing")
+    overwrite: bool = option("begin again", False, either="existing")
+    found: int = 3
+
+
+def parser(**more: Any) -> argparse.ArgumentParser:
     made = argparse.ArgumentParser()
-    add_task(made, "task_id", "tasks")
-    made.add_argument("--layers", type=number_range, nargs="+", action=Numbers)
-    add_capture_output(made, "PATH", "the store")
+    add_options(made, Settings, **more)
     return made
 
 
-def test_published_names_are_silent_and_no_help_shows_either():
+def read(*words: str) -> Settings:
+    return read_options(Settings, parser().parse_args(words), **({} if "--place" in words else {"place": "here"}))
+
+
+def test_without_options_settings_are_their_defaults():
+    assert read() == Settings("here")
+
+
+def test_what_is_given_has_the_type_of_its_field():
+    given = read(
+        *("--place", "there", "--layers", "0-2", "7", "--denoise", "all", "--images", "a", "--images", "b"),
+        *("--number", "1", "--seed", "0", "--weight", "0.25", "--kind", "all", "--no-kept", "--overwrite"),
+    )
+    assert given == Settings(
+        "there", None, (0, 1, 2, 7), ("all",), ("a", "b"), 1, 0, 0.25, "all", kept=False, overwrite=True
+    )
+    assert read_options(Settings, argparse.Namespace(found=4), place="", number=9) == Settings("", number=9, found=4)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["--number", "0"], "Cannot use --number 0; expected at least 1"),
+        (["--seed", "-1"], "Cannot use --seed -1; expected at least 0"),
+    ],
+)
+def test_a_number_below_the_least_is_refused(words, sentence):
+    with pytest.raises(BadArgument, match=sentence):
+        read(*words)
+
+
+@pytest.mark.parametrize("words", [["--kind", "none"], ["--resume", "--overwrite"], ["--number", "x"]])
+def test_what_cannot_be_ends_with_2(words, capsys):
+    with pytest.raises(SystemExit) as ended:
+        read(*words)
+    assert (ended.value.code, words[0] in capsys.readouterr().err) == (2, True)
+
+
+def test_a_help_names_each_option_once_and_no_published_name():
+    shown = parser().format_help().partition("\n\n")[2]
+    for one in ("place", "task", "layers", "denoise", "number", "folder", "kept", "resume"):
+        assert shown.count(f"--{one} ") + shown.count(f"--{one},") == 1, one
+    assert not {"--task-id", "--output-dir"} & set(shown.split())
+
+
+def test_a_command_says_and_leaves_out_what_is_its_own():
+    shown = parser(defaults="as in the store", number="of another kind", seed=None).format_help()
+    assert "what (default: as in the store):" in shown
+    assert ("of another kind" in shown, "--seed" in shown, "(default: all)" in shown) == (True, False, False)
+    assert parser(number={"default": 8}).parse_args([]).number == 8
+
+
+def test_published_names_are_silent():
     with warnings.catch_warnings():
         warnings.simplefilter("error", Note)
         given = parser().parse_args(["--task-id", "5", "--output-dir", "results"])
-    assert (given.task_id, str(given.output_dir), given.store) == ([5], "results", None)
-    shown = parser().format_help()
-    assert "--task " in shown
-    for name in ("--task-id", "--output-dir"):
-        assert name not in shown
-
-
-def test_an_output_is_a_store_or_a_folder():
-    given = parser().parse_args(["--output", "runs/a.zarr", "--output", "results"])
-    assert (str(given.store), str(given.output_dir)) == ("runs/a.zarr", "results")
+    assert (given.task_id, given.output_dir) == ([5], Path("results"))
 
 
 def test_ranges_and_numbers_are_one_list():

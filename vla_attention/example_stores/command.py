@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vla_attention.example_stores import EXAMPLES, archive_of
-from vla_attention.schemas.command_line import command_parser, run_command
+from vla_attention.schemas.command_line import OneSentenceParser, run_command
 from vla_attention.schemas.errors import BadArgument
 
 PROGRAM = "vla-attention example"
@@ -33,7 +33,9 @@ Try:
 
 def main(argv: Sequence[str]) -> int:
     """Copy the stores; returns the exit code."""
-    parser = command_parser(PROGRAM, "Copy the small stores that come along into a folder.", _EXAMPLES)
+    parser = OneSentenceParser(
+        prog=PROGRAM, description="Copy the small stores that come along into a folder.", epilog=_EXAMPLES
+    )
     parser.add_argument("folder", nargs="?", type=Path, default=Path("example"), metavar="FOLDER", help="where to")
     folder: Path = parser.parse_args(argv).folder
     return run_command(PROGRAM, lambda: _copy(folder), "a copy may be incomplete; remove it and copy again.")

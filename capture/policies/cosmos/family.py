@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-import argparse
-from typing import TYPE_CHECKING, Any
+from argparse import SUPPRESS
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal
 
 from vla_attention.capture.environments.episode_protocol import EvaluationProtocol
 from vla_attention.capture.environments.suites import STANDARD_SUITES
-from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
-from vla_attention.capture.policies.model_arguments import UNTRAINED_POLICIES, add_model_arguments
+from vla_attention.capture.policies.cosmos.config import DEFAULT_CONFIG_NAME, CosmosConfig
+from vla_attention.capture.policies.family import (
+    UNTRAINED_POLICIES,
+    ModelSettings,
+    PolicyFamily,
+    PublishedScript,
+    checkpoint_option,
+)
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.options import option
 
 if TYPE_CHECKING:
     from vla_attention.capture.policies.cosmos.policy import CosmosPolicy
@@ -27,125 +35,125 @@ _EXAMPLES = f"""\
 """
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    model = add_model_arguments(
-        parser,
-        checkpoint_options=("--ckpt-path", "--checkpoint"),
-        checkpoint="checkpoint folder, ORG/NAME on the Hugging Face hub, or a file of weights",
-        config_name="the reference's name for the configuration",
-        dtype_default="bfloat16 on a GPU, float32 on a CPU",
-    )
-    model.add_argument("--dataset-stats-path", metavar="PATH", help="statistics (default: the checkpoint's own)")
-    model.add_argument(
-        "--t5-text-embeddings-path", metavar="PATH", help="precomputed embeddings (default: the checkpoint's own)"
-    )
-    model.add_argument(
-        "--t5-tokenizer", metavar="PATH", help="T5's spiece.model: makes words of the instruction selectable"
-    )
-    model.add_argument(
-        "--t5-encoder", metavar="PATH", help="T5 model folder, for instructions without a precomputed embedding"
-    )
-    model.add_argument("--vae-path", metavar="PATH", help="image encoder's weights (default: the checkpoint's own)")
-    model.add_argument("--num-denoising-steps-action", type=int, metavar="N", help="denoise steps (default: 5)")
-    model.add_argument("--chunk-size", type=int, metavar="N", help="actions of a call (default: 16)")
-    model.add_argument(
-        "--num-open-loop-steps", type=int, metavar="N", help="actions executed per call (default: the chunk)"
-    )
-    model.add_argument("--compile", action="store_true", help=argparse.SUPPRESS)  # refused in `_build`
-    frames = parser.add_argument_group("frames of the published proxy (the store keeps all of them)")
-    frames.add_argument(
-        "--query-frame", default="action", metavar="NAME", help="whose queries are recorded (default: action)"
-    )
-    frames.add_argument(
-        "--visual-frame", default="curr_last", metavar="NAME", help="numerator frame (default: curr_last)"
-    )
-    frames.add_argument(
-        "--text-frame", default="frame0", metavar="NAME", help="denominator frame (default: frame0, a blank one)"
-    )
-    frames.add_argument(
-        "--prefer-S", dest="prefer_s", type=int, metavar="N", help="length that the analysed call must have"
-    )
-    frames.add_argument("--prefer-call", default="last", metavar="NAME", help="last (default) or first of those calls")
+@dataclass(frozen=True)
+class CosmosSettings(ModelSettings):
+    """Which Cosmos Policy is loaded; None takes what the checkpoint or the named configuration has.
 
-
-def _build(arguments: argparse.Namespace, device: str) -> CosmosPolicy:
-    from vla_attention.capture.policies.cosmos.config import DEFAULT_CONFIG_NAME
-    from vla_attention.capture.policies.cosmos.loading import build_cosmos_policy
-
-    if getattr(arguments, "compile", False):
-        raise BadArgument("Cannot use --compile with a Cosmos policy: so far only pi models have it; leave it out.")
-    return build_cosmos_policy(
-        arguments.checkpoint,
-        device=device,
-        config_name=arguments.config_name or DEFAULT_CONFIG_NAME,
-        num_denoising_steps_action=arguments.num_denoising_steps_action,
-        chunk_size=arguments.chunk_size,
-        num_open_loop_steps=arguments.num_open_loop_steps,
-        dataset_stats_path=arguments.dataset_stats_path,
-        t5_text_embeddings_path=arguments.t5_text_embeddings_path,
-        t5_tokenizer=arguments.t5_tokenizer,
-        t5_encoder=arguments.t5_encoder,
-        vae_path=arguments.vae_path,
-        dtype=arguments.dtype,
-        query_frame=arguments.query_frame,
-        visual_frame=arguments.visual_frame,
-        text_frame=arguments.text_frame,
-        prefer_s=arguments.prefer_s,
-        prefer_call=arguments.prefer_call,
-    )
-
-
-def _analysis_arguments(arguments: argparse.Namespace) -> list[str]:
-    """Return the published scripts' proxy: the mass of one latent frame over that of another, of self-attention.
-
-    The groups carry the frames' names, because the denominator's default frame is a blank picture without language.
+    dtype: None takes bfloat16 on a GPU, like the reference, and float32 on a CPU. image_size: pixels of one side, for a
+    checkpoint with another size than the published one.
     """
-    above, below = arguments.visual_frame, arguments.text_frame
-    groups = ["--group", f"{above}=frame:{above}", "--group", f"{below}=frame:{below}"]
-    return ["--site", "self", *groups, "--ratio", f"{above}/{below}", "--denoise", arguments.prefer_call]
 
-
-def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
-    facts = {
-        "query_frame": identity.config["query_frame"],
-        "num_denoising_steps_action": identity.config["config"]["sampler"]["num_steps"],
-        "chunk_size": identity.action_horizon,
-    }
-    if identity.checkpoint_format == "seeded":
-        return {"checkpoint": identity.name, **facts}
-    return {
-        "checkpoint": identity.checkpoint,
-        "config_name": identity.config["configuration"],
-        "dtype": identity.config["dtype"],
-        **facts,
-    }
-
-
-def _check_files(arguments: argparse.Namespace) -> None:
-    from pathlib import Path
-
-    from vla_attention.capture.policies.cosmos.locate import (
-        EMBEDDINGS_NAME,
-        STATISTICS_NAME,
-        find_beside,
-        find_checkpoint,
-        find_vae,
-        find_weights,
+    checkpoint: str = checkpoint_option(
+        "checkpoint folder, ORG/NAME on the Hugging Face hub, or a file of weights",
+        name="ckpt-path",
+        also="checkpoint",
+        dest="checkpoint",
     )
-    from vla_attention.capture.policies.cosmos.preprocess import read_statistics
-    from vla_attention.capture.policies.cosmos.t5_pickle import read_embeddings
-    from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
-    from vla_attention.capture.policies.hub import split_hub_name
+    config_name: str = option("the reference's name for sizes, frames and noise levels", DEFAULT_CONFIG_NAME)
+    dtype: Literal["float32", "bfloat16"] | None = option(
+        "precision (default: bfloat16 on a GPU, float32 on a CPU)", None
+    )
+    dataset_stats_path: str | None = option("statistics (default: the checkpoint's own)", None, metavar="PATH")
+    t5_text_embeddings_path: str | None = option(
+        "precomputed embeddings (default: the checkpoint's own)", None, metavar="PATH"
+    )
+    t5_tokenizer: str | None = option(
+        "T5's spiece.model: makes words of the instruction selectable", None, metavar="PATH"
+    )
+    t5_encoder: str | None = option(
+        "T5 model folder, for instructions without a precomputed embedding", None, metavar="PATH"
+    )
+    vae_path: str | None = option("image encoder's weights (default: the checkpoint's own)", None, metavar="PATH")
+    num_denoising_steps_action: int | None = option("denoise steps (default: 5)", None)
+    chunk_size: int | None = option("actions of a call (default: 16)", None)
+    num_open_loop_steps: int | None = option("actions executed per call (default: the chunk)", None)
+    compile: bool = option(SUPPRESS, False)  # refused in `_build`
+    query_frame: str = option(
+        "whose queries are recorded (default: %(default)s)",
+        "action",
+        group="frames of the published proxy (the store keeps all of them)",
+    )
+    visual_frame: str = option("numerator frame (default: %(default)s)", "curr_last")
+    text_frame: str = option("denominator frame (default: %(default)s, a blank one)", "frame0")
+    prefer_s: int | None = option("length that the analysed call must have", None, name="prefer-S", dest="prefer_s")
+    prefer_call: Literal["last", "first"] = option("last (default) or first of those calls", "last")
+    image_size: int | None = None
 
-    name = arguments.checkpoint
-    on_hub = split_hub_name(name) is not None and not Path(name).expanduser().exists()
-    if name not in UNTRAINED_POLICIES and not on_hub:
-        folder = find_checkpoint(name)
-        weights = find_weights(folder)
-        read_statistics(find_beside(folder, arguments.dataset_stats_path, STATISTICS_NAME))
-        read_embeddings(find_beside(folder, arguments.t5_text_embeddings_path, EMBEDDINGS_NAME))
-        for file in (weights, find_vae(folder, arguments.vae_path)):
-            read_tensors(file)  # mapped into memory: the numbers are not read
+    def apply(self, config: CosmosConfig) -> CosmosConfig:
+        """Return the configuration with the user's choices."""
+        changes: dict[str, Any] = {}
+        if self.num_denoising_steps_action is not None:
+            changes["sampler"] = replace(config.sampler, num_steps=self.num_denoising_steps_action)
+        if self.chunk_size is not None:
+            changes["chunk_size"] = self.chunk_size
+        if self.image_size is not None:
+            changes["image_size"] = self.image_size
+        return replace(config, **changes)
+
+    def open_loop_steps(self, config: CosmosConfig) -> int:
+        """Return how many actions of a chunk are executed; by default all of them."""
+        return config.chunk_size if self.num_open_loop_steps is None else self.num_open_loop_steps
+
+    def build(self, device: str) -> CosmosPolicy:
+        """Load the policy; see `build_cosmos_policy`."""
+        from vla_attention.capture.policies.cosmos.loading import build_cosmos_policy
+
+        if self.compile:
+            raise BadArgument("Cannot use --compile with a Cosmos policy: so far only pi models have it; leave it out.")
+        return build_cosmos_policy(self, device)
+
+    def analysis_arguments(self) -> list[str]:
+        """Return the published scripts' proxy: the mass of one latent frame over that of another, of self-attention.
+
+        The groups carry the frames' names, because the denominator's default frame is a blank picture without language.
+        """
+        above, below = self.visual_frame, self.text_frame
+        groups = ["--group", f"{above}=frame:{above}", "--group", f"{below}=frame:{below}"]
+        return ["--site", "self", *groups, "--ratio", f"{above}/{below}", "--denoise", self.prefer_call]
+
+    @staticmethod
+    def of_store(identity: PolicyIdentity) -> dict[str, Any]:
+        """Return the settings with which `build` makes the policy of a store again."""
+        facts = {
+            "query_frame": identity.config["query_frame"],
+            "num_denoising_steps_action": identity.config["config"]["sampler"]["num_steps"],
+            "chunk_size": identity.action_horizon,
+        }
+        if identity.checkpoint_format == "seeded":
+            return {"checkpoint": identity.name, **facts}
+        return {
+            "checkpoint": identity.checkpoint,
+            "config_name": identity.config["configuration"],
+            "dtype": identity.config["dtype"],
+            **facts,
+        }
+
+    def check_files(self) -> None:
+        """Raise what `build` would where a local checkpoint lacks files; loads nothing."""
+        from pathlib import Path
+
+        from vla_attention.capture.policies.cosmos.locate import (
+            EMBEDDINGS_NAME,
+            STATISTICS_NAME,
+            find_beside,
+            find_checkpoint,
+            find_vae,
+            find_weights,
+        )
+        from vla_attention.capture.policies.cosmos.preprocess import read_statistics
+        from vla_attention.capture.policies.cosmos.t5_pickle import read_embeddings
+        from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
+        from vla_attention.capture.policies.hub import split_hub_name
+
+        name = self.checkpoint
+        on_hub = split_hub_name(name) is not None and not Path(name).expanduser().exists()
+        if name not in UNTRAINED_POLICIES and not on_hub:
+            folder = find_checkpoint(name)
+            weights = find_weights(folder)
+            read_statistics(find_beside(folder, self.dataset_stats_path, STATISTICS_NAME))
+            read_embeddings(find_beside(folder, self.t5_text_embeddings_path, EMBEDDINGS_NAME))
+            for file in (weights, find_vae(folder, self.vae_path)):
+                read_tensors(file)  # mapped into memory: the numbers are not read
 
 
 FAMILY = PolicyFamily(
@@ -153,21 +161,17 @@ FAMILY = PolicyFamily(
     title="Cosmos Policy",
     description="Record a Cosmos Policy: self-attention over latent frames, cross-attention over text.",
     examples=_EXAMPLES,
-    add_arguments=_add_arguments,
-    build=_build,
+    settings=CosmosSettings,
     store_prefix="cosmos_",
     replan_default="--num-open-loop-steps",
     protocols=(COSMOS,),
     seed_of="seed of the noise; the simulator's is 0, as published",
     built_in=UNTRAINED_POLICIES,
-    analysis_arguments=_analysis_arguments,
     published=PublishedScript(
         program="evaluate-attention-ratio-cosmos",
         checkpoint=CHECKPOINT,
         layers=(25, 26, 27),
-        variables={"QUERY_FRAME": "--query-frame", "VISUAL_FRAME": "--visual-frame", "TEXT_FRAME": "--text-frame"},
+        variables=("QUERY_FRAME", "VISUAL_FRAME", "TEXT_FRAME"),
     ),
     trained_on={CHECKPOINT: STANDARD_SUITES},
-    rebuild=_rebuild,
-    check_files=_check_files,
 )

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from vla_attention.capture.environments.episode_protocol import OPENPI_REPLAN_STEPS
+from vla_attention.capture.policies.family import UNTRAINED, UNTRAINED_TINY
 from vla_attention.capture.policies.identity import PolicySource
-from vla_attention.capture.policies.model_arguments import UNTRAINED, UNTRAINED_TINY
 from vla_attention.capture.policies.pi.config import GemmaConfig, PiConfig, SiglipConfig, find_variant
 from vla_attention.capture.policies.pi.model import PiModel, expected_shapes, model_from_state
 from vla_attention.capture.policies.pi.policy import PiPolicy

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from vla_attention.capture.environments.episode_protocol import CAMERAS, LEROBOT, OPENPI
 from vla_attention.capture.environments.suites import STANDARD_SUITES
-from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
-from vla_attention.capture.policies.model_arguments import UNTRAINED_POLICIES, add_model_arguments
-from vla_attention.capture.policies.robot import NONE, Robot, read_camera_choices
+from vla_attention.capture.policies.family import (
+    UNTRAINED_POLICIES,
+    ModelSettings,
+    PolicyFamily,
+    PublishedScript,
+    checkpoint_option,
+)
+from vla_attention.capture.policies.pi.formats import CheckpointFormat
+from vla_attention.capture.policies.robot import NONE, Robot, RobotData
 from vla_attention.schemas.jsonable import from_json
+from vla_attention.schemas.options import option
 
 if TYPE_CHECKING:
     from vla_attention.capture.policies.pi.policy import PiPolicy
@@ -36,120 +43,91 @@ _EXAMPLES = """\
 """
 
 
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    model = add_model_arguments(
-        parser,
-        checkpoint="checkpoint folder of openpi (JAX or PyTorch) or LeRobot, ORG/NAME on the Hugging Face hub, or "
-        f"gs://...; '{CUBES_POLICY}' is a small trained policy that comes with the tool",
-        default=CUBES_POLICY,
-        config_name="openpi's name for the configuration (pi05_libero, pi0_libero ...)",
-        dtype_default="what a LeRobot checkpoint states, else float32",
+@dataclass(frozen=True)
+class PiSettings(ModelSettings):
+    """Which pi policy is loaded; None takes what the checkpoint has or says.
+
+    robot_data: the data set that the policy is called on; robot: what was found for it before. With neither it acts in
+    the simulators.
+    """
+
+    checkpoint: str = checkpoint_option(
+        "checkpoint folder of openpi (JAX or PyTorch) or LeRobot, ORG/NAME on the Hugging Face hub, or gs://...; "
+        f"'{CUBES_POLICY}' is a small trained policy that comes with the tool",
+        CUBES_POLICY,
     )
-    model.add_argument(
-        "--checkpoint-format",
-        metavar="NAME",
-        help="openpi_torch, openpi_jax or lerobot (default: recognised from the files)",
+    config_name: str | None = option("openpi's name for the configuration (pi05_libero, pi0_libero ...)", None)
+    dtype: Literal["float32", "bfloat16"] | None = option(
+        "precision (default: what a LeRobot checkpoint states, else float32)", None
     )
-    model.add_argument(
-        "--model-config",
-        type=Path,
-        metavar="PATH",
-        help="JSON file with the sizes that a checkpoint does not state (default: a case.json beside it, if any)",
+    checkpoint_format: CheckpointFormat | None = option("format (default: recognised from the files)", None)
+    model_config: Path | None = option(
+        "JSON file with the sizes that a checkpoint does not state (default: a case.json beside it, if any)", None
     )
-    model.add_argument(
-        "--discrete-state-input", action="store_true", help="openpi's pi0.5 trained with the state in its prompt"
+    discrete_state_input: bool = option("openpi's pi0.5 trained with the state in its prompt", False)
+    norm_stats: Path | None = option(
+        "openpi's norm_stats.json of the training (default: the one in the checkpoint's assets)", None
     )
-    model.add_argument(
-        "--norm-stats",
-        type=Path,
-        metavar="FILE",
-        help="openpi's norm_stats.json of the training (default: the one in the checkpoint's assets)",
-    )
-    model.add_argument(
-        "--asset-id", metavar="NAME", help="which statistics, where the checkpoint's assets have several"
-    )
-    model.add_argument(
-        "--camera",
+    asset_id: str | None = option("which statistics, where the checkpoint's assets have several", None)
+    camera: tuple[str, ...] = option(
+        f"what one camera of the policy sees: {' or '.join(CAMERAS)} of the simulators, or a column of a data set; "
+        f"{NONE} leaves it black and masked (default: that of the checkpoint's evaluation, or the column of the same "
+        "name)",
+        (),
         action="append",
-        default=[],
         metavar="POLICY=PICTURE",
-        help=f"what one camera of the policy sees: {' or '.join(CAMERAS)} of the simulators, or a column of a "
-        f"data set; {NONE} leaves it black and masked (default: that of the checkpoint's evaluation, or the "
-        "column of the same name)",
     )
-    model.add_argument("--tokenizer", metavar="PATH", help="sentencepiece model of the policy's language model")
-    model.add_argument("--paligemma-variant", metavar="NAME", help="checked against the checkpoint (gemma_2b ...)")
-    model.add_argument(
-        "--action-expert-variant", metavar="NAME", help="checked against the checkpoint (gemma_300m ...)"
+    tokenizer: str | None = option("sentencepiece model of the policy's language model", None, metavar="PATH")
+    paligemma_variant: str | None = option("checked against the checkpoint (gemma_2b ...)", None)
+    action_expert_variant: str | None = option("checked against the checkpoint (gemma_300m ...)", None)
+    compile: bool = option(
+        "denoise steps through torch.compile, as CUDA graphs on a GPU; the first call takes minutes", False
     )
-    model.add_argument(
-        "--compile",
-        action="store_true",
-        help="denoise steps through torch.compile, as CUDA graphs on a GPU; the first call takes minutes",
-    )
-    model.add_argument("--num-image-tokens", type=int, metavar="N", help="checked against the policy's layout")
+    num_image_tokens: int | None = option("checked against the policy's layout", None)
+    robot_data: RobotData | None = None
+    robot: Robot | None = None
 
+    def stored(self) -> dict[str, str]:
+        """Return the files and names that a rerun needs, for a store's root."""
+        given = {"model_config": self.model_config, "norm_stats": self.norm_stats, "asset_id": self.asset_id}
+        return {name: str(value) for name, value in given.items() if value is not None}
 
-def _build(arguments: argparse.Namespace, device: str) -> PiPolicy:
-    from vla_attention.capture.policies.pi.loading import build_pi_policy
+    def build(self, device: str) -> PiPolicy:
+        """Load the policy; see `build_pi_policy`."""
+        from vla_attention.capture.policies.pi.loading import build_pi_policy
 
-    return build_pi_policy(
-        arguments.checkpoint,
-        tokenizer=arguments.tokenizer,
-        device=device,
-        checkpoint_format=arguments.checkpoint_format,
-        config_name=arguments.config_name,
-        model_config=arguments.model_config,
-        discrete_state_input=arguments.discrete_state_input,
-        dtype=arguments.dtype,
-        paligemma_variant=arguments.paligemma_variant,
-        action_expert_variant=arguments.action_expert_variant,
-        num_image_tokens=arguments.num_image_tokens,
-        norm_stats=arguments.norm_stats,
-        asset_id=arguments.asset_id,
-        cameras=read_camera_choices(arguments.camera, CAMERAS),
-        data=getattr(arguments, "robot_data", None),
-        robot=getattr(arguments, "robot", None),
-        compiled=getattr(arguments, "compile", False),
-    )
+        return build_pi_policy(self, device)
 
+    def check_files(self) -> None:
+        """See `check_pi_files`."""
+        from vla_attention.capture.policies.pi.loading import check_pi_files
 
-def _check_files(arguments: argparse.Namespace) -> None:
-    from vla_attention.capture.policies.pi.loading import check_pi_files
+        check_pi_files(self)
 
-    check_pi_files(
-        arguments.checkpoint,
-        tokenizer=arguments.tokenizer,
-        checkpoint_format=arguments.checkpoint_format,
-        config_name=arguments.config_name,
-        model_config=arguments.model_config,
-        norm_stats=arguments.norm_stats,
-        asset_id=arguments.asset_id,
-    )
-
-
-def _rebuild(identity: PolicyIdentity) -> dict[str, Any]:
-    facts = identity.config
-    if "robot" in facts:
-        same: dict[str, Any] = {"robot": from_json(Robot, facts["robot"])}
-    else:
-        sources = {camera.name: camera.source for camera in identity.cameras}
-        slots = facts.get("config", {}).get("cameras", ())
-        same = {"camera": [f"{name}={sources.get(name, NONE)}" for name in slots]}
-    same |= {name: Path(facts[name]) for name in ("model_config", "norm_stats") if name in facts}
-    same |= {name: facts[name] for name in ("asset_id",) if name in facts}
-    if "denoise_steps" in facts:
-        same["compile"] = True
-    if identity.checkpoint_format == "seeded":
-        return {"checkpoint": identity.name, **same}
-    settings = {"checkpoint": identity.checkpoint, "dtype": identity.config["dtype"], **same}
-    if identity.checkpoint_format in ("openpi_torch", "openpi_jax", "lerobot"):
-        settings["checkpoint_format"] = identity.checkpoint_format
-    if identity.checkpoint_format.startswith("openpi"):
-        settings["discrete_state_input"] = identity.config["config"].get("discrete_state_input", False)
-    if "config_name" in identity.config:
-        settings["config_name"] = identity.config["config_name"]
-    return settings
+    @staticmethod
+    def of_store(identity: PolicyIdentity) -> dict[str, Any]:
+        """Return the settings with which `build` makes the policy of a store again."""
+        facts = identity.config
+        if "robot" in facts:
+            same: dict[str, Any] = {"robot": from_json(Robot, facts["robot"])}
+        else:
+            sources = {camera.name: camera.source for camera in identity.cameras}
+            slots = facts.get("config", {}).get("cameras", ())
+            same = {"camera": [f"{name}={sources.get(name, NONE)}" for name in slots]}
+        same |= {name: Path(facts[name]) for name in ("model_config", "norm_stats") if name in facts}
+        same |= {name: facts[name] for name in ("asset_id",) if name in facts}
+        if "denoise_steps" in facts:
+            same["compile"] = True
+        if identity.checkpoint_format == "seeded":
+            return {"checkpoint": identity.name, **same}
+        settings = {"checkpoint": identity.checkpoint, "dtype": identity.config["dtype"], **same}
+        if identity.checkpoint_format in ("openpi_torch", "openpi_jax", "lerobot"):
+            settings["checkpoint_format"] = identity.checkpoint_format
+        if identity.checkpoint_format.startswith("openpi"):
+            settings["discrete_state_input"] = identity.config["config"].get("discrete_state_input", False)
+        if "config_name" in identity.config:
+            settings["config_name"] = identity.config["config_name"]
+        return settings
 
 
 FAMILY = PolicyFamily(
@@ -157,8 +135,7 @@ FAMILY = PolicyFamily(
     title="pi0 or pi0.5",
     description="Record a pi0 or pi0.5 policy.",
     examples=_EXAMPLES,
-    add_arguments=_add_arguments,
-    build=_build,
+    settings=PiSettings,
     store_prefix="",
     replan_default="5 for openpi, n_action_steps for LeRobot",
     protocols=(OPENPI, LEROBOT),
@@ -169,11 +146,9 @@ FAMILY = PolicyFamily(
         program="evaluate-attention-ratio",
         checkpoint="~/.cache/openpi/openpi-assets/checkpoints/pi05_libero",
         layers=(25, 26, 27),
-        variables={"PROTOCOL": "--protocol"},
+        variables=("PROTOCOL",),
     ),
     trained_on={CUBES_POLICY: ("cubes",)} | dict.fromkeys(_OF_LIBERO, STANDARD_SUITES),
     kinds=("pi0", "pi05"),
     reads_data_sets=True,
-    rebuild=_rebuild,
-    check_files=_check_files,
 )

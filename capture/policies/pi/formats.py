@@ -12,7 +12,7 @@ from vla_attention.capture.policies.checkpoints import (
     check_checkpoint_file,
     read_json_object,
 )
-from vla_attention.schemas.errors import listing, unknown_name
+from vla_attention.schemas.errors import listing
 
 CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot"]
 CHECKPOINT_FORMATS: tuple[CheckpointFormat, ...] = get_args(CheckpointFormat)
@@ -43,14 +43,6 @@ _OTHER_FAMILIES = {
     "gemma": "Gemma (the language model alone)",
     "siglip": "SigLIP (the image encoder alone)",
 }
-
-
-def find_format(name: str) -> CheckpointFormat:
-    """Return the format of that name; `UnknownName` lists the three."""
-    for known in CHECKPOINT_FORMATS:
-        if known == name:
-            return known
-    raise unknown_name("checkpoint format", name, CHECKPOINT_FORMATS)
 
 
 def detect_format(folder: str | Path, wanted: CheckpointFormat | None = None) -> CheckpointFormat:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
+from vla_attention.capture.environments.episode_protocol import CAMERAS
 from vla_attention.capture.policies.checkpoints import UnsupportedCheckpoint
+from vla_attention.capture.policies.family import UNTRAINED, UNTRAINED_TINY
 from vla_attention.capture.policies.hub import downloads, hub_version
 from vla_attention.capture.policies.identity import PolicySource
-from vla_attention.capture.policies.model_arguments import UNTRAINED, UNTRAINED_TINY
 from vla_attention.capture.policies.pi.compiled import compile_steps
 from vla_attention.capture.policies.pi.config import (
     CAMERA_SLOTS,
@@ -25,8 +25,8 @@ from vla_attention.capture.policies.pi.config import (
 )
 from vla_attention.capture.policies.pi.data_set_robot import asset_name, lerobot_robot, openpi_robot
 from vla_attention.capture.policies.pi.embedded import dummy_policy, embedded_policy
-from vla_attention.capture.policies.pi.family import SHIPPED
-from vla_attention.capture.policies.pi.formats import CheckpointFormat, detect_format, find_format
+from vla_attention.capture.policies.pi.family import SHIPPED, PiSettings
+from vla_attention.capture.policies.pi.formats import CheckpointFormat, detect_format
 from vla_attention.capture.policies.pi.lerobot import load_lerobot, load_lerobot_weights
 from vla_attention.capture.policies.pi.lerobot_config import read_lerobot_config
 from vla_attention.capture.policies.pi.lerobot_pipeline import read_lerobot_pipeline
@@ -52,8 +52,8 @@ from vla_attention.capture.policies.pi.stated_sizes import (
     states_sizes,
 )
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
-from vla_attention.capture.policies.robot import Robot, RobotData
-from vla_attention.capture.policies.weights import find_dtype
+from vla_attention.capture.policies.robot import read_camera_choices
+from vla_attention.capture.policies.weights import DTYPES
 from vla_attention.schemas.errors import BadArgument, listing
 
 
@@ -75,58 +75,35 @@ def load_pi_model(
 DROID_ASSET = "droid"
 
 
-@dataclasses.dataclass(frozen=True)
-class CheckpointOptions:
-    """A user's choices for a checkpoint; None takes the checkpoint's own value.
-
-    config_name: one of openpi's names. model_config: a file like case.json. discrete_state_input: openpi's pi0.5 with
-    the state in the prompt. norm_stats, asset_id: see `read_norm_stats`. cameras: policy camera -> camera of the
-    simulators.
-    """
-
-    checkpoint_format: CheckpointFormat | None = None
-    config_name: str | None = None
-    model_config: Path | None = None
-    discrete_state_input: bool = False
-    dtype: torch.dtype | None = None
-    norm_stats: Path | None = None
-    asset_id: str | None = None
-    cameras: Mapping[str, str] = dataclasses.field(default_factory=dict)
-
-    def stored(self) -> dict[str, str]:
-        """Return the files and names that a rerun needs, for a store's root."""
-        given = {"model_config": self.model_config, "norm_stats": self.norm_stats, "asset_id": self.asset_id}
-        return {name: str(value) for name, value in given.items() if value is not None}
-
-
 def load_pi_policy(
     checkpoint: str | Path,
     tokenizer: str | Path,
+    settings: PiSettings | None = None,
     *,
-    options: CheckpointOptions | None = None,
     config: PiConfig | None = None,
     device: str | torch.device = "cpu",
-    data: RobotData | None = None,
-    robot: Robot | None = None,
 ) -> PiPolicy:
     """Load a policy from a checkpoint folder of any of the three formats and a tokenizer file.
 
-    config: the model's configuration, for library callers; the command line names one in `options`. data: the data set
-    that the policy is called on, or robot: what was found for it before; with neither it acts in the simulators.
+    settings: of which `checkpoint` and `device` are not used. config: the model's configuration, for library callers;
+    the command line names one in `settings`.
     """
-    folder, options = Path(checkpoint), options or CheckpointOptions()
-    detected = detect_format(folder, options.checkpoint_format)
+    folder, settings = Path(checkpoint), settings or PiSettings()
+    data, robot = settings.robot_data, settings.robot
+    chosen_cameras = {} if data is not None else read_camera_choices(settings.camera, CAMERAS)
+    given_dtype = None if settings.dtype is None else DTYPES[settings.dtype]
+    detected = detect_format(folder, settings.checkpoint_format)
     if config is not None:
         chosen = ChosenConfig(config, "given")
     else:
-        chosen = choose_config(folder, detected, options, of_data_set=bool(data or robot))
+        chosen = choose_config(folder, detected, settings, of_data_set=bool(data or robot))
         config = chosen.config
-    norm_stats = None if detected == "lerobot" else read_norm_stats(folder, options.norm_stats, options.asset_id)
+    norm_stats = None if detected == "lerobot" else read_norm_stats(folder, settings.norm_stats, settings.asset_id)
     if data is not None and norm_stats is None:
         robot = lerobot_robot(folder, data)
     elif data is not None:
         robot = openpi_robot(data, norm_stats, RELATIVE_ACTIONS if chosen.name in _OF_RELATIVE_ACTIONS else 0)
-    if options.discrete_state_input and config is not None:
+    if settings.discrete_state_input and config is not None:
         _check_state_input(config)
     # Small files first: if the tokenizer is missing, the minutes for loading the weights are saved.
     prompt_tokenizer = PromptTokenizer(tokenizer)
@@ -135,19 +112,19 @@ def load_pi_policy(
         model, processing = load_lerobot(
             folder,
             sizes=config,
-            dtype=options.dtype,
+            dtype=given_dtype,
             device=device,
             robot=robot,
-            chosen_cameras=options.cameras,
+            chosen_cameras=chosen_cameras,
         )
     else:
         cameras = None
         if robot is None:  # before the weights: names may be wrong
             slots = CAMERA_SLOTS if config is None else config.cameras
-            cameras = simulator_cameras(slots, CAMERA_OF_SLOT, options.cameras)
-        dtype = options.dtype or torch.float32
+            cameras = simulator_cameras(slots, CAMERA_OF_SLOT, chosen_cameras)
+        dtype = given_dtype or torch.float32
         model, _ = load_pi_model(folder, checkpoint_format=detected, config=config, dtype=dtype, device=device)
-        if options.discrete_state_input:
+        if settings.discrete_state_input:
             _check_state_input(model.config)
             model.config = dataclasses.replace(model.config, discrete_state_input=True)
         pi05 = model.config.pi05
@@ -169,7 +146,7 @@ def load_pi_policy(
         untrained=False,
         configuration=chosen.source,
         config_name=chosen.name if chosen.stated else "",
-        options=options.stored(),
+        options=settings.stored(),
     )
     return PiPolicy(model, prompt_tokenizer, processing, source)
 
@@ -198,41 +175,41 @@ class ChosenConfig:
 
 
 def choose_config(
-    folder: Path, found: CheckpointFormat, options: CheckpointOptions, *, of_data_set: bool = False
+    folder: Path, found: CheckpointFormat, settings: PiSettings, *, of_data_set: bool = False
 ) -> ChosenConfig:
-    """Return the configuration of the options, of a case.json beside the checkpoint, or that the checkpoint implies.
+    """Return the configuration of the settings, of a case.json beside the checkpoint, or that the checkpoint implies.
 
     of_data_set: the policy is for the robot of a data set, which the name of the checkpoint's statistics may tell.
 
     Raises:
-        BadArgument: options contradict each other or the format.
+        BadArgument: settings contradict each other or the format.
         UnsupportedCheckpoint: nothing states the configuration.
     """
-    if options.config_name is not None and options.model_config is not None:
+    if settings.config_name is not None and settings.model_config is not None:
         raise BadArgument("Give --config-name or --model-config, not both.")
-    if found == "lerobot" and (options.config_name is not None or options.discrete_state_input):
+    if found == "lerobot" and (settings.config_name is not None or settings.discrete_state_input):
         raise BadArgument(
             "A LeRobot checkpoint states its configuration in config.json; leave --config-name and "
             "--discrete-state-input out."
         )
-    if options.norm_stats is not None and options.asset_id is not None:
+    if settings.norm_stats is not None and settings.asset_id is not None:
         raise BadArgument("Give --norm-stats or --asset-id, not both.")
-    if found == "lerobot" and (options.norm_stats is not None or options.asset_id is not None):
+    if found == "lerobot" and (settings.norm_stats is not None or settings.asset_id is not None):
         raise BadArgument(
             "A LeRobot checkpoint has its statistics in its saved pipelines (policy_preprocessor.json); leave "
             "--norm-stats and --asset-id out."
         )
-    if options.config_name is not None:
-        return ChosenConfig.named(options.config_name, stated=True)
-    if options.model_config is not None:
-        path = options.model_config.expanduser()
+    if settings.config_name is not None:
+        return ChosenConfig.named(settings.config_name, stated=True)
+    if settings.model_config is not None:
+        path = settings.model_config.expanduser()
         return ChosenConfig(read_config(path), str(path))
     beside = folder.absolute().parent / CASE_FILE
     if beside.is_file():
         return ChosenConfig(read_config(beside), f"{CASE_FILE} beside the checkpoint")
     if found == "openpi_torch" and states_sizes(folder / CONFIG_FILE):
         return ChosenConfig(read_config(folder / CONFIG_FILE), CONFIG_FILE)
-    if of_data_set and found != "lerobot" and (options.asset_id or asset_name(folder)) == DROID_ASSET:
+    if of_data_set and found != "lerobot" and (settings.asset_id or asset_name(folder)) == DROID_ASSET:
         name = _droid_config_name(folder, found)
         return ChosenConfig.named(name, f" (its statistics are those of '{DROID_ASSET}')")
     if found == "openpi_jax":
@@ -266,54 +243,23 @@ def _check_state_input(config: PiConfig) -> None:
 _UNTRAINED = {UNTRAINED: embedded_policy, UNTRAINED_TINY: dummy_policy}
 
 
-def build_pi_policy(
-    checkpoint: str,
-    *,
-    tokenizer: str | None,
-    device: str,
-    checkpoint_format: str | None = None,
-    config_name: str | None = None,
-    model_config: Path | None = None,
-    discrete_state_input: bool = False,
-    dtype: str | None = None,
-    paligemma_variant: str | None = None,
-    action_expert_variant: str | None = None,
-    num_image_tokens: int | None = None,
-    norm_stats: Path | None = None,
-    asset_id: str | None = None,
-    cameras: Mapping[str, str] | None = None,
-    data: RobotData | None = None,
-    robot: Robot | None = None,
-    compiled: bool = False,
-) -> PiPolicy:
-    """Build the policy and check the options against it.
+def build_pi_policy(settings: PiSettings, device: str) -> PiPolicy:
+    """Build the policy and check the settings against it.
 
-    `checkpoint` is a folder, a name on a hub, or one of the two untrained policies that come with the package:
-    `untrained`, `untrained-tiny`. `compiled`: denoise steps through torch.compile. `data` and `robot`: see
-    `load_pi_policy`; with either, there are no `cameras` of simulators to choose. Raises `BadArgument` if a variant or
-    the number of image tokens contradicts the policy, or if nothing can be compiled here.
+    Raises `BadArgument` if a variant or the number of image tokens contradicts the policy, or if nothing can be
+    compiled here.
     """
-    wanted = {
-        "--paligemma-variant": find_variant(paligemma_variant) if paligemma_variant else None,
-        "--action-expert-variant": find_variant(action_expert_variant) if action_expert_variant else None,
-    }
-    if cameras and data is None and robot is not None:
+    checkpoint, robot, data = settings.checkpoint, settings.robot, settings.robot_data
+    named = (settings.paligemma_variant, settings.action_expert_variant)
+    variants = [find_variant(name) if name else None for name in named]
+    cameras = {} if data is not None else read_camera_choices(settings.camera, CAMERAS)
+    if cameras and robot is not None:
         raise BadArgument("Cannot use --camera: the pictures of a data set's store are chosen already; leave it out.")
-    options = CheckpointOptions(
-        checkpoint_format=find_format(checkpoint_format) if checkpoint_format else None,
-        config_name=config_name,
-        model_config=model_config,
-        discrete_state_input=discrete_state_input,
-        dtype=find_dtype(dtype) if dtype else None,
-        norm_stats=norm_stats,
-        asset_id=asset_id,
-        cameras={} if data is not None or cameras is None else cameras,
-    )
-    if config_name is not None:
-        find_config(config_name)  # an unknown name is reported before any download
+    if settings.config_name is not None:
+        find_config(settings.config_name)  # an unknown name is reported before any download
     if checkpoint in _UNTRAINED:
-        of_checkpoints = dataclasses.replace(options, dtype=None, cameras={}) != CheckpointOptions()
-        if of_checkpoints or options.dtype == torch.bfloat16:
+        sizes = (settings.checkpoint_format, settings.config_name, settings.model_config, *settings.stored())
+        if any(sizes) or settings.discrete_state_input or settings.dtype == "bfloat16":
             raise BadArgument(
                 f"The policy '{checkpoint}' comes with the program, in float32; --checkpoint-format, --config-name, "
                 "--model-config, --discrete-state-input, --norm-stats, --asset-id and --dtype bfloat16 are for "
@@ -321,14 +267,14 @@ def build_pi_policy(
             )
         if data is not None:
             robot = openpi_robot(data, None)
-        elif options.cameras:
-            robot = simulated_arm(simulator_cameras(CAMERA_SLOTS, CAMERA_OF_SLOT, options.cameras))
+        elif cameras:
+            robot = simulated_arm(simulator_cameras(CAMERA_SLOTS, CAMERA_OF_SLOT, cameras))
         policy = _UNTRAINED[checkpoint](device=device, robot=robot)
     else:
         path = SHIPPED[checkpoint] if checkpoint in SHIPPED else find_checkpoint(checkpoint)
-        detect_format(path, options.checkpoint_format)  # a folder without a checkpoint is reported first
-        tokenizer_path = find_tokenizer(path, tokenizer)
-        policy = load_pi_policy(path, tokenizer_path, options=options, device=device, data=data, robot=robot)
+        detect_format(path, settings.checkpoint_format)  # a folder without a checkpoint is reported first
+        tokenizer_path = find_tokenizer(path, settings.tokenizer)
+        policy = load_pi_policy(path, tokenizer_path, settings, device=device)
         policy.source = dataclasses.replace(policy.source, downloads=downloads(path, tokenizer_path))
         version = hub_version(path)
         if version is not None and not Path(checkpoint).expanduser().exists():
@@ -339,47 +285,32 @@ def build_pi_policy(
             policy.source = dataclasses.replace(policy.source, checkpoint=checkpoint)
     config = policy.model.config
     for option, given, actual in (
-        ("--paligemma-variant", wanted["--paligemma-variant"], config.paligemma),
-        ("--action-expert-variant", wanted["--action-expert-variant"], config.action_expert),
+        ("--paligemma-variant", variants[0], config.paligemma),
+        ("--action-expert-variant", variants[1], config.action_expert),
     ):
         if given is not None and given != actual:
             raise BadArgument(
                 f"{option} contradicts the policy '{checkpoint}', whose part has {_sizes(actual)}, not "
                 f"{_sizes(given)}; leave the option out."
             )
-    if num_image_tokens is not None and num_image_tokens != config.siglip.num_tokens:
+    if settings.num_image_tokens not in (None, config.siglip.num_tokens):
         raise BadArgument(
-            f"--num-image-tokens {num_image_tokens} contradicts the layout: each of the cameras "
+            f"--num-image-tokens {settings.num_image_tokens} contradicts the layout: each of the cameras "
             f"{listing(config.cameras)} has {config.siglip.num_tokens} keys; leave the option out."
         )
-    if compiled:
+    if settings.compile:
         compile_steps(policy.model)
     return policy
 
 
-def check_pi_files(
-    checkpoint: str,
-    *,
-    tokenizer: str | None,
-    checkpoint_format: str | None,
-    config_name: str | None,
-    model_config: Path | None,
-    norm_stats: Path | None,
-    asset_id: str | None,
-) -> None:
+def check_pi_files(settings: PiSettings) -> None:
     """Raise what `build_pi_policy` would for a checkpoint of this machine that lacks a file; reads no weights."""
+    checkpoint = settings.checkpoint
     if checkpoint in (*SHIPPED, *_UNTRAINED) or would_be_fetched(checkpoint):
         return
     folder = find_checkpoint(checkpoint)
-    options = CheckpointOptions(
-        checkpoint_format=find_format(checkpoint_format) if checkpoint_format else None,
-        config_name=config_name,
-        model_config=model_config,
-        norm_stats=norm_stats,
-        asset_id=asset_id,
-    )
-    found = detect_format(folder, options.checkpoint_format)
-    choose_config(folder, found, options)
+    found = detect_format(folder, settings.checkpoint_format)
+    choose_config(folder, found, settings)
     if found == "openpi_jax":
         for leaf in list_leaves(folder / "params"):
             OpenLeaf(folder / "params", leaf)
@@ -389,8 +320,8 @@ def check_pi_files(
     if found == "lerobot":
         read_lerobot_pipeline(folder, read_lerobot_config(folder))
     else:
-        read_norm_stats(folder, norm_stats, asset_id)
-    find_tokenizer(folder, tokenizer)
+        read_norm_stats(folder, settings.norm_stats, settings.asset_id)
+    find_tokenizer(folder, settings.tokenizer)
 
 
 def _sizes(config: GemmaConfig) -> str:

@@ -6,7 +6,7 @@ import argparse
 
 import pytest
 
-from vla_attention.capture.interventions.arguments import add_intervention_arguments, read_interventions
+from vla_attention.capture.interventions.arguments import InterventionSettings, read_interventions
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.interventions import (
     AttentionScale,
@@ -17,11 +17,12 @@ from vla_attention.schemas.interventions import (
     NoiseChange,
     PromptChange,
 )
+from vla_attention.schemas.options import add_options
 
 
 def read(*words: str) -> Interventions:
     parser = argparse.ArgumentParser()
-    add_intervention_arguments(parser)
+    add_options(parser, InterventionSettings)
     return read_interventions(parser.parse_args(words))
 
 
@@ -96,7 +97,7 @@ def test_noise():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--random-keys", "3"], "--random-keys has nothing to act on; give --knockout or --keep too"),
+        (["--random-keys", "0"], "--random-keys has nothing to act on; give --knockout or --keep too"),
         (["--allow-empty"], "--allow-empty has nothing to act on"),
         (["--prompt", "task:²"], "'task:²'"),
     ],

@@ -206,7 +206,7 @@ def test_actions_rows_and_states_are_those_of_a_run_without_effects(tmp_path, ki
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        ({"effects": "word"}, "EffectSettings.items has no 'word'; expected text, cameras, objects, tokens"),
+        ({"effects": "word"}, "no item 'word'; expected text, cameras, objects, tokens"),
         ({"layout": small_layout()}, "by the reader 'all': no rule of the layout 'small' says which calls are passes"),
         ({"repeat": None}, "Cannot measure effects at environment step 0 of task000_episode000: the call cannot be"),
     ],

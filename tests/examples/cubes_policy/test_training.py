@@ -21,6 +21,7 @@ from examples.cubes_policy.training_pass import _RmsNorm, encode, velocities
 from tests.examples.cubes_policy.test_dataset import make_batches
 from tests.kit.made_up_demonstrations import INSTRUCTIONS
 from tests.thorough.hostile_checkpoints.hostile_files import TRACE, executing_pickle, pipe, torch_zip
+from vla_attention.capture.policies.pi.family import PiSettings
 from vla_attention.capture.policies.pi.flow_time import denoise_times
 from vla_attention.capture.policies.pi.gemma import RMSNorm
 from vla_attention.capture.policies.pi.loading import build_pi_policy
@@ -159,7 +160,7 @@ def test_an_exported_policy_runs_like_any_checkpoint(demonstrations, whole, tmp_
     training, folder = whole
     card = export(folder, tmp_path / "mark_0", "my_policy")
     assert card["steps"] == 8
-    policy = build_pi_policy(str(tmp_path / "mark_0"), tokenizer=None, device="cpu")
+    policy = build_pi_policy(PiSettings(str(tmp_path / "mark_0")), "cpu")
     assert policy.name == "my_policy"
     assert not policy.identity().untrained
     assert policy.model.config == small_config(policy.tokenizer.vocab_size)

@@ -14,7 +14,8 @@ from tests.kit.cosmos_checkpoint import WEIGHTS_NAME
 from tests.kit.cosmos_helpers import INSTRUCTION, OTHER_INSTRUCTION
 from tests.kit.policy_inputs import make_observation
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound
-from vla_attention.capture.policies.cosmos.loading import CosmosOptions, load_cosmos_policy
+from vla_attention.capture.policies.cosmos.family import CosmosSettings
+from vla_attention.capture.policies.cosmos.loading import load_cosmos_policy
 from vla_attention.capture.policies.cosmos.locate import (
     EMBEDDINGS_NAME,
     POLICY_REPOSITORY,
@@ -22,13 +23,16 @@ from vla_attention.capture.policies.cosmos.locate import (
     VAE_NAME,
     VAE_REPOSITORY,
 )
+from vla_attention.capture.policies.cosmos.policy import CosmosPolicy
 from vla_attention.capture.policies.identity import downloads_of
 from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.layout import Role
 
-#: The dummy's pictures are smaller than those of the published configuration.
-SMALL = CosmosOptions(image_size=64, num_denoising_steps=3)
+
+def load(checkpoint: str) -> CosmosPolicy:
+    """The dummy's pictures are smaller than those of the published configuration."""
+    return load_cosmos_policy(CosmosSettings(checkpoint, image_size=64, num_denoising_steps_action=3))
 
 
 @pytest.fixture(autouse=True)
@@ -43,7 +47,7 @@ def folder(dummy_folder, tmp_path):
 
 
 def test_a_folder_gives_the_policy_that_was_written(folder, dummy, capsys):
-    policy = load_cosmos_policy(str(folder), options=SMALL)
+    policy = load(str(folder))
     assert policy.config == dummy.config
     assert "T5's tokenizer (spiece.model) was not found" in capsys.readouterr().err
     observation = make_observation(0)
@@ -58,13 +62,13 @@ def test_a_folder_gives_the_policy_that_was_written(folder, dummy, capsys):
 def test_the_file_of_weights_may_be_named_itself(folder):
     shutil.copyfile(folder / WEIGHTS_NAME, folder / "another.pt")
     with pytest.raises(CheckpointNotFound, match=r"several files of weights.*Give one of them as --ckpt-path"):
-        load_cosmos_policy(str(folder), options=SMALL)
-    assert load_cosmos_policy(str(folder / "another.pt"), options=SMALL).num_layers == 3
+        load(str(folder))
+    assert load(str(folder / "another.pt")).num_layers == 3
 
 
 def test_with_t5s_tokenizer_the_words_are_known(folder):
     shutil.copyfile(EMBEDDED_TOKENIZER, folder / "spiece.model")
-    policy = load_cosmos_policy(str(folder), options=SMALL)
+    policy = load(str(folder))
     prepared = policy.prepare(make_observation(0), OTHER_INSTRUCTION)
     assert (prepared.key_role["cross"] == Role.INSTRUCTION).sum() == len(prepared.prompt.pieces) > 0
 
@@ -79,7 +83,7 @@ def test_with_t5s_tokenizer_the_words_are_known(folder):
 def test_missing_files_are_named(folder, missing, error, message):
     (folder / missing).unlink()
     with pytest.raises(error, match=message):
-        load_cosmos_policy(str(folder), options=SMALL)
+        load(str(folder))
 
 
 def test_embeddings_of_another_model_are_refused(folder, tmp_path):
@@ -88,7 +92,7 @@ def test_embeddings_of_another_model_are_refused(folder, tmp_path):
     with open(folder / EMBEDDINGS_NAME, "wb") as file:
         pickle.dump({INSTRUCTION: torch.ones(1, 64, 7)}, file)
     with pytest.raises(BadArgument, match="7 numbers a position, but the policy reads 24"):
-        load_cosmos_policy(str(folder), options=SMALL)
+        load(str(folder))
 
 
 def test_every_file_from_the_hub_is_of_a_commit_that_is_kept(folder, tmp_path, monkeypatch):
@@ -108,8 +112,8 @@ def test_every_file_from_the_hub_is_of_a_commit_that_is_kept(folder, tmp_path, m
         return str(snapshot)
 
     monkeypatch.setitem(sys.modules, "huggingface_hub", SimpleNamespace(snapshot_download=snapshot_download))
-    policy = load_cosmos_policy(POLICY_REPOSITORY, options=SMALL)
+    policy = load(POLICY_REPOSITORY)
     assert policy.identity().checkpoint == f"{POLICY_REPOSITORY}@{'a' * 40}"
     assert downloads_of(policy) == {f"hub {name}": commit for name, commit in commits.items()}
-    assert load_cosmos_policy(policy.identity().checkpoint, options=SMALL).identity() == policy.identity()
+    assert load(policy.identity().checkpoint).identity() == policy.identity()
     assert [revision for name, revision in asked if name == POLICY_REPOSITORY] == [None, "a" * 40]

@@ -12,8 +12,9 @@ from tests.kit.pi_golden import GOLDEN
 from tests.kit.small_tokenizer import train_small_tokenizer
 from vla_attention.capture.policies.pi.config import find_config
 from vla_attention.capture.policies.pi.data_set_robot import openpi_robot
+from vla_attention.capture.policies.pi.family import PiSettings
 from vla_attention.capture.policies.pi.lerobot import lerobot_image
-from vla_attention.capture.policies.pi.loading import CheckpointOptions, choose_config, load_pi_policy
+from vla_attention.capture.policies.pi.loading import choose_config, load_pi_policy
 from vla_attention.capture.policies.pi.preprocess import read_norm_stats
 from vla_attention.capture.policies.pi.stated_sizes import read_config
 from vla_attention.capture.policies.robot import Robot, RobotData
@@ -69,11 +70,11 @@ def test_openpi_s_configuration_of_droid_is_known_by_its_statistics(tmp_path, ca
     folder = openpi_checkpoint(tmp_path, case, "droid", 8, 8)
     # This one states small sizes of its own in config.json; a released one does not.
     (folder / "config.json").write_text(json.dumps({"action_dim": 32, "action_horizon": 15}))
-    chosen = choose_config(folder, "openpi_torch", CheckpointOptions(), of_data_set=True)
+    chosen = choose_config(folder, "openpi_torch", PiSettings(), of_data_set=True)
     assert chosen.config == find_config(name)
     assert (chosen.name, chosen.stated) == (name, False)
     assert name in chosen.source
-    assert choose_config(folder, "openpi_torch", CheckpointOptions()).config is None
+    assert choose_config(folder, "openpi_torch", PiSettings()).config is None
 
 
 def test_actions_of_a_robot_are_unnormalised_and_made_absolute(tmp_path, tokenizer):
@@ -83,7 +84,7 @@ def test_actions_of_a_robot_are_unnormalised_and_made_absolute(tmp_path, tokeniz
         chosen_cameras={"left_wrist_0_rgb": "none"}, relative_actions=6,
     )  # fmt: skip
     config = read_config(GOLDEN / "pi05_batch2" / "case.json")
-    policy = load_pi_policy(folder, tokenizer, config=config, data=data)
+    policy = load_pi_policy(folder, tokenizer, PiSettings(robot_data=data), config=config)
     assert policy.robot.cameras == {"base_0_rgb": "observation.images.cam_high"}
     state = np.linspace(-0.5, 0.5, 14)
     model = np.random.default_rng(1).uniform(-1, 1, (config.action_horizon, config.action_dim))

@@ -13,10 +13,11 @@ from tests.kit.pi_golden import GOLDEN
 from tests.kit.policy_inputs import assert_same_input, make_observation
 from tests.kit.small_tokenizer import train_small_tokenizer
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint, UnsupportedCheckpoint
+from vla_attention.capture.policies.pi.family import PiSettings
 from vla_attention.capture.policies.pi.lerobot import lerobot_image
 from vla_attention.capture.policies.pi.lerobot_config import read_lerobot_config
 from vla_attention.capture.policies.pi.lerobot_pipeline import LerobotNormaliser, read_lerobot_pipeline
-from vla_attention.capture.policies.pi.loading import CheckpointOptions, load_pi_policy
+from vla_attention.capture.policies.pi.loading import load_pi_policy
 from vla_attention.capture.policies.pi.preprocess import libero_state
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, digitise_state
 from vla_attention.capture.policies.policy import Policy
@@ -287,13 +288,8 @@ def test_sizes_that_only_a_case_file_states(checkpoint, tokenizer_path, tmp_path
     (tmp_path / "case.json").rename(tmp_path / "sizes.json")
     with pytest.raises(CheckpointMismatch, match=r"32 wide.*case\.json beside its folder, or --model-config"):
         load_pi_policy(checkpoint, tokenizer_path)
-    options = CheckpointOptions(model_config=tmp_path / "sizes.json")
-    assert (
-        load_pi_policy(checkpoint, tokenizer_path, options=options)
-        .identity()
-        .config["configuration"]
-        .endswith("sizes.json")
-    )
-    contradiction = CheckpointOptions(config_name="pi05_libero", model_config=tmp_path / "sizes.json")
+    options = PiSettings(model_config=tmp_path / "sizes.json")
+    assert load_pi_policy(checkpoint, tokenizer_path, options).identity().config["configuration"].endswith("sizes.json")
+    contradiction = PiSettings(config_name="pi05_libero", model_config=tmp_path / "sizes.json")
     with pytest.raises(BadArgument):
-        load_pi_policy(checkpoint, tokenizer_path, options=contradiction)
+        load_pi_policy(checkpoint, tokenizer_path, contradiction)

@@ -15,6 +15,7 @@ from vla_attention.capture.policies.hub import (
     hub_cache,
 )
 from vla_attention.capture.policies.identity import downloads_of
+from vla_attention.capture.policies.pi.family import PiSettings
 from vla_attention.capture.policies.pi.loading import build_pi_policy
 from vla_attention.capture.policies.pi.locate import (
     HUB_FILES,
@@ -78,10 +79,10 @@ def asked(monkeypatch) -> list[tuple[str, str | None]]:
 
 def test_a_policy_from_the_hub_says_its_commit_and_is_built_again_from_it(asked):
     tokenizer = train_small_tokenizer(hub_cache().parent / "small.model")
-    policy = build_pi_policy("org/name", tokenizer=str(tokenizer), device="cpu")
+    policy = build_pi_policy(PiSettings("org/name", tokenizer=str(tokenizer)), "cpu")
     assert policy.identity().checkpoint == f"org/name@{COMMIT}"
     assert downloads_of(policy) == {"hub org/name": COMMIT}
-    again = build_pi_policy(policy.identity().checkpoint, tokenizer=str(tokenizer), device="cpu")
+    again = build_pi_policy(PiSettings(policy.identity().checkpoint, tokenizer=str(tokenizer)), "cpu")
     assert again.identity() == policy.identity()
     assert asked == [("org/name", None), ("org/name", COMMIT)]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.kit.policy_inputs import make_observation
-from vla_attention.capture.policies.pi.family import CUBES_POLICY
+from vla_attention.capture.policies.pi.family import CUBES_POLICY, PiSettings
 from vla_attention.capture.policies.pi.loading import build_pi_policy
 from vla_attention.capture.policies.pi.policy import PiPolicy
 from vla_attention.schemas.layout import Role
@@ -16,7 +16,7 @@ from vla_attention.schemas.layout import Role
 
 @pytest.fixture(scope="module")
 def policy() -> PiPolicy:
-    return build_pi_policy(CUBES_POLICY, tokenizer=None, device="cpu")
+    return build_pi_policy(PiSettings(), "cpu")
 
 
 def test_stores_name_it_and_not_the_place_where_it_is_installed(policy: PiPolicy) -> None:

@@ -15,6 +15,7 @@ from tests.kit.pi_golden import GOLDEN
 from tests.kit.small_tokenizer import train_small_tokenizer
 from tests.kit.still_scene import capture_without_simulator
 from vla_attention.capture.__main__ import main as capture
+from vla_attention.capture.policies.pi.family import PiSettings
 from vla_attention.capture.policies.pi.loading import build_pi_policy
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import open_store
@@ -59,7 +60,7 @@ def split(folder: Path) -> dict[str, str]:
 
 
 def build(folder: Path, tokenizer: str, **options):
-    return build_pi_policy(str(folder), tokenizer=tokenizer, device="cpu", **options)
+    return build_pi_policy(PiSettings(str(folder), tokenizer=tokenizer, **options), "cpu")
 
 
 def test_a_step_of_openpi_s_training_is_read_with_its_sizes(tmp_path, tokenizer):
@@ -227,15 +228,15 @@ def test_cameras_are_chosen_by_name_on_both_sides(tmp_path, tokenizer, of):
     else:
         trained(folder, of)
     first = "front" if lerobot else "base_0_rgb"
-    policy = build(folder, tokenizer, model_config=CASE, cameras={first: "robot0_eye_in_hand"})
+    policy = build(folder, tokenizer, model_config=CASE, camera=(f"{first}=robot0_eye_in_hand",))
     assert {camera.name: camera.source for camera in policy.cameras}[first] == "robot0_eye_in_hand"
     if lerobot:  # its own name of the feature means the same
-        same = {"observation.images.front": "robot0_eye_in_hand"}
-        assert build(folder, tokenizer, model_config=CASE, cameras=same).cameras == policy.cameras
+        same = ("observation.images.front=robot0_eye_in_hand",)
+        assert build(folder, tokenizer, model_config=CASE, camera=same).cameras == policy.cameras
     for wrong, said in (
-        ({"base": "agentview"}, f"Unknown camera of the policy 'base'.*{first}"),
-        ({first: "frontview"}, r"Unknown camera of the simulators 'frontview'.*agentview, robot0_eye_in_hand, none"),
-        (dict.fromkeys((camera.name for camera in policy.cameras), "none"), "None of the policy's cameras"),
+        (["base=agentview"], f"Unknown camera of the policy 'base'.*{first}"),
+        ([f"{first}=frontview"], r"Unknown camera of the simulators 'frontview'.*agentview, robot0_eye_in_hand, none"),
+        ([f"{camera.name}=none" for camera in policy.cameras], "None of the policy's cameras"),
     ):
         with pytest.raises(UserError, match=said):
-            build(folder, tokenizer, model_config=CASE, cameras=wrong)
+            build(folder, tokenizer, model_config=CASE, camera=tuple(wrong))
