@@ -25,7 +25,6 @@ from vla_attention.analyze.core import measure
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.question_settings import settings_from_keywords
-from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.capture.store import codecs as store_codecs
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
@@ -63,9 +62,9 @@ def measured(monkeypatch) -> list[str]:
     names: list[str] = []
     one = measure._measured
 
-    def watched(item: SelectedEpisode, **settings: Any) -> dict[str, Any]:
-        names.append(item.episode.name)
-        return one(item, **settings)
+    def watched(given: Any, **settings: Any) -> dict[str, Any]:
+        names.append(given[0].episode.name)
+        return one(given, **settings)
 
     monkeypatch.setattr(measure, "_measured", watched)
     return names
