@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from msgspec.structs import replace
 
 from vla_attention.capture.engine.progress import say
-from vla_attention.capture.engine.settings import RecordingSettings as RecordingSettings
 from vla_attention.capture.policies.identity import announcement
 from vla_attention.capture.store.disk_estimate import DiskEstimate, describe
 from vla_attention.schemas.errors import BadArgument, listing
@@ -28,6 +27,7 @@ from vla_attention.schemas.stores.store_format import (
 from vla_attention.schemas.stores.verify import DamagedEpisode
 
 if TYPE_CHECKING:
+    from vla_attention.capture.engine.settings import RecordingSettings
     from vla_attention.capture.policies.policy import ModelSizes, Policy
 
 _QUERIES = {"mean": "the mean over", "steps": "the action steps' means over", "all": "each of"}

@@ -12,7 +12,8 @@ from msgspec.structs import replace
 
 from vla_attention.capture.effects.arguments import EffectSettings
 from vla_attention.capture.effects.conditions import refuse_both
-from vla_attention.capture.engine.plan import RecordingSettings, recording_of, root_attributes
+from vla_attention.capture.engine.plan import recording_of, root_attributes
+from vla_attention.capture.engine.settings import RecordingSettings
 from vla_attention.capture.machine import describe_machine
 from vla_attention.capture.torch_policies.batch_rows import rows_apart
 from vla_attention.capture.torch_policies.knockouts import interventions_of
