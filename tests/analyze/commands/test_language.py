@@ -163,7 +163,7 @@ def test_effects_say_which_words_decide_and_which_were_not_tested():
     question = question_about(unpacked(GOLDEN / "tables/stores/effects.tar.xz"))
     table = language(question)["word_effects"]
     golden = pl.read_parquet(GOLDEN / "tables/effects_effects/effects_summary.parquet")
-    rows = golden.filter(scope="all", phase="all")
+    rows = golden
     for reader, ending in (("total", "_queries_all"), ("direct", "")):
         for word, value in table.drop_nulls("total").select("item", reader).iter_rows():
             condition = f"without_word_{word[1:-1]}{ending}"
