@@ -63,9 +63,9 @@ def measured(monkeypatch) -> list[str]:
     names: list[str] = []
     one = measure._measured
 
-    def watched(item: SelectedEpisode, **settings: Any) -> dict[str, Any]:
-        names.append(item.episode.name)
-        return one(item, **settings)
+    def watched(given: tuple[SelectedEpisode, Any], **settings: Any) -> dict[str, Any]:
+        names.append(given[0].episode.name)
+        return one(given, **settings)
 
     monkeypatch.setattr(measure, "_measured", watched)
     return names
