@@ -107,7 +107,7 @@ def _tokens() -> EpisodeTokens:
 
 def _resolve(grouping: Grouping) -> None:
     tokens = _tokens()
-    check_names(grouping, collect_vocabulary([tokens]), tokens.layout)
+    check_names(grouping, collect_vocabulary([tokens]))
     resolve(grouping, tokens)
 
 

@@ -120,7 +120,7 @@ def test_overlap_is_an_error_that_names_groups_key_and_word(tokens):
 def test_unknown_names_say_what_exists(tokens, selector, said):
     grouping = Grouping("g", {"g": (selector,)})
     with pytest.raises(LookupError if selector.startswith(("role", "frame")) else SelectorError) as caught:
-        check_names(grouping, collect_vocabulary([tokens]), tokens.layout)
+        check_names(grouping, collect_vocabulary([tokens]))
     assert said in str(caught.value)
 
 
@@ -137,7 +137,7 @@ def test_regions_outside_the_layout_are_errors(tokens, selector):
 def test_builtin_groupings_take_every_key_exactly_once(name, data):
     tokens = data.draw(episode_tokens())
     grouping = BUILTIN_GROUPINGS[name](collect_vocabulary([tokens]))
-    check_names(grouping, collect_vocabulary([tokens]), tokens.layout)
+    check_names(grouping, collect_vocabulary([tokens]))
     total = resolve(grouping, tokens).weights.sum(axis=2)
     np.testing.assert_allclose(total, 1.0, atol=1e-6)
 

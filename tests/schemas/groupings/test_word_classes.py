@@ -71,7 +71,7 @@ def test_shared_keys_are_the_sums_of_what_both_groups_take(data):
 def test_what_exists_nowhere_is_said(selector, said):
     tokens = bowl_tokens(replans=1)
     with pytest.raises(SelectorError) as caught:
-        check_names(Grouping("g", {"g": (selector,)}), collect_vocabulary([tokens]), tokens.layout)
+        check_names(Grouping("g", {"g": (selector,)}), collect_vocabulary([tokens]))
     assert said in str(caught.value)
 
 
