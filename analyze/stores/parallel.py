@@ -105,13 +105,6 @@ def each_episode(
             progress(1)
 
 
-def map_episodes(
-    function: Callable[[Item], Result], items: Iterable[Item], progress: Callable[[int], object] | None = None
-) -> list[Result]:
-    """All results of `each_episode`."""
-    return list(each_episode(function, items, progress))
-
-
 def _in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
     number = min(_MOST_AT_ONCE, threads_of_this_process().number)
     with one_blas_thread(), stoppable_threads(number, "episodes") as executor:

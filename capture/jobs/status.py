@@ -29,7 +29,6 @@ class EpisodeStatus:
     by: the worker; empty if no log names it.
     """
 
-    task_id: int
     episode: int
     success: bool | None
     bytes: int
@@ -139,7 +138,6 @@ def store_status(path: Path, expected: int | None = None, verify: bool = False) 
         instructions[task_id] = stored.attributes.instruction
         episodes.setdefault(task_id, []).append(
             EpisodeStatus(
-                task_id=task_id,
                 episode=index,
                 success=stored.attributes.success,
                 bytes=sum(file.stat().st_size for file in local_path(stored.folder).rglob("*") if file.is_file()),

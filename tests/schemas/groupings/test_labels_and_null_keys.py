@@ -62,12 +62,6 @@ def test_words_that_nobody_can_place_are_an_error_that_says_what_to_do(selector)
     assert resolve(whole, UNSPELT).num_keys.tolist() == [[7.0]]
 
 
-def test_words_with_known_places_are_found():
-    grouping = Grouping("g", {"noun": ("word:bowl",)})
-    check_names(grouping, collect_vocabulary([SPELT]))
-    assert resolve(grouping, SPELT).weights[0, :, 0].tolist() == [0, 0, 1, 0, 0, 0, 0, 0, 0, 0]
-
-
 def test_a_text_left_out_on_purpose_is_no_error():
     """An all-zero embedding: every position is a null key, and there is an instruction that none of them spells."""
     empty = replace(UNSPELT, key_role=np.full((1, 10), Role.NULL, dtype=np.uint8))
