@@ -16,6 +16,7 @@ import msgspec
 
 from vla_attention.schemas.limits import DOCUMENT_BYTES, DOCUMENT_NESTS, NESTING, WHOLE_NUMBER
 
+_TOO_DEEP = f"its lists, objects and tables are nested more than {NESTING} deep"
 _OTHER_BYTES = bytes(set(range(256)) - set(b"[]{}"))
 #: Strings of JSON, in which brackets mean nothing. The quantifier gives nothing back, so that the time is linear.
 _STRING = re.compile(rb'"(?:[^"\\]|\\.)*+"', re.DOTALL)
@@ -54,7 +55,7 @@ def decode_json(content: bytes, most: int = DOCUMENT_BYTES, nests: int = DOCUMEN
             json.dumps(document, ensure_ascii=False).encode()
         return document
     except RecursionError:
-        raise ValueError(_too_deep()) from None
+        raise ValueError(_TOO_DEEP) from None
     except UnicodeEncodeError:
         raise ValueError("it has half a surrogate pair, which is no character") from None
     except UnicodeDecodeError as error:
@@ -82,7 +83,7 @@ def _check_brackets(content: bytes, nests: int) -> None:
         return
     # Texts may hold brackets that are never closed.
     if not _is_flat(_STRING.sub(b"", content).translate(None, _OTHER_BYTES)):
-        raise ValueError(_too_deep())
+        raise ValueError(_TOO_DEEP)
 
 
 def _is_flat(brackets: bytes) -> bool:
@@ -97,10 +98,6 @@ def _is_flat(brackets: bytes) -> bool:
     return not brackets
 
 
-def _too_deep() -> str:
-    return f"its lists and objects are nested more than {NESTING} deep"
-
-
 def decode_toml(text: str) -> dict[str, Any]:
     """The table of a TOML document.
 
@@ -113,13 +110,13 @@ def decode_toml(text: str) -> dict[str, Any]:
     dots = max((line.partition("=")[0].count(".") for line in bare.split("\n")), default=0)
     inline = max((line.count(".") for line in bare.split("\n") if "{" in line), default=0)
     if dots > NESTING or inline > 10 * NESTING or not _is_flat(re.sub(r"[^][{}]", "", bare).encode()):
-        raise ValueError(f"its tables and lists are nested more than {NESTING} deep")
+        raise ValueError(_TOO_DEEP)
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError:
         raise
     except RecursionError:
-        raise ValueError(f"its tables and lists are nested more than {NESTING} deep") from None
+        raise ValueError(_TOO_DEEP) from None
     except (ValueError, OverflowError) as error:
         reason = "it has a whole number of more than 4,000 digits" if "digits" in str(error) else str(error)
         raise ValueError(reason) from None

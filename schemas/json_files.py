@@ -45,17 +45,7 @@ def schema_text(document: dict[str, Any]) -> str:
     return json.dumps(document, indent=2, ensure_ascii=False) + "\n"
 
 
-def write_schema_files(folder: Path = FOLDER) -> list[Path]:
-    """Write every schema file into a folder and return their paths."""
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    for name, document in schema_documents().items():
-        path = folder / name
-        path.write_text(schema_text(document), encoding="utf-8")
-        paths.append(path)
-    return paths
-
-
 if __name__ == "__main__":
-    for written in write_schema_files():
-        print(written)
+    for name, document in schema_documents().items():
+        (FOLDER / name).write_text(schema_text(document), encoding="utf-8")
+        print(FOLDER / name)

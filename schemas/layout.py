@@ -21,9 +21,6 @@ from vla_attention.schemas.limit_checks import check_at_most
 from vla_attention.schemas.limits import AXIS, KEYS, PICTURE_PIXELS, PICTURE_SIDE, QUERIES, SPANS, TEXT_CHARACTERS
 from vla_attention.schemas.safe_text import check_free_text, check_name
 
-#: Any name that `check_site_name` accepts. `joint`: prefix and suffix keys together (pi). `self` and `cross`: the
-#: query's own tokens, and the text or prefix.
-SiteName = str
 SpanKind = Literal["image", "text", "state", "action", "latent"]
 ROLE_DTYPE = np.uint8
 #: What sums and quotients of fractions of a picture are off by, at most.
@@ -224,6 +221,9 @@ class Span(Document, frozen=True):
 class SiteLayout(Document, frozen=True):
     """The spans of one softmax family, in key order, without gaps.
 
+    `name`: any that `check_site_name` accepts. `joint`: prefix and suffix keys together (pi). `self` and `cross`: the
+    query's own tokens, and the text or prefix.
+
     `layers`: the blocks that have this site; empty where all recorded blocks have it. `heads`: its number of heads, and
     `num_action_queries`: its number of action queries; 0 where they are those of the policy and of the recording.
 
@@ -231,7 +231,7 @@ class SiteLayout(Document, frozen=True):
     grids of one camera are of pictures of different sizes.
     """
 
-    name: SiteName
+    name: str
     spans: tuple[Span, ...]
     layers: tuple[int, ...] = ()
     heads: int = 0

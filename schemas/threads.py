@@ -12,7 +12,7 @@ CPU quota of its control group, and what SLURM gave to the task.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -111,23 +111,13 @@ def available_cores() -> int:
 
 
 def _cores() -> int:
-    """Return the number of physical cores that this process may run on."""
+    """Return the number of physical cores that this process may run on: two processors of one core are no faster."""
     try:
         processors = os.sched_getaffinity(0)
     except AttributeError:  # macOS and Windows bind no process to processors
         return os.cpu_count() or 1
-    return count_cores(processors)
-
-
-def count_cores(processors: Iterable[int], root: Path = Path("/")) -> int:
-    """Return the number of physical cores of processors: two that share a core multiply no faster than one.
-
-    Args:
-        processors: numbers of processors.
-        root: folder in place of /, for tests.
-    """
-    topology = "sys/devices/system/cpu/cpu{}/topology/thread_siblings_list"
-    return len({text_of(root / topology.format(number)) or str(number) for number in processors})
+    topology = "/sys/devices/system/cpu/cpu{}/topology/thread_siblings_list"
+    return len({text_of(Path(topology.format(number))) or str(number) for number in processors})
 
 
 def cpu_quota(root: Path = Path("/")) -> float | None:

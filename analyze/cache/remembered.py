@@ -121,8 +121,8 @@ def remembered(
     question: CachedQuestion,
     episodes: Sequence[StoredEpisode],
     measure: Callable[[Sequence[int]], Iterable[Arrays]],
-    arguments: Sequence[Any] | None = None,
-    progress: Callable[[int], object] | None = None,
+    arguments: Sequence[Any],
+    progress: Callable[[int], object],
 ) -> Iterator[Arrays]:
     """The numbers of every episode, in order; those from the cache are bit for bit those that were measured.
 
@@ -141,13 +141,12 @@ def remembered(
         return
     check_cache_place(place)
     folder, room = place.folder / question.digest.hex()[:32], place.most_bytes
-    extra = arguments or [None] * len(episodes)
     # Before anything is measured: a file that changes in the meantime makes what is kept of it invalid.
-    keys = [_key(question.digest, episode, one) for episode, one in zip(episodes, extra, strict=True)]
+    keys = [_key(question.digest, episode, one) for episode, one in zip(episodes, arguments, strict=True)]
     paths = [folder / f"{(key or b'').hex()[:32]}{ENDING}" for key in keys]
     kept = {entry.name for entry in entries(folder)}
     missing = [i for i, (key, path) in enumerate(zip(keys, paths, strict=True)) if key is None or path.name not in kept]
-    if progress is not None and len(missing) < len(episodes):
+    if len(missing) < len(episodes):
         progress(len(episodes) - len(missing))
     measured = iter(measure(missing) if missing else ())
     to_measure = set(missing)

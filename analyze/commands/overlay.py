@@ -120,7 +120,7 @@ def _outlines(question: Question, texts: Sequence[str]) -> Grouping | None:
     grouping = with_groups(None, [parse_group_argument(text) for text in texts])
     named = {name: value for name, value in grouping.groups.items() if name != "rest" or value != ("*",)}
     groups = replace(grouping, groups=named, overlap=True, ratio=None, allow_empty=tuple(named))
-    check_names(groups, question.vocabulary, question.selected[0].tokens.layout)
+    check_names(groups, question.vocabulary)
     return groups
 
 

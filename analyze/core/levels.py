@@ -117,7 +117,7 @@ def levels_of(question: Question, heads: bool = False) -> Levels:
         SelectorError, EmptyGroup: a group names what no episode has, or has no key in any.
     """
     grouping = question.grouping
-    check_names(grouping, question.vocabulary, question.selected[0].tokens.layout)
+    check_names(grouping, question.vocabulary)
     names = len(grouping.names)
     keep = ("denoise", "head") if heads else ("denoise",)
 

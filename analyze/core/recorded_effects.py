@@ -279,7 +279,7 @@ def _at_site(question: Question, site: str) -> Question:
 
 def _has_name(question: Question, selector: str) -> bool:
     try:
-        check_names(_grouping((selector,)), question.vocabulary, question.selected[0].tokens.layout)
+        check_names(_grouping((selector,)), question.vocabulary)
     except (SelectorError, UnknownName):  # a site of pictures has no words
         return False
     return True

@@ -131,7 +131,7 @@ def ask(stores: Sequence[Store], settings: AnalysisSettings, known: KnownEpisode
         if settings.skip_corrupt:
             chosen, faulty = _without_faulty(chosen)
             skipped += faulty
-        names, notes_of_runs = Names(), RunNotes()
+        names, notes_of_runs = Names(root.site(site)), RunNotes()
 
         def look(store: Store, episode: StoredEpisode, tokens: EpisodeTokens) -> None:
             names.add(tokens)

@@ -210,7 +210,7 @@ def resolve_all(
         OverlappingGroups: groups share keys and the grouping does not allow it.
         EmptyGroup: a group has no key in any selected episode.
     """
-    check_names(grouping, vocabulary, selected[0].tokens.layout)
+    check_names(grouping, vocabulary)
     resolved = [resolve_episode(grouping, item) for item in selected]
     check_not_empty(grouping, [item.num_keys for item in resolved])
     return resolved

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
@@ -92,7 +92,7 @@ def lines_of_store(store: Store, tasks: Sequence[int | str] | None = None) -> It
     of_tasks: dict[int, tuple[str, str]] = {}  # instruction, and objects of interest in the first episode
     num_episodes: Counter[int] = Counter()
     first: dict[str, EpisodeTokens] = {}
-    names: dict[str, Names] = defaultdict(Names)
+    names = {site.name: Names(site) for site in root.sites}
     for episode in read_one_by_one(episodes):
         attributes = episode.attributes
         success.append(attributes.success)

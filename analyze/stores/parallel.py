@@ -7,6 +7,7 @@ functions that are handed over here can be pickled: they are defined at the top 
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import multiprocessing
 import os
@@ -20,12 +21,14 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
+from itertools import product
 from multiprocessing.connection import wait as wait_for_end
 from types import ModuleType
 from typing import Any, TypeVar
 
-from vla_attention.analyze.stores.blas import one_blas_thread
+import numpy as np
+
 from vla_attention.schemas.errors import BadArgument, MissingDependency, UserError
 from vla_attention.schemas.stop_signals import UNAWAITED, stops_kept_from_children
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
@@ -47,6 +50,9 @@ _BEGUN_AT_LEAST = 16
 _AHEAD = 16
 #: Seconds after which a wait for a result looks whether the program was stopped, and within which a scheduler answers.
 _LOOK_UP_S, _ANSWER_WITHIN = 0.2, 15
+#: The number of threads belongs to the library, so there is one limit for the process: how many there were when each
+#: block that is open began.
+_LIMIT_LOCK, _LIMITS_BEFORE = threading.Lock(), list[int]()
 
 
 class WorkersLost(UserError, RuntimeError):
@@ -99,17 +105,51 @@ def each_episode(
             progress(1)
 
 
-def map_episodes(
-    function: Callable[[Item], Result], items: Iterable[Item], progress: Callable[[int], object] | None = None
-) -> list[Result]:
-    """All results of `each_episode`."""
-    return list(each_episode(function, items, progress))
-
-
 def _in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
     number = min(_MOST_AT_ONCE, threads_of_this_process().number)
     with one_blas_thread(), stoppable_threads(number, "episodes") as executor:
         yield from in_order(lambda item: executor.submit(function, item), items, number * _BEGUN_AHEAD)
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Compute matrix products with one thread each within the block; afterwards with as many as before.
+
+    Threads of OpenBLAS that wait keep a core busy. Beside other work they make a scan ten times slower, and the
+    episodes have threads of their own. Blocks of several threads may overlap. Nothing changes where numpy uses a
+    library that offers no such call (Apple's Accelerate).
+
+    threadpoolctl does the same, but lets only the first thread of a process that limits OpenBLAS do so from then on
+    (3.8); scans may begin in any thread.
+    """
+    functions = _thread_functions()
+    if functions is None:
+        yield
+        return
+    get, limit = functions
+    with _LIMIT_LOCK:
+        _LIMITS_BEFORE.append(get())
+        limit(1)
+    try:
+        yield
+    finally:
+        with _LIMIT_LOCK:
+            limit(_LIMITS_BEFORE.pop())  # 1, unless it is the last block
+
+
+@cache
+def _thread_functions() -> tuple[Callable[[], int], Callable[[int], None]] | None:
+    """Return (number of threads, set it) of the BLAS library that numpy is linked with."""
+    # A symbol is searched in a library and in what it is linked with, so numpy's own extension leads to its BLAS.
+    library = ctypes.CDLL(np.linalg._umath_linalg.__file__)
+    names = [
+        (f"{prefix}openblas_get_num_threads{suffix}", f"{prefix}openblas_set_num_threads{suffix}")
+        for prefix, suffix in product(("scipy_", ""), ("64_", ""))
+    ]
+    for get, limit in [*names, ("MKL_Get_Max_Threads", "MKL_Set_Num_Threads")]:
+        if hasattr(library, limit):
+            return getattr(library, get), getattr(library, limit)
+    return None
 
 
 def _by(

@@ -153,16 +153,8 @@ def parse_denoise_steps(words: Sequence[str] | None, recorded: Sequence[int]) ->
     return tuple(steps)
 
 
-def task_numbers(store: Store, tasks: Sequence[int | str]) -> tuple[int, ...]:
-    """The numbers of tasks of a store that were chosen by number or by instruction (`options.resolve_tasks`)."""
-    instructions: dict[int, str] = {}
-    if not all(isinstance(task, int) for task in tasks):
-        instructions = {one.attributes.task_id: one.attributes.instruction for one in store.episodes}
-    return resolve_tasks(tasks, instructions, str(store.path))
-
-
 def select_episodes(store: Store, tasks: Sequence[int | str] | None) -> tuple[StoredEpisode, ...]:
-    """The store's episodes of the wanted tasks, in order; an empty selection is an error."""
+    """The store's episodes of the wanted tasks (numbers or instructions), in order; no episode is an error."""
     if not store.episodes:
         raise StoreError(
             f"The store {store.path} holds no complete episode yet: vla-attention capture status {store.path} "
@@ -170,7 +162,10 @@ def select_episodes(store: Store, tasks: Sequence[int | str] | None) -> tuple[St
         )
     if tasks is None:
         return store.episodes
-    numbers = task_numbers(store, tasks)
+    instructions: dict[int, str] = {}
+    if not all(isinstance(task, int) for task in tasks):
+        instructions = {one.attributes.task_id: one.attributes.instruction for one in store.episodes}
+    numbers = resolve_tasks(tasks, instructions, str(store.path))
     for task in numbers:
         if task not in store.task_ids:
             raise BadArgument(

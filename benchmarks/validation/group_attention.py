@@ -132,7 +132,7 @@ def _fitting(
     for group in groups:
         try:
             grouping = _grouping([group])
-            check_names(grouping, question.vocabulary, question.selected[0].tokens.layout)
+            check_names(grouping, question.vocabulary)
             resolved = resolve_all(grouping, question.selected, question.vocabulary)
         except UserError as error:
             notes[group] = str(error)

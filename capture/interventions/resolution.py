@@ -141,12 +141,11 @@ def run_vocabularies(
     for layout in sites:
         reads = any(span.kind == "text" for span in layout.spans)
         vocabularies[layout.name] = Vocabulary(
+            layout=layout,
             cameras=layout.cameras,
-            spans=tuple(span.name for span in layout.spans),
             roles=tuple(role.label for role in Role),
             words=tuple(dict.fromkeys(word for sentence in sentences for word in sentence)) if reads else (),
             objects=tuple(thing.name for thing in objects) if layout.pictured else (),
-            layout=layout,
             sentences=sentences if reads else (),
         )
     return vocabularies

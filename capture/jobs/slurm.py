@@ -7,9 +7,6 @@ import subprocess
 
 from vla_attention.schemas.stores.worker import Worker
 
-#: Only a job in one of these states may be requeued. A cancelled job must stay cancelled.
-_REQUEUEABLE_STATES = ("RUNNING",)
-
 
 def array_task_ids() -> tuple[int, ...]:
     """Return all indices of the SLURM array of this process; empty without an array, and if SLURM does not determine
@@ -47,7 +44,7 @@ def ask_for_requeue(worker: Worker, most_restarts: int) -> str:
     except (OSError, subprocess.SubprocessError) as error:
         return f"Not requeued: SLURM did not answer about job {worker.job_name} ({error}); submit it again to go on."
     state = next((field.partition("=")[2] for field in shown.split() if field.startswith("JobState=")), "unknown")
-    if state not in _REQUEUEABLE_STATES:
+    if state != "RUNNING":  # a cancelled job must stay cancelled
         return f"Not requeued: SLURM lists job {worker.job_name} as {state} and decides whether it starts again."
     try:
         _slurm("scontrol", "requeue", worker.job_name)

@@ -5,6 +5,7 @@ Tables and videos stay open between the calls.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -14,14 +15,15 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from vla_attention.capture.foreign_files.pictures import PictureRefused, decode_picture
 from vla_attention.capture.replay.data_tables import DamagedDataSet, DataSetNotFound, DataTable, stacked
 from vla_attention.capture.replay.video import VideoFile
-from vla_attention.schemas.limits import PICTURE_BYTES
+from vla_attention.schemas.limits import PICTURE_BYTES, PICTURE_PIXELS, PICTURE_SIDE
 from vla_attention.schemas.regular_files import read_regular
 
 #: Rows of pictures that are in memory at once: with two cameras of a megabyte each, a quarter of a gigabyte.
 _ROWS = 128
+#: How a PNG and a JPEG begin.
+_PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 
 #: The episodes of one file follow one another.
 _table = lru_cache(maxsize=2)(DataTable)
@@ -83,6 +85,39 @@ def _decoded(folder: Path, what: str, cell: Any) -> NDArray[np.uint8]:
         if isinstance(error, DataSetNotFound):
             raise
         raise DamagedDataSet(f"{what} cannot be read: {error.strerror or error}.") from error
+
+
+class PictureRefused(ValueError):
+    """Bytes that are no picture of these formats, or a damaged one; the text completes "it ..."."""
+
+
+def decode_picture(content: bytes) -> NDArray[np.uint8]:
+    """Return a picture, PNG or JPEG, as (height, width, 3) uint8 RGB, in an array of its own.
+
+    No other format: pillow starts Ghostscript for an EPS, whatever its file is called.
+
+    Raises:
+        PictureRefused: it is no PNG and no JPEG, is larger than a picture is, or is damaged.
+    """
+    from PIL import JpegImagePlugin, PngImagePlugin
+
+    if not content.startswith((_PNG, _JPEG)):
+        raise PictureRefused("cannot be decoded: it is no PNG and no JPEG")
+    # Not by `Image.open`, which warns of large pictures before their size is known here.
+    kind = PngImagePlugin.PngImageFile if content.startswith(_PNG) else JpegImagePlugin.JpegImageFile
+    try:
+        with kind(io.BytesIO(content)) as image:
+            width, height = image.size
+            if max(width, height) > PICTURE_SIDE or width * height > PICTURE_PIXELS:
+                raise PictureRefused(
+                    f"has {width:,} x {height:,} pixels; expected at most {PICTURE_SIDE:,} on a side and "
+                    f"{PICTURE_PIXELS:,} in all"
+                )
+            return np.array(image.convert("RGB"))  # a copy: torch warns of arrays that cannot be written
+    except (OSError, SyntaxError, ValueError) as error:
+        if isinstance(error, PictureRefused):
+            raise
+        raise PictureRefused(f"cannot be decoded ({(str(error) or type(error).__name__).splitlines()[0]})") from error
 
 
 def read_video_picture(video: Path, seconds: float, tolerance: float) -> NDArray[np.uint8]:

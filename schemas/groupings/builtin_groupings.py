@@ -122,7 +122,7 @@ def reference(vocabulary: Vocabulary, text_keys: int | None = None) -> Grouping:
         text_keys: length of the scripts' prompt (their `--max-token-len`), for pi; None is their default, 256.
     """
     name = "reference" if text_keys is None else f"reference-{text_keys}"
-    spans = vocabulary.layout.spans if vocabulary.layout is not None else ()
+    spans = vocabulary.layout.spans
     if any(span.kind == "latent" for span in spans):
         if text_keys is not None:
             raise GroupingError(
@@ -139,7 +139,7 @@ def reference(vocabulary: Vocabulary, text_keys: int | None = None) -> Grouping:
             published_denoise="last",
         )
     images = [span for span in spans if span.kind == "image"]
-    if vocabulary.layout is None or not images or not any(span.kind == "text" for span in spans):
+    if not images or not any(span.kind == "text" for span in spans):
         raise GroupingError(
             "The grouping 'reference' is defined for the sites 'joint' (pi) and 'self' (Cosmos) only; "
             "choose with --site."

@@ -25,7 +25,6 @@ from vla_attention.schemas.groupings.selector_parser import (
 )
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS, Membership, SelectorError, no_keys
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
-from vla_attention.schemas.layout import SiteLayout
 from vla_attention.schemas.limits import CLAIMED_BYTES, EXPANSION
 
 
@@ -55,12 +54,12 @@ class ResolvedGrouping:
     num_valid: NDArray[np.int64]
 
 
-def check_names(grouping: Grouping, vocabulary: Vocabulary, layout: SiteLayout) -> None:
+def check_names(grouping: Grouping, vocabulary: Vocabulary) -> None:
     """Raise `SelectorError` or `UnknownName` for the first selector with a name that no selected episode has."""
     for group, selectors in grouping.groups.items():
         for text in selectors:
             for atom in dict.fromkeys(atoms_of(parse_selector(text))):
-                problem = SELECTOR_KINDS[atom.kind].problem(atom.argument, vocabulary, layout)
+                problem = SELECTOR_KINDS[atom.kind].problem(atom.argument, vocabulary)
                 if problem:
                     raise SelectorError(f"Group '{group}', selector '{shortened(text)}': {problem}")
 

@@ -39,7 +39,9 @@ def check_selector(text: str, vocabularies: Mapping[str, Vocabulary]) -> None:
         unusable = {site: problem for site, problem in problems.items() if problem}
         if len(unusable) == len(problems):
             # A site with such keys says which names exist; the others only that they have none.
-            telling = [problem for site, problem in unusable.items() if _has_keys(atom, vocabularies[site])]
+            telling = [
+                problem for site, problem in unusable.items() if SELECTOR_KINDS[atom.kind].has_keys(vocabularies[site])
+            ]
             raise SelectorError(f"Selector '{shortened(text)}': {(telling or list(unusable.values()))[0]}")
 
 
@@ -68,18 +70,10 @@ def selector_weights(
 
 
 def _problem(atom: Atom, vocabulary: Vocabulary) -> str | None:
-    if vocabulary.layout is None:
-        raise ValueError("a vocabulary needs its site's layout")
     try:
-        return SELECTOR_KINDS[atom.kind].problem(atom.argument, vocabulary, vocabulary.layout)
+        return SELECTOR_KINDS[atom.kind].problem(atom.argument, vocabulary)
     except UserError as error:
         return str(error)
-
-
-def _has_keys(atom: Atom, vocabulary: Vocabulary) -> bool:
-    """Whether a site has keys of an atom's kind at all, whatever their names."""
-    layout = vocabulary.layout
-    return layout is not None and SELECTOR_KINDS[atom.kind].has_keys(vocabulary, layout)
 
 
 def _only(selector: Selector, known: list[Atom]) -> Selector:

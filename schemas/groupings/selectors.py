@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from vla_attention.schemas.errors import UserError, did_you_mean, listing
 from vla_attention.schemas.groupings.vocabulary import NO_COVERAGE, NO_WORDS, EpisodeTokens, Vocabulary
 from vla_attention.schemas.groupings.words import Word, find_phrase, has_phrase, split_words, word_class
-from vla_attention.schemas.layout import SiteLayout, find_role
+from vla_attention.schemas.layout import find_role
 
 #: The (key, cell) pairs that a selector takes, axes (replan or 1, key, cell or 1). `resolve` says what a cell is.
 Membership = NDArray[np.bool_]
@@ -41,16 +41,15 @@ class SelectorKind:
     Attributes:
         takes: what it selects, in words, for errors and `--list`.
         keys: a function of the argument and an episode's tokens; returns the keys that it takes.
-        problem: a function of the argument, the names in all selected episodes and the site's layout; returns what is
-            wrong with the argument, as the end of a sentence, or None.
-        has_keys: a function of those names and the layout: whether the site has keys of this kind, whatever their
-            names.
+        problem: a function of the argument and the names in all selected episodes; returns what is wrong with the
+            argument, as the end of a sentence, or None.
+        has_keys: a function of those names: whether the site has keys of this kind at all.
     """
 
     takes: str
     keys: Callable[[str, EpisodeTokens], Membership]
-    problem: Callable[[str, Vocabulary, SiteLayout], str | None]
-    has_keys: Callable[[Vocabulary, SiteLayout], bool] = lambda vocabulary, layout: True
+    problem: Callable[[str, Vocabulary], str | None]
+    has_keys: Callable[[Vocabulary], bool] = lambda names: True
 
 
 def no_keys(tokens: EpisodeTokens) -> Membership:
@@ -81,8 +80,8 @@ def _camera_keys(argument: str, tokens: EpisodeTokens) -> Membership:
     return member
 
 
-def _camera_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
-    return _missing("camera", argument, layout.cameras)
+def _camera_problem(argument: str, vocabulary: Vocabulary) -> str | None:
+    return _missing("camera", argument, vocabulary.layout.cameras)
 
 
 def _span_keys(argument: str, tokens: EpisodeTokens) -> Membership:
@@ -90,8 +89,8 @@ def _span_keys(argument: str, tokens: EpisodeTokens) -> Membership:
     return _key_range(tokens, span.start, span.stop)
 
 
-def _span_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
-    return _missing("span", argument, vocabulary.spans)
+def _span_problem(argument: str, vocabulary: Vocabulary) -> str | None:
+    return _missing("span", argument, [span.name for span in vocabulary.layout.spans])
 
 
 def _frame_keys(argument: str, tokens: EpisodeTokens) -> Membership:
@@ -99,8 +98,8 @@ def _frame_keys(argument: str, tokens: EpisodeTokens) -> Membership:
     return _key_range(tokens, span.start, span.stop)
 
 
-def _frame_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
-    layout.frame(argument)  # raises the error that lists the frames
+def _frame_problem(argument: str, vocabulary: Vocabulary) -> str | None:
+    vocabulary.layout.frame(argument)  # raises the error that lists the frames
     return None
 
 
@@ -112,7 +111,7 @@ def _role_keys(argument: str, tokens: EpisodeTokens) -> Membership:
     return member
 
 
-def _role_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
+def _role_problem(argument: str, vocabulary: Vocabulary) -> str | None:
     find_role(argument)  # raises the error that lists the roles
     return None
 
@@ -127,7 +126,7 @@ def _word_keys(argument: str, tokens: EpisodeTokens) -> Membership:
     return _keys_of_words(tokens, [places[id(words)] for words in tokens.words])
 
 
-def _word_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
+def _word_problem(argument: str, vocabulary: Vocabulary) -> str | None:
     if not vocabulary.words:
         return f"{NO_WORDS}."
     words = [argument[start:stop] for start, stop in split_words(argument)]
@@ -155,7 +154,7 @@ def _words_keys(argument: str, tokens: EpisodeTokens) -> Membership:
     return _keys_of_words(tokens, chosen)
 
 
-def _words_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
+def _words_problem(argument: str, vocabulary: Vocabulary) -> str | None:
     if argument.casefold() not in _WORD_CLASSES:
         return _missing("word class", argument, _WORD_CLASSES)
     return None if vocabulary.words else f"{NO_WORDS}."
@@ -190,7 +189,7 @@ def _object_keys(argument: str, tokens: EpisodeTokens) -> Membership:
     return member
 
 
-def _object_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
+def _object_problem(argument: str, vocabulary: Vocabulary) -> str | None:
     if argument.startswith("@") and argument not in _OBJECT_CLASSES:
         return _missing("object class", argument, _OBJECT_CLASSES)
     if not vocabulary.objects:
@@ -237,8 +236,8 @@ def _patch_keys(argument: str, tokens: EpisodeTokens) -> Membership:
     return member
 
 
-def _patch_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
-    return _camera_problem(argument.partition("[")[0], vocabulary, layout)
+def _patch_problem(argument: str, vocabulary: Vocabulary) -> str | None:
+    return _camera_problem(argument.partition("[")[0], vocabulary)
 
 
 # keys: numbers.
@@ -256,55 +255,43 @@ def _number_keys(argument: str, tokens: EpisodeTokens) -> Membership:
     return _key_range(tokens, first, last + 1)
 
 
-def _number_problem(argument: str, vocabulary: Vocabulary, layout: SiteLayout) -> str | None:
-    return None  # a range that leaves the site is found when the keys are taken
-
-
-# Whether a site has keys of a kind at all.
-
-
-def _has_cameras(vocabulary: Vocabulary, layout: SiteLayout) -> bool:
-    return bool(layout.cameras)
-
-
-def _has_frames(vocabulary: Vocabulary, layout: SiteLayout) -> bool:
-    return any(span.kind == "latent" for span in layout.spans)
-
-
-def _has_words(vocabulary: Vocabulary, layout: SiteLayout) -> bool:
-    return bool(vocabulary.words)
-
-
-def _has_objects(vocabulary: Vocabulary, layout: SiteLayout) -> bool:
-    return bool(vocabulary.objects)
-
-
 SELECTOR_KINDS: dict[str, SelectorKind] = {
-    "camera": SelectorKind("every key of one camera", _camera_keys, _camera_problem, _has_cameras),
+    "camera": SelectorKind(
+        "every key of one camera", _camera_keys, _camera_problem, lambda names: bool(names.layout.cameras)
+    ),
     "role": SelectorKind("every key with one role", _role_keys, _role_problem),
     "span": SelectorKind("every key of one span", _span_keys, _span_problem),
-    "frame": SelectorKind("every key of one latent frame", _frame_keys, _frame_problem, _has_frames),
+    "frame": SelectorKind(
+        "every key of one latent frame",
+        _frame_keys,
+        _frame_problem,
+        lambda names: any(span.kind == "latent" for span in names.layout.spans),
+    ),
     "word": SelectorKind(
-        "every piece of a word of the instruction; a phrase in quotes", _word_keys, _word_problem, _has_words
+        "every piece of a word of the instruction; a phrase in quotes",
+        _word_keys,
+        _word_problem,
+        lambda names: bool(names.words),
     ),
     "words": SelectorKind(
         "the words of the instruction by class: content, stop (a shipped list of function words) or all",
         _words_keys,
         _words_problem,
-        _has_words,
+        lambda names: bool(names.words),
     ),
     "object": SelectorKind(
         "the patches that an object covers, by covered area; @interest, @robot or @background",
         _object_keys,
         _object_problem,
-        _has_objects,
+        lambda names: bool(names.objects),
     ),
     "patch": SelectorKind(
         "a region of a camera's picture: camera[r0:r1,c0:c1], rows and columns of its patch grid from the top left, "
         "r1 and c1 excluded, or fractions of the picture, such as 0.5, by the patches' centres",
         _patch_keys,
         _patch_problem,
-        _has_cameras,
+        lambda names: bool(names.layout.cameras),
     ),
-    "keys": SelectorKind("keys by number, a-b with both ends", _number_keys, _number_problem),
+    # A range that leaves the site is found when the keys are taken.
+    "keys": SelectorKind("keys by number, a-b with both ends", _number_keys, lambda argument, names: None),
 }

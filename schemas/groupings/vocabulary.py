@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Literal
 
 import numpy as np
@@ -104,44 +105,42 @@ class EpisodeTokens:
 class Vocabulary:
     """The names that selectors may use over a selection of episodes, for validation and for "did you mean".
 
-    `words` are case-folded, and `sentences` are the instructions as such words; `layout` is the site's, the same for
-    all episodes of a selection.
+    `layout` is the site's, the same for all episodes of a selection. `words` are case-folded, and `sentences` are the
+    instructions as such words.
     """
 
+    layout: SiteLayout
     cameras: tuple[str, ...]
-    spans: tuple[str, ...]
     roles: tuple[str, ...]
     words: tuple[str, ...]
     objects: tuple[str, ...]
-    layout: SiteLayout | None = None
     sentences: tuple[tuple[str, ...], ...] = ()
 
 
 def collect_vocabulary(episodes: Iterable[EpisodeTokens]) -> Vocabulary:
-    """Union of the names in the given episodes in order of appearance, without cameras that are always masked."""
-    names = Names()
-    for tokens in episodes:
+    """Union of the names in at least one episode in order of appearance, without cameras that are always masked."""
+    given = iter(episodes)
+    first = next(given)
+    names = Names(first.layout)
+    for tokens in chain([first], given):
         names.add(tokens)
     return names.vocabulary()
 
 
 class Names:
-    """The names in episodes that come one after the other; none of the episodes is kept."""
+    """The names at one site in episodes that come one after the other; none of the episodes is kept."""
 
-    def __init__(self) -> None:
+    def __init__(self, layout: SiteLayout) -> None:
+        self._layout = layout
         self._cameras: dict[str, None] = {}
-        self._spans: dict[str, None] = {}
         self._roles: dict[str, None] = {}
         self._words: dict[str, None] = {}
         self._objects: dict[str, None] = {}
         self._sentences: dict[tuple[str, ...], None] = {}
-        self._layout: SiteLayout | None = None
 
     def add(self, tokens: EpisodeTokens) -> None:
         """Add the names in one episode."""
-        self._layout = tokens.layout
-        for span in tokens.layout.spans:
-            self._spans[span.name] = None
+        for span in self._layout.spans:
             if span.camera is None or span.camera in self._cameras:
                 continue
             if (tokens.static_roles[:, span.start : span.stop] != Role.MASKED_IMAGE).any():
@@ -167,11 +166,10 @@ class Names:
     def vocabulary(self) -> Vocabulary:
         """The union of what was added, in order of appearance."""
         return Vocabulary(
+            self._layout,
             tuple(self._cameras),
-            tuple(self._spans),
             tuple(self._roles),
             tuple(self._words),
             tuple(self._objects),
-            self._layout,
             tuple(self._sentences),
         )

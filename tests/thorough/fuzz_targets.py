@@ -24,8 +24,8 @@ from tests.kit.lerobot_data_sets import encoded, made_up_episodes, numbered_pict
 from tests.kit.stores import StoreSpec, small_effects, small_steps, write_store
 from tests.kit.tokens import small_tokens
 from vla_attention.analyze.published.results_reader import read_results_file
-from vla_attention.capture.foreign_files.pictures import PictureRefused, decode_picture
 from vla_attention.capture.replay.data_set_files import INFO, read_info
+from vla_attention.capture.replay.data_set_reader import PictureRefused, decode_picture
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.groupings.grouping import Grouping, read_grouping_file
 from vla_attention.schemas.groupings.resolve import check_names, resolve
@@ -107,7 +107,7 @@ def _tokens() -> EpisodeTokens:
 
 def _resolve(grouping: Grouping) -> None:
     tokens = _tokens()
-    check_names(grouping, collect_vocabulary([tokens]), tokens.layout)
+    check_names(grouping, collect_vocabulary([tokens]))
     resolve(grouping, tokens)
 
 

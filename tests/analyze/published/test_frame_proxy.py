@@ -44,7 +44,7 @@ def test_one_frame_over_another_is_named_as_it_was_typed():
 
 
 def test_the_grouping_reference_is_one():
-    vocabulary = Vocabulary(("wrist", "primary"), FRAMES, ("image", "blank"), (), (), SELF)
+    vocabulary = Vocabulary(SELF, ("wrist", "primary"), ("image", "blank"), (), ())
     found = frame_proxy(root(query_frame="primary"), SELF, BUILTIN_GROUPINGS["reference"](vocabulary))
     assert found == FrameProxy(20, "primary", "curr_last", "frame0", num_queries=4)
 

@@ -13,7 +13,7 @@ from tests.analyze.stores.episode_work import slow_square
 from tests.kit.stores import write_store
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.stores import parallel
-from vla_attention.analyze.stores.parallel import map_episodes, workers
+from vla_attention.analyze.stores.parallel import each_episode, workers
 from vla_attention.schemas.errors import BadArgument
 
 pytestmark = pytest.mark.thorough
@@ -72,7 +72,7 @@ def test_a_worker_that_is_killed_in_the_middle_is_replaced(cluster):
             os.kill(killed[0], signal.SIGKILL)
 
     with workers(cluster.scheduler_address):
-        assert map_episodes(slow_square, range(12), kill_once) == [i * i for i in range(12)]
+        assert list(each_episode(slow_square, range(12), kill_once)) == [i * i for i in range(12)]
     assert killed
 
 

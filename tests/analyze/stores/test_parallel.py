@@ -5,14 +5,14 @@ from functools import partial
 
 import pytest
 
-from vla_attention.analyze.stores.parallel import each_episode, map_episodes
+from vla_attention.analyze.stores.parallel import each_episode
 
 
 def test_the_first_error_ends_it():
     begun = []
     gate = threading.Event()
     with pytest.raises(ValueError, match="episode 0"):
-        map_episodes(partial(_fail_first, begun=begun, gate=gate), range(1000))
+        list(each_episode(partial(_fail_first, begun=begun, gate=gate), range(1000)))
     assert len(begun) < 1000
 
 

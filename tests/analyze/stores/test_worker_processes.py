@@ -13,7 +13,7 @@ from tests.analyze.stores.episode_work import damaged, defect, killed_at_two, pr
 from tests.kit.planted_effects import planted_effects
 from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main
-from vla_attention.analyze.stores.parallel import WorkersLost, each_episode, map_episodes, workers
+from vla_attention.analyze.stores.parallel import WorkersLost, each_episode, workers
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 
@@ -35,9 +35,9 @@ def two():
 
 def test_results_come_in_order_from_other_processes(two):
     counted = []
-    assert map_episodes(square, range(20), counted.append) == [i * i for i in range(20)]
+    assert list(each_episode(square, range(20), counted.append)) == [i * i for i in range(20)]
     assert counted == [1] * 20
-    found = set(map_episodes(process_of, range(20)))
+    found = set(each_episode(process_of, range(20)))
     assert os.getpid() not in found
     assert len(found) <= 2
 
@@ -69,7 +69,7 @@ def test_every_question_has_the_same_answer_to_the_last_bit(store, monkeypatch):
 @pytest.mark.thorough
 def test_a_process_that_is_killed_in_the_middle_is_a_sentence():
     with workers(2), pytest.raises(WorkersLost, match="A worker process ended"):
-        map_episodes(killed_at_two, range(6))
+        list(each_episode(killed_at_two, range(6)))
 
 
 def test_errors_are_raised_as_in_this_process(two):
@@ -78,8 +78,8 @@ def test_errors_are_raised_as_in_this_process(two):
     with pytest.raises(CorruptEpisode, match=r"^Episode 2 is damaged\.$"):
         next(results)
     with pytest.raises(ZeroDivisionError, match="a defect at 0"):
-        map_episodes(defect, range(3))
-    assert map_episodes(square, range(3)) == [0, 1, 4]
+        list(each_episode(defect, range(3)))
+    assert list(each_episode(square, range(3))) == [0, 1, 4]
 
 
 @pytest.mark.thorough

@@ -17,9 +17,14 @@ from vla_attention.schemas.groupings.grouping import (
 )
 from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.groupings.vocabulary import Vocabulary
+from vla_attention.schemas.layout import SiteLayout, Span
 
 VOCABULARY = Vocabulary(
-    ("base", "wrist"), ("base", "wrist", "prompt"), ("image", "instruction"), ("bowl",), ("bowl_1",)
+    SiteLayout("joint", (Span("base", "image", 0, 1, "base"), Span("prompt", "text", 1, 2))),
+    cameras=("base", "wrist"),
+    roles=("image", "instruction"),
+    words=("bowl",),
+    objects=("bowl_1",),
 )
 
 

@@ -18,18 +18,19 @@ def test_a_new_kind_is_one_entry_of_the_table(monkeypatch):
         member[:, :: int(argument)] = True
         return member
 
-    def problem(argument, vocabulary, layout):
-        return None if argument.isdigit() and 0 < int(argument) < layout.num_keys else f"'{argument}' is no step."
+    def problem(argument, vocabulary):
+        steps = range(1, vocabulary.layout.num_keys)
+        return None if argument.isdigit() and int(argument) in steps else f"'{argument}' is no step."
 
     monkeypatch.setitem(SELECTOR_KINDS, "every", SelectorKind("every nth key", every_nth, problem))
     tokens = small_tokens(2, 0, [0])
     vocabulary = collect_vocabulary([tokens])
     grouping = Grouping("g", {"some": ("every:3 - camera:base_0_rgb",), "rest": ("*",)})
-    check_names(grouping, vocabulary, tokens.layout)
+    check_names(grouping, vocabulary)
     weights = resolve(grouping, tokens).weights
     assert np.flatnonzero(weights[0, :, 0]).tolist() == [12, 15, 18, 21, 24, 27, 30, 33, 36]
     assert (weights.sum(axis=2) == 1).all()
     with pytest.raises(SelectorError, match="Group 'some', selector 'every:99': '99' is no step"):
-        check_names(Grouping("g", {"some": ("every:99",)}), vocabulary, tokens.layout)
+        check_names(Grouping("g", {"some": ("every:99",)}), vocabulary)
     with pytest.raises(SelectorError, match="did you mean 'every'"):
         Grouping("g", {"some": ("evry:3",)})

@@ -11,7 +11,7 @@ import pytest
 from PIL import EpsImagePlugin, Image
 
 from tests.kit.lerobot_data_sets import encoded, numbered_picture
-from vla_attention.capture.foreign_files.pictures import PictureRefused, decode_picture
+from vla_attention.capture.replay.data_set_reader import PictureRefused, decode_picture
 
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 96 64\n%%EndComments\nshowpage\n"
 
