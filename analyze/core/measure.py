@@ -31,7 +31,7 @@ from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.analyze.stores.parallel import each_episode
 from vla_attention.analyze.stores.rows import layer_rows
 from vla_attention.analyze.stores.selection import Selection
-from vla_attention.schemas.groupings.resolve import counted_keys
+from vla_attention.schemas.groupings.resolve import counted_keys, once_if_unchanged
 from vla_attention.schemas.segments import segment_members, weights_on_segments
 
 Array: TypeAlias = NDArray[np.float64]
@@ -62,7 +62,7 @@ class Items:
         """
         totals = [self.whole if isinstance(self.whole, np.ndarray) else item.valid, item.valid]
         parts = [self.weights, *(part[:, :, None].astype(np.float32) for part in totals)]
-        each = [part[:1] if (part[1:] == part[:-1]).all() else part for part in parts]
+        each = [once_if_unchanged(part) for part in parts]
         replans = max(map(len, each))
         weights = np.concatenate([np.broadcast_to(part, (replans, *part.shape[1:])) for part in each], axis=2)
         weights[:, list(item.without)] = 0.0

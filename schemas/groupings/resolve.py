@@ -88,11 +88,16 @@ def stack_over_keys(weights: Sequence[NDArray[np.float32]]) -> NDArray[np.float3
     a word in hundreds of episodes then take little, and stay in the processor's cache.
     """
     replans = max(len(weight) for weight in weights)
-    each = [weight[:1] if (weight[1:] == weight[:-1]).all() else weight for weight in weights]
+    each = [once_if_unchanged(weight) for weight in weights]
     kept = max(len(weight) for weight in each)
     keys = weights[0].shape[1]
     stacked = np.stack([np.broadcast_to(weight, (kept, keys)) for weight in each], axis=-1, dtype=np.float32)
     return np.broadcast_to(stacked, (replans, keys, len(weights)))
+
+
+def once_if_unchanged(weights: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Weights (replan or 1, key, ...), of the first replan alone where they are the same at all."""
+    return weights[:1] if (weights[1:] == weights[:-1]).all() else weights
 
 
 def counted_keys(weights: NDArray[np.float32], existing: NDArray[np.bool_] | None) -> NDArray[np.float64]:

@@ -153,16 +153,10 @@ class StoredEpisode:
         return self._arrays[name]
 
     def reading_step(self, name: str) -> int:
-        """Indices along the first axis of an array that are read at once without more memory than is stored for them.
-
-        They are all, or those of a chunk: of large arrays, and where each chunk holds nothing but one number.
-        """
-        array = self.array(name)
-        shape, step = array.metadata.shape, array.metadata.chunk_shape[0]
-        decoded = array.metadata.dtype.itemsize * math.prod(shape)
-        if decoded <= READ_AT_ONCE_BYTES:
-            return max(1, shape[0])
-        return step
+        """Indices along the first axis of an array that are read at once: all, or of large arrays those of a chunk."""
+        about = self.array(name).metadata
+        whole = about.dtype.itemsize * math.prod(about.shape) <= READ_AT_ONCE_BYTES
+        return max(1, about.shape[0]) if whole else about.chunk_shape[0]
 
     def read(self, name: str, index: int | slice = slice(None)) -> NDArray[Any]:
         """Values of one array, or numbers of the attributes (`NUMBERS`) as one.

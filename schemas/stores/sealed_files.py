@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 from vla_attention.schemas.limits import DOCUMENT_BYTES
@@ -25,7 +26,6 @@ class SealedFiles:
 
     source: ByteSource
     records: Mapping[str, FileRecord]
-    _shards: dict[str, SealedShard] = field(default_factory=dict, repr=False, compare=False)
 
     def whole(self, file: str, most: int | None = None) -> bytes:
         """All bytes of a file.
@@ -40,12 +40,8 @@ class SealedFiles:
             most = DOCUMENT_BYTES if file.endswith("zarr.json") else record.size
         if record.size > most:
             raise CorruptEpisode(f"its {file} has {record.size:,} bytes; expected at most {most:,}", file)
-        try:
+        with _reading(file):
             content = self.source.whole(file, most=most)
-        except RemoteFailure:
-            raise
-        except OSError as error:
-            raise CorruptEpisode(_lost(file, error), file) from None
         if len(content) != record.size or bytes_digest(content) != record.sha256:
             raise CorruptEpisode(_differs(file), file)
         return content
@@ -74,7 +70,7 @@ class SealedFiles:
             yield 0, self.whole(file)
             return
         digest = hashlib.sha256()
-        try:
+        with _reading(file):
             if isinstance(self.source, Folder):
                 self.source.check_not_sparse(file)
             for offset in range(0, record.size, PART_BYTES):
@@ -86,23 +82,13 @@ class SealedFiles:
                     break
                 digest.update(part)
                 yield offset, part
-        except RemoteFailure:
-            raise
-        except OSError as error:
-            raise CorruptEpisode(_lost(file, error), file) from None
         if digest.hexdigest() != record.sha256:
             raise CorruptEpisode(_differs(file), file)
 
     def shard(self, file: str, chunks: int, most: int) -> SealedShard:
         """The shard in a file, of which single chunks can be read; see `SealedShard.open`."""
-        if file not in self._shards:
-            try:
-                self._shards[file] = SealedShard.open(self.source, file, self.record(file), chunks, most)
-            except RemoteFailure:
-                raise
-            except OSError as error:
-                raise CorruptEpisode(_lost(file, error), file) from None
-        return self._shards[file]
+        with _reading(file):
+            return SealedShard.open(self.source, file, self.record(file), chunks, most)
 
     def problems(self) -> dict[str, str]:
         """What is wrong, by file: it is missing, or has another size than in the seal. Reads none of them."""
@@ -125,6 +111,17 @@ class SealedFiles:
         if record is None:
             raise CorruptEpisode(f"its {file} does not agree with its seal, which does not list it", file)
         return record
+
+
+@contextmanager
+def _reading(file: str) -> Iterator[None]:
+    """Within the block a file of the episode is read: that it cannot be is damage, and that a network fails is none."""
+    try:
+        yield
+    except RemoteFailure:
+        raise
+    except OSError as error:
+        raise CorruptEpisode(_lost(file, error), file) from None
 
 
 def _differs(file: str) -> str:

@@ -80,11 +80,11 @@ class SealedShard:
             index = read_index(stored, record.size).tolist()
         except CorruptEpisode as error:
             raise CorruptEpisode(f"its {file} cannot be read: {error}", file) from None
-        longest = max((length for _, length in index), default=0)
-        if longest > most:
-            raise CorruptEpisode(f"its index names a chunk of {longest} bytes; expected at most {most}", file)
         parts = (checksums[i : i + CHECKSUM_BYTES] for i in range(0, len(checksums), CHECKSUM_BYTES))
-        return cls(source, file, [(*place, part) for place, part in zip(index, parts, strict=True)])
+        shard = cls(source, file, [(*place, part) for place, part in zip(index, parts, strict=True)])
+        if shard.longest > most:
+            raise CorruptEpisode(f"its index names a chunk of {shard.longest} bytes; expected at most {most}", file)
+        return shard
 
     @property
     def longest(self) -> int:
