@@ -3,7 +3,7 @@
 #   make capture     run a policy in simulation and record its attention (installs torch and the simulators)
 #   make analyze     masses, ratios, tables and pictures from a store (installs the laptop's small set only)
 #   make test        the gate: formatting, types, tests, and the package as others install it; minutes by part
-#   make test-thorough   attacks, damages, fuzz, kills, memory, many examples, site and notebooks too (an hour or more)
+#   make test-thorough   attacks, damages, kills, memory, many examples, site and notebooks too (an hour or more)
 #   make faults      twenty faults planted one at a time: the tests of their area have to catch each
 #   make test-policies   policies of transformers 5 and LeRobot, in environments of their own (.venv-transformers, .venv-lerobot)
 #   make package-newest  the wheel with the newest libraries, on each Python that is there (gigabytes; PYTHONS names others)
@@ -11,7 +11,6 @@
 #   make test-remote stores in S3, on moto's server on this machine, in an environment of its own (.venv-remote)
 #   make viewer      the page of `vla-attention view` from its sources in analyze/view/web (needs node and npm)
 #   make notebooks   the notebooks of examples/, run from beginning to end, in an environment of its own (.venv-notebooks)
-#   make fuzz        made-up bytes for every parser of files, for SECONDS=3600, in an environment of its own (.venv-fuzz)
 #   make docs        the documentation site, into site/, in an environment of its own (.venv-docs)
 #   make pictures    the pictures and printed samples of README and guides, from the run of make capture
 #   make screenshots the pictures of the viewer's page in docs/viewer.md, from the same run, in this machine's Chromium
@@ -46,7 +45,7 @@ WORKERS ?= 2
 # An empty PYTHONDONTWRITEBYTECODE: where it is set, both processes compile all tests anew at every run.
 PYTEST := PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: capture analyze test test-policies test-remote test-slurm notebooks fuzz faults test-thorough check unit package package-newest test-numpy1 audit setup setup-analyze schemas docs pictures screenshots viewer clean
+.PHONY: capture analyze test test-policies test-remote test-slurm notebooks faults test-thorough check unit package package-newest test-numpy1 audit setup setup-analyze schemas docs pictures screenshots viewer clean
 
 capture: .venv/capture-installed
 	$(BIN)/vla-capture $(POLICY) --checkpoint $(CHECKPOINT) --task-suite $(SUITE) --output $(STORE) \
@@ -101,11 +100,6 @@ test-remote: .venv-remote/installed
 # Executed, with their pictures, in results/notebooks.
 notebooks: .venv-notebooks/installed
 	.venv-notebooks/bin/python scripts/run_notebooks.py $(ARGS)
-
-# What it finds is kept in results/reliability/fuzz; mended findings belong into tests/thorough/fuzz/corpus.
-SECONDS ?= 3600
-fuzz: .venv-fuzz/installed
-	nice .venv-fuzz/bin/python benchmarks/reliability.py fuzz --seconds $(SECONDS)
 
 # Takes about ten minutes, most of it waiting: SLURM holds a requeued job back for two. Works with any environment that is active.
 test-slurm:
@@ -204,11 +198,5 @@ setup-analyze: .venv/analyze-installed
 	.venv-audit/bin/python -m pip install --quiet --disable-pip-version-check 'pip-audit>=2.9'
 	@touch $@
 
-.venv-fuzz/installed: pyproject.toml constraints.txt
-	@echo "Installing atheris into .venv-fuzz ..."
-	$(PYTHON) -m venv .venv-fuzz
-	.venv-fuzz/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e . atheris
-	@touch $@
-
 clean:
-	rm -rf .venv .venv-transformers .venv-lerobot .venv-remote .venv-audit .venv-notebooks .venv-fuzz .venv-docs .venv-numpy1 build site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-transformers .venv-lerobot .venv-remote .venv-audit .venv-notebooks .venv-docs .venv-numpy1 build site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,13 +1,13 @@
-"""How reliable stores are: captures that are killed, files that rot, parsers that are fuzzed, processes that race.
+"""How reliable stores are: captures that are killed, files that rot, processes that race.
 
-Usage: python benchmarks/reliability.py PART [--folder FOLDER] [--share 0.1] [--seconds 3600]
+Usage: python benchmarks/reliability.py PART [--folder FOLDER] [--share 0.1]
        python benchmarks/reliability.py rows [--folder FOLDER]
-PART: kill, rot, race, fuzz
+PART: kill, rot, race
 
 Every part writes each case into FOLDER as it ends, and goes on where an earlier run stopped. `rows` makes the tables of
 docs/benchmarks/reliability.json from what is there. A case that shows a problem is printed, and its files stay in
-FOLDER/PART. `--share` tries a part of the cases: 0.1 a tenth. Whole runs take an hour (kill), 20 minutes (rot), an hour
-(fuzz, in the environment of `make fuzz`) and ten minutes (race) on two cores. Kill needs root for the full disk.
+FOLDER/PART. `--share` tries a part of the cases: 0.1 a tenth. Whole runs take an hour (kill), 20 minutes (rot) and ten
+minutes (race) on two cores. Kill needs root for the full disk.
 """
 
 from __future__ import annotations
@@ -68,15 +68,6 @@ def rot(folder: Path, results: Results, share: float) -> None:
                 case = {"series": kind.name, "number": number, "what": damage.what, "path": damage.path}
                 answers = list(noticed.analyses.values())
                 results.add({**case, "named": noticed.named, "answers": answers, "problems": noticed.problems})
-
-
-def fuzz(folder: Path, results: Results, seconds: float) -> None:
-    """Made-up bytes for every parser; every run adds to the earlier ones."""
-    from reliability_fuzz import run
-
-    from tests.thorough.fuzz_targets import TARGETS
-
-    run(folder, results, seconds, TARGETS)
 
 
 def kill_table(results: Results) -> Table:
@@ -174,27 +165,11 @@ def race_table(results: Results) -> Table:
     return Table(columns, [row])
 
 
-def fuzz_table(results: Results) -> Table:
-    """A row for each parser."""
-    rows: Rows = [
-        {
-            "target": f"`{name}`",
-            "inputs": sum(case["inputs"] for case in cases),
-            "minutes": sum(case["seconds"] for case in cases) / 60,
-            "open": len(cases[-1]["problems"]),
-        }
-        for name, cases in results.series().items()
-    ]
-    columns = {"target": "parser", "inputs": "inputs", "minutes": "minutes", "open": "open findings"}
-    return Table(columns, rows)
-
-
 Part = tuple[Callable[[Path, Results, float], None], Callable[[Results], Table]]
 PARTS: dict[str, Part] = {
     "kill": (kill, kill_table),
     "rot": (rot, rot_table),
     "race": (race, race_table),
-    "fuzz": (fuzz, fuzz_table),
 }
 
 
@@ -203,8 +178,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("part", choices=(*PARTS, "rows"))
     parser.add_argument("--folder", type=Path, default=ROOT / "results" / "reliability")
-    parser.add_argument("--share", type=float, default=1.0, help="part of the cases (kill, rot, race)")
-    parser.add_argument("--seconds", type=float, default=3600, help="of fuzzing, for all parsers together")
+    parser.add_argument("--share", type=float, default=1.0, help="part of the cases")
     arguments = parser.parse_args(argv)
     every = {name: Results(arguments.folder / f"{name}.jsonl") for name in PARTS}
     if arguments.part == "rows":
@@ -218,8 +192,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("MUJOCO_GL", "egl")
     folder = (arguments.folder / arguments.part).resolve()
     folder.mkdir(parents=True, exist_ok=True)
-    extent = arguments.seconds if arguments.part == "fuzz" else arguments.share
-    PARTS[arguments.part][0](folder, every[arguments.part], extent)
+    PARTS[arguments.part][0](folder, every[arguments.part], arguments.share)
     return int(any(case["problems"] for case in every[arguments.part].cases()))
 
 

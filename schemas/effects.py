@@ -11,8 +11,6 @@ from typing import Literal
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.jsonable import Document, Number
-from vla_attention.schemas.limit_checks import check_at_most
-from vla_attention.schemas.limits import AXIS, CONDITIONS, EFFECT_ENTRIES, REPLANS
 
 #: Changes of actions under the conditions of `EpisodeEffects`; below each site, the weights of the keys cut for them.
 CHANGE = "effects/change"
@@ -43,10 +41,11 @@ class EffectsRecorded(Document, frozen=True):
         """Check that something is measured, and the numbers."""
         if not self.items or not self.readers:
             raise BadArgument("Effects without an item or without a reader: nothing would be measured.")
-        check_at_most("The number of replans from one with effects to the next", self.every, REPLANS, least=1)
-        check_at_most("The number of denoise steps of effects", self.denoise_steps, AXIS, least=1)
-        if self.seed < 0:
-            raise BadArgument(f"The seed of effects is {self.seed}; expected 0 or more.")
+        if self.every < 1 or self.denoise_steps < 1 or self.seed < 0:
+            raise BadArgument(
+                f"Effects at every {self.every} replans, of {self.denoise_steps} denoise steps, with the seed "
+                f"{self.seed}; expected at least 1, 1 and 0."
+            )
 
 
 class EpisodeEffects(Document, frozen=True):
@@ -61,13 +60,3 @@ class EpisodeEffects(Document, frozen=True):
     units: tuple[Number, ...]
     replan: tuple[int, ...]
     condition: tuple[int, ...]
-
-    def __post_init__(self) -> None:
-        """Check that the entries are of conditions that there are, in order, each once."""
-        check_at_most("The number of conditions of effects", len(self.conditions), CONDITIONS)
-        check_at_most("The number of measured effects", len(self.replan), EFFECT_ENTRIES)
-        if not all(0 <= number < len(self.conditions) for number in self.condition) or min(self.replan, default=0) < 0:
-            raise BadArgument("The entries of effects name a replan or a condition that does not exist.")
-        entries = list(zip(self.replan, self.condition, strict=False))
-        if len(self.replan) != len(self.condition) or entries != sorted(set(entries)):
-            raise BadArgument("The entries of effects are not in order, or name a replan and a condition twice.")

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
-from itertools import islice
 
-from vla_attention.schemas.limits import COMPARED_NAMES, NAME_CHARACTERS, SENTENCE_CHARACTERS, SHOWN_CHARACTERS
+#: Characters of an error's sentence; what is longer repeats what was given.
+SENTENCE_CHARACTERS = 4000
+#: Characters of one given value or name in a sentence.
+SHOWN_CHARACTERS = 300
 
 
 class UserError(Exception):
@@ -76,9 +78,7 @@ def runs_of(numbers: Iterable[int]) -> list[list[int]]:
 
 def did_you_mean(given: str, existing: Iterable[str]) -> str:
     """Return " Did you mean 'x'?" for the nearest existing name, or an empty string when nothing is near."""
-    if len(given) > NAME_CHARACTERS:
-        return ""
-    by_folded = {name.casefold(): name for name in islice(existing, COMPARED_NAMES) if len(name) <= NAME_CHARACTERS}
+    by_folded = {name.casefold(): name for name in existing}
     folded = given.casefold()
     # The most frequent mistake is half a name ('base' for 'base_0_rgb'), which is too short for the similarity measure.
     near = [name for name in by_folded if len(folded) > 2 and name.startswith(folded)]

@@ -28,6 +28,20 @@ class Document(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What is written as JSON, and read again. `msgspec.structs` has `replace`, `asdict` and `fields` for them."""
 
 
+def decode_json(content: bytes) -> Any:
+    """The value of a JSON document in UTF-8; `NaN` and `Infinity` are numbers, as the published scripts write them.
+
+    Raises:
+        ValueError: it is no JSON.
+    """
+    try:
+        return msgspec.json.decode(content)
+    except msgspec.DecodeError:
+        return json.loads(content)  # slower; says where a document that is none goes wrong
+    except RecursionError:
+        raise ValueError("its lists and objects are nested too deep") from None
+
+
 def to_json(value: Any) -> Any:
     """Turn documents, tuples and mappings into plain JSON values; a non-finite number is an error (JSON has none)."""
     return json.loads(json.dumps(msgspec.to_builtins(value, str_keys=True), allow_nan=False))

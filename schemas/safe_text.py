@@ -19,8 +19,6 @@ from urllib.parse import quote
 
 from vla_attention.schemas.errors import BadArgument, shortened
 from vla_attention.schemas.errors import visible as visible
-from vla_attention.schemas.limit_checks import check_at_most
-from vla_attention.schemas.limits import LINE_CHARACTERS, NAME_CHARACTERS, TEXT_CHARACTERS
 
 #: Beside letters and digits, what stays as it is in `file_part`.
 _PLAIN = re.compile(r"[\w ._+=,@-]")
@@ -32,35 +30,23 @@ def check_name(what: str, name: str) -> None:
 
     `what` says whose name it is, for instance "suite".
     """
-    _check_printable(what, name, NAME_CHARACTERS)
+    check_text(what, name)
     if not name.strip() or name in (".", "..") or "/" in name or "\\" in name:
         raise BadArgument(f"'{name}' cannot be the name of a {what}: expected text without / and \\ that is no '..'.")
 
 
 def check_text(what: str, text: str) -> None:
     """Raise `BadArgument` unless a text of one line that is in no path (a policy, an address) is printable."""
-    _check_printable(what, text, LINE_CHARACTERS)
-
-
-def check_free_text(what: str, text: str) -> None:
-    """Raise `BadArgument` for an instruction or a prompt, which is any text, that is longer than any policy reads."""
-    if len(text) > TEXT_CHARACTERS:
-        check_at_most(f"The length of the {what} '{visible(shortened(text, 60))}'", len(text), TEXT_CHARACTERS)
+    if not text.isprintable():
+        raise BadArgument(f"The {what} '{visible(shortened(text))}' has control characters: expected printable text.")
 
 
 @functools.lru_cache(maxsize=4096)
 def check_inner_path(path: str) -> None:
     """Raise `BadArgument` unless a path of a file or array stays inside the folder that it is relative to."""
-    _check_printable("path", path, LINE_CHARACTERS)
+    check_text("path", path)
     if any(part in ("", ".", "..") or "\\" in part for part in path.split("/")):
         raise BadArgument(f"'{path}' cannot be the path of a file or array: expected names joined by /, without '..'.")
-
-
-def _check_printable(what: str, text: str, most: int) -> None:
-    if len(text) > most:
-        check_at_most(f"The length of the {what} '{visible(shortened(text, 60))}'", len(text), most)
-    if not text.isprintable():
-        raise BadArgument(f"The {what} '{visible(shortened(text))}' has control characters: expected printable text.")
 
 
 def file_part(name: str) -> str:

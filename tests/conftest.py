@@ -33,7 +33,7 @@ for _name, _count in PROFILES.items():
 settings.load_profile("fast")
 
 
-#: Attacks, fuzz and campaigns.
+#: Attacks.
 THOROUGH = Path(__file__).with_name("thorough")
 
 #: Where temporary folders go if it has this much room: files in memory take a third of the time of those on a disk.

@@ -26,10 +26,8 @@ import polars as pl
 from msgspec.structs import fields
 
 from vla_attention.analyze.measures.frames import LAYERS_AVG
-from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import listing, shortened
-from vla_attention.schemas.limits import RESULTS_BYTES, RESULTS_NESTS
-from vla_attention.schemas.regular_files import read_regular
+from vla_attention.schemas.jsonable import decode_json
 from vla_attention.schemas.results import (
     RESULTS_PREFIX,
     EpisodeResult,
@@ -170,11 +168,11 @@ def read_results_file(path: Path) -> ResultsFile:
         ResultsError: it is no results file, or a field is wrong; names the file, the episode and the field.
     """
     try:
-        content = read_regular(path, RESULTS_BYTES)
+        content = path.read_bytes()
     except OSError as error:
         raise ResultsNotFound(f"Cannot read results file {path}: {error.strerror or error}.") from None
     try:
-        document = decode_json(content, RESULTS_BYTES, RESULTS_NESTS)
+        document = decode_json(content)
     except ValueError as error:
         raise ResultsError(f"{path} is not a results file: not valid JSON ({error}).") from None
     try:

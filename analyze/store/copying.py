@@ -22,7 +22,6 @@ from typing import Any
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 from vla_attention.schemas.stores.digest import run_digest, with_digest
 from vla_attention.schemas.stores.durable_files import publish, publish_file
-from vla_attention.schemas.stores.episode_files import files_of_no_array, refuse_links
 from vla_attention.schemas.stores.locks import WHOLE_STORE, store_locks
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
@@ -34,7 +33,6 @@ from vla_attention.schemas.stores.root import (
     group_document,
     names_document,
     read_run,
-    without_other_fields,
 )
 from vla_attention.schemas.stores.seal import SEAL_FILE, seal_episode
 from vla_attention.schemas.stores.store_format import (
@@ -85,9 +83,9 @@ def open_source(place: StorePlace) -> Store:
 
 
 def _tars(store: Path) -> dict[str, Path]:
-    """The tar files of a copy by the name of their episode; a link is none."""
+    """The tar files of a copy by the name of their episode."""
     tars = {path.name.removesuffix(TAR_SUFFIX): path for path in (store / EPISODES_GROUP).glob(f"*{TAR_SUFFIX}")}
-    return {name: path for name, path in tars.items() if is_episode_name(name) and not path.is_symlink()}
+    return {name: path for name, path in tars.items() if is_episode_name(name)}
 
 
 def _unpacked(episode: StoredEpisode, building: Path, only: str = "") -> StoredEpisode:
@@ -254,12 +252,6 @@ def copy_episode(
 
     linked: shares a file of the episode with a place, where it can.
     """
-    if beyond := files_of_no_array(store.attributes, episode.attributes, episode.files.records):
-        raise CorruptEpisode(
-            f"Episode {episode.name} has files that belong to no array: {listing(beyond, 5)}. They are not copied, and "
-            "without them its seal would not fit."
-        )
-    refuse_links(episode)
     for name in episode.attributes.arrays:
         if _part_of(name) not in without and f"{name}/zarr.json" not in episode.files.records:
             raise CorruptEpisode(f"Episode {episode.name} lacks the array {name}: its files are gone.")
@@ -287,7 +279,7 @@ def copy_episode(
 
 def _root_document(store: Store, without: tuple[str, ...]) -> bytes:
     """The copy's `zarr.json`: that of the run, in the version that it has, with the omitted parts."""
-    content = without_other_fields(source_of(store.path).whole("zarr.json"))
+    content = source_of(store.path).whole("zarr.json")
     from_hub = isinstance(store.path, StoreUrl) and store.path.url.startswith(HUB_PROTOCOL)
     if not without and not from_hub:
         return content
@@ -318,7 +310,7 @@ def _episodes_document(store: Store) -> bytes:
         raise
     except (OSError, ValueError):
         return group_document({})
-    return group_document({}) if stated else without_other_fields(content)
+    return group_document({}) if stated else content
 
 
 def _without_arrays(changed: dict[str, Any], without: tuple[str, ...]) -> bytes:

@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from vla_attention.schemas.regular_files import open_regular, read_all
 from vla_attention.schemas.stores.store_url import StorePlace
 from vla_attention.schemas.user_cache import user_cache
 
@@ -73,16 +72,14 @@ def _make_private(folder: Path) -> None:
 def _private_token(path: Path) -> str | None:
     """What a file says that is this user's own, and that nobody else can read; None: there is no such file."""
     try:
-        handle, size = open_regular(path, follow=False)
+        handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError:
         return None
-    try:
+    with open(handle, "rb") as file:
         status = os.fstat(handle)
-        if status.st_uid != os.geteuid() or status.st_mode & _OTHERS or size > 100:
+        if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & _OTHERS:
             return None
-        content = read_all(handle, size)
-    finally:
-        os.close(handle)
+        content = file.read()
     return content.decode() if _TOKEN.fullmatch(content) else None
 
 

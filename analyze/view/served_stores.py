@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -10,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from vla_attention.analyze.view.summaries import Summary
-from vla_attention.schemas.stores.byte_source import ByteSource
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.remote_source import source_of
 from vla_attention.schemas.stores.root import episode_folders
@@ -60,20 +60,20 @@ class ServedStore:
         Those of a file elsewhere are asked for once.
         """
         if isinstance(self.place, Path):
-            return self._source().size(file)
+            # The folder may have got links that lead elsewhere, also while the page is open.
+            path, place = os.path.realpath(self.place / file), os.path.realpath(self.place)
+            if not path.startswith(f"{place}{os.sep}") or not os.path.isfile(path):
+                raise FileNotFoundError(file)
+            return os.stat(path).st_size
         if file not in self._sizes:
-            self._sizes[file] = self._source().size(file)
+            self._sizes[file] = source_of(self.place).size(file)
         return self._sizes[file]
 
     def pieces(self, file: str, first: int, end: int) -> Iterator[bytes]:
         """The bytes [first, end) of a file, some megabytes at a time."""
-        source = self._source()
+        source = source_of(self.place)
         for at in range(first, end, _PIECE):
             yield source.part(file, at, min(_PIECE, end - at))
-
-    def _source(self) -> ByteSource:
-        # Anew for each request: a folder of this machine that was looked at may since have become a link.
-        return source_of(self.place)
 
 
 def stores_document(stores: Sequence[ServedStore], with_paths: bool = False) -> dict[str, Any]:

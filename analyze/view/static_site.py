@@ -11,7 +11,7 @@ from vla_attention.analyze.render.files import write_text, writing
 from vla_attention.analyze.view.paths import PAGE_FILES, STORES_DOCUMENT
 from vla_attention.analyze.view.served_stores import ServedStore, stores_document
 from vla_attention.schemas.errors import BadArgument, listing
-from vla_attention.schemas.stores.episode_files import beyond_the_format
+from vla_attention.schemas.stores.episode_files import foreign_in_episode, foreign_in_store
 from vla_attention.schemas.stores.reader import Store
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX
 from vla_attention.schemas.stores.store_place import refuse_in_store
@@ -44,7 +44,8 @@ def check_uploads(folder: Path, stores: Sequence[Store]) -> None:
     A site has links to the stores of this machine, so that whoever uploads it has to follow links.
     """
     for store in stores:
-        if more := beyond_the_format(store):
+        more = [*foreign_in_store(store), *(file for episode in store.episodes for file in foreign_in_episode(episode))]
+        if more:
             raise BadArgument(
                 f"Cannot write a site of {store.path}: {listing(more, 5)} would be published with it, and "
                 f"{'is' if len(more) == 1 else 'are'} no part of the store. vla-attention store copy {store.path} "

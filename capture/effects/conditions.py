@@ -23,7 +23,6 @@ from vla_attention.schemas.interventions import (
     PromptChange,
     Queries,
 )
-from vla_attention.schemas.limits import WHOLE_NUMBER
 
 #: Whose attention a reader is, as of `KeyKnockout`.
 _READERS: dict[EffectReaders, tuple[Queries, str]] = {
@@ -67,7 +66,7 @@ def planned_effects(settings: EffectSettings | None, policy: Policy, seed: int) 
     if settings is None:
         return None
     steps = policy.num_denoise_steps if settings.denoise_steps is None else settings.denoise_steps
-    other = seed + 1 if seed + 1 < WHOLE_NUMBER else seed - 1
+    other = seed + 1 if seed + 1 < 2**63 else seed - 1
     planned = EffectsRecorded(settings.items, settings.readers, settings.every, steps, other)
     check_effects(planned, policy)
     return planned

@@ -6,13 +6,13 @@ A pipe would wait for ever, a device gives bytes without end, and a link may lea
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import UserError
-from vla_attention.schemas.regular_files import NotRegular, open_regular, read_regular
+from vla_attention.schemas.jsonable import decode_json
 
 #: What makes an error of a sentence: mostly a class of errors.
 Refuse = Callable[[str], UserError]
@@ -35,19 +35,18 @@ def check_regular(path: Path, refuse: Refuse, *, inside: Path | None = None) -> 
         What `refuse` makes: the path is no regular file, or a link that leads out of the folder.
     """
     try:
-        handle, size = open_regular(path)
-        os.close(handle)
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise refuse(f"'{path}' cannot be read: it is no regular file.")
         if inside is not None:
             _check_inside(path, inside, refuse)
     except FileNotFoundError:
         raise
-    except NotRegular as error:
-        raise refuse(f"'{path}' cannot be read: {error.strerror}.") from None
     except (OSError, RuntimeError) as error:  # a circle of links is a RuntimeError of pathlib
         if isinstance(error, UserError):
             raise
         raise refuse(f"'{path}' cannot be read ({getattr(error, 'strerror', None) or error}).") from error
-    return size
+    return status.st_size
 
 
 def _check_inside(path: Path, folder: Path, refuse: Refuse) -> None:
@@ -101,11 +100,10 @@ def read_object(path: Path, refuse: Refuse, *, inside: Path | None = None) -> di
         FileNotFoundError: there is no such file.
         What `refuse` makes: it is no regular file, too large, no JSON, too deep, or holds something else.
     """
-    check_regular(path, refuse, inside=inside)
+    if (size := check_regular(path, refuse, inside=inside)) > MAX_JSON_BYTES:
+        raise refuse(f"'{path}' has {size:,} bytes; expected at most {MAX_JSON_BYTES:,}.")
     try:
-        content = decode_json(read_regular(path, MAX_JSON_BYTES))
-    except NotRegular as error:
-        raise refuse(f"'{path}' cannot be read: {error.strerror}.") from None
+        content = decode_json(path.read_bytes())
     except (ValueError, OSError) as error:
         raise refuse(f"'{path}' is not valid JSON ({error}).") from error
     if not isinstance(content, dict):

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from vla_attention.schemas.documents import decode_json, decode_toml
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.groupings.words import split_words
 from vla_attention.schemas.interventions import PromptChange
-from vla_attention.schemas.limits import WRITTEN_FILE_BYTES
-from vla_attention.schemas.regular_files import read_regular
+from vla_attention.schemas.jsonable import decode_json
 
 
 def changed_instruction(
@@ -83,8 +82,8 @@ def check_synonyms(change: PromptChange, instructions: Iterable[str]) -> None:
 def read_synonyms(path: Path) -> dict[str, str]:
     """Read a JSON object or a TOML table of words and what replaces them; the ending of the name says which."""
     try:
-        given = read_regular(path, WRITTEN_FILE_BYTES)
-        content = decode_toml(given.decode()) if path.suffix == ".toml" else decode_json(given)
+        given = path.read_bytes()
+        content = tomllib.loads(given.decode()) if path.suffix == ".toml" else decode_json(given)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise BadArgument(f"Cannot read the synonyms '{path}' ({reason}); expected JSON or TOML.") from None

@@ -15,20 +15,13 @@ import warnings
 from collections.abc import Mapping, Set
 from contextlib import suppress
 from datetime import UTC, datetime
-from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
 from msgspec.structs import replace
 
-from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import Note, listing, plural, shortened
-from vla_attention.schemas.jsonable import Document, MalformedDocument, from_json, to_json
-from vla_attention.schemas.limit_checks import check_at_most
-from vla_attention.schemas.limits import JOB_FILES, LOGS_BYTES, PLANNED_EPISODES
-from vla_attention.schemas.regular_files import read_regular
-from vla_attention.schemas.stores.locks import no_link
-from vla_attention.schemas.stores.store_format import StoreError
+from vla_attention.schemas.jsonable import Document, MalformedDocument, decode_json, from_json, to_json
 from vla_attention.schemas.stores.worker import Worker
 
 #: Ending of the folder of logs. It may be deleted while no capture runs.
@@ -48,7 +41,6 @@ class PlannedTask(Document, frozen=True):
 
     def __post_init__(self) -> None:
         """Check the number, by which missing episodes are counted."""
-        check_at_most(f"The number of episodes of task {self.task_id}", self.episodes, PLANNED_EPISODES)
         if self.indices and len(self.indices) != self.episodes:
             raise ValueError(f"task {self.task_id} has {len(self.indices)} indices for {self.episodes} episodes")
 
@@ -151,12 +143,8 @@ class WorkerLog:
 
 
 def log_folder(store: Path) -> Path:
-    """Return the folder of the logs. It is beside the store, so that a copy of the store omits it.
-
-    Raises:
-        StoreError: it is a link.
-    """
-    return no_link(store.with_name(store.name + LOG_SUFFIX))
+    """Return the folder of the logs. It is beside the store, so that a copy of the store omits it."""
+    return store.with_name(store.name + LOG_SUFFIX)
 
 
 def read_logs(store: Path) -> list[WorkerRecord]:
@@ -164,22 +152,16 @@ def read_logs(store: Path) -> list[WorkerRecord]:
 
     A line that cannot be read is no damage of the store: its file is named in a `Note`. The last line of a killed
     process may be half a line.
-
-    Raises:
-        StoreError: there are more logs, or more bytes in them, than captures write.
     """
-    identity, folder, left = store_identity(store), log_folder(store), LOGS_BYTES
+    identity, folder = store_identity(store), log_folder(store)
     records: list[WorkerRecord] = []
     unreadable: list[str] = []
     for file in _log_files(folder):
         try:
-            content = read_regular(file, left, follow=False)
+            content = file.read_bytes()
         except OSError as error:
-            if file.is_file() and file.stat().st_size > left:
-                raise _too_much(folder, f"more than {LOGS_BYTES:,} bytes") from None
             unreadable.append(f"{file.name} ({error.strerror or error})")
             continue
-        left -= len(content)
         found, whole = _read_log(content)
         records += [record for record in found if record.store == identity]
         unreadable += [] if whole else [file.name]
@@ -196,18 +178,8 @@ def read_logs(store: Path) -> list[WorkerRecord]:
 
 def _log_files(folder: Path) -> list[Path]:
     with suppress(FileNotFoundError, NotADirectoryError), os.scandir(folder) as entries:
-        names = [entry.name for entry in islice(entries, JOB_FILES + 1)]
-        if len(names) > JOB_FILES:
-            raise _too_much(folder, f"more than {JOB_FILES:,} entries")
-        return [folder / name for name in sorted(names) if name.endswith(".jsonl")]
+        return sorted(Path(entry.path) for entry in entries if entry.name.endswith(".jsonl"))
     return []
-
-
-def _too_much(folder: Path, what: str) -> StoreError:
-    return StoreError(
-        f"{folder} has {what}, which is more than captures write. Delete the folder when no capture runs; no reader of "
-        "the store needs it."
-    )
 
 
 def _read_log(content: bytes) -> tuple[list[WorkerRecord], bool]:
@@ -228,19 +200,10 @@ def _read_log(content: bytes) -> tuple[list[WorkerRecord], bool]:
 
 
 def planned_tasks(records: list[WorkerRecord]) -> dict[int, PlannedTask]:
-    """Return every planned task by its id, with all episodes that workers planned.
-
-    Raises:
-        StoreError: together they have more episodes than are counted one by one.
-    """
+    """Return every planned task by its id, with all episodes that workers planned."""
     plan: dict[int, PlannedTask] = {}
     for task in (task for record in records for task in record.plan):
         plan[task.task_id] = plan[task.task_id].with_those_of(task) if task.task_id in plan else task
-    if (planned := sum(task.episodes for task in plan.values())) > PLANNED_EPISODES:
-        raise StoreError(
-            f"The workers' logs plan {planned:,} episodes; expected at most {PLANNED_EPISODES:,}. Delete "
-            f"NAME{LOG_SUFFIX} beside the store when no capture runs; no reader of the store needs it."
-        )
     return plan
 
 

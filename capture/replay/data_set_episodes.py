@@ -19,10 +19,8 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.capture.replay.data_tables import DamagedDataSet, DataSetNotFound, DataTable
-from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import listing
-from vla_attention.schemas.limits import DATA_SET_EPISODES, DATA_SET_TEXT_BYTES, LINE_CHARACTERS, WHOLE_NUMBER
-from vla_attention.schemas.regular_files import NotRegular, read_regular
+from vla_attention.schemas.jsonable import decode_json
 from vla_attention.schemas.safe_text import check_inner_path
 
 #: How a template may write a number or a name; any other way is not LeRobot's, and could write a path of any length.
@@ -93,7 +91,7 @@ class Episodes(Mapping[int, EpisodeEntry]):
         return EpisodeEntry(index, int(self._lengths[row]), self._tasks[row], data, videos)
 
     def _rank(self, index: int) -> int | None:
-        rank = int(np.searchsorted(self._indices, index)) if 0 <= index < WHOLE_NUMBER else len(self)
+        rank = int(np.searchsorted(self._indices, index)) if 0 <= index < 2**63 else len(self)
         return rank if rank < len(self) and self._indices[rank] == index else None
 
     def lengths_and_tasks(self) -> Iterator[tuple[int, int, tuple[str, ...]]]:
@@ -141,8 +139,6 @@ class Paths:
         try:
             if not isinstance(template, str):
                 raise ValueError("it is no text")
-            if len(template) > LINE_CHARACTERS:
-                raise ValueError(f"it has {len(template):,} characters; expected at most {LINE_CHARACTERS:,}")
             # A plain name in braces only: anything more would reach into the values.
             parts = [(name, form) for _, name, form, _ in string.Formatter().parse(template) if name is not None]
             if any(name not in values for name, _ in parts):
@@ -206,10 +202,8 @@ def _lines(path: Path) -> Iterator[list[dict[str, Any]]]:
     if not path.is_file():
         raise DataSetNotFound(f"There is no '{path}', which a data set of this version needs.")
     try:
-        lines = [line for line in read_regular(path, DATA_SET_TEXT_BYTES).split(b"\n") if line.strip()]
-        yield decode_json(b"[" + b",".join(lines) + b"]", 2 * DATA_SET_TEXT_BYTES, 4 * DATA_SET_EPISODES)
-    except NotRegular as error:
-        raise DamagedDataSet(f"'{path}' cannot be read: {error.strerror}.") from None
+        lines = [line for line in path.read_bytes().split(b"\n") if line.strip()]
+        yield decode_json(b"[" + b",".join(lines) + b"]")
     except KeyError as error:
         raise DamagedDataSet(f"'{path}' has a line without {error}.") from error
     except (ValueError, TypeError, AttributeError) as error:
@@ -218,7 +212,7 @@ def _lines(path: Path) -> Iterator[list[dict[str, Any]]]:
 
 def _whole(value: object) -> int:
     """A whole number that 64 bits hold, also one that is written as 3.0; `ValueError` for anything else."""
-    if isinstance(value, (int, float)) and -WHOLE_NUMBER <= value < WHOLE_NUMBER and value == int(value):
+    if isinstance(value, (int, float)) and -(2**63) <= value < 2**63 and value == int(value):
         return int(value)
     raise ValueError(f"{str(value)[:40]!r} is no whole number")
 

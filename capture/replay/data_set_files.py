@@ -22,7 +22,6 @@ from vla_attention.capture.replay.data_set_episodes import (
 )
 from vla_attention.capture.replay.data_tables import DamagedDataSet, DataSetError, DataSetNotFound
 from vla_attention.schemas.errors import listing
-from vla_attention.schemas.limits import TEXT_CHARACTERS
 
 
 class UnsupportedDataSet(DataSetError):
@@ -111,8 +110,6 @@ def read_info(folder: Path) -> DataSetInfo:
         tasks, episodes = tasks_of_table(folder), episodes_of_tables(folder, paths)
     else:
         tasks, episodes = tasks_of_lines(folder), episodes_of_lines(folder, paths)
-    if any(len(task) > TEXT_CHARACTERS for task in tasks.values()):
-        raise DamagedDataSet(f"The data set '{folder}' has a task of more than {TEXT_CHARACTERS:,} characters.")
     next(iter(episodes.values()), None)  # a template that cannot be filled is said now
     return DataSetInfo(
         version=version,

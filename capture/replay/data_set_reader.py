@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.replay.data_tables import DamagedDataSet, DataSetNotFound, DataTable, stacked
 from vla_attention.capture.replay.video import VideoFile
-from vla_attention.schemas.limits import PICTURE_BYTES, PICTURE_PIXELS, PICTURE_SIDE
-from vla_attention.schemas.regular_files import read_regular
 
 #: Rows of pictures that are in memory at once: with two cameras of a megabyte each, a quarter of a gigabyte.
 _ROWS = 128
@@ -77,7 +75,7 @@ def _decoded(folder: Path, what: str, cell: Any) -> NDArray[np.uint8]:
             # A path that leads out of the data set is not followed.
             if place == Path() or place.is_absolute() or ".." in place.parts or not (folder / place).is_file():
                 raise DataSetNotFound(f"{what} is neither in its table nor in a file of the data set ('{place}').")
-            content = read_regular(folder / place, PICTURE_BYTES)
+            content = (folder / place).read_bytes()
         return decode_picture(content)
     except PictureRefused as error:
         raise DamagedDataSet(f"{what} {error}.") from error
@@ -107,12 +105,6 @@ def decode_picture(content: bytes) -> NDArray[np.uint8]:
     kind = PngImagePlugin.PngImageFile if content.startswith(_PNG) else JpegImagePlugin.JpegImageFile
     try:
         with kind(io.BytesIO(content)) as image:
-            width, height = image.size
-            if max(width, height) > PICTURE_SIDE or width * height > PICTURE_PIXELS:
-                raise PictureRefused(
-                    f"has {width:,} x {height:,} pixels; expected at most {PICTURE_SIDE:,} on a side and "
-                    f"{PICTURE_PIXELS:,} in all"
-                )
             return np.array(image.convert("RGB"))  # a copy: torch warns of arrays that cannot be written
     except (OSError, SyntaxError, ValueError) as error:
         if isinstance(error, PictureRefused):

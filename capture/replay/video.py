@@ -7,7 +7,6 @@ the last key frame before the wanted one until the one with exactly its time sta
 
 from __future__ import annotations
 
-import math
 from array import array
 from collections.abc import Iterator
 from importlib import metadata
@@ -21,8 +20,10 @@ from numpy.typing import NDArray
 from vla_attention.capture.replay.data_set_files import UndecodableVideo
 from vla_attention.capture.replay.data_tables import DamagedDataSet, DataSetNotFound
 from vla_attention.schemas.errors import MissingDependency
-from vla_attention.schemas.limits import PICTURE_PIXELS, PICTURE_SIDE, VIDEO_EARLIER_KEYS
 
+#: Key frames before the last one at which decoding begins again, where a picture does not come out: in an open group,
+#: pictures need the one before.
+_EARLIER_KEYS = 8
 #: How FFmpeg opens a file: only as MP4. Of a list of files or addresses (concat, HLS), it would open each.
 _OPTIONS = {"format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2", "protocol_whitelist": "file"}
 
@@ -91,11 +92,6 @@ class VideoFile:
             )
         self.codec: str = stream.codec_context.codec.canonical_name
         self.size: tuple[int, int] = (stream.codec_context.height, stream.codec_context.width)
-        if max(self.size) > PICTURE_SIDE or math.prod(self.size) > PICTURE_PIXELS:
-            raise UndecodableVideo(
-                f"'{self.path}' says that its pictures have {self.size[1]:,} x {self.size[0]:,} pixels; expected at "
-                f"most {PICTURE_SIDE:,} on a side and {PICTURE_PIXELS:,} in all."
-            )
         stamps, keys, read, size = array("q"), array("q"), 0, self.path.stat().st_size
         try:
             for packet in self._container.demux(stream):
@@ -161,7 +157,7 @@ class VideoFile:
     def _frame(self, stamp: int) -> Any:
         """Return the decoded frame with exactly this time stamp."""
         key = int(np.searchsorted(self._keys, stamp, side="right")) - 1
-        earliest = max(key - VIDEO_EARLIER_KEYS, 0)
+        earliest = max(key - _EARLIER_KEYS, 0)
         if not self._is_ahead(stamp, key):
             self._seek(max(key, 0))
         while True:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from vla_attention.schemas.documents import decode_toml
 from vla_attention.schemas.errors import BadArgument, UserError, did_you_mean, listing, shortened
 from vla_attention.schemas.groupings.selector_parser import atoms_of, parse_selector
 from vla_attention.schemas.groupings.selectors import SelectorError
 from vla_attention.schemas.jsonable import Document, MalformedDocument, from_json
-from vla_attention.schemas.limits import GROUPS, NAME_CHARACTERS, WRITTEN_FILE_BYTES
-from vla_attention.schemas.regular_files import read_regular
 from vla_attention.schemas.safe_text import check_text, visible
 
 #: The selector that, alone, means: whatever no other group of the grouping takes.
@@ -75,10 +73,8 @@ class Grouping:
         """Check everything that can be checked without a layout."""
         if not self.groups:
             raise GroupingError(f"Grouping '{self.name}' has no groups; expected at least one NAME = SELECTOR.")
-        if len(self.groups) > GROUPS:
-            raise GroupingError(f"Grouping '{self.name}' has {len(self.groups)} groups; expected at most {GROUPS:,}.")
         for group, selectors in self.groups.items():
-            if group in _RESERVED_NAMES or not _GROUP_NAME.fullmatch(group) or len(group) > NAME_CHARACTERS:
+            if group in _RESERVED_NAMES or not _GROUP_NAME.fullmatch(group):
                 raise GroupingError(
                     f"'{visible(shortened(group))}' cannot name a group: expected letters, digits, '_', '.', '-', and "
                     f"none of {listing(_RESERVED_NAMES)}."
@@ -125,7 +121,7 @@ class Grouping:
 def read_grouping_file(path: Path) -> Grouping:
     """Read a TOML grouping; every error names the file."""
     try:
-        document = decode_toml(read_regular(path, WRITTEN_FILE_BYTES).decode())
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise GroupingNotFound(f"Cannot read grouping file {path}: {reason}.") from None

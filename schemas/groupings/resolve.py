@@ -25,7 +25,6 @@ from vla_attention.schemas.groupings.selector_parser import (
 )
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS, Membership, SelectorError, no_keys
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
-from vla_attention.schemas.limits import CLAIMED_BYTES, EXPANSION
 
 
 class OverlappingGroups(GroupingError):
@@ -174,13 +173,6 @@ def describe_key(key: int, tokens: EpisodeTokens) -> str:
 def cell_coverage(tokens: EpisodeTokens) -> NDArray[np.float32]:
     """Area of each key's cells, shape (replan, key, 1 + object); they sum to 1. Cell 0 is what no object covers."""
     replans, keys, things = tokens.num_replans, tokens.layout.num_keys, len(tokens.objects)
-    covered = sum(coverage.nbytes for coverage in (tokens.coverage or {}).values())
-    cells = 4 * replans * keys * (1 + things)
-    if cells > max(2 * CLAIMED_BYTES, EXPANSION * covered):
-        raise GroupingError(
-            f"The coverage of {things} objects on {keys} keys at {replans} replans takes {cells:,} bytes, of which "
-            f"{covered:,} are stored: the store has more objects and keys than its pictures show."
-        )
     area = np.zeros((replans, keys, 1 + things), dtype=np.float32)
     for camera, coverage in (tokens.coverage or {}).items():
         area[:, tokens.layout.patch_keys(camera), 1:] = coverage

@@ -18,7 +18,6 @@ from typing import TypeVar
 
 from vla_attention.schemas.errors import did_you_mean, listing, shortened
 from vla_attention.schemas.groupings.selectors import SELECTOR_KINDS, SelectorError
-from vla_attention.schemas.limits import PARENTHESES
 
 
 @dataclass(frozen=True)
@@ -113,7 +112,6 @@ class _Parser:
         self.text = text
         self.tokens = self._tokenise()
         self.next = 0
-        self.depth = 0
 
     def _fail(self, position: int, problem: str) -> SelectorError:
         return SelectorError(f"Cannot read selector '{shortened(self.text)}' at character {position + 1}: {problem}.")
@@ -175,11 +173,7 @@ class _Parser:
         kind, word, position = self._peek()
         self.next += 1
         if kind == "open":
-            self.depth += 1
-            if self.depth > PARENTHESES:
-                raise self._fail(position, f"it has more than {PARENTHESES} parentheses in one another")
             tree = self._selector()
-            self.depth -= 1
             if self._peek()[0] != "close":
                 raise self._fail(self._peek()[2], "expected ')'")
             self.next += 1

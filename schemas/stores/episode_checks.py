@@ -35,7 +35,7 @@ from vla_attention.schemas.stores.content_rules import (
     unseen_problems,
 )
 from vla_attention.schemas.stores.digest import ArrayDigest
-from vla_attention.schemas.stores.episode_files import files_of_no_array, metadata_problems
+from vla_attention.schemas.stores.episode_files import metadata_problems
 from vla_attention.schemas.stores.episode_shapes import effect_misfits, expected_shapes, shape_problems, step_misfits
 from vla_attention.schemas.stores.reader import StoredEpisode
 from vla_attention.schemas.stores.root import attributes_in
@@ -66,8 +66,6 @@ def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[P
 def form_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[Problem]:
     """Which files and shapes of an episode are not as its run and its attributes say; reads none of the files."""
     attributes = episode.attributes
-    for file in files_of_no_array(root, attributes, episode.files.records):
-        yield Problem(f"its seal lists {file}, which belongs to no array of an episode")
     shapes = expected_shapes(root, attributes)
     numbers = {name: (len(given),) for name in NUMBERS if (given := getattr(attributes, name))}
     listed = {name: record.shape for name, record in attributes.arrays.items()} | numbers

@@ -28,15 +28,11 @@ import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import NamedTuple
 
-from vla_attention.schemas.documents import decode_json
-from vla_attention.schemas.jsonable import MalformedDocument, from_json, to_json
-from vla_attention.schemas.limits import JOB_FILES, LOCK_BYTES
-from vla_attention.schemas.regular_files import read_regular
+from vla_attention.schemas.jsonable import MalformedDocument, decode_json, from_json, to_json
 from vla_attention.schemas.stores.store_format import StoreError, StoreExists, is_episode_name
 from vla_attention.schemas.stores.worker import Worker, is_known_dead, this_worker
 
@@ -97,7 +93,7 @@ class Locks:
     """
 
     def __init__(self, folder: Path, owner: Path, is_name: Callable[[str], bool], worker: Worker | None = None) -> None:
-        self.folder = no_link(folder)
+        self.folder = folder
         self.owner = owner
         self.worker = worker or this_worker()
         self.touch_every_s, self.dead_after_s = TOUCH_EVERY_S, DEAD_AFTER_S
@@ -212,10 +208,10 @@ class Locks:
         return self.folder / f"{name}{_LOCK}"
 
     def _entries(self) -> list[Path]:
-        """What is in the folder; none if it does not exist, and not more than processes fill a store."""
+        """What is in the folder; none if it does not exist."""
         try:
             with os.scandir(self.folder) as entries:
-                return sorted(Path(entry.path) for entry in islice(entries, JOB_FILES))
+                return sorted(Path(entry.path) for entry in entries)
         except OSError:
             return []
 
@@ -324,36 +320,18 @@ class Locks:
 
 
 def episode_locks(store: Path, worker: Worker | None = None) -> Locks:
-    """The locks on a store's episodes.
-
-    Raises:
-        StoreError: their folder is a link.
-    """
+    """The locks on a store's episodes."""
     return Locks(store / WRITING_FOLDER, store, is_episode_name, worker)
 
 
 def store_locks(store: Path, worker: Worker | None = None) -> Locks:
-    """The lock on a place where a whole store is made, copied, merged or deleted; raises as `episode_locks` does."""
+    """The lock on a place where a whole store is made, copied, merged or deleted."""
     return Locks(store.with_name(store.name + PARTIAL_SUFFIX), store, lambda name: name == WHOLE_STORE, worker)
-
-
-def no_link(folder: Path) -> Path:
-    """A folder in which this program makes, moves and removes things; a link may lead to those of others.
-
-    Raises:
-        StoreError: it is a link, which this program never makes.
-    """
-    if folder.is_symlink():
-        raise StoreError(
-            f"{folder} is a link, and nothing is written, moved or removed where it leads to: expected a folder, or "
-            "nothing. Remove the link and run the command again."
-        )
-    return folder
 
 
 def _look(file: Path) -> _Seen | None:
     try:
-        content = read_regular(file, LOCK_BYTES, follow=False)
+        content = file.read_bytes()
     except FileNotFoundError:
         return None
     except OSError:

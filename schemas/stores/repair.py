@@ -14,9 +14,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from vla_attention.schemas.stores.durable_files import publish_file
-from vla_attention.schemas.stores.locks import Holder, Locks, episode_locks, no_link
+from vla_attention.schemas.stores.locks import Holder, Locks, episode_locks
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
-from vla_attention.schemas.stores.root import group_document, refuse_linked_group
+from vla_attention.schemas.stores.root import group_document
 from vla_attention.schemas.stores.seal import read_seal
 from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, StoreError
 from vla_attention.schemas.stores.store_url import local_path
@@ -41,8 +41,8 @@ class Finding:
 
 
 def damaged_folder(store: Path) -> Path:
-    """Return the folder of episodes that were moved aside; raises `StoreError` where it is a link."""
-    return no_link(store.with_name(store.name + DAMAGED_SUFFIX))
+    """Return the folder of episodes that were moved aside."""
+    return store.with_name(store.name + DAMAGED_SUFFIX)
 
 
 def repair_store(path: Path, verify: bool = False, dry_run: bool = False) -> list[Finding]:
@@ -63,7 +63,6 @@ def repair_store(path: Path, verify: bool = False, dry_run: bool = False) -> lis
     # Episodes are moved beside the store itself; a link to it may be on another file system.
     path = path.resolve() if path.is_symlink() else path
     store = open_store(path)
-    refuse_linked_group(path)
     _check_root(store)
     looks = [(episode, look_at(store, episode, verify)) for episode in store.episodes]
     damaged = [(episode, fault) for episode, fault in looks if fault is not None]
@@ -111,12 +110,6 @@ def _move(store: Store, episode: StoredEpisode, locks: Locks, verify: bool) -> F
 
 def _move_aside(store: Path, folder: Path, damaged: DamagedEpisode) -> Path:
     """Rename an episode's folder into a new entry of `NAME.zarr.damaged`, beside a file with the reason."""
-    for part in folder.relative_to(store).parents:
-        if part.parts and (store / part).is_symlink():
-            raise StoreError(
-                f"Cannot move {damaged.name} of {store}: {store / part} is a link, and what it leads to is not moved; "
-                "put the folder itself in its place."
-            )
     now = datetime.now(UTC)
     entry = _new_entry(damaged_folder(store), f"{damaged.name}-{now:%Y%m%dT%H%M%SZ}")
     reason = {
@@ -155,7 +148,6 @@ def repair_groups(path: Path, dry_run: bool = False) -> list[str]:
     lines = []
     for fault in store_faults(open_store(path)):
         if fault.where == EPISODES_DOCUMENT:
-            refuse_linked_group(path)
             if not dry_run:
                 _write_whole(path / EPISODES_DOCUMENT, group_document({}))
             lines.append(f"  {'would be written' if dry_run else 'written'} again: {fault.where}, {fault.problem}")

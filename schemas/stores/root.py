@@ -10,11 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
-from vla_attention.schemas.jsonable import MalformedDocument, from_json
-from vla_attention.schemas.limits import DOCUMENT_BYTES, ROOT_BYTES
-from vla_attention.schemas.regular_files import read_regular
+from vla_attention.schemas.jsonable import MalformedDocument, decode_json, from_json
 from vla_attention.schemas.stores.digest import run_digest
 from vla_attention.schemas.stores.remote_source import RemoteFailure, RemoteFolder, is_web, source_of
 from vla_attention.schemas.stores.store_format import (
@@ -33,10 +30,6 @@ from vla_attention.schemas.stores.store_url import StorePlace, StoreUrl
 NAMES_FILE = "episodes.json"
 #: Ending of an episode in a copy that is to be carried in few files (`store copy --tar`).
 TAR_SUFFIX = ".tar"
-#: What the document of a group may say; zarr-python writes the last one as null.
-_GROUP_FIELDS = {"attributes", "zarr_format", "node_type", "consolidated_metadata"}
-
-
 #: What to do without a store.
 _MAKE_ONE = "Make one: vla-attention capture pi --output NAME.zarr; vla-attention example copies small ones."
 
@@ -59,7 +52,7 @@ def read_run(path: StorePlace) -> tuple[RootAttributes, str]:
         there = f"Stores in {path.parent}: {listing(nearby, 5)}. " if nearby else ""
         raise StoreNotFound(f"There is no store at {path}.{did_you_mean(str(path), nearby)} {there}{_MAKE_ONE}")
     try:
-        attributes = group_attributes(source_of(path).whole("zarr.json", most=ROOT_BYTES))
+        attributes = group_attributes(source_of(path).whole("zarr.json"))
     except (RemoteFailure, BadArgument):
         raise
     except (FileNotFoundError, NotADirectoryError):
@@ -95,7 +88,7 @@ def _refuse_inside(path: Path, attributes: dict[str, Any]) -> None:
         return
     for above in path.absolute().parents:
         try:
-            stated = group_attributes(read_regular(above / "zarr.json", ROOT_BYTES))
+            stated = group_attributes((above / "zarr.json").read_bytes())
         except (OSError, ValueError):
             return  # the store's groups are all above one another
         if stated.get("format") == FORMAT_NAME:
@@ -122,7 +115,6 @@ def list_episodes(path: StorePlace) -> tuple[list[StorePlace], list[str]]:
             ) from None
         is_episode_of = {name: is_episode_name(name) for name in names}
     else:
-        refuse_linked_group(path)
         try:
             entries = (path / EPISODES_GROUP).iterdir()
             is_episode_of = {entry.name: is_episode_name(entry.name) and entry.is_dir() for entry in entries}
@@ -138,15 +130,6 @@ def list_episodes(path: StorePlace) -> tuple[list[StorePlace], list[str]]:
     return [path / EPISODES_GROUP / name for name, is_episode in is_episode_of.items() if is_episode], strays
 
 
-def refuse_linked_group(path: Path) -> None:
-    """Raise `StoreError` for a store whose group of episodes is a link: nothing is written or moved elsewhere."""
-    if (path / EPISODES_GROUP).is_symlink():
-        raise StoreError(
-            f"The store {path} cannot be used: its group '{EPISODES_GROUP}' is a link, and what lies elsewhere is no "
-            "part of it; put the folder itself in its place."
-        )
-
-
 def names_document(names: Sequence[str]) -> bytes:
     """The content of a copy's `NAMES_FILE`."""
     return json.dumps(names, indent=0).encode()
@@ -160,7 +143,7 @@ def listed_names(path: StoreUrl) -> list[str]:
         OSError: there is none.
     """
     try:
-        names = decode_json(source_of(path).whole(NAMES_FILE, most=DOCUMENT_BYTES))
+        names = decode_json(source_of(path).whole(NAMES_FILE))
     except ValueError as error:
         raise StoreError(f"The store {path} cannot be read: its {NAMES_FILE}: {error}.") from None
     if not isinstance(names, list) or not all(isinstance(name, str) and is_episode_name(name) for name in names):
@@ -186,20 +169,6 @@ def attributes_in(content: Any) -> dict[str, Any]:
     if not isinstance(attributes, dict):
         raise MalformedDocument("zarr.json has no attributes")
     return attributes
-
-
-def fields_beyond(document: dict[str, Any]) -> list[str]:
-    """What a `zarr.json` says beyond that it is a group with attributes: other readers of Zarr may believe it."""
-    beyond = sorted(set(document) - _GROUP_FIELDS)
-    return beyond if document.get("consolidated_metadata") is None else [*beyond, "consolidated_metadata"]
-
-
-def without_other_fields(content: bytes) -> bytes:
-    """A group's `zarr.json` as it is, or a new one with its attributes only where it says more (`fields_beyond`)."""
-    attributes = group_attributes(content)
-    if not fields_beyond(decode_json(content)):
-        return content
-    return group_document(attributes)
 
 
 def group_document(attributes: dict[str, Any]) -> bytes:

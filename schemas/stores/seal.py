@@ -18,13 +18,12 @@ from typing import Any
 from msgspec.structs import replace
 
 from vla_attention.schemas.jsonable import from_json, to_json
-from vla_attention.schemas.limits import DOCUMENT_BYTES
 from vla_attention.schemas.stores.array_metadata import array_metadata
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder
 from vla_attention.schemas.stores.digest import CHECKSUM_BYTES, bytes_digest
 from vla_attention.schemas.stores.root import group_attributes
-from vla_attention.schemas.stores.shards import index_size, read_index
-from vla_attention.schemas.stores.store_format import SEAL_GROUP, CorruptEpisode, EpisodeSeal, FileRecord
+from vla_attention.schemas.stores.sealed_files import index_places, index_size
+from vla_attention.schemas.stores.store_format import SEAL_GROUP, EpisodeSeal, FileRecord
 
 SEAL_FILE = f"{SEAL_GROUP}/zarr.json"
 
@@ -39,15 +38,14 @@ def seal_episode(folder: Path, name: str, run: str, copied_from: str = "") -> Ep
         copied_from: digest of the seal under which the episode was captured, if this is a changed copy.
     """
     (folder / SEAL_FILE).unlink(missing_ok=True)
-    files = sorted(file for file in folder.rglob("*") if file.is_file())
-    documents = {file: json.loads(file.read_bytes()) for file in files if file.name == "zarr.json"}
-    shards = {file.parent: chunks for file, document in documents.items() if (chunks := _chunks_in_shard(document))}
-    records: dict[str, FileRecord] = {}
-    for file in files:
-        chunks = None if file.name == "zarr.json" else next((shards[at] for at in file.parents if at in shards), None)
-        records[file.relative_to(folder).as_posix()] = _file_record(file, chunks)
-    repeated = {file.relative_to(folder).as_posix(): document for file, document in documents.items()}
-    seal = EpisodeSeal(name, run, records, repeated, digest="", copied_from=copied_from)
+    files = {file.relative_to(folder).as_posix(): file for file in sorted(folder.rglob("*")) if file.is_file()}
+    documents = {name: json.loads(file.read_bytes()) for name, file in files.items() if file.name == "zarr.json"}
+    about = {
+        name.rpartition("/")[0]: array_metadata(of) for name, of in documents.items() if of["node_type"] == "array"
+    }
+    shards = {f"{name}/{array.file}": array.shard_chunks for name, array in about.items()}
+    records = {name: _file_record(file, shards.get(name)) for name, file in files.items()}
+    seal = EpisodeSeal(name, run, records, documents, digest="", copied_from=copied_from)
     content = seal_document(to_json(seal))
     (folder / SEAL_GROUP).mkdir(exist_ok=True)
     (folder / SEAL_FILE).write_bytes(content)
@@ -70,7 +68,7 @@ def read_seal(place: Path | ByteSource) -> EpisodeSeal:
         ValueError: it is no seal, or its own digest does not fit.
     """
     source = Folder(place) if isinstance(place, Path) else place
-    content = source.whole(SEAL_FILE, most=DOCUMENT_BYTES)
+    content = source.whole(SEAL_FILE)
     attributes = group_attributes(content)
     digest = str(attributes.get("digest"))
     if bytes_digest(content.replace(digest.encode(), b"", 1)) != digest:
@@ -90,14 +88,6 @@ def identity_problem(seal: EpisodeSeal, name: str, run: str) -> str | None:
     return None
 
 
-def _chunks_in_shard(document: Any) -> int | None:
-    """Number of chunks in the file of an array whose `zarr.json` this is; None for anything else."""
-    try:
-        return array_metadata(document).shard_chunks
-    except CorruptEpisode:
-        return None
-
-
 def _file_record(path: Path, chunks: int | None) -> FileRecord:
     with path.open("rb") as file:
         size = os.fstat(file.fileno()).st_size
@@ -105,10 +95,6 @@ def _file_record(path: Path, chunks: int | None) -> FileRecord:
         if chunks is None:
             return record
         stored = os.pread(file.fileno(), index_size(chunks), max(0, size - index_size(chunks)))
-        # Offset and length 0: a chunk that was not written.
-        ends = (int(offset + length) for offset, length in read_index(stored, size))
-        checksums = [
-            os.pread(file.fileno(), CHECKSUM_BYTES, end - CHECKSUM_BYTES) if end else bytes(CHECKSUM_BYTES)
-            for end in ends
-        ]
+        ends = (max(0, offset + length - CHECKSUM_BYTES) for offset, length in index_places(stored))
+        checksums = [os.pread(file.fileno(), CHECKSUM_BYTES, end) for end in ends]
     return replace(record, index=bytes_digest(stored), chunks=b"".join(checksums).hex())

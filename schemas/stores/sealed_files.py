@@ -1,23 +1,39 @@
-"""Files of an episode as its seal lists them: bytes that are not those that were sealed are never returned."""
+"""Files of an episode as its seal lists them: bytes that are not those that were sealed are never returned.
+
+Of a shard (a file of compressed chunks with an index of their places at its end, Zarr's codec `sharding_indexed`)
+single chunks are read: the index is compared with the digest in the seal, a chunk with the checksum in the seal and
+with its own.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from vla_attention.schemas.limits import DOCUMENT_BYTES
-from vla_attention.schemas.regular_files import NotRegular
-from vla_attention.schemas.stores.byte_source import ByteSource, Folder
-from vla_attention.schemas.stores.digest import bytes_digest
+import numpy as np
+
+from vla_attention.schemas.stores.byte_source import ByteSource, Memory
+from vla_attention.schemas.stores.digest import CHECKSUM_BYTES, bytes_digest, crc32c
 from vla_attention.schemas.stores.remote_source import RemoteFailure
-from vla_attention.schemas.stores.shards import SealedShard
 from vla_attention.schemas.stores.store_format import CorruptEpisode, FileRecord
 
-#: Bytes of a file that are in memory at once where no more than its digest is wanted.
+#: Bytes of a file that are in memory at once where it is copied, or no more than its digest is wanted.
 PART_BYTES = 16_000_000
+
+
+def index_size(chunks: int) -> int:
+    """Bytes of a shard's index of that many chunks, with its checksum."""
+    return 16 * chunks + CHECKSUM_BYTES
+
+
+def index_places(stored: bytes) -> list[tuple[int, int]]:
+    """Offset and length of every chunk, from the bytes of the index; -1 and -1 for one that was not written."""
+    return [
+        (offset, length) for offset, length in np.frombuffer(stored[:-CHECKSUM_BYTES], "<i8").reshape(-1, 2).tolist()
+    ]
 
 
 @dataclass(frozen=True)
@@ -27,28 +43,34 @@ class SealedFiles:
     source: ByteSource
     records: Mapping[str, FileRecord]
 
-    def whole(self, file: str, most: int | None = None) -> bytes:
+    def whole(self, file: str) -> bytes:
         """All bytes of a file.
-
-        most: bytes that it may have; without, as many as the seal says, and no more than documents have at most.
 
         Raises:
             CorruptEpisode: the file is missing, not in the seal, or not the one that was sealed.
         """
         record = self.record(file)
-        if most is None:
-            most = DOCUMENT_BYTES if file.endswith("zarr.json") else record.size
-        if record.size > most:
-            raise CorruptEpisode(f"its {file} has {record.size:,} bytes; expected at most {most:,}", file)
         with _reading(file):
-            content = self.source.whole(file, most=most)
+            content = self.source.whole(file)
         if len(content) != record.size or bytes_digest(content) != record.sha256:
             raise CorruptEpisode(_differs(file), file)
         return content
 
+    def parts(self, file: str) -> Iterator[bytes]:
+        """The bytes of a file part by part; its end raises as `whole` does unless they are those of the seal."""
+        record, digest = self.record(file), hashlib.sha256()
+        with _reading(file):
+            # One byte more at the end: a file that has grown is not the one that was sealed.
+            for offset in range(0, record.size + 1, PART_BYTES):
+                part = self.source.part(file, offset, min(PART_BYTES, record.size + 1 - offset))
+                digest.update(part)
+                yield part
+        if digest.hexdigest() != record.sha256:
+            raise CorruptEpisode(_differs(file), file)
+
     def check(self, file: str) -> None:
         """Read a file part by part; raises `CorruptEpisode` as `whole` does."""
-        for _ in self._parts(file):
+        for _ in self.parts(file):
             pass
 
     def copy(self, file: str, path: Path) -> int:
@@ -56,39 +78,24 @@ class SealedFiles:
 
         What has been written when the error is raised is of no use.
         """
-        record = self.record(file)
         with path.open("wb") as copied:
-            for offset, part in self._parts(file):
-                copied.seek(offset)
-                copied.write(part)
-        return record.size
+            return sum(copied.write(part) for part in self.parts(file))
 
-    def _parts(self, file: str) -> Iterator[tuple[int, bytes]]:
-        """Offset and bytes of each part of a file; they are those of the seal when all of them have been taken."""
-        record = self.record(file)
-        if record.size <= PART_BYTES:
-            yield 0, self.whole(file)
-            return
-        digest = hashlib.sha256()
-        with _reading(file):
-            if isinstance(self.source, Folder):
-                self.source.check_not_sparse(file)
-            for offset in range(0, record.size, PART_BYTES):
-                length = min(PART_BYTES, record.size - offset)
-                # One byte more at the end: a file that has grown is not the one that was sealed.
-                last = offset + length == record.size
-                part = self.source.part(file, offset, length + last)
-                if len(part) != length:
-                    break
-                digest.update(part)
-                yield offset, part
-        if digest.hexdigest() != record.sha256:
-            raise CorruptEpisode(_differs(file), file)
+    def shard(self, file: str, chunks: int) -> SealedShard:
+        """The shard of so many chunks in a file.
 
-    def shard(self, file: str, chunks: int, most: int) -> SealedShard:
-        """The shard in a file, of which single chunks can be read; see `SealedShard.open`."""
+        Raises:
+            CorruptEpisode: its index is not the one in the seal, or the file cannot be read.
+        """
+        record, size = self.record(file), index_size(chunks)
+        checksums = bytes.fromhex(record.chunks)
         with _reading(file):
-            return SealedShard.open(self.source, file, self.record(file), chunks, most)
+            # One byte more: a file that has grown is not the one that was sealed.
+            stored = self.source.part(file, max(0, record.size - size), size + 1)
+        if bytes_digest(stored) != record.index or len(checksums) != CHECKSUM_BYTES * chunks:
+            raise CorruptEpisode(f"{_differs(file)}: its index was changed, or it has another size", file)
+        sealed = [checksums[i : i + CHECKSUM_BYTES] for i in range(0, len(checksums), CHECKSUM_BYTES)]
+        return SealedShard(self.source, file, list(zip(index_places(stored), sealed, strict=True)))
 
     def problems(self) -> dict[str, str]:
         """What is wrong, by file: it is missing, or has another size than in the seal. Reads none of them."""
@@ -113,6 +120,45 @@ class SealedFiles:
         return record
 
 
+@dataclass(frozen=True)
+class SealedShard:
+    """One shard's file, whose index agrees with the seal. places: offset and length of each chunk, sealed checksum."""
+
+    source: ByteSource
+    file: str
+    places: Sequence[tuple[tuple[int, int], bytes]]
+
+    @property
+    def longest(self) -> int:
+        """Bytes of the longest chunk, with its checksum."""
+        return max((length for (_, length), _ in self.places), default=0)
+
+    def chunk(self, number: int, memory: Memory | None = None) -> Memory:
+        """The encoded bytes of one chunk, without the checksum that follows them in the file.
+
+        memory: as much as the `longest` chunk takes, for the result; new memory without. To be given new memory for
+        half a megabyte takes longer than to read it from the system's cache.
+
+        Raises:
+            CorruptEpisode: the chunk is missing, or its checksum is another one than in the seal or than that of its
+                bytes.
+        """
+        (offset, length), sealed = self.places[number]
+        if length < 0:
+            raise CorruptEpisode(f"its {self.file} lacks chunk {number}: it is missing", self.file)
+        stored = np.empty(length, np.uint8) if memory is None else memory[:length]
+        with _reading(self.file):
+            count = self.source.read_into(stored, self.file, offset)
+        if count != length:
+            raise CorruptEpisode(f"its {self.file} ends in chunk {number}", self.file)
+        chunk, checksum = stored[:-CHECKSUM_BYTES], stored[-CHECKSUM_BYTES:].tobytes()
+        if checksum != sealed:
+            raise CorruptEpisode(f"chunk {number} of its {self.file} does not agree with its seal", self.file)
+        if crc32c(chunk) != int.from_bytes(checksum, "little"):
+            raise CorruptEpisode(f"the checksum of chunk {number} of its {self.file} does not fit", self.file)
+        return chunk
+
+
 @contextmanager
 def _reading(file: str) -> Iterator[None]:
     """Within the block a file of the episode is read: that it cannot be is damage, and that a network fails is none."""
@@ -129,6 +175,4 @@ def _differs(file: str) -> str:
 
 
 def _lost(file: str, error: OSError) -> str:
-    if isinstance(error, NotRegular):
-        return f"its {file} cannot be read: {error.strerror}"
     return f"it has lost its {file} ({error.strerror or error})"

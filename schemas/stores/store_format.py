@@ -40,19 +40,7 @@ from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.jsonable import Document, Number
 from vla_attention.schemas.layout import Prompt, SiteLayout
-from vla_attention.schemas.limit_checks import check_at_most
-from vla_attention.schemas.limits import (
-    AXIS,
-    EPISODE_FILES,
-    KEYS,
-    PLACES,
-    QUERIES,
-    REPLANS,
-    SITES,
-    SPANS,
-)
-from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
-from vla_attention.schemas.safe_text import check_free_text, check_inner_path, check_name, check_text
+from vla_attention.schemas.safe_text import check_inner_path, check_name, check_text
 from vla_attention.schemas.segments import Segment
 
 FORMAT_NAME = "vla-attention"
@@ -143,19 +131,6 @@ class Recording(Document, frozen=True):
     contributions: bool = False
     num_pools: int = 0
     effects: EffectsRecorded | None = None
-
-    def __post_init__(self) -> None:
-        """Check the numbers: arrays have axes of these lengths."""
-        for what, numbers in self.axis_numbers.items():
-            name = "denoise steps" if what == "denoise" else f"{what}s"
-            check_at_most(f"The number of recorded {name}", len(numbers), AXIS, least=1)
-            check_at_most(f"The lowest of the recorded {name}", min(numbers), AXIS)
-            check_at_most(f"The highest of the recorded {name}", max(numbers), AXIS)
-        check_at_most("The number of action queries", self.num_action_queries, QUERIES)
-        check_at_most("The number of pools of action queries", self.num_pools, QUERIES)
-        check_at_most("The number of mantissa bits", self.mantissa_bits, FLOAT32_MANTISSA_BITS)
-        places = len(self.layers) * len(self.denoise_steps) * len(self.heads) * self.num_queries
-        check_at_most("The number of layers x denoise steps x heads x queries", places, PLACES)
 
     @property
     def num_queries(self) -> int:
@@ -272,8 +247,6 @@ class PolicyIdentity(Document, frozen=True):
         """Check that names and addresses are text of one line."""
         for name in ("name", "family", "checkpoint", "checkpoint_format", "digest"):
             check_text(f"policy's {name}", getattr(self, name))
-        for name in ("num_layers", "num_heads", "num_denoise_steps", "action_horizon"):
-            check_at_most(f"The policy's {name}", getattr(self, name), AXIS)
 
 
 class DataSetSource(Document, frozen=True):
@@ -327,7 +300,6 @@ class RootAttributes(Document, frozen=True):
 
     def __post_init__(self) -> None:
         """Check that sites have different names, and that something of each is recorded."""
-        check_at_most("The number of sites of the run", len(self.sites), SITES, least=1)
         names = [site.name for site in self.sites]
         if len(set(names)) != len(names):
             raise BadArgument(f"The sites {listing(names)} do not have different names.")
@@ -399,16 +371,9 @@ class EpisodeAttributes(Document, frozen=True):
     steps: EpisodeSteps | None = None
 
     def __post_init__(self) -> None:
-        """Check the task's name, the names of arrays, which are paths, and the lengths."""
+        """Check the task's name, and the names of arrays, which are paths."""
         check_name("task", self.task_name)
         check_text("task's family", self.task_family)
-        check_free_text("instruction", self.instruction)
-        check_at_most("The number of replans", self.num_replans, REPLANS)
-        check_at_most("The number of prompts", len(self.prompts), REPLANS)
-        check_at_most("The number of objects", len(self.objects), KEYS)
-        check_at_most("The number of arrays", len(self.arrays), EPISODE_FILES)
-        for site, segments in self.segments.items():
-            check_at_most(f"The number of segments of site '{site}'", len(segments), 16 * SPANS)
         for path in self.arrays:
             check_inner_path(path)
 
@@ -439,9 +404,6 @@ def is_episode_name(name: str) -> bool:
         return False
 
 
-_CHECKSUMS = re.compile(r"([0-9a-f]{8})*")
-
-
 class FileRecord(Document, frozen=True):
     """Size in bytes and sha256 of a file of an episode.
 
@@ -454,13 +416,6 @@ class FileRecord(Document, frozen=True):
     sha256: str
     index: str = ""
     chunks: str = ""
-
-    def __post_init__(self) -> None:
-        """Check the size and the form of the checksums."""
-        if self.size < 0:
-            raise BadArgument(f"a file of {self.size} bytes")
-        if not _CHECKSUMS.fullmatch(self.chunks):
-            raise BadArgument("the checksums of the chunks of a file are not 8 hexadecimal digits each")
 
 
 class EpisodeSeal(Document, frozen=True):
@@ -481,6 +436,5 @@ class EpisodeSeal(Document, frozen=True):
 
     def __post_init__(self) -> None:
         """Check the paths: a seal lists files inside of its episode's folder."""
-        check_at_most("The number of files", len(self.files), EPISODE_FILES)
         for path in self.files:
             check_inner_path(path)

@@ -11,8 +11,6 @@ from pathlib import Path
 
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.schemas.limits import ROOT_BYTES
-from vla_attention.schemas.regular_files import read_regular
 from vla_attention.schemas.stores.root import group_attributes
 from vla_attention.schemas.stores.store_format import FORMAT_NAME, STORE_SUFFIX
 
@@ -51,7 +49,7 @@ def _refuse_in(folders: Iterable[Path], path: Path, doing: str) -> None:
 
 def _is_store(folder: Path) -> bool:
     try:
-        return group_attributes(read_regular(folder / "zarr.json", ROOT_BYTES)).get("format") == FORMAT_NAME
+        return group_attributes((folder / "zarr.json").read_bytes()).get("format") == FORMAT_NAME
     except (OSError, ValueError):
         return False
 

@@ -9,8 +9,8 @@ import re
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
-from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.jsonable import decode_json
 
 #: What the operating system makes of the two slashes when an address went through `Path`: one.
 _ADDRESS = re.compile(r"([a-z][a-z0-9+.-]+):/{1,3}(?=[^/])")

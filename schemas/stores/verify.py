@@ -10,15 +10,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from vla_attention.schemas.documents import decode_json
 from vla_attention.schemas.errors import listing, plural
-from vla_attention.schemas.limits import ROOT_BYTES
 from vla_attention.schemas.stores.digest import root_digest
 from vla_attention.schemas.stores.episode_checks import content_problems, form_problems
 from vla_attention.schemas.stores.episode_files import check_presence, foreign_in_episode
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
 from vla_attention.schemas.stores.remote_source import RemoteFailure, source_of
-from vla_attention.schemas.stores.root import NAMES_FILE, fields_beyond, group_attributes, names_document
+from vla_attention.schemas.stores.root import NAMES_FILE, group_attributes, names_document
 from vla_attention.schemas.stores.seal import SEAL_FILE
 from vla_attention.schemas.stores.store_format import EPISODES_DOCUMENT, CorruptEpisode, Problem, StoreError
 
@@ -89,7 +87,7 @@ def store_faults(store: Store) -> list[Fault]:
             raise
         except OSError as error:
             faults.append(Fault(file, f"it is lost ({error.strerror or error})"))
-        except (ValueError, RecursionError) as error:
+        except ValueError as error:
             faults.append(Fault(file, f"it is damaged: {error}"))
     if isinstance(store.path, Path) and (store.path / NAMES_FILE).is_file():
         names = [episode.name for episode in store.episodes]
@@ -99,10 +97,8 @@ def store_faults(store: Store) -> list[Fault]:
 
 
 def _group_problems(store: Store, file: str) -> Iterator[str]:
-    content = source_of(store.path).whole(file, most=ROOT_BYTES)
+    content = source_of(store.path).whole(file)
     attributes = group_attributes(content)
-    if others := fields_beyond(decode_json(content)):
-        yield f"it says more than that it is a group with attributes: {listing(others, 5)}"
     if file == EPISODES_DOCUMENT:
         if attributes:
             yield "it has attributes, and the group of episodes has none"

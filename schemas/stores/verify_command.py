@@ -144,14 +144,10 @@ def _print_faults(path: StorePlace, faults: Iterable[Fault]) -> None:
 
 
 def _print_foreign(path: StorePlace, beside: Sequence[str], found: Iterable[EpisodeReport]) -> None:
-    from vla_attention.schemas.stores.episode_files import MOST_NAMED
-
     lists = [("", beside), *((f"{report.episode}: ", report.foreign) for report in found)]
     for where, names in lists:
         for name in names:
             print(f"{path}: {where}{visible(name)} is no part of the store; nothing reads it")
-        if len(names) == MOST_NAMED:
-            print(f"{path}: {where}there may be more of them; {MOST_NAMED} are named")
 
 
 def _document(

@@ -142,11 +142,10 @@ def test_an_answer_of_another_place_is_never_a_number(server, copied):
 
 def test_a_server_that_does_not_answer_is_a_sentence(server, monkeypatch):
     monkeypatch.setattr(remote_source, "ANSWER_WITHIN_S", 0.2)
-    monkeypatch.setattr(remote_source, "SLOWEST_BYTES_A_SECOND", 10**9)
     ends = threading.Event()
     server.change = lambda path, content: content if ends.wait(60) else b""
     try:
-        with pytest.raises(UserError, match="gave no whole answer within 0 s"):
+        with pytest.raises(UserError, match="gave nothing for 0 s"):
             open_store(f"{server.url}/a.zarr")
     finally:
         ends.set()

@@ -293,19 +293,3 @@ def test_resuming_records_what_is_missing_and_says_what_is_damaged(tmp_path, mon
     assert "Cannot use --verify without --resume" in capsys.readouterr().err
     assert store_status(store).complete
     assert analyze(["store", "verify", str(store)]) == 0
-
-
-def test_episodes_of_another_store_are_not_moved(store, tmp_path, capsys):
-    """A group of episodes that is a link: every episode in it is damaged, and belongs to somebody else."""
-    other = tmp_path / "other.zarr"
-    shutil.copytree(store, other)
-    before = files(other)
-    shutil.rmtree(store / "episodes")
-    (store / "episodes").symlink_to(other / "episodes")
-    assert main(["verify", str(store), "--repair", "--quick"]) == 2
-    assert "its group 'episodes' is a link, and what lies elsewhere is no part of it" in capsys.readouterr().err
-    (store / "episodes").unlink()
-    (store / "episodes").symlink_to(other)  # its zarr.json is no group of episodes
-    shutil.copyfile(other / "zarr.json", store / "zarr.json")
-    assert main(["verify", str(store), "--repair", "--quick"]) == 2
-    assert files(other) == before

@@ -16,7 +16,7 @@ from tests.kit.stores import StoreSpec, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.seal import seal_document
-from vla_attention.schemas.stores.shards import index_size
+from vla_attention.schemas.stores.sealed_files import index_size
 
 #: Two layers and two denoise steps: four chunks of 39 keys.
 SPEC = StoreSpec(tasks=(0, 1), episodes=1, replans=9)

@@ -52,7 +52,6 @@ def test_a_newer_version_is_refused_and_both_are_named(path):
     [
         ({"store_version": None}, "has no store_version; expected 1"),
         ({"store_version": 0}, "has the store_version 0; expected 1"),
-        ({"store_version": 10**40}, "64 bits"),
         ({"store_version": True}, "has the store_version True; expected 1"),
         ({"store_version": "1"}, "has the store_version '1'; expected 1"),
         ({"store_version": 1.0}, "has the store_version 1.0; expected 1"),
