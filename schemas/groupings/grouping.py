@@ -21,6 +21,8 @@ REST = "*"
 
 #: Column names of tables begin with group names; these are taken by the ratio.
 _RESERVED_NAMES = ("numerator", "denominator", "ratio")
+#: Names become parts of files' names.
+_NAME_CHARACTERS = 255
 _GROUP_NAME = re.compile(r"[A-Za-z0-9_][\w.@-]*")
 
 
@@ -74,7 +76,7 @@ class Grouping:
         if not self.groups:
             raise GroupingError(f"Grouping '{self.name}' has no groups; expected at least one NAME = SELECTOR.")
         for group, selectors in self.groups.items():
-            if group in _RESERVED_NAMES or not _GROUP_NAME.fullmatch(group):
+            if group in _RESERVED_NAMES or not _GROUP_NAME.fullmatch(group) or len(group) > _NAME_CHARACTERS:
                 raise GroupingError(
                     f"'{visible(shortened(group))}' cannot name a group: expected letters, digits, '_', '.', '-', and "
                     f"none of {listing(_RESERVED_NAMES)}."

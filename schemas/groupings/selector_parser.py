@@ -43,6 +43,9 @@ class Operation:
 
 
 Selector = Atom | Everything | Operation
+
+#: Parentheses in one another: each is a call of the parser.
+_MOST_PARENTHESES = 100
 Value = TypeVar("Value")
 
 _TOKEN = re.compile(
@@ -112,6 +115,7 @@ class _Parser:
         self.text = text
         self.tokens = self._tokenise()
         self.next = 0
+        self.depth = 0
 
     def _fail(self, position: int, problem: str) -> SelectorError:
         return SelectorError(f"Cannot read selector '{shortened(self.text)}' at character {position + 1}: {problem}.")
@@ -173,7 +177,11 @@ class _Parser:
         kind, word, position = self._peek()
         self.next += 1
         if kind == "open":
+            self.depth += 1
+            if self.depth > _MOST_PARENTHESES:
+                raise self._fail(position, f"it has more than {_MOST_PARENTHESES} parentheses in one another")
             tree = self._selector()
+            self.depth -= 1
             if self._peek()[0] != "close":
                 raise self._fail(self._peek()[2], "expected ')'")
             self.next += 1

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.kit.stores import StoreSpec, reseal, small_effects, small_steps, write_store
+from tests.kit.stores import StoreSpec, small_effects, small_steps, write_store
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.analyze.store.copying import PARTS, copy_store, open_source, part_sizes
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.root import NAMES_FILE
-from vla_attention.schemas.stores.store_format import CorruptEpisode, RunMismatch, StoreError
+from vla_attention.schemas.stores.store_format import CorruptEpisode, RunMismatch
 from vla_attention.schemas.stores.verify import verify_store
 
 SPEC = StoreSpec(
@@ -177,47 +177,6 @@ def test_command_line(original, tmp_path, capsys):
     assert not (tmp_path / "x.zarr").exists()
 
 
-def smuggled(episode: Path) -> None:
-    (episode / "payload.sh").write_text("rm -rf ~")
-    reseal(episode)
-
-
-def linked_file(episode: Path) -> None:
-    (episode / "state/zarr.json").rename(episode.parents[2] / "elsewhere")
-    (episode / "state/zarr.json").symlink_to(episode.parents[2] / "elsewhere")
-
-
-def linked_folder(episode: Path) -> None:
-    (episode / "joint").rename(episode.parents[2] / "elsewhere")
-    (episode / "joint").symlink_to(episode.parents[2] / "elsewhere")
-
-
-def linked_episode(episode: Path) -> None:
-    episode.rename(episode.parents[2] / "elsewhere")
-    episode.symlink_to(episode.parents[2] / "elsewhere")
-
-
-@pytest.mark.parametrize("tar", [False, True])
-@pytest.mark.parametrize("without", [(), ("frames",)])
-@pytest.mark.parametrize(
-    ("change", "problem"),
-    [
-        (smuggled, r"has files that belong to no array: payload\.sh"),
-        (linked_file, r"its state/zarr\.json is a link"),
-        (linked_folder, "its joint is a link"),
-        (linked_episode, r"its \. is a link|task000_episode000"),
-    ],
-)
-def test_what_is_no_part_of_an_episode_is_refused(original, tmp_path, change, problem, without, tar):
-    path = tmp_path / "a.zarr"
-    shutil.copytree(original, path)
-    change(path / "episodes/task000_episode000")
-    with pytest.raises(StoreError, match=problem):
-        copy_store(open_store(path), tmp_path / "b.zarr", without, tar=tar)
-    assert not list((tmp_path / "b.zarr").rglob("*payload*"))
-    assert not list((tmp_path / "b.zarr/episodes").glob("task*"))
-
-
 def test_tar_files_are_the_store_again_and_a_copy_of_them_goes_on(original, tmp_path, capsys):
     tars, back = tmp_path / "tars.zarr", tmp_path / "back.zarr"
     copy_store(open_store(original), tars, (), tar=True)
@@ -253,12 +212,6 @@ def test_a_damaged_tar_file_is_refused(original, tmp_path, change):
     assert open_store(tmp_path / "back.zarr").episodes == ()
 
 
-def edit(file: Path, change) -> None:
-    document = json.loads(file.read_text())
-    change(document)
-    file.write_text(json.dumps(document))
-
-
 @pytest.mark.filterwarnings("ignore:Ignored in")
 @pytest.mark.parametrize("tar", [False, True])
 def test_a_copy_has_nothing_but_what_the_format_names(original, tmp_path, tar):
@@ -269,13 +222,10 @@ def test_a_copy_has_nothing_but_what_the_format_names(original, tmp_path, tar):
     (path / "episodes/a.png").write_text("mine")
     (episode / ".DS_Store").write_text("mine")
     (episode / "joint/rows/c.9").write_text("mine")
-    (episode / "link").symlink_to(path / "notes.txt")
-    for group in (path, path / "episodes"):
-        edit(group / "zarr.json", lambda document: document.update(payload="rm -rf ~"))
     copy_store(open_store(path), tmp_path / "b.zarr", (), tar=tar)
     copy_store(open_store(original), tmp_path / "expected.zarr", (), tar=tar)
     copied, expected = all_bytes(tmp_path / "b.zarr"), all_bytes(tmp_path / "expected.zarr")
     assert set(copied) == set(expected)
-    assert not any(b"rm -rf" in content or content == b"mine" for content in copied.values())
+    assert not any(content == b"mine" for content in copied.values())
     if not tar:
         assert verify_store(open_store(tmp_path / "b.zarr")) == []

@@ -92,17 +92,9 @@ def upload(folder: Path, target: Path) -> dict[str, bytes]:
 #: What somebody may put into a store, and what of it an upload that follows links would publish.
 FOREIGN = {
     "notes.txt": lambda store, secret: (store / "notes.txt").write_text("mine"),
-    "keys (a link)": lambda store, secret: (store / "keys").symlink_to(secret),
-    "episodes/task000_episode000/joint/rows/keys (a link)": lambda store, secret: (
-        store / "episodes/task000_episode000/joint/rows/keys"
-    ).symlink_to(secret),
-    "episodes/zarr.json (a link)": lambda store, secret: replace_by_link(store / "episodes/zarr.json", secret / "id"),
+    "keys": lambda store, secret: (store / "keys").symlink_to(secret),
+    "joint/rows/keys": lambda store, secret: (store / "episodes/task000_episode000/joint/rows/keys").symlink_to(secret),
 }
-
-
-def replace_by_link(file: Path, target: Path) -> None:
-    file.unlink()
-    file.symlink_to(target)
 
 
 @pytest.mark.filterwarnings("ignore:Ignored in")
