@@ -37,7 +37,9 @@ def decode_json(content: bytes) -> Any:
     try:
         return msgspec.json.decode(content)
     except msgspec.DecodeError:
-        return json.loads(content)  # slower; says where a document that is none goes wrong
+        if b"NaN" not in content and b"Infinity" not in content:
+            raise
+        return json.loads(content)  # slower
     except RecursionError:
         raise ValueError("its lists and objects are nested too deep") from None
 

@@ -20,6 +20,8 @@ from vla_attention.capture.replay.video import VideoFile
 
 #: Rows of pictures that are in memory at once: with two cameras of a megabyte each, a quarter of a gigabyte.
 _ROWS = 128
+#: Pixels of a picture: a little more than 4K. A kilobyte can say that it has a billion.
+_MOST_PIXELS = 10_000_000
 #: How a PNG and a JPEG begin.
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 
@@ -105,6 +107,9 @@ def decode_picture(content: bytes) -> NDArray[np.uint8]:
     kind = PngImagePlugin.PngImageFile if content.startswith(_PNG) else JpegImagePlugin.JpegImageFile
     try:
         with kind(io.BytesIO(content)) as image:
+            width, height = image.size
+            if width * height > _MOST_PIXELS:
+                raise PictureRefused(f"has {width:,} x {height:,} pixels; expected at most {_MOST_PIXELS:,} in all")
             return np.array(image.convert("RGB"))  # a copy: torch warns of arrays that cannot be written
     except (OSError, SyntaxError, ValueError) as error:
         if isinstance(error, PictureRefused):

@@ -100,12 +100,12 @@ LIBERO: dict[str, Case] = {
     ),
     "initial states that are a table": Case(as_states({"a": 1}), "holds no initial states"),
     "initial states of another scene": Case(as_states(np.zeros((50, 3))), "do not belong together|cannot be built"),
-    "a pipe for initial states": Case(states(pipe), "it is a FIFO"),
+    "a pipe for initial states": Case(states(pipe), "no regular file"),
     "initial states of 5 GB": Case(states(lambda path: sparse(path, 5 * 10**9)), NO_TORCH_FILE),
     "a task that executes": Case(task(executing_task), "as an angle .*Nothing of it was executed"),
     "a task of parentheses": Case(task(lambda path: path.write_text("(" * 100_000 + ")" * 100_000)), "parentheses"),
-    "a pipe for a task": Case(task(pipe), "it is a FIFO"),
+    "a pipe for a task": Case(task(pipe), "no regular file"),
     "a pipe among the assets": Case(
-        lambda folder: made(lambda path, file, assets: pipe(assets / "scenes" / "x.xml"), folder), "it is a FIFO"
+        lambda folder: made(lambda path, file, assets: pipe(assets / "scenes" / "x.xml"), folder), "no regular file"
     ),
 }

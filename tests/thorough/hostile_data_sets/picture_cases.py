@@ -74,7 +74,7 @@ def text_bomb() -> bytes:
     return chunk(b"zTXt", b"a\0\0" + zlib.compress(bytes(200_000_000), 9))
 
 
-LARGE = r"has 1\d,000 x 1\d,000 pixels; expected at most 8,192 on a side"
+LARGE = r"has 1\d,000 x 1\d,000 pixels; expected at most"
 
 PICTURES: dict[str, Case] = {
     "a PNG of 13,000 x 13,000": Case(picture(lambda: png(13_000, 13_000)), LARGE),
@@ -87,7 +87,7 @@ PICTURES: dict[str, Case] = {
     "an EPS": Case(picture(eps), "no PNG and no JPEG"),
     "a file of a terabyte": Case(
         file(lambda path: sparse(path, 2**40, png(96, 64))),
-        r"cannot be read: it has .* bytes; expected at most 80,000,000",
+        "cannot be read with 4 GB of memory",
     ),
     "a pipe": Case(file(pipe), "neither in its table nor in a file"),
 }
