@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from vla_attention.schemas.errors import Note, UserError, did_you_mean
+from vla_attention.schemas.errors import Note, UserError, did_you_mean, shortened
 from vla_attention.schemas.safe_text import visible, visible_output
 from vla_attention.schemas.stop_signals import run_until_stopped
 
@@ -189,7 +189,7 @@ def describe_os_error(error: OSError) -> str:
     from vla_attention.schemas.stores.store_place import why_refused
 
     named = [str(name) for name in (error.filename, error.filename2) if name is not None]
-    where = f" {' -> '.join(named)}" if named else ""
+    where = f" {' -> '.join(map(shortened, named))}" if named else ""
     why = why_refused(error, Path(named[-1])) if named else error.strerror or str(error) or type(error).__name__
     return f"The operating system refused{where or ' to go on'}: {why}."
 

@@ -149,20 +149,10 @@ def repair_groups(path: Path, dry_run: bool = False) -> list[str]:
     for fault in store_faults(open_store(path)):
         if fault.where == EPISODES_DOCUMENT:
             if not dry_run:
-                _write_whole(path / EPISODES_DOCUMENT, group_document({}))
+                building = path / f".{uuid.uuid4().hex}"
+                building.write_bytes(group_document({}))
+                publish_file(building, path / EPISODES_DOCUMENT)
             lines.append(f"  {'would be written' if dry_run else 'written'} again: {fault.where}, {fault.problem}")
         else:
             lines.append(f"  left as it is: {fault.where}, {fault.problem}")
     return lines
-
-
-def _write_whole(path: Path, content: bytes) -> None:
-    """Write a file in one step, which survives a crash of the machine."""
-    building = path.with_name(f".{path.name}-{uuid.uuid4().hex}")
-    try:
-        building.write_bytes(content)
-        publish_file(building, path)
-    except OSError as error:
-        raise StoreError(f"Cannot write {path}: {error.strerror or error}.") from None
-    finally:
-        building.unlink(missing_ok=True)

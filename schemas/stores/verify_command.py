@@ -1,32 +1,27 @@
-"""`verify` of both command lines: its arguments, a line for every episode, and JSON for programs."""
+"""`verify` of both command lines: its arguments, a line for every episode, and JSON for programs; and `--repair`."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from vla_attention.schemas.command_line import format_bytes
-from vla_attention.schemas.errors import BadArgument, Note
+from vla_attention.schemas.errors import BadArgument, Note, plural
 from vla_attention.schemas.jsonable import to_json
-from vla_attention.schemas.safe_text import plain_stderr, print_line, visible
+from vla_attention.schemas.safe_text import print_line
 from vla_attention.schemas.stores.store_url import StorePlace, local_path, store_place
 
 if TYPE_CHECKING:
     from vla_attention.schemas.stores.reader import Store
-    from vla_attention.schemas.stores.verify import Depth, EpisodeReport, Fault
-
-import os
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
     from vla_attention.schemas.stores.repair import Finding
+    from vla_attention.schemas.stores.verify import Depth, EpisodeReport
 
 DESCRIPTION = (
     "Compare every file with what was sealed, and what an episode says with its run. A line for every episode. Foreign "
@@ -44,32 +39,38 @@ EXAMPLES = """examples:
 Reports = Callable[["Store", "Depth"], Iterable["EpisodeReport"]]
 
 
+#: Of `vla-attention capture status`.
+VERIFY_HELP = "read every byte, instead of only seals, presence and sizes of files"
+_LOOKED: dict[Depth, str] = {
+    "quick": "seals, metadata, presence and sizes; without --quick every byte is read",
+    "files": "every file; --values looks at the numbers too",
+    "values": "every file and number",
+}
+_OPTIONS = {
+    "--quick": "look at seals, metadata, and the presence and size of every file, and read no array",
+    "--values": "read the arrays, too, and apply the rules that the writer applied: row sums, roles, shares, counts",
+    "--json": "print everything as JSON",
+    "--repair": "move damaged episodes into NAME.zarr.damaged, beside the store, with the reason, and remove what "
+    "killed processes of this machine left; no episode is deleted, and those that are being written are left alone",
+    "--dry-run": "with --repair: list what would be done, and do none of it",
+}
+
+
 def add_verify_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of `verify`."""
     parser.add_argument("stores", nargs="+", type=store_place, metavar="STORE", help="NAME.zarr or addresses")
-    parser.add_argument(
-        "--quick",
-        action="store_true",
-        help="look at seals, metadata, and the presence and size of every file, and read no array",
-    )
-    parser.add_argument(
-        "--values",
-        action="store_true",
-        help="read the arrays, too, and apply the rules that the writer applied: row sums, roles, shares, counts",
-    )
-    parser.add_argument("--json", action="store_true", help="print everything as JSON")
-    parser.add_argument(
-        "--repair",
-        action="store_true",
-        help="move damaged episodes into NAME.zarr.damaged, beside the store, with the reason, and remove what killed "
-        "processes of this machine left; no episode is deleted, and those that are being written are left alone",
-    )
-    parser.add_argument(
-        "--dry-run", action="store_true", help="with --repair: list what would be done, and do none of it"
-    )
+    for option, text in _OPTIONS.items():
+        parser.add_argument(option, action="store_true", help=text)
 
 
-def run_verify_command(arguments: argparse.Namespace, reports: Reports | None = None) -> int:
+def one_after_the_other(store: Store, depth: Depth) -> Iterator[EpisodeReport]:
+    """Reports of the episodes, made in this thread."""
+    from vla_attention.schemas.stores.verify import episode_report
+
+    return (episode_report(store, replace(episode), depth) for episode in store.episodes)  # what is read goes with it
+
+
+def run_verify_command(arguments: argparse.Namespace, reports: Reports = one_after_the_other) -> int:
     """Check the stores of parsed arguments, or repair them; returns the exit code."""
     if arguments.repair:
         for option in ("json", "values"):
@@ -82,116 +83,51 @@ def run_verify_command(arguments: argparse.Namespace, reports: Reports | None = 
     if arguments.quick and arguments.values:
         raise BadArgument("--quick reads no array and --values reads all; give one of them.")
     depth: Depth = "quick" if arguments.quick else "values" if arguments.values else "files"
-    return run_verify(arguments.stores, depth, as_json=arguments.json, reports=reports or one_after_the_other)
+    found = [_verified(place, depth, reports, as_json=arguments.json) for place in arguments.stores]
+    if arguments.json:
+        print(json.dumps(found, indent=1))
+    return int(not all(one["whole"] for one in found))
 
 
-def one_after_the_other(store: Store, depth: Depth) -> Iterator[EpisodeReport]:
-    """Reports of the episodes, made in this thread."""
-    from vla_attention.schemas.stores.verify import episode_report
-
-    return (episode_report(store, replace(episode), depth) for episode in store.episodes)  # what is read goes with it
-
-
-def run_verify(
-    stores: Sequence[StorePlace], depth: Depth, *, as_json: bool, reports: Reports = one_after_the_other
-) -> int:
-    """Check stores, and print what was found; returns the exit code: 1 if anything is wrong."""
+def _verified(path: StorePlace, depth: Depth, reports: Reports, *, as_json: bool) -> dict[str, Any]:
+    """Check a store, and print a line for every episode unless all of it will be printed as JSON."""
+    from vla_attention.schemas.progress_bar import progress_bar
     from vla_attention.schemas.stores.episode_files import foreign_in_store
     from vla_attention.schemas.stores.reader import open_store
     from vla_attention.schemas.stores.verify import store_faults
 
-    documents, wrong = [], False
-    for path in stores:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Note)  # what lies among the episodes is named below
-            store = open_store(path)
-        faults, foreign = store_faults(store), foreign_in_store(store)
-        reports_of_store = []
+    def say(line: str) -> None:
         if not as_json:
-            _print_faults(path, faults)
-        with _counter(len(store.episodes), quiet=not as_json and sys.stdout.isatty()) as count:
-            for report in reports(store, depth):
-                count()
-                reports_of_store.append(report)
-                if as_json:
-                    continue
-                _print_faults(path, report.faults)
-                if not report.problems:
-                    whole = f"whole, {report.files} files, {format_bytes(report.bytes)}"
-                    print(f"{path}: {report.episode}: {whole}", flush=True)
-        wrong = wrong or bool(faults) or any(report.problems for report in reports_of_store)
-        if as_json:
-            documents.append(_document(store, depth, faults, foreign, reports_of_store))
-        else:
-            _print_foreign(path, foreign, reports_of_store)
-            number = len(faults) + sum(len(report.problems) for report in reports_of_store)
-            result = "all whole" if not number else "1 fault" if number == 1 else f"{number} faults"
-            looked = {
-                "quick": "seals, metadata, presence and sizes; without --quick every byte is read",
-                "files": "every file; --values looks at the numbers too",
-                "values": "every file and number",
-            }[depth]
-            plural = "" if len(reports_of_store) == 1 else "s"
-            print(f"{path}: {len(reports_of_store)} episode{plural}, {result} ({looked}).", flush=True)
-    if as_json:
-        print(json.dumps(documents, indent=1))
-    return 1 if wrong else 0
+            print_line(f"{path}: {line}")
 
-
-def _print_faults(path: StorePlace, faults: Iterable[Fault]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Note)  # what lies among the episodes is named below
+        store = open_store(path)
+    faults, foreign = store_faults(store), foreign_in_store(store)
+    found: list[EpisodeReport] = []
     for fault in faults:
-        print_line(f"{path}: {fault.where}: {fault.problem}")
-
-
-def _print_foreign(path: StorePlace, beside: Sequence[str], found: Iterable[EpisodeReport]) -> None:
-    lists = [("", beside), *((f"{report.episode}: ", report.foreign) for report in found)]
-    for where, names in lists:
-        for name in names:
-            print(f"{path}: {where}{visible(name)} is no part of the store; nothing reads it")
-
-
-def _document(
-    store: Store,
-    depth: Depth,
-    faults: Sequence[Fault],
-    foreign: Sequence[str],
-    found: Sequence[EpisodeReport],
-) -> dict[str, object]:
+        say(f"{fault.where}: {fault.problem}")
+    # Lines at a terminal show how far it is, too.
+    with progress_bar(len(store.episodes), "episodes", hidden=sys.stdout.isatty() and not as_json) as advance:
+        for report in reports(store, depth):
+            advance(1)
+            found.append(report)
+            whole = f"whole, {report.files} files, {format_bytes(report.bytes)}"
+            for problem in report.problems or (whole,):
+                say(f"{report.episode}: {problem}")
+    for name in (*foreign, *(f"{report.episode}: {name}" for report in found for name in report.foreign)):
+        say(f"{name} is no part of the store; nothing reads it")
+    number = len(faults) + sum(len(report.problems) for report in found)
+    say(f"{plural(len(found), 'episode')}, {plural(number, 'fault') if number else 'all whole'} ({_LOOKED[depth]}).")
     return {
         "store": str(store.path),
         "version": store.attributes.store_version,
         "depth": depth,
-        "whole": not faults and not any(report.problems for report in found),
+        "whole": not number,
         "faults": to_json(faults),
         "foreign": list(foreign),
         "episodes": to_json(found),
     }
-
-
-@contextmanager
-def _counter(total: int, *, quiet: bool) -> Iterator[Callable[[], None]]:
-    """Yield a function that counts episodes on stderr, at a terminal. The lines of a terminal's stdout count, too."""
-    shown = plain_stderr()
-    quiet = quiet or not shown.isatty()
-    done = 0
-
-    def count() -> None:
-        nonlocal done
-        done += 1
-        if not quiet:
-            shown.write(f"\r{done} of {total} episodes")
-            shown.flush()
-
-    try:
-        yield count
-    finally:
-        if done and not quiet:
-            shown.write("\r" + " " * 40 + "\r")
-            shown.flush()
-
-
-#: Of `vla-attention capture status`.
-VERIFY_HELP = "read every byte, instead of only seals, presence and sizes of files"
 
 
 def run_repair(stores: Sequence[Path], *, verify: bool, dry_run: bool) -> int:
@@ -208,8 +144,7 @@ def run_repair(stores: Sequence[Path], *, verify: bool, dry_run: bool) -> int:
         findings = repair_store(path, verify, dry_run)
         mended = repair_groups(path, dry_run)
         total = len(open_store(path).episodes) + sum(finding.moved_to is not None for finding in findings)
-        print("\n".join(map(visible, _lines(path, findings, total, verify, dry_run))), flush=True)
-        for line in (*mended, *_leftovers(path, dry_run)):
+        for line in (*_lines(path, findings, total, verify, dry_run), *mended, *_leftovers(path, dry_run)):
             print_line(line)
         if dry_run:
             print("Nothing was changed (--dry-run).", flush=True)
