@@ -47,7 +47,7 @@ class SelectedEpisode:
         brief = _Prompts(replace(episode), number) if number else ()
         vars(kept)["attributes"] = structs.replace(episode.attributes, prompts=brief)
         prompts = _Prompts(replace(episode), number, store.attributes, site) if tokens.prompts else ()
-        return cls(store, kept, replace(tokens, prompts=prompts)).fresh()
+        return cls(store, kept, _with_words(replace(tokens, prompts=prompts), tokens)).fresh()
 
     def fresh(self) -> SelectedEpisode:
         """The same, with nothing that was read of it since it was selected."""
@@ -56,7 +56,7 @@ class SelectedEpisode:
         episode = replace(self.episode)
         vars(episode)["attributes"] = self.episode.attributes
         coverage = episode.coverage(self.store.attributes, self.tokens.layout.name)
-        return replace(self, episode=episode, tokens=replace(self.tokens, coverage=coverage))
+        return replace(self, episode=episode, tokens=_with_words(replace(self.tokens, coverage=coverage), self.tokens))
 
     @property
     def task(self) -> tuple[str, int]:
@@ -108,6 +108,13 @@ class SelectedEpisode:
                 f"{protocol.wait_steps} steps of waiting; check the store with vla-attention store verify."
             )
         return starts, num_steps
+
+
+def _with_words(tokens: EpisodeTokens, known: EpisodeTokens) -> EpisodeTokens:
+    """The tokens, with the words that others of the episode know: its prompts are not read again for them."""
+    if "words" in vars(known):
+        vars(tokens)["words"] = known.words
+    return tokens
 
 
 @dataclass(frozen=True)

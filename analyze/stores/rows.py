@@ -1,6 +1,6 @@
 """Rows of one episode, one layer and denoise step at a time: no analysis holds all rows of an episode.
 
-Every row that is read is held against its stored sum: a chunk of another episode has a checksum that fits, too.
+What is read is held against its stored sums.
 """
 
 from __future__ import annotations
@@ -67,7 +67,8 @@ def layer_rows(
         # (replan, head or 1, of which the mean is taken, key): a product with the shares, which is a BLAS call.
         parts = whole[:, heads].reshape(replans, -1, of_mean, keys)
         rows = (parts if mean is None else np.matmul(share, parts, out=mean))[:, :, 0]
-        if not add_up(whole, sums[:, layer, step], recording.mantissa_bits):
+        expected = sums[:, layer, step][:, heads].reshape(replans, -1, of_mean).mean(axis=-1)
+        if not add_up(rows, expected, recording.mantissa_bits):
             here = replace(recording, layers=(recording.layers[layer],), denoise_steps=(recording.denoise_steps[step],))
             _refuse(episode, name, whole, sums[:, layer, step], here)
         yield LayerRows(i, j, rows)
