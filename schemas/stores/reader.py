@@ -22,7 +22,6 @@ from vla_attention.schemas.jsonable import from_json
 from vla_attention.schemas.layout import Prompt, Role, prompt_at
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.byte_source import ByteSource, Folder
-from vla_attention.schemas.stores.episode_shapes import misfits
 from vla_attention.schemas.stores.remote_source import RemoteFailure, at_commit, source_of
 from vla_attention.schemas.stores.root import attributes_in, list_episodes, read_run
 from vla_attention.schemas.stores.seal import identity_problem, read_seal
@@ -226,8 +225,6 @@ class StoredEpisode:
     def tokens(self, root: RootAttributes, site: str) -> EpisodeTokens:
         """What every key of a site is in this episode."""
         layout = root.site(site)
-        for problem in misfits(root, self.attributes):
-            raise CorruptEpisode(f"Episode {self.name} is damaged: {problem}.")
         roles = self.read(f"{site}/key_role")
         if roles.max(initial=0) > max(Role):
             raise CorruptEpisode(f"Array {site}/key_role of episode {self.name} has codes that are no roles.")
