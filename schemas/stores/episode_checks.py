@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.schemas.effects import CHANGE, CUT
-from vla_attention.schemas.episode_steps import EXECUTED, GRIPPER, POSES
-from vla_attention.schemas.jsonable import to_json
+from vla_attention.schemas.episode_steps import EXECUTED, GRIPPER, POSE, POSES
 from vla_attention.schemas.layout import prompt_at
 from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
 from vla_attention.schemas.stores.content_rules import (
@@ -36,10 +35,14 @@ from vla_attention.schemas.stores.content_rules import (
 )
 from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.episode_files import metadata_problems
-from vla_attention.schemas.stores.episode_shapes import effect_misfits, expected_shapes, shape_problems, step_misfits
 from vla_attention.schemas.stores.reader import StoredEpisode
-from vla_attention.schemas.stores.root import attributes_in
-from vla_attention.schemas.stores.store_format import NUMBERS, CorruptEpisode, Problem, RootAttributes
+from vla_attention.schemas.stores.store_format import (
+    NUMBERS,
+    CorruptEpisode,
+    EpisodeAttributes,
+    Problem,
+    RootAttributes,
+)
 
 
 def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[Problem]:
@@ -59,21 +62,71 @@ def content_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[P
     for name, record in attributes.arrays.items():
         if name not in wrong:
             yield from _guarded(_array_problems(root, episode, name, record.sha256))
-    for check in (_axis_problems, _token_problems, _camera_problems, _counter_problems):
+    for check in (_token_problems, _camera_problems, _counter_problems):
         yield from _guarded(check(root, episode))
 
 
 def form_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[Problem]:
     """Which files and shapes of an episode are not as its run and its attributes say; reads none of the files."""
     attributes = episode.attributes
-    shapes = expected_shapes(root, attributes)
+    shapes = _expected_shapes(root, attributes)
     numbers = {name: (len(given),) for name in NUMBERS if (given := getattr(attributes, name))}
     listed = {name: record.shape for name, record in attributes.arrays.items()} | numbers
     for name in sorted(set(shapes) - set(listed)):
         yield Problem(f"{name} is not in the episode")
     for name, shape in listed.items():
-        yield from map(Problem, shape_problems(name, shape, shapes.get(name, (attributes.num_replans,))))
-    yield from map(Problem, [*effect_misfits(root, attributes), *step_misfits(attributes)])
+        yield from map(Problem, _shape_problems(name, shape, shapes.get(name, (attributes.num_replans,))))
+
+
+def _expected_shapes(root: RootAttributes, attributes: EpisodeAttributes) -> dict[str, tuple[int, ...]]:
+    """First axes of every array that must be there; arrays that are not named here begin with the replans."""
+    replans = attributes.num_replans
+    shapes: dict[str, tuple[int, ...]] = {"denoise_time": (len(root.recording.denoise_steps),)}
+    shapes |= dict.fromkeys(("env_step", "prompt_index"), (replans,))
+    if not root.protocol.of_other_loop:
+        shapes |= dict.fromkeys(("noise_seed", "state", "actions"), (replans,))
+    if attributes.effects is not None and attributes.effects.replan:
+        entries = len(attributes.effects.replan)
+        actions = attributes.arrays.get("actions")
+        # The caller's own loop may give one action of a chunk.
+        horizon = root.policy.action_horizon if actions is None else actions.shape[1]
+        shapes[CHANGE] = (entries, horizon, len(attributes.effects.units))
+        shapes |= {f"{site.name}/{CUT}": (entries, site.num_keys) for site in root.sites}
+    if attributes.steps is not None:
+        moments = attributes.num_steps + 1
+        shapes[POSES] = (moments, len(attributes.steps.bodies), POSE)
+        shapes |= {GRIPPER: (moments,), EXECUTED: (attributes.num_steps,)}
+    if "dataset_actions" in attributes.arrays:
+        shapes["dataset_action_count"] = (replans,)
+    for site in root.sites:
+        recording = root.recording.of_site(site)
+        cells = (
+            replans,
+            len(recording.layers),
+            len(recording.denoise_steps),
+            len(recording.heads),
+            recording.num_queries,
+        )
+        shapes[f"{site.name}/rows"] = (*cells, site.num_keys)
+        shapes[f"{site.name}/row_sum"] = cells
+        shapes[f"{site.name}/atoms"] = (*cells, len(attributes.segments.get(site.name, ())))
+        shapes[f"{site.name}/key_role"] = (replans, site.num_keys)
+        shapes[f"{site.name}/uniform"] = (*cells, site.num_keys)
+        if recording.contributions:
+            parts = len(attributes.segments.get(site.name, ())) + 1
+            shapes[f"{site.name}/contribution"] = (*cells[:3], parts, parts)
+    return shapes
+
+
+def _shape_problems(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> Iterator[str]:
+    """Whether an array has another shape than its first axes must have (`_expected_shapes`), as a sentence."""
+    # Axes of `uniform` but the last have length 1 where nothing changes along them.
+    if name.endswith("/uniform") and len(shape) == len(expected) and shape[-1:] == expected[-1:]:
+        if all(given in (1, length) for given, length in zip(shape, expected, strict=True)):
+            return
+        yield f"{name} has the shape {shape}; expected {expected}, or 1 in place of a length but the last"
+    elif shape[: len(expected)] != expected:
+        yield f"{name} has the shape {shape}; expected {expected}"
 
 
 def _guarded(check: Iterator[str]) -> Iterator[Problem]:
@@ -143,15 +196,6 @@ def _uniform(episode: StoredEpisode, site: str) -> NDArray[np.float32] | None:
     rows = episode.shape_of(f"{site}/rows")
     fits = uniform.ndim == len(rows) and all(n in (1, m) for n, m in zip(uniform.shape, rows, strict=True))
     return uniform if fits else None
-
-
-def _axis_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
-    """The numbers of layers, denoise steps and heads in the attributes of every site are those of the run."""
-    for site in root.sites:
-        given = attributes_in(episode.document(f"{site.name}/zarr.json"))
-        expected = to_json(root.recording.of_site(site).axis_numbers)
-        if given != expected:
-            yield f"the attributes of {site.name} are {given}; expected {expected}"
 
 
 def _token_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:

@@ -220,15 +220,6 @@ def test_attributes_that_contradict_the_arrays(path, change, problem):
     assert problem in only_fault_of(path)
 
 
-def test_the_numbers_of_a_site_s_axes_are_those_of_the_run(path):
-    folder = path / "episodes" / EPISODE
-    document = json.loads((folder / "joint/zarr.json").read_text())
-    document["attributes"]["layer"].reverse()
-    (folder / "joint/zarr.json").write_text(json.dumps(document))
-    reseal(folder)
-    assert "the attributes of joint are {'layer': [2, 0]" in only_fault_of(path)
-
-
 @pytest.fixture(scope="module")
 def victim(original, tmp_path_factory) -> tuple[StoredEpisode, Path, dict[str, np.ndarray]]:
     """A copy to damage and repair, and what it holds."""
