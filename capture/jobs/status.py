@@ -173,7 +173,7 @@ def _text(status: StoreStatus) -> str:
         f"{status.store}: {status.suite}, policy {status.policy}, {plural(committed, 'episode')} of "
         f"{plural(begun, 'task')}, {format_bytes(size)}"
     ]
-    rows = [("task", "episodes", "solved", "size", "last written (UTC)", "by", "instruction")]
+    rows: list[tuple[str, ...]] = [("task", "episodes", "solved", "size", "last written (UTC)", "by", "instruction")]
     rows += [task.cells() for task in tasks]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines += ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
