@@ -118,11 +118,11 @@ class EpisodeLoop:
                 with self._opened():
                     self._record_until_complete(missing)
             except BaseException as error:
-                self.log.end("stopped" if isinstance(error, (Terminated, KeyboardInterrupt)) else "failed")
+                self.log.add("stopped" if isinstance(error, (Terminated, KeyboardInterrupt)) else "failed")
                 if isinstance(error, Terminated):
                     self.progress.say(self._describe_stop(missing))
                 raise
-        self.log.end("failed" if self.faults.dropped else "finished")
+        self.log.add("failed" if self.faults.dropped else "finished")
         return self.results
 
     @contextmanager
@@ -340,10 +340,10 @@ class EpisodeLoop:
         try:
             again = self.faults.note(name, error)
         except MachineBroken:
-            self.log.add_drop(name, str(error))
+            self.log.add("dropped", name, str(error))
             raise
         if not again:
-            self.log.add_drop(name, str(error))
+            self.log.add("dropped", name, str(error))
         return again
 
     def _note_written(self) -> None:
@@ -369,7 +369,7 @@ class EpisodeLoop:
 
     def _note_commit(self, running: _Running, result: Committed, num_bytes: int) -> None:
         self.results.append(result)
-        self.log.add_commit(running.job.name)
+        self.log.add("committed", running.job.name)
         self.faults.note_recorded()
         self._show_end(running, result, num_bytes)
         self.store.locks.release(running.job.name)

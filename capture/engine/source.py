@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from vla_attention.capture.engine.call import Caller, PolicyCall
 from vla_attention.capture.engine.progress import say
 from vla_attention.capture.environments.base import Task
-from vla_attention.capture.jobs.worker_log import PlannedTask
 from vla_attention.capture.store.replan_records import EpisodeStart, RecordedSteps
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.stores.store_format import episode_name
@@ -36,18 +35,6 @@ class EpisodeJob:
     def name(self) -> str:
         """The episode's name in the store."""
         return episode_name(self.task.task_id, self.episode_index)
-
-
-def plan_of(jobs: Sequence[EpisodeJob]) -> tuple[PlannedTask, ...]:
-    """Return the tasks of the jobs with the indices of their episodes, for the logs of workers."""
-    indices: dict[int, set[int]] = {}
-    for job in jobs:
-        indices.setdefault(job.task.task_id, set()).add(job.episode_index)
-    tasks = {job.task.task_id: job.task for job in reversed(jobs)}
-    return tuple(
-        PlannedTask.of_episodes(number, tasks[number].name, tasks[number].instruction, indices[number])
-        for number in sorted(indices)
-    )
 
 
 def episode_start(

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence, Set
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
 from vla_attention.capture.environments.suites import SUITES
-from vla_attention.capture.jobs.worker_log import REASON_CHARACTERS, WorkerRecord, planned_tasks, read_logs
+from vla_attention.capture.jobs.worker_log import Event, planned_episodes, read_logs
 from vla_attention.schemas.command_line import format_bytes
-from vla_attention.schemas.errors import BadArgument, listing, plural, shortened
+from vla_attention.schemas.errors import BadArgument, listing, plural
 from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.locks import Holder, episode_locks
@@ -21,61 +21,44 @@ from vla_attention.schemas.stores.store_url import local_path
 from vla_attention.schemas.stores.verify import DamagedEpisode, look_at
 
 
-@dataclass(frozen=True)
-class EpisodeStatus:
-    """One committed episode that is whole, as far as was looked.
-
-    at: time of the commit (ISO 8601, UTC).
-    by: the worker; empty if no log names it.
-    """
-
-    episode: int
-    success: bool | None
-    bytes: int
-    at: str
-    by: str
-
-
-@dataclass(frozen=True)
-class DroppedEpisode:
-    """An episode that the store lacks, because a worker left it out after a fault.
-
-    at: time of the last such fault (ISO 8601, UTC). by: the worker. reason: the sentence of the fault.
-    """
-
-    name: str
-    at: str
-    by: str
-    reason: str
-
-    def describe(self) -> str:
-        """Return the episode and what happened as one line."""
-        return f"{self.name} by {self.by}, {_plain_time(self.at)}: {self.reason}"
-
-
-@dataclass(frozen=True)
+@dataclass
 class TaskStatus:
     """One task.
 
     expected: number of episodes; None if neither the user nor a log gives it.
     committed, success, bytes: of the episodes that are not damaged. unknown: how many of them have no known outcome.
+    last_at, last_by: time of the last commit (ISO 8601, UTC), and the worker; empty if no log names it.
     missing: indices of the expected episodes that the store lacks.
     damaged: episodes that are in the store, but cannot be used.
-    dropped: missing episodes that a capture left out after a fault, with the reason.
+    dropped: missing episodes that a capture left out after a fault, each with the last one.
     """
 
     task_id: int
-    instruction: str
-    committed: int
-    expected: int | None
-    success: int
-    bytes: int
-    last_at: str
-    last_by: str
-    missing: tuple[int, ...]
-    damaged: tuple[DamagedEpisode, ...]
+    instruction: str = ""
+    expected: int | None = None
+    committed: int = 0
+    success: int = 0
     unknown: int = 0
-    dropped: tuple[DroppedEpisode, ...] = ()
+    bytes: int = 0
+    last_at: str = ""
+    last_by: str = ""
+    missing: list[int] = field(default_factory=list)
+    damaged: list[DamagedEpisode] = field(default_factory=list)
+    dropped: list[Event] = field(default_factory=list)
+
+    def cells(self) -> tuple[str, ...]:
+        """Return what the table has of it."""
+        known = self.committed - self.unknown
+        solved = f"{self.success} of {known}" if self.unknown else str(self.success)
+        return (
+            str(self.task_id),
+            f"{self.committed} of {'?' if self.expected is None else self.expected}",
+            solved if known else "-",
+            format_bytes(self.bytes) if self.committed else "-",
+            _plain_time(self.last_at) or "-",
+            visible(self.last_by) or ("unknown" if self.committed else "-"),
+            visible(self.instruction),
+        )
 
 
 @dataclass(frozen=True)
@@ -103,7 +86,11 @@ class StoreStatus:
             for task in self.tasks
             if task.missing
         ]
-        dropped = [f"dropped: {episode.describe()}" for task in self.tasks for episode in task.dropped]
+        dropped = [
+            f"dropped: {one.episode} by {one.by}, {_plain_time(one.at)}: {one.reason}"
+            for task in self.tasks
+            for one in task.dropped
+        ]
         return missing + dropped + [f"damaged: {episode.describe()}" for task in self.tasks for episode in task.damaged]
 
 
@@ -121,63 +108,42 @@ def store_status(path: Path, expected: int | None = None, verify: bool = False) 
     if expected is not None and expected < 1:
         raise BadArgument(f"Cannot use --expected {expected}; expected at least 1.")
     store = open_store(path)
-    root = store.attributes
-    records = read_logs(path)
-    plan = planned_tasks(records)
-    writers = {episode: (at, record.worker) for record in records for episode, at in record.committed}
-    episodes: dict[int, list[EpisodeStatus]] = {}
-    damaged: dict[int, list[DamagedEpisode]] = {}
-    instructions: dict[int, str] = {task.task_id: task.instruction for task in plan.values()}
+    root, events = store.attributes, read_logs(path)
+    planned = planned_episodes(events)
+    # Of several events of one episode the last one counts.
+    commits = {event.episode: event for event in events if event.event == "committed"}
+    drops = {event.episode: event for event in events if event.event == "dropped" and is_episode_name(event.episode)}
+    present = {stored.name: parse_episode_name(stored.name) for stored in store.episodes}
+    drops = {name: drops[name] for name in sorted(drops) if name not in present}
+    ids = {*planned, *(task for task, _ in present.values()), *(parse_episode_name(name)[0] for name in drops)}
+    if expected is not None and not planned:
+        ids |= set(range(next((suite.num_tasks for suite in SUITES if suite.name == root.protocol.suite), 0)))
+    instructions = {task.task_id: task.instruction for event in events for task in event.plan}
+    tasks = {task_id: TaskStatus(task_id, instructions.get(task_id, "")) for task_id in sorted(ids)}
+    for task in tasks.values():
+        wanted = planned.get(task.task_id) if expected is None else set(range(expected))
+        if wanted is not None:
+            task.expected = len(wanted)
+            task.missing = sorted(wanted - {index for task_id, index in present.values() if task_id == task.task_id})
+    for name, event in drops.items():
+        tasks[parse_episode_name(name)[0]].dropped.append(event)
     for stored in store.episodes:
-        task_id, index = parse_episode_name(stored.name)
+        task, folder = tasks[present[stored.name][0]], local_path(stored.folder)
         fault = look_at(store, stored, verify)
         if fault is not None:
-            damaged.setdefault(task_id, []).append(fault)
+            task.damaged.append(fault)
             continue
-        at, worker = writers.get(stored.name, ("", None))
-        instructions[task_id] = stored.attributes.instruction
-        episodes.setdefault(task_id, []).append(
-            EpisodeStatus(
-                episode=index,
-                success=stored.attributes.success,
-                bytes=sum(file.stat().st_size for file in local_path(stored.folder).rglob("*") if file.is_file()),
-                at=at or _time_of(local_path(stored.folder)),
-                by=worker.describe() if worker else "",
-            )
-        )
-    dropped = _dropped(records, {stored.name for stored in store.episodes})
-    ids = set(plan) | set(episodes) | set(damaged) | set(dropped)
-    if expected is not None and not plan:
-        ids |= set(range(next((suite.num_tasks for suite in SUITES if suite.name == root.protocol.suite), 0)))
-    tasks = []
-    for task_id in sorted(ids):
-        committed = episodes.get(task_id, [])
-        planned = plan[task_id].wanted if task_id in plan else None
-        wanted = planned if expected is None else set(range(expected))
-        faulty = damaged.get(task_id, [])
-        present = {parse_episode_name(episode.name)[1] for episode in faulty} | {
-            episode.episode for episode in committed
-        }
-        last = max(committed, key=lambda episode: episode.at, default=None)
-        tasks.append(
-            TaskStatus(
-                task_id=task_id,
-                instruction=instructions.get(task_id, ""),
-                committed=len(committed),
-                expected=None if wanted is None else len(wanted),
-                success=sum(episode.success is True for episode in committed),
-                bytes=sum(episode.bytes for episode in committed),
-                last_at=last.at if last else "",
-                last_by=last.by if last else "",
-                missing=tuple(sorted((wanted or set()) - present)),
-                damaged=tuple(faulty),
-                unknown=sum(episode.success is None for episode in committed),
-                dropped=tuple(dropped.get(task_id, ())),
-            )
-        )
-    return StoreStatus(
-        str(path), root.protocol.suite, root.policy.name, tuple(tasks), tuple(episode_locks(path).holders())
-    )
+        task.instruction = stored.attributes.instruction
+        task.committed += 1
+        task.success += stored.attributes.success is True
+        task.unknown += stored.attributes.success is None
+        task.bytes += sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+        commit = commits.get(stored.name)
+        at = commit.at if commit else datetime.fromtimestamp(folder.stat().st_mtime, UTC).isoformat(timespec="seconds")
+        if at > task.last_at:
+            task.last_at, task.last_by = at, commit.by if commit else ""
+    writing = tuple(episode_locks(path).holders())
+    return StoreStatus(str(path), root.protocol.suite, root.policy.name, tuple(tasks.values()), writing)
 
 
 def print_status(stores: Sequence[Path], expected: int | None, as_json: bool, check: bool, verify: bool = False) -> int:
@@ -194,47 +160,9 @@ def print_status(stores: Sequence[Path], expected: int | None, as_json: bool, ch
     return 1 if check and any(status.complete is False for status in statuses) else 0
 
 
-def _dropped(records: Sequence[WorkerRecord], present: Set[str]) -> dict[int, list[DroppedEpisode]]:
-    """The episodes that workers dropped and that the store lacks, by task, each with its last fault."""
-    last: dict[str, DroppedEpisode] = {}
-    for record in records:
-        for drop in record.dropped:
-            known, reason = last.get(drop.episode), shortened(drop.reason, 2 * REASON_CHARACTERS)
-            if drop.episode not in present and is_episode_name(drop.episode) and (known is None or known.at <= drop.at):
-                last[drop.episode] = DroppedEpisode(drop.episode, drop.at, record.worker.describe(), reason)
-    by_task: dict[int, list[DroppedEpisode]] = {}
-    for name in sorted(last):
-        by_task.setdefault(parse_episode_name(name)[0], []).append(last[name])
-    return by_task
-
-
 def _plain_time(at: str) -> str:
     """A time of the logs without its offset, which is that of UTC."""
     return at.removesuffix("+00:00").replace("T", " ")
-
-
-def _time_of(folder: Path) -> str:
-    return datetime.fromtimestamp(folder.stat().st_mtime, UTC).isoformat(timespec="seconds")
-
-
-def _solved(task: TaskStatus) -> str:
-    """Number of solved episodes, and of how many where not every outcome is known."""
-    known = task.committed - task.unknown
-    if not known:
-        return "-"
-    return f"{task.success} of {known}" if task.unknown else str(task.success)
-
-
-def _cells(task: TaskStatus) -> tuple[str, ...]:
-    return (
-        str(task.task_id),
-        f"{task.committed} of {'?' if task.expected is None else task.expected}",
-        _solved(task),
-        format_bytes(task.bytes) if task.committed else "-",
-        _plain_time(task.last_at) or "-",
-        visible(task.last_by) or ("unknown" if task.committed else "-"),
-        visible(task.instruction),
-    )
 
 
 def _text(status: StoreStatus) -> str:
@@ -245,8 +173,9 @@ def _text(status: StoreStatus) -> str:
         f"{status.store}: {status.suite}, policy {status.policy}, {plural(committed, 'episode')} of "
         f"{plural(begun, 'task')}, {format_bytes(size)}"
     ]
-    rows = [("task", "episodes", "solved", "size", "last written (UTC)", "by", "instruction"), *map(_cells, tasks)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    rows: list[tuple[str, ...]] = [("task", "episodes", "solved", "size", "last written (UTC)", "by", "instruction")]
+    rows += [task.cells() for task in tasks]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines += ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     lines += status.lacking_lines()
     if any(task.damaged for task in tasks):

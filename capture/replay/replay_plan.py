@@ -16,9 +16,10 @@ from vla_attention.capture.engine.faults import Faults
 from vla_attention.capture.engine.loop import EpisodeLoop
 from vla_attention.capture.engine.plan import announce
 from vla_attention.capture.engine.settings import StoreOutput
-from vla_attention.capture.engine.source import EpisodeJob, Source, plan_of
+from vla_attention.capture.engine.source import EpisodeJob, Source
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Termination
+from vla_attention.capture.jobs.worker_log import plan_of
 from vla_attention.capture.policies.robot import RobotData, read_camera_choices
 from vla_attention.capture.replay.arguments import ReplaySettings
 from vla_attention.capture.replay.data_set_files import INDEX_COLUMNS
@@ -181,7 +182,7 @@ def record_episodes(plan: ReplayPlan, store: RunStore, todo: Sequence[int], ever
         for index in todo:
             jobs.append(plan.job(index, every))
             advance(1)
-    loop = EpisodeLoop(store, plan_of(jobs), plan.termination, "call", source)
+    loop = EpisodeLoop(store, plan_of((job.task, job.episode_index) for job in jobs), plan.termination, "call", source)
     results = loop.record_all(jobs)
     plan.faults.dropped.update(loop.faults.dropped)
     return len(results)

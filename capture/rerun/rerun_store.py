@@ -19,10 +19,11 @@ from vla_attention.capture.engine.faults import Faults
 from vla_attention.capture.engine.loop import EpisodeLoop
 from vla_attention.capture.engine.plan import root_attributes
 from vla_attention.capture.engine.progress import Progress, say
-from vla_attention.capture.engine.source import Episode, EpisodeJob, Outcome, Source, episode_start, plan_of
+from vla_attention.capture.engine.source import Episode, EpisodeJob, Outcome, Source, episode_start
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.jobs.termination import Termination
+from vla_attention.capture.jobs.worker_log import plan_of
 from vla_attention.capture.policies.policy import Policy, stored_picture_sizes
 from vla_attention.capture.rerun.base_store import families_of, instructions_of
 from vla_attention.capture.rerun.fidelity import check_fidelity
@@ -218,7 +219,9 @@ class Rerun:
             say(describe_effects(self.recording.effects))
         caller = replace(caller, effects=effects)
         source = StoredEpisodes(caller, store, episodes, self.machine)
-        loop = EpisodeLoop(store, plan_of(jobs), self.termination, "call", source)
+        loop = EpisodeLoop(
+            store, plan_of((job.task, job.episode_index) for job in jobs), self.termination, "call", source
+        )
         try:
             loop.record_all(todo)
         finally:

@@ -22,7 +22,7 @@ from vla_attention.capture.interventions.prompts import check_synonyms
 from vla_attention.capture.interventions.resolution import check_not_compiled, interventions_for
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.jobs.termination import Termination
-from vla_attention.capture.jobs.worker_log import PlannedTask, planned_tasks, read_logs
+from vla_attention.capture.jobs.worker_log import plan_of, planned_episodes, read_logs
 from vla_attention.capture.machine import POLICY_BATCH, describe_machine
 from vla_attention.capture.policies.families import family_of_kind
 from vla_attention.capture.policies.identity import downloads_of
@@ -148,13 +148,10 @@ def _record_missing(
     bound = estimate_disk(attributes.recording, attributes.sites, pictures, max_replans(attributes.protocol), len(todo))
     announce(attributes, list(_lines_on_source(attributes)), bound, store.path, len(names), damaged)
     damaged_names = [fault.name for fault in damaged]
-    expected = {task.task_id: task for task in (*wanted, *(tasks[index] for index in settings.array_task_ids))}
-    plan = tuple(
-        PlannedTask(task.task_id, task.name, task.instruction, settings.num_episodes)
-        for _, task in sorted(expected.items())
-    )
-    known = planned_tasks(read_logs(store.path))
-    if not todo and all(task.task_id in known and known[task.task_id].wanted >= task.wanted for task in plan):
+    expected = (*wanted, *(tasks[index] for index in settings.array_task_ids))
+    plan = plan_of((task, episode) for task in expected for episode in range(settings.num_episodes))
+    known = planned_episodes(read_logs(store.path))
+    if not todo and all(known.get(task.task_id, set()) >= {*task.indices} for task in plan):
         return [], damaged_names, Faults()
     num_envs = min(settings.num_envs or default_num_envs(), len(todo))
     batch = num_envs if largest_batch is None else min(largest_batch, num_envs)

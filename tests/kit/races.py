@@ -165,7 +165,7 @@ def overlapping_lists(random: Random, processes: int) -> tuple[tuple[int, ...], 
 
 def _committed_twice(store: Path) -> tuple[str, ...]:
     """Episodes that are in the logs of two workers."""
-    names = [episode for record in read_logs(store) for episode, _ in record.committed]
+    names = [event.episode for event in read_logs(store) if event.event == "committed"]
     return tuple(sorted({name for name in names if names.count(name) > 1}))
 
 

@@ -159,7 +159,7 @@ def test_a_fault_that_stays_costs_the_episode_and_resuming_records_it(scene, who
     )
     assert said.err.count("\n") == 1
     (dropped,) = store_status(store).tasks[0].dropped
-    assert dropped.name == "task000_episode001"
+    assert dropped.episode == "task000_episode001"
     assert sentence in dropped.reason
     assert "2 episodes added, 0 solved, 1 missing. Store:" in said.out
     assert [episode.name for episode in open_store(store).episodes] == ["task000_episode000", "task000_episode002"]

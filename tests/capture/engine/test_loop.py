@@ -14,10 +14,10 @@ from tests.kit.stores import StoreSpec, root_attributes, write_episode
 from vla_attention.capture.engine.loop import EpisodeLoop
 from vla_attention.capture.engine.progress import Unit
 from vla_attention.capture.engine.simulation import SimulationFailed
-from vla_attention.capture.engine.source import Committed, Episode, EpisodeJob, Outcome, Source, plan_of
+from vla_attention.capture.engine.source import Committed, Episode, EpisodeJob, Outcome, Source
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.jobs.termination import Terminated, Termination
-from vla_attention.capture.jobs.worker_log import read_logs
+from vla_attention.capture.jobs.worker_log import plan_of, read_logs
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.store.store_writer import RunStore, open_run
 from vla_attention.schemas.stores.locks import episode_locks
@@ -73,7 +73,7 @@ def store(tmp_path: Path) -> RunStore:
 
 
 def loop_of(store: RunStore, source: MadeUpSource, unit: Unit = "step") -> EpisodeLoop:
-    return EpisodeLoop(store, plan_of(JOBS), Termination(), unit, source)
+    return EpisodeLoop(store, plan_of((job.task, job.episode_index) for job in JOBS), Termination(), unit, source)
 
 
 def test_every_episode_is_recorded_and_noted(store: RunStore, capsys: pytest.CaptureFixture[str]) -> None:
@@ -82,8 +82,8 @@ def test_every_episode_is_recorded_and_noted(store: RunStore, capsys: pytest.Cap
     names = [job.name for job in JOBS]
     assert [result.folder.name for result in results] == names
     assert source.tried == [*(word for name in names for word in (name, f"{name} closed")), "closed"]
-    (record,) = read_logs(store.path)
-    assert (record.state, [episode for episode, _ in record.committed]) == ("finished", names)
+    events = [(event.event, event.episode) for event in read_logs(store.path)]
+    assert events == [("began", ""), *(("committed", name) for name in names), ("finished", "")]
     assert not (store.path / ".writing").exists()
     said = capsys.readouterr().out
     assert said.count(f"{names[0]} begins") == 1
@@ -129,8 +129,9 @@ def test_a_fault_costs_its_episode(store: RunStore, capsys, error: Exception, tr
     assert len(loop.record_all(JOBS)) == 3
     assert source.tried.count(JOBS[1].name) == tries
     assert loop.faults.dropped == {JOBS[1].name: str(error)}
-    (record,) = read_logs(store.path)
-    assert (record.state, [drop.episode for drop in record.dropped]) == ("failed", [JOBS[1].name])
+    events = read_logs(store.path)
+    assert [event.episode for event in events if event.event == "dropped"] == [JOBS[1].name]
+    assert events[-1].event == "failed"
     said = capsys.readouterr().out
     assert said.count("The episode begins again.") == tries - 1
     assert said.count("The episode is left out, and the run goes on.") == 1
@@ -148,7 +149,7 @@ def test_sigterm_drops_one_episode_and_says_what_is_missing(store: RunStore, cap
     assert source.tried[-1] == "closed"
     said = capsys.readouterr().out
     assert f"Stopped by SIGTERM: dropped {JOBS[1].name} at call 2; committed 1 episode ({JOBS[0].name}); 3 of" in said
-    assert [record.state for record in read_logs(store.path)] == ["stopped"]
+    assert read_logs(store.path)[-1].event == "stopped"
     assert not (store.path / ".writing").exists()
 
 

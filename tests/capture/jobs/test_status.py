@@ -16,7 +16,7 @@ from vla_attention.capture.jobs.worker_log import (
     PlannedTask,
     WorkerLog,
     log_folder,
-    planned_tasks,
+    planned_episodes,
     read_logs,
 )
 from vla_attention.schemas.errors import Note
@@ -27,7 +27,7 @@ NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2", 0)
 
 
 def planned(task: int, episodes: int) -> PlannedTask:
-    return PlannedTask(task, f"task_{task}", INSTRUCTIONS[task], episodes)
+    return PlannedTask(task, INSTRUCTIONS[task], tuple(range(episodes)))
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def test_without_logs_the_expected_number_is_unknown(store, capsys):
 
 def test_the_expected_number_can_be_given(store, capsys):
     status = store_status(store, expected=3)
-    assert [task.missing for task in status.tasks] == [(2,), (2,)]
+    assert [task.missing for task in status.tasks] == [[2], [2]]
     assert main(["status", str(store), "--expected", "3", "--check"]) == 1
     assert "task 0 lacks 1 of 3 episodes: 2" in capsys.readouterr().out
     assert main(["status", str(store), "--expected", "3"]) == 0
@@ -65,14 +65,14 @@ def test_the_expected_number_can_be_given(store, capsys):
 
 def test_plans_of_several_processes_add_up(store, capsys):
     first = WorkerLog(store, NODE, (planned(0, 2), planned(1, 2)))
-    first.add_commit("task000_episode001")
-    first.end("stopped")
+    first.add("committed", "task000_episode001")
+    first.add("stopped")
     WorkerLog(store, replace(NODE, tag="node8-5-cd", host="node8", job_name="98_0"), (planned(0, 4),))
-    assert {task: plan.episodes for task, plan in planned_tasks(read_logs(store)).items()} == {0: 4, 1: 2}
+    assert planned_episodes(read_logs(store)) == {0: {0, 1, 2, 3}, 1: {0, 1}}
     status = store_status(store)
     by_id = {task.task_id: task for task in status.tasks}
-    assert by_id[0].missing == (2, 3)
-    assert by_id[1].missing == (0, 1)
+    assert by_id[0].missing == [2, 3]
+    assert by_id[1].missing == [0, 1]
     assert (by_id[1].instruction, by_id[1].committed, by_id[1].last_by) == (INSTRUCTIONS[1], 0, "")
     assert by_id[2].expected is None  # in the store, but in no plan
     os.utime(store / "episodes/task000_episode000", (0, 0))
@@ -94,7 +94,9 @@ def test_damaged_logs_are_named_and_ignored(store):
     (file,) = log_folder(store).iterdir()
     file.write_text(file.read_text() + '{"event": "committed", "epis')  # killed inside of a line
     assert store_status(store).complete
-    WorkerLog(store, NODE, (planned(0, 3),)).add_commit("task000_episode000")  # the next process has the same number
+    WorkerLog(store, NODE, (planned(0, 3),)).add(
+        "committed", "task000_episode000"
+    )  # the next process has the same number
     file.write_text("{\n" + file.read_text())
     with pytest.warns(Note, match=f"2 lines|1 log in .* cannot be read in full: {file.name}"):
-        assert store_status(store).tasks[0].missing == (2,)
+        assert store_status(store).tasks[0].missing == [2]

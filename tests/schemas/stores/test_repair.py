@@ -121,7 +121,7 @@ def test_a_damaged_episode_is_listed_moved_aside_and_missing(store, episode, ori
 
     assert names(store) == WHOLE
     assert verify_store(open_store(store)) == []
-    assert [task.missing for task in store_status(store, expected=2).tasks] == [(1,), ()]
+    assert [task.missing for task in store_status(store, expected=2).tasks] == [[1], []]
     assert sorted(path.name for path in store.parent.iterdir()) == ["a.zarr", "a.zarr.damaged"]  # and no logs
     assert main(["verify", str(store), "--repair", "--quick"]) == 0
     assert f"{store}: none of 3 episodes is damaged" in capsys.readouterr().out
