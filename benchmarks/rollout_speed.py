@@ -36,6 +36,7 @@ from vla_attention.capture.engine import loop as loops  # noqa: E402
 from vla_attention.capture.engine.call import Caller  # noqa: E402
 from vla_attention.capture.engine.simulation import Simulation  # noqa: E402
 from vla_attention.capture.engine.simulators import SimulatedEpisode, SimulatorProcess  # noqa: E402
+from vla_attention.capture.engine.source import Committed  # noqa: E402
 from vla_attention.capture.engine.writing import EpisodeInBackground, WritingThread  # noqa: E402
 from vla_attention.capture.machine import load_torch  # noqa: E402
 from vla_attention.capture.policies.policy import Policy  # noqa: E402
@@ -86,7 +87,7 @@ class NotWritten(EpisodeInBackground):
 
     def commit(self, outcome: Any) -> None:
         name = f"task{self.start.task_id:03d}_episode{self.start.episode_index:03d}"
-        self.committed = outcome, Path(tempfile.gettempdir()) / name, 0
+        self.committed = Committed(outcome, 1, Path(tempfile.gettempdir()) / name)
         self.thread.put(lambda: None)
 
 

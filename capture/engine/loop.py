@@ -22,10 +22,10 @@ from multiprocessing.connection import Connection, wait
 
 from vla_attention.capture.effects.measurement import EpisodeEffectsMeasured
 from vla_attention.capture.engine.call import Caller, PolicyCall, RecordedCall, record_of
-from vla_attention.capture.engine.faults import EPISODE_FAULTS, Faults, MachineBroken, SimulatorDied
+from vla_attention.capture.engine.faults import EPISODE_FAULTS, Faults, SimulatorDied
 from vla_attention.capture.engine.progress import EpisodeProgress, Progress, Unit
 from vla_attention.capture.engine.source import Committed, Episode, EpisodeJob, Outcome, Source, SourceLost
-from vla_attention.capture.engine.writing import EpisodeInBackground, WritingThread, bytes_of
+from vla_attention.capture.engine.writing import EpisodeInBackground, WritingThread
 from vla_attention.capture.jobs.termination import Terminated, Termination
 from vla_attention.capture.jobs.worker_log import PlannedTask, WorkerLog
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
@@ -140,8 +140,7 @@ class EpisodeLoop:
 
     def _close_episodes(self) -> None:
         for running in self._running:
-            if running.episode is not None:
-                running.episode.close()
+            running.close()
 
     def _record_until_complete(self, missing: Sequence[EpisodeJob]) -> None:
         left = self._attempt_all(missing)
@@ -238,7 +237,7 @@ class EpisodeLoop:
             case Committed() as committed:
                 self._running.remove(running)
                 running.close()
-                self._note_commit(running, committed, bytes_of(committed.folder))
+                self._note_commit(running, committed)
                 return
             case None:
                 if (how := running.episode.overdue()) is not None:
@@ -327,24 +326,18 @@ class EpisodeLoop:
             again = isinstance(error, (EpisodeTaken, Held)) and not self._has(running.job)
             said = f"{error} This process's copy was dropped."
         else:
-            again = self._noted(name, error)
+            again = False
+            try:
+                again = self.faults.note(name, error)
+            finally:
+                if not again:
+                    self.log.add("dropped", name, str(error))
             what_next = "The episode begins again." if again else "The episode is left out, and the run goes on."
             said = f"{name}: {error} {what_next}"
         self.progress.end(running.progress, again=again)
         self.progress.say(said)
         if again:
             self._left.insert(0, running.job)
-
-    def _noted(self, name: str, error: Exception) -> bool:
-        """Note a fault; returns whether the episode shall be tried again."""
-        try:
-            again = self.faults.note(name, error)
-        except MachineBroken:
-            self.log.add("dropped", name, str(error))
-            raise
-        if not again:
-            self.log.add("dropped", name, str(error))
-        return again
 
     def _note_written(self) -> None:
         """Note what the thread has committed, and what it could not store.
@@ -364,19 +357,15 @@ class EpisodeLoop:
         for running in list(self._committing):
             if running.writer is not None and running.writer.committed is not None:
                 self._committing.remove(running)
-                outcome, folder, num_bytes = running.writer.committed
-                self._note_commit(running, Committed(outcome, running.num_replans, folder), num_bytes)
+                self._note_commit(running, running.writer.committed)
 
-    def _note_commit(self, running: _Running, result: Committed, num_bytes: int) -> None:
+    def _note_commit(self, running: _Running, result: Committed) -> None:
+        """Note and show that an episode is committed, and after the first one what the others will take."""
         self.results.append(result)
         self.log.add("committed", running.job.name)
         self.faults.note_recorded()
-        self._show_end(running, result, num_bytes)
         self.store.locks.release(running.job.name)
-
-    def _show_end(self, running: _Running, result: Committed, num_bytes: int) -> None:
-        """Show that an episode is committed, and after the first one what the others will take."""
-        job, seconds, share = running.job, running.progress.seconds, 1.0
+        job, seconds, share, num_bytes = running.job, running.progress.seconds, 1.0, result.num_bytes
         if self.unit == "call":
             self.progress.end(running.progress)
         else:

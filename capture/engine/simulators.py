@@ -78,20 +78,20 @@ def check_protocol(protocol: Protocol, policy: Policy) -> None:
         )
 
 
-class LocalSimulator:
+class LocalSimulator(SimulatorServer):
     """A simulator in this process, which has answered when `ask` returns; otherwise as a `SimulatorProcess`."""
 
     connection = None
 
     def __init__(self, source: Simulators) -> None:
+        super().__init__(self._answer, source.setup, source.check)
         self._source = source
         self._answers: deque[object] = deque()
-        self._server = SimulatorServer(self._answer, source.setup, source.check)
 
     def ask(self, request: BeginEpisode | Execute) -> None:
         """Do what is asked for."""
         self._answers.clear()
-        self._server.answer(request)
+        self.answer(request)
 
     def has_answer(self) -> bool:
         """Whether there is an answer."""
@@ -108,7 +108,7 @@ class LocalSimulator:
     def close(self) -> None:
         """Close the environment; one that has failed may fail again."""
         with suppress(Exception):
-            self._server.close()
+            super().close()
 
     def _answer(self, answer: object) -> None:
         if isinstance(answer, ResetsFirst):

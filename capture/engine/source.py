@@ -81,6 +81,11 @@ class Committed:
     num_replans: int
     folder: Path
 
+    @property
+    def num_bytes(self) -> int:
+        """Bytes of its files."""
+        return sum(file.stat().st_size for file in self.folder.rglob("*") if file.is_file())
+
 
 class Episode(ABC):
     """An episode that is under way.

@@ -11,14 +11,13 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.engine.source import Outcome
+from vla_attention.capture.engine.source import Committed, Outcome
 from vla_attention.capture.store.episode_writer import EpisodeWriter
 from vla_attention.capture.store.replan_records import EpisodeStart, ReplanRecord
 from vla_attention.capture.store.store_writer import RunStore
@@ -37,13 +36,13 @@ class EpisodeInBackground:
     store: RunStore
     start: EpisodeStart
     denoise_times: NDArray[np.float64]
-    #: Of a committed episode how it ended, its folder, and its bytes.
-    committed: tuple[Outcome, Path, int] | None = field(default=None, init=False)
+    committed: Committed | None = field(default=None, init=False)
     #: What ended the writing. What was given afterwards is skipped.
     error: BaseException | None = field(default=None, init=False)
     #: Of the thread alone: the episode's open writer, and what closes it.
     _writer: EpisodeWriter | None = field(default=None, init=False)
     _open: ExitStack = field(default_factory=ExitStack, init=False)
+    _num_replans: int = field(default=0, init=False)
     _dropped: bool = field(default=False, init=False)
 
     def append(self, record: ReplanRecord) -> None:
@@ -84,18 +83,14 @@ class EpisodeInBackground:
         if self._writer is None:
             self._writer = self._open.enter_context(self.store.episode(self.start, self.denoise_times))
         self._writer.append(record)
+        self._num_replans += 1
 
     def _commit(self, outcome: Outcome) -> None:
         if self._writer is None:
             raise ValueError("an episode without replans cannot be committed")
         folder = self._writer.commit(outcome.success, outcome.num_steps, outcome.steps)
         self.close()
-        self.committed = outcome, folder, bytes_of(folder)
-
-
-def bytes_of(folder: Path) -> int:
-    """Return the bytes of the files of an episode."""
-    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+        self.committed = Committed(outcome, self._num_replans, folder)
 
 
 class WritingThread:

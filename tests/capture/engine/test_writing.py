@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vla_attention.capture.engine.source import Outcome
+from vla_attention.capture.engine.source import Committed, Outcome
 from vla_attention.capture.engine.writing import WritingThread
 
 
@@ -88,7 +88,7 @@ def test_replans_and_commits_are_written_in_order() -> None:
         one.append(record(1, 1))
         one.commit(Outcome(True, 7))
         writing.wait_until(lambda: one.committed)
-        assert one.committed == (Outcome(True, 7), Path("one-that-is-not-there"), 0)
+        assert one.committed == Committed(Outcome(True, 7), 2, Path("one-that-is-not-there"))
         assert other.committed is None
     # The other one is dropped with the end of the block.
     expected = ["one: open", "one: 0", "other: open", "other: 0", "one: 1", "one: commit True 7", "one: close"]
