@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vla_attention.schemas.control_groups import of_own_group, text_of
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.threads import of_own_group, text_of
 
 if TYPE_CHECKING:
     import torch

@@ -12,12 +12,12 @@ CPU quota of its control group, and what SLURM gave to the task.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vla_attention.schemas.control_groups import of_own_group, text_of
 from vla_attention.schemas.errors import BadArgument
 
 if TYPE_CHECKING:
@@ -131,3 +131,24 @@ def cpu_quota(root: Path = Path("/")) -> float | None:
     if len(words) != 2 or not all(word.isdecimal() for word in words) or int(words[1]) == 0:
         return None
     return int(words[0]) / int(words[1])
+
+
+def of_own_group(name: str, root: Path = Path("/")) -> str:
+    """Return the text of a file of this process's control group (version 2), such as `cpu.max`; empty without one.
+
+    root: folder in place of /, for tests.
+    """
+    own = re.search(r"^0::/(.*)$", text_of(root / "proc/self/cgroup"), re.MULTILINE)
+    if own is None:
+        return ""
+    mount = root / "sys/fs/cgroup"
+    # A container may see the path of its group on the host, and the group itself in the place of the whole tree.
+    return text_of(mount / own[1] / name) or text_of(mount / name)
+
+
+def text_of(path: Path) -> str:
+    """Return the text of a file of the kernel; empty where there is none, or it is not for us."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError:
+        return ""
