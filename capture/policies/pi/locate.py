@@ -1,4 +1,4 @@
-"""Find a checkpoint and a tokenizer: on disk, in the caches of openpi and the Hugging Face hub, or by download.
+"""Find a checkpoint and a tokenizer: on disk, in the caches of openpi and the Hugging Face hub, or on the hub.
 
 Downloads go into the caches of the ecosystem's own tools, so that nothing is downloaded twice. Without a network or a
 client, the error names the files and the place for them.
@@ -7,20 +7,17 @@ client, the error names the files and the place for them.
 from __future__ import annotations
 
 import os
-import shutil
 from pathlib import Path
-from typing import Any
 
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound
 from vla_attention.capture.policies.hub import (
     CheckpointUnavailable,
     fetch_from_hub,
-    first_line,
     in_hub_cache,
     snapshots_folder,
     split_hub_name,
 )
-from vla_attention.schemas.errors import BadArgument, MissingDependency, listing
+from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.safe_text import check_inner_path
 
 #: Files of a hub repository that a policy needs; only these are downloaded.
@@ -37,8 +34,6 @@ HUB_FILES = (
 )
 #: openpi's published checkpoints, in its bucket and below its cache.
 OPENPI_CHECKPOINTS = "openpi-assets/checkpoints"
-#: Folders of an openpi checkpoint that a policy needs; training states are several times as large.
-OPENPI_FOLDERS = ("params", "assets")
 
 TOKENIZER_NAME = "paligemma_tokenizer.model"
 TOKENIZER_URL = "gs://big_vision/paligemma_tokenizer.model"
@@ -49,9 +44,9 @@ TOKENIZER_REPOSITORY = "google/paligemma-3b-pt-224"
 def find_checkpoint(name: str) -> Path:
     """Return the folder of a checkpoint.
 
-    It is a local folder, `gs://...` in openpi's cache, or `ORG/NAME` or `ORG/NAME@COMMIT` of the hub. What is not in
-    the cache is downloaded; `CheckpointUnavailable` or `MissingDependency` if that fails, `CheckpointNotFound` for a
-    path or another name that leads nowhere.
+    It is a local folder, `gs://...` in openpi's cache, or `ORG/NAME` or `ORG/NAME@COMMIT` of the hub, which is
+    downloaded where the hub's cache lacks it. `CheckpointUnavailable` or `MissingDependency` if it cannot be had,
+    `CheckpointNotFound` for a path or another name that leads nowhere.
     """
     if name.startswith("gs://"):
         return _from_openpi_cache(name.rstrip("/"))
@@ -69,14 +64,11 @@ def find_checkpoint(name: str) -> Path:
 
 
 def would_be_fetched(name: str) -> bool:
-    """Whether `find_checkpoint` would ask the hub, or the bucket of openpi, for a checkpoint."""
-    if name.startswith("gs://"):
-        return not _in_openpi_cache(name).is_dir()
-    return split_hub_name(name) is not None and not Path(name).expanduser().exists()
+    """Whether `find_checkpoint` would ask the hub for a checkpoint."""
+    return not name.startswith("gs://") and split_hub_name(name) is not None and not Path(name).expanduser().exists()
 
 
 def _in_openpi_cache(url: str) -> Path:
-    # A rerun takes the address from a store, and a download replaces what is at its place.
     inner = url.removeprefix("gs://").rstrip("/")
     check_inner_path(inner)
     return openpi_cache() / inner
@@ -91,7 +83,7 @@ def _where_else(path: Path) -> str:
     address = f"gs://{OPENPI_CHECKPOINTS}/{place.name}"
     if place.is_dir():
         return f" openpi's cache has one of this name: give '{place}' or {address}."
-    return f" openpi's checkpoints have addresses: give {address}, which is downloaded once into its cache, '{place}'."
+    return f" openpi's checkpoints have addresses: give {address}, once it is in its cache, '{place}'."
 
 
 def openpi_cache() -> Path:
@@ -101,36 +93,12 @@ def openpi_cache() -> Path:
 
 def _from_openpi_cache(url: str) -> Path:
     target = _in_openpi_cache(url)
-    if target.is_dir():
-        return target
-    how = f"fetch it with `gsutil -m cp -r {url} {target.parent}/` (so that {target / 'params'} exists)"
-    try:
-        import gcsfs
-    except ImportError as error:
-        raise MissingDependency(
-            f"'{url}' is not in openpi's cache at '{target}', and gcsfs, which could download it, is not installed; "
-            f"{how}, or `pip install gcsfs`."
-        ) from error
-    partial = target.with_name(target.name + ".partial")
-    try:
-        _download(gcsfs.GCSFileSystem(token="anon"), url, partial)  # noqa: S106 - without an account
-    except Exception as error:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise CheckpointUnavailable(f"'{url}' could not be fetched ({first_line(error)}); {how}.") from error
-    partial.rename(target)
+    if not target.is_dir():
+        raise CheckpointUnavailable(
+            f"'{url}' is not in openpi's cache at '{target}'; fetch it where there is a network, with openpi or with "
+            f"`gsutil -m cp -r {url} {target.parent}/` (so that {target / 'params'} exists)."
+        )
     return target
-
-
-def _download(files: Any, url: str, partial: Path) -> None:
-    """Download the folders that a policy needs; the caller moves them into place when all are complete."""
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    source = url.removeprefix("gs://")
-    present = [folder for folder in OPENPI_FOLDERS if files.exists(f"{source}/{folder}")]
-    if "params" not in present:
-        raise FileNotFoundError("there is no checkpoint with a params folder at that address")
-    for folder in present:
-        files.get(f"{source}/{folder}", str(partial / folder), recursive=True)
 
 
 def find_tokenizer(checkpoint: Path, given: str | None) -> Path:
