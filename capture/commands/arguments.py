@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from vla_attention.capture.doctor.command import DOCTOR_EXAMPLES, add_doctor_arguments
 from vla_attention.capture.effects.arguments import add_effect_options
 from vla_attention.capture.engine.settings import RecordingSettings
 from vla_attention.capture.environments.suites import ALL_SUITES, STANDARD_SUITES, SUITES, find_suite, list_tasks
 from vla_attention.capture.interventions.arguments import InterventionSettings
 from vla_attention.capture.jobs.termination import Termination
-from vla_attention.capture.policies.families import policy_families
+from vla_attention.capture.policies.families import default_family, policy_families
 from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
 from vla_attention.capture.replay.arguments import REPLAY_EXAMPLES, add_replay_arguments
 from vla_attention.capture.rerun.arguments import RERUN_EXAMPLES, add_rerun_arguments
@@ -25,11 +24,16 @@ from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.options import add_options, option
 from vla_attention.schemas.stores import verify_command
 from vla_attention.schemas.stores.verify_command import VERIFY_HELP
+from vla_attention.schemas.threads import use_threads
 
 _FURTHER_EXAMPLES = """\
   vla-attention capture status runs/libero_10.zarr                     what is there, what is missing, who is writing
   vla-attention capture verify runs/libero_10.zarr               check everything; --repair moves damaged episodes aside
   vla-attention capture doctor                                         what this machine can do, and what is missing
+"""
+_DOCTOR_EXAMPLES = """\
+  vla-attention capture doctor                                    this machine, for a run of the policy that comes along
+  vla-attention capture doctor pi --checkpoint gs://openpi-assets/checkpoints/pi05_libero --task-suite libero_10
 """
 
 
@@ -87,9 +91,9 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
         description="Takes the options of a capture and prints a line for everything that it needs: memory, simulator "
         "and assets, drawing, disk, GPU, checkpoint, each with what to do. Loads no policy and runs no simulator. Exit "
         "code 1 when something is missing.",
-        epilog=f"examples:\n{DOCTOR_EXAMPLES}",
+        epilog=f"examples:\n{_DOCTOR_EXAMPLES}",
     )
-    add_doctor_arguments(doctor, given[1:] if "doctor" in given[:1] else (), _add_capture_arguments)
+    _add_doctor_arguments(doctor, given[1:] if "doctor" in given[:1] else ())
     verify = commands.add_parser(
         "verify",
         help="read stores back and check every file, digest and row sum",
@@ -171,6 +175,30 @@ def _add_capture_arguments(
         f"analysis that runs afterwards; may be given twice, once for each (default: {default})",
         resume=f"continue an existing store with what is missing{resumed}",
     )
+
+
+def _add_doctor_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -> None:
+    """Add all options. given: what will be parsed; a policy among it decides the model's options."""
+    families, default = {family.name: family for family in policy_families()}, default_family()
+    parser.add_argument(
+        "policy",
+        nargs="?",
+        choices=list(families),
+        default=default.name,
+        metavar="POLICY",
+        help=f"{', '.join(families)} (default: {default.name}), then the options of the run",
+    )
+    family = next((families[word] for word in given if word in families), default)
+    _add_capture_arguments(parser, family)
+    parser.set_defaults(command=_run_doctor, family=family)
+
+
+def _run_doctor(arguments: argparse.Namespace, termination: Termination) -> int:
+    threads = use_threads(arguments.threads)  # before torch is loaded
+
+    from vla_attention.capture.doctor import run_doctor
+
+    return run_doctor(arguments, threads)
 
 
 def _add_status_arguments(parser: argparse.ArgumentParser) -> None:
