@@ -223,7 +223,7 @@ def arguments_from_environment(environment: Mapping[str, str], family: PolicyFam
     Raises:
         BadArgument: a variable has a value that it cannot have, or belongs to another family's script.
     """
-    given = {name: text for name, value in environment.items() if (text := value.strip())}
+    given = {name: value.strip() for name, value in environment.items() if value.strip()}
     own = family.published.variables if family.published else ()
     for other in policy_families():
         for name in other.published.variables if other.published else ():
@@ -231,7 +231,7 @@ def arguments_from_environment(environment: Mapping[str, str], family: PolicyFam
                 raise BadArgument(f"{name} is for {other.title}, and means nothing to {family.title}; unset it.")
     options: dict[str, list[str]] = {}
     for name, (pattern, expected) in (_VARIABLES | dict.fromkeys(own, ("", ""))).items():
-        if (text := given.get(name)) is None:
+        if not (text := given.get(name, "")):
             continue
         if pattern and not re.fullmatch(pattern, text.lower()):
             raise BadArgument(f"{name} is '{text}'; expected {expected}.")
