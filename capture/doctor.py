@@ -21,7 +21,7 @@ from vla_attention.capture.environments.suites import list_tasks
 from vla_attention.capture.machine import memory_limits
 from vla_attention.capture.run.run_settings import RunSettings, run_settings
 from vla_attention.capture.store.store_root import read_existing_root
-from vla_attention.schemas.command_line import format_bytes
+from vla_attention.schemas.command_line import describe_os_error, format_bytes
 from vla_attention.schemas.errors import INSTALL_CAPTURE, UserError, plural
 from vla_attention.schemas.safe_text import print_line
 from vla_attention.schemas.stores.root import episode_folders
@@ -43,6 +43,8 @@ def run_doctor(arguments: argparse.Namespace, threads: Threads) -> int:
             status, text = check()
         except UserError as error:
             status, text = "MISSING", str(error)
+        except OSError as error:  # a file without permission
+            status, text = "MISSING", describe_os_error(error)
         print_line(f"{status:<8} {what:<11} {text}")
         if status == "MISSING":
             missing.append(what)
