@@ -40,8 +40,7 @@ def run_capture_command(
             nonlocal max_requeues
             arguments = parse()
             max_requeues = getattr(arguments, "max_requeues", 0)
-            exit_code: int = arguments.command(arguments, termination)
-            return exit_code
+            return int(arguments.command(arguments, termination))
 
         try:
             return run_command(program, lambda: _until_terminated(command, termination), if_stopped)

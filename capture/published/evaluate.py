@@ -8,6 +8,7 @@ continued. One command may run several suites, or one task of an array job.
 from __future__ import annotations
 
 import argparse
+import copy
 import os
 import re
 import shlex
@@ -115,14 +116,10 @@ def _plan_suites(arguments: argparse.Namespace, index: int | None) -> dict[Path,
         output = Path("results") / f"attention_ratio_{arguments.family.store_prefix}{name}" if given is None else given
         if several and given is not None:
             output = given / name
-        own = {
-            "task_suite": name,
-            "task_id": task_ids,
-            "output_dir": output,
-            "layers": None,
-            "array_task_ids": [task_id for suite, task_id in of_array if suite == name],
-        }
-        suites[output] = run_settings(argparse.Namespace(**vars(arguments) | own))
+        one = copy.copy(arguments)
+        one.task_suite, one.task_id, one.output_dir, one.layers = name, task_ids, output, None
+        one.array_task_ids = [task_id for suite, task_id in of_array if suite == name]
+        suites[output] = run_settings(one)
     return suites
 
 
@@ -186,19 +183,16 @@ def _analyze(arguments: argparse.Namespace, settings: RunSettings, output: Path)
     apart = output / f"layers_{'_'.join(named)}"
     code = run_analysis(arguments, store, apart, more)
     if code == 0:
-        _publish(apart, output)
+        shutil.copytree(apart, output, copy_function=_copy_whole, dirs_exist_ok=True)
         say(f"The same files are in {output}; {apart} keeps them when other layers are analysed.")
     return code
 
 
-def _publish(source: Path, target: Path) -> None:
-    """Copy every file of a folder into another one; no reader sees a partial file."""
-    for file in sorted(path for path in source.rglob("*") if path.is_file()):
-        place = target / file.relative_to(source)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        temporary = place.with_name(f".{place.name}.{os.getpid()}.partial")
-        shutil.copyfile(file, temporary)
-        temporary.replace(place)
+def _copy_whole(source: str, target: str) -> None:
+    """Copy a file; no reader sees a part of it."""
+    temporary = Path(target).with_name(f".{Path(target).name}.{os.getpid()}.partial")
+    shutil.copyfile(source, temporary)
+    temporary.replace(target)
 
 
 _ANY = ("CONFIG_NAME", "TASK_SUITE", "OUTPUT_DIR", "STORE", "STAGE", "CHECKPOINT", "CKPT_PATH", "DEVICE")
