@@ -6,13 +6,13 @@ What they need is imported inside of them, so that Ctrl-C is a sentence from the
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn
 
 from vla_attention.schemas.stop_signals import end_program, run_until_stopped
 
 if TYPE_CHECKING:
-    from vla_attention.capture.jobs.termination import Termination
+    import argparse
 
 #: What is said after Ctrl-C.
 IF_STOPPED = "complete episodes are kept, continue with --resume."
@@ -32,21 +32,18 @@ def main(argv: Sequence[str] | None = None, program: str = "vla-capture") -> int
     def run() -> int:
         from vla_attention.capture.commands.command_line import run_capture_command
 
-        return run_capture_command(
-            program, lambda termination: _run(given, program, termination), lambda: 0, if_stopped
-        )
+        return run_capture_command(program, lambda: _parse(given, program), if_stopped)
 
     return run_until_stopped(program, run, if_stopped)
 
 
-def _run(given: Sequence[str], program: str, termination: Termination) -> int:
+def _parse(given: Sequence[str], program: str) -> argparse.Namespace:
     from vla_attention.capture.commands.arguments import build_parser
     from vla_attention.capture.commands.mistakes import refuse_other_tools_words
 
     refuse_other_tools_words(given)
-    arguments = build_parser(given, program).parse_args(given)
-    exit_code: int = arguments.command(arguments, termination)
-    return exit_code
+    parsed: argparse.Namespace = build_parser(given, program).parse_args(given)
+    return parsed
 
 
 def program() -> NoReturn:
@@ -56,27 +53,20 @@ def program() -> NoReturn:
 
 def evaluate_attention_ratio() -> NoReturn:
     """The console script `evaluate-attention-ratio`."""
-
-    def run() -> int:
-        from vla_attention.capture.published.evaluate import evaluate_attention_ratio
-
-        return evaluate_attention_ratio()
-
-    _end_published("evaluate-attention-ratio", run)
+    _end_published("evaluate-attention-ratio")
 
 
 def evaluate_attention_ratio_cosmos() -> NoReturn:
     """The console script `evaluate-attention-ratio-cosmos`."""
+    _end_published("evaluate-attention-ratio-cosmos")
 
+
+def _end_published(name: str) -> NoReturn:
     def run() -> int:
-        from vla_attention.capture.published.evaluate import evaluate_attention_ratio_cosmos
+        from vla_attention.capture.published.evaluate import evaluate
 
-        return evaluate_attention_ratio_cosmos()
+        return evaluate(name)
 
-    _end_published("evaluate-attention-ratio-cosmos", run)
-
-
-def _end_published(name: str, run: Callable[[], int]) -> NoReturn:
     end_program(run_until_stopped(name, run, IF_STOPPED))
 
 

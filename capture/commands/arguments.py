@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from vla_attention.capture.doctor.command import DOCTOR_EXAMPLES, add_doctor_arguments
 from vla_attention.capture.effects.arguments import add_effect_options
 from vla_attention.capture.engine.settings import RecordingSettings
 from vla_attention.capture.environments.suites import ALL_SUITES, STANDARD_SUITES, SUITES, find_suite, list_tasks
 from vla_attention.capture.interventions.arguments import InterventionSettings
 from vla_attention.capture.jobs.termination import Termination
-from vla_attention.capture.policies.families import policy_families
+from vla_attention.capture.policies.families import default_family, policy_families
 from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
 from vla_attention.capture.replay.arguments import REPLAY_EXAMPLES, add_replay_arguments
 from vla_attention.capture.rerun.arguments import RERUN_EXAMPLES, add_rerun_arguments
@@ -25,11 +24,16 @@ from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.options import add_options, option
 from vla_attention.schemas.stores import verify_command
 from vla_attention.schemas.stores.verify_command import VERIFY_HELP
+from vla_attention.schemas.threads import use_threads
 
 _FURTHER_EXAMPLES = """\
   vla-attention capture status runs/libero_10.zarr                     what is there, what is missing, who is writing
   vla-attention capture verify runs/libero_10.zarr               check everything; --repair moves damaged episodes aside
   vla-attention capture doctor                                         what this machine can do, and what is missing
+"""
+_DOCTOR_EXAMPLES = """\
+  vla-attention capture doctor                                    this machine, for a run of the policy that comes along
+  vla-attention capture doctor pi --checkpoint gs://openpi-assets/checkpoints/pi05_libero --task-suite libero_10
 """
 
 
@@ -46,62 +50,17 @@ def build_parser(given: Sequence[str] = (), program: str = "vla-capture") -> arg
         epilog=f"examples:\n{examples}{_FURTHER_EXAMPLES}",
     )
     commands = parser.add_subparsers(required=True, metavar="POLICY", parser_class=OneSentenceParser)
+
+    def add(name: str, about: str, description: str, examples: str) -> argparse.ArgumentParser:
+        epilog = f"examples:\n{examples}" if examples else None
+        return commands.add_parser(name, help=about, description=description, epilog=epilog)
+
     for family in families:
-        capture = commands.add_parser(
-            family.name,
-            help=family.title,
-            description=family.description,
-            epilog=f"examples:\n{family.examples}{_FURTHER_EXAMPLES}",
-        )
+        capture = add(family.name, family.title, family.description, family.examples + _FURTHER_EXAMPLES)
         _add_capture_arguments(capture, family)
         capture.set_defaults(command=run_capture_of_family, family=family)
-    replay = commands.add_parser(
-        "replay",
-        help="make policy calls on the frames of a data set of a robot",
-        description="Feed the pictures, states and tasks of a LeRobotDataset (2.0, 2.1 or 3.0) to a policy, without a "
-        "simulator, and record its attention into a store like any other, beside the actions that the data set has. "
-        "See docs/data-sets.md.",
-        epilog=f"examples:\n{REPLAY_EXAMPLES}",
-    )
-    add_replay_arguments(replay, given if "replay" in given[:1] else ())
-    rerun = commands.add_parser(
-        "rerun",
-        help="make the policy calls of a store again, unchanged or with interventions",
-        description="Give the policy of a store the same pictures, state, prompt and noise again, without a simulator. "
-        "First the calls of one episode are made again unchanged, and their distance from the stored ones is printed. "
-        "With interventions, or with --output, the calls of all episodes go into a store like any other.",
-        epilog=f"examples:\n{RERUN_EXAMPLES}",
-    )
-    add_rerun_arguments(rerun, given if "rerun" in given[:1] else ())
-    status = commands.add_parser(
-        "status",
-        help="what a store holds, what is missing, and who is writing",
-        description="Episodes committed and expected per task, success, size, last writer, what is missing and what "
-        "is being written; which episodes are damaged and why. Reads only; works while captures run, and needs neither "
-        "torch nor a GPU.",
-    )
-    _add_status_arguments(status)
-    doctor = commands.add_parser(
-        "doctor",
-        help="what this machine can do for a run, and what is missing for it",
-        description="Takes the options of a capture and prints a line for everything that it needs: memory, simulator "
-        "and assets, drawing, disk, GPU, checkpoint, each with what to do. Loads no policy and runs no simulator. Exit "
-        "code 1 when something is missing.",
-        epilog=f"examples:\n{DOCTOR_EXAMPLES}",
-    )
-    add_doctor_arguments(doctor, given[1:] if "doctor" in given[:1] else (), _add_capture_arguments)
-    verify = commands.add_parser(
-        "verify",
-        help="read stores back and check every file, digest and row sum",
-        description=verify_command.DESCRIPTION,
-        epilog=verify_command.EXAMPLES.replace("NAME", "vla-attention capture"),
-    )
-    verify_command.add_verify_arguments(verify)
-    verify.set_defaults(command=_run_verify)
-    tasks = commands.add_parser("tasks", help="the tasks of a suite", description="The tasks of a suite by their ids.")
-    tasks.add_argument("suite", metavar="SUITE", help="task suite")
-    tasks.add_argument("--array", action="store_true", help="only the range of ids, as sbatch --array takes it")
-    tasks.set_defaults(command=_run_tasks)
+    for name, (about, description, examples, add_arguments) in _COMMANDS.items():
+        add_arguments(add(name, about, description, examples), given[1:] if name in given[:1] else ())
     return parser
 
 
@@ -173,18 +132,31 @@ def _add_capture_arguments(
     )
 
 
-def _add_status_arguments(parser: argparse.ArgumentParser) -> None:
+def _add_doctor_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -> None:
+    """Add all options. given: what will be parsed; a policy among it decides the model's options."""
+    families, default = {family.name: family for family in policy_families()}, default_family()
+    text = f"{', '.join(families)} (default: {default.name}), then the options of the run"
+    parser.add_argument("policy", nargs="?", choices=[*families], default=default.name, metavar="POLICY", help=text)
+    family = next((families[word] for word in given if word in families), default)
+    _add_capture_arguments(parser, family)
+    parser.set_defaults(command=_run_doctor, family=family)
+
+
+def _run_doctor(arguments: argparse.Namespace, termination: Termination) -> int:
+    threads = use_threads(arguments.threads)  # before torch is loaded
+
+    from vla_attention.capture.doctor import run_doctor
+
+    return run_doctor(arguments, threads)
+
+
+def _add_status_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -> None:
     parser.add_argument("stores", nargs="+", type=Path, metavar="STORE", help="one or several NAME.zarr")
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
     parser.add_argument(
-        "--expected",
-        type=int,
-        metavar="N",
-        help="episodes expected per task (default: what the runs that filled the store planned)",
+        "--expected", type=int, metavar="N", help="episodes of each task (default: as the runs planned)"
     )
-    parser.add_argument(
-        "--check", action="store_true", help="exit code 1 when an expected episode is missing, or one is damaged"
-    )
+    parser.add_argument("--check", action="store_true", help="exit code 1 if an expected episode is missing or damaged")
     parser.add_argument("--verify", action="store_true", help=VERIFY_HELP)
     parser.set_defaults(command=_run_status)
 
@@ -192,17 +164,18 @@ def _add_status_arguments(parser: argparse.ArgumentParser) -> None:
 def _run_status(arguments: argparse.Namespace, termination: Termination) -> int:
     from vla_attention.capture.jobs.status import print_status
 
-    return print_status(
-        arguments.stores,
-        arguments.expected,
-        as_json=arguments.json,
-        check=arguments.check,
-        verify=arguments.verify,
-    )
+    return print_status(arguments.stores, arguments.expected, arguments.json, arguments.check, arguments.verify)
 
 
-def _run_verify(arguments: argparse.Namespace, termination: Termination) -> int:
-    return verify_command.run_verify_command(arguments)
+def _add_verify_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -> None:
+    verify_command.add_verify_arguments(parser)
+    parser.set_defaults(command=lambda arguments, termination: verify_command.run_verify_command(arguments))
+
+
+def _add_tasks_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -> None:
+    parser.add_argument("suite", metavar="SUITE", help="task suite")
+    parser.add_argument("--array", action="store_true", help="only the range of ids, as sbatch --array takes it")
+    parser.set_defaults(command=_run_tasks)
 
 
 def _run_tasks(arguments: argparse.Namespace, termination: Termination) -> int:
@@ -216,3 +189,46 @@ def _run_tasks(arguments: argparse.Namespace, termination: Termination) -> int:
     for task in list_tasks(find_suite(arguments.suite)):
         print(f"{task.task_id:>3}  {task.instruction}")
     return 0
+
+
+#: Commands beside those of the policy families: what each is for, in a line and in sentences, examples, and what adds
+#: its arguments to a parser, which may go by the words that will be parsed.
+_COMMANDS: dict[str, tuple[str, str, str, Callable[[argparse.ArgumentParser, Sequence[str]], None]]] = {
+    "replay": (
+        "make policy calls on the frames of a data set of a robot",
+        "Feed the pictures, states and tasks of a LeRobotDataset (2.0, 2.1 or 3.0) to a policy, without a simulator, "
+        "and record its attention into a store like any other, beside the data set's actions. See docs/data-sets.md.",
+        REPLAY_EXAMPLES,
+        add_replay_arguments,
+    ),
+    "rerun": (
+        "make the policy calls of a store again, unchanged or with interventions",
+        "Give the policy of a store the same pictures, state, prompt and noise again, without a simulator. First the "
+        "calls of one episode are made again unchanged, and their distance from the stored ones is printed. With "
+        "interventions, or with --output, the calls of all episodes go into a store like any other.",
+        RERUN_EXAMPLES,
+        add_rerun_arguments,
+    ),
+    "status": (
+        "what a store holds, what is missing, and who is writing",
+        "Episodes committed and expected per task, success, size, last writer, what is missing, being written, or "
+        "damaged and why. Reads only; works while captures run, and needs neither torch nor a GPU.",
+        "",
+        _add_status_arguments,
+    ),
+    "doctor": (
+        "what this machine can do for a run, and what is missing for it",
+        "Takes the options of a capture and prints a line for everything that it needs: memory, simulator and assets, "
+        "drawing, disk, GPU, checkpoint, each with what to do. Loads no policy and runs no simulator. Exit code 1 when "
+        "something is missing.",
+        _DOCTOR_EXAMPLES,
+        _add_doctor_arguments,
+    ),
+    "verify": (
+        "read stores back and check every file, digest and row sum",
+        verify_command.DESCRIPTION,
+        verify_command.EXAMPLES.removeprefix("examples:\n").replace("NAME", "vla-attention capture"),
+        _add_verify_arguments,
+    ),
+    "tasks": ("the tasks of a suite", "The tasks of a suite by their ids.", "", _add_tasks_arguments),
+}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import signal
 import sys
@@ -21,24 +22,28 @@ class GpuMemoryFull(UserError, MemoryError):
 
 def run_capture_command(
     program: str,
-    command: Callable[[Termination], int],
-    max_requeues: Callable[[], int],
+    parse: Callable[[], argparse.Namespace],
     if_stopped: str = "complete episodes are kept, continue with --resume.",
 ) -> int:
     """Run a command that captures; returns the exit code: 2 after a mistake, 130 after Ctrl-C, 75 after SIGTERM.
 
-    After SIGTERM a SLURM job is put back into the queue, at most `max_requeues()` times (0: never). if_stopped: what is
-    kept and how to go on, for the sentence after either signal.
+    parse: returns the arguments; their `command` is called with them. After SIGTERM a SLURM job is put back into the
+    queue, at most `max_requeues` times where that is among them. if_stopped: what is kept and how to go on, for the
+    sentence after either signal.
     """
+    max_requeues = 0
     # Set before MuJoCo is imported, because GPU nodes and CI have no display.
     os.environ.setdefault("MUJOCO_GL", "egl")
     with listening_for_sigterm() as termination:
+
+        def command() -> int:
+            nonlocal max_requeues
+            arguments = parse()
+            max_requeues = getattr(arguments, "max_requeues", 0)
+            return int(arguments.command(arguments, termination))
+
         try:
-            return run_command(
-                program,
-                lambda: _until_terminated(command, termination),
-                if_stopped,
-            )
+            return run_command(program, lambda: _until_terminated(command, termination), if_stopped)
         except Terminated:
             # SLURM sends the signal again to a job that is being requeued.
             signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -46,15 +51,15 @@ def run_capture_command(
             from vla_attention.capture.jobs.slurm import ask_for_requeue
             from vla_attention.schemas.stores.worker import this_worker
 
-            requeued = ask_for_requeue(this_worker(), max_requeues()) if max_requeues() else ""
+            requeued = ask_for_requeue(this_worker(), max_requeues) if max_requeues else ""
             what_next = requeued or if_stopped[:1].upper() + if_stopped[1:]
             print(f"{program}: stopped by SIGTERM. {what_next}", file=sys.stderr, flush=True)
             return EXIT_TERMINATED
 
 
-def _until_terminated(command: Callable[[Termination], int], termination: Termination) -> int:
+def _until_terminated(command: Callable[[], int], termination: Termination) -> int:
     try:
-        return command(termination)
+        return command()
     except UserError:
         raise
     except Exception as error:

@@ -5,8 +5,6 @@ A pipe would wait for ever, a device gives bytes without end, and a link may lea
 
 from __future__ import annotations
 
-import os
-import stat
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,41 +18,29 @@ Refuse = Callable[[str], UserError]
 #: Files and folders below one folder of a checkpoint. Those of openpi have some hundreds.
 MAX_FILES = 100_000
 
-#: The folder of the hub's cache whose files are links to `blobs` beside it.
-_SNAPSHOTS = "snapshots"
-
 
 def check_regular(path: Path, refuse: Refuse, *, inside: Path | None = None) -> int:
     """Return the size in bytes of a regular file.
 
-    inside: the folder that a link may not leave; None for a file that the user named. Links of the hub's cache lead
-    from a snapshot to the blobs of the same repository.
+    inside: the folder that a link may not leave; None for a file that the user named.
 
     Raises:
         FileNotFoundError: there is nothing, or a link to nothing.
         What `refuse` makes: the path is no regular file, or a link that leads out of the folder.
     """
-    try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise refuse(f"'{path}' cannot be read: it is no regular file.")
-        if inside is not None:
-            _check_inside(path, inside, refuse)
-    except FileNotFoundError:
-        raise
-    except (OSError, RuntimeError) as error:  # a circle of links is a RuntimeError of pathlib
-        if isinstance(error, UserError):
-            raise
-        raise refuse(f"'{path}' cannot be read ({getattr(error, 'strerror', None) or error}).") from error
-    return status.st_size
+    size = path.stat().st_size
+    if not path.is_file():
+        raise refuse(f"'{path}' cannot be read: it is no regular file.")
+    if inside is not None:
+        _check_inside(path, inside, refuse)
+    return size
 
 
 def _check_inside(path: Path, folder: Path, refuse: Refuse) -> None:
     real, home = path.resolve(), folder.resolve()
-    if real.is_relative_to(home):
-        return
-    repository = next((part.parent for part in home.parents if part.name == _SNAPSHOTS), None)
-    if repository is None or not real.is_relative_to(repository / "blobs"):
+    # Links of the hub's cache lead from a snapshot to the blobs of the same repository.
+    blobs = [part.parent / "blobs" for part in home.parents if part.name == "snapshots"]
+    if not any(real.is_relative_to(place) for place in (home, *blobs[:1])):
         raise refuse(
             f"'{path}' is a link that leads out of its folder, to '{real}'; put a copy of the file in its place."
         )
@@ -65,27 +51,14 @@ def check_folder(folder: Path, refuse: Refuse, *, inside: bool = True) -> None:
 
     inside: whether links have to stay in it. Where they need not, one may lead to a folder, which is not searched.
     """
-    waiting, seen = [folder], 0
-    while waiting:
-        here = waiting.pop()
-        try:
-            entries = list(os.scandir(here))
-        except OSError as error:
-            raise refuse(f"'{here}' cannot be read ({error.strerror or error}).") from error
-        seen += len(entries)
-        if seen > MAX_FILES:
+    for seen, path in enumerate(folder.rglob("*")):
+        if seen == MAX_FILES:
             raise refuse(f"'{folder}' holds more than {MAX_FILES} files; expected some hundreds.")
-        for entry in entries:
-            if entry.is_dir(follow_symlinks=not inside):
-                if not entry.is_symlink():
-                    waiting.append(Path(entry.path))
-                continue
-            try:
-                check_regular(Path(entry.path), refuse, inside=folder if inside else None)
-            except FileNotFoundError as error:
-                if isinstance(error, UserError):
-                    raise
-                raise refuse(f"'{entry.path}' is a link to a file that does not exist.") from None
+        if path.is_dir() and not (inside and path.is_symlink()):
+            continue
+        if not path.exists():
+            raise refuse(f"'{path}' is a link to a file that does not exist.")
+        check_regular(path, refuse, inside=folder if inside else None)
 
 
 #: Bytes of a JSON file. The largest of a real checkpoint, statistics and trees of arrays, have 0.2 MB; decoded, empty

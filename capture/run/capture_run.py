@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 from vla_attention.capture.effects.conditions import refuse_both
 from vla_attention.capture.effects.mean_pictures import pictures_of
-from vla_attention.capture.effects.measurement import EffectMeasurement, measurement_of
+from vla_attention.capture.effects.measurement import measurement_of
 from vla_attention.capture.engine.call import Caller
 from vla_attention.capture.engine.faults import EpisodesMissing, Faults, describe_missing
 from vla_attention.capture.engine.loop import EpisodeLoop
@@ -27,15 +26,11 @@ from vla_attention.capture.machine import POLICY_BATCH, describe_machine
 from vla_attention.capture.policies.families import family_of_kind
 from vla_attention.capture.policies.identity import downloads_of
 from vla_attention.capture.policies.policy import BatchPolicy, Policy, is_compiled, stored_picture_sizes
-from vla_attention.capture.run.run_settings import RunSettings, default_num_envs, default_policy_batch
+from vla_attention.capture.run.run_settings import RunSettings, default_num_envs
 from vla_attention.capture.store.disk_estimate import estimate_disk
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument, listing, plural
-from vla_attention.schemas.stores.store_format import (
-    PolicyIdentity,
-    Protocol,
-    RootAttributes,
-)
+from vla_attention.schemas.stores.store_format import PolicyIdentity, Protocol
 from vla_attention.schemas.stores.verify import DamagedEpisodesLeft, find_damaged, what_to_do
 
 
@@ -60,44 +55,6 @@ def plan_protocol(settings: RunSettings, evaluation: EvaluationProtocol, policy:
     )
 
 
-@dataclass(frozen=True)
-class RunPlan:
-    """What a run of some settings is with a policy, before its store is opened.
-
-    tasks: of the suite. wanted: those of them that are run. note: a line to print if layer numbers were translated.
-    effects: what measures the effects of calls, if the run does.
-    """
-
-    evaluation: EvaluationProtocol
-    tasks: tuple[Task, ...]
-    wanted: tuple[Task, ...]
-    changes: RunChanges
-    attributes: RootAttributes
-    note: str | None
-    effects: EffectMeasurement | None = None
-
-
-def plan_run(settings: RunSettings, policy: Policy, machine: Mapping[str, str]) -> RunPlan:
-    """Plan a run, and check the settings against the policy. machine: provenance of this process."""
-    evaluation = settings.protocol or policy.default_protocol
-    protocol = plan_protocol(settings, evaluation, policy)
-    check_protocol(protocol, policy)
-    noise = protocol.seed if settings.interventions.noise is None else settings.interventions.noise.seed
-    recording, note = plan_recording(settings.recording, policy, noise)
-    tasks = list_tasks(settings.suite)
-    wanted = tasks if settings.task_ids is None else tuple(tasks[number] for number in settings.task_ids)
-    changes = plan_changes(settings, policy, tasks)
-    if recording.effects is not None:
-        refuse_both(changes.interventions)
-    attributes = root_attributes(
-        policy.identity(), policy.sites, protocol, recording, machine, interventions=changes.interventions
-    )
-    families = [(task.task_id, task.instruction, task.task_family) for task in tasks]
-    pictures = pictures_of(settings.recording.effects, policy, settings.suite.name)
-    effects = measurement_of(recording.effects, policy, families, say, pictures)
-    return RunPlan(evaluation, tasks, wanted, changes, attributes, note, effects)
-
-
 def run_capture(
     settings: RunSettings, policy: Policy, device: str, termination: Termination | None = None
 ) -> list[Committed]:
@@ -108,133 +65,123 @@ def run_capture(
         EpisodesMissing: episodes were dropped, each after a fault of its own; all others were recorded.
         DamagedEpisodesLeft: all missing episodes were recorded, but the store holds damaged ones, which stay.
     """
-    results, damaged, faults = _record_missing(settings, policy, device, termination or Termination())
-    missing = f", {len(faults.dropped)} missing" if faults.dropped else ""
-    solved = sum(bool(result.outcome.success) for result in results)
-    say(f"{plural(len(results), 'episode')} added, {solved} solved{missing}. Store: {settings.store}")
-    left = find_damaged(settings.store, damaged, settings.output.verify) if damaged else []
-    if left and faults.dropped:
-        raise EpisodesMissing(f"{describe_missing(faults.dropped)} {what_to_do(settings.store, left)}")
-    faults.raise_missing()
-    if left:
-        raise DamagedEpisodesLeft(what_to_do(settings.store, left))
-    return results
-
-
-def _record_missing(
-    settings: RunSettings, policy: Policy, device: str, termination: Termination
-) -> tuple[list[Committed], list[str], Faults]:
-    """Record what is missing; also returns the names of damaged episodes of the store, and the faults of this run."""
-    machine = describe_machine(device) | downloads_of(policy)
-    run_plan = plan_run(settings, policy, machine)
-    tasks, wanted, changes, attributes = run_plan.tasks, run_plan.wanted, run_plan.changes, run_plan.attributes
+    machine, termination = describe_machine(device) | downloads_of(policy), termination or Termination()
+    evaluation = settings.protocol or policy.default_protocol
+    protocol = plan_protocol(settings, evaluation, policy)
+    check_protocol(protocol, policy)
+    tasks = list_tasks(settings.suite)
+    wanted = tasks if settings.task_ids is None else tuple(tasks[number] for number in settings.task_ids)
+    caller = _plan_calls(settings, policy, protocol, tasks)
+    changes = caller.changes
+    attributes = root_attributes(
+        policy.identity(), policy.sites, protocol, caller.recording, machine, interventions=changes.interventions
+    )
     for task in wanted:
         check_initial_state_index(task, settings.num_episodes - 1)
-    largest_batch = _policy_batch(settings, policy, device)
-    if run_plan.note:
-        say(run_plan.note)
-    environment_settings = EnvironmentSettings(run_plan.evaluation, settings.libero_assets)
+    num_envs = settings.num_envs or default_num_envs()
+    batch = _policy_batch(settings, policy, device, num_envs)
     store = open_run(settings.store, attributes, settings.output.mode)
     done = store.committed()
     jobs = [
-        EpisodeJob(task, episode, attributes.protocol.max_steps, f"task {task.task_id} episode {episode}")
-        for task in sorted(wanted, key=lambda task: task.task_id)
+        EpisodeJob(task, episode, protocol.max_steps, f"task {task.task_id} episode {episode}")
+        for task in wanted
         for episode in range(settings.num_episodes)
     ]
     todo = [job for job in jobs if (job.task.task_id, job.episode_index) not in done]
-    names = {job.name for job in jobs}
-    damaged = find_damaged(store.path, names, settings.output.verify) if done else []
-    pictures = stored_picture_sizes(policy, attributes.protocol.image_size)
-    bound = estimate_disk(attributes.recording, attributes.sites, pictures, max_replans(attributes.protocol), len(todo))
-    announce(attributes, list(_lines_on_source(attributes)), bound, store.path, len(names), damaged)
-    damaged_names = [fault.name for fault in damaged]
+    damaged = find_damaged(store.path, {job.name for job in jobs}, settings.output.verify) if done else []
+    pictures = stored_picture_sizes(policy, protocol.image_size)
+    bound = estimate_disk(caller.recording, policy.sites, pictures, max_replans(protocol), len(todo))
+    announce(attributes, _lines_on_source(policy.identity(), protocol), bound, store.path, len(jobs), damaged)
     expected = (*wanted, *(tasks[index] for index in settings.array_task_ids))
     plan = plan_of((task, episode) for task in expected for episode in range(settings.num_episodes))
     known = planned_episodes(read_logs(store.path))
-    if not todo and all(known.get(task.task_id, set()) >= {*task.indices} for task in plan):
-        return [], damaged_names, Faults()
-    num_envs = min(settings.num_envs or default_num_envs(), len(todo))
-    batch = num_envs if largest_batch is None else min(largest_batch, num_envs)
-    if batch > 1:  # calls of a batch round differently, and which share one depends on the simulators' speed
-        machine = {**machine, POLICY_BATCH: str(batch)}
-    if num_envs > 1:
-        batches = f" Policy calls in batches of at most {batch}; --policy-batch N changes it." if batch > 1 else ""
-        say(f"Simulators: {num_envs} processes; --num-envs N changes it.{batches}")
-    caller = Caller(policy, attributes.recording, changes, run_plan.effects)
-    source = Simulators(
-        settings.suite, environment_settings, store, caller, machine, termination.check, max(1, num_envs)
-    )
-    loop = EpisodeLoop(store, plan, termination, "step", source, batch)
-    results = loop.record_all(todo)
-    if (empty := changes.describe_empty()) is not None:
-        say(empty)
-    return results, damaged_names, loop.faults
+    results, faults = [], Faults()
+    if todo or not all(known.get(task.task_id, set()) >= {*task.indices} for task in plan):
+        num_envs = min(num_envs, len(todo))
+        batch = min(batch, num_envs)
+        if batch > 1:  # calls of a batch round differently, and which share one depends on the simulators' speed
+            machine[POLICY_BATCH] = str(batch)
+        if num_envs > 1:
+            batches = f" Policy calls in batches of at most {batch}; --policy-batch N changes it." if batch > 1 else ""
+            say(f"Simulators: {num_envs} processes; --num-envs N changes it.{batches}")
+        environment = EnvironmentSettings(evaluation, settings.libero_assets)
+        source = Simulators(settings.suite, environment, store, caller, machine, termination.check, max(1, num_envs))
+        loop = EpisodeLoop(store, plan, termination, "step", source, batch)
+        results, faults = loop.record_all(todo), loop.faults
+        if (empty := changes.describe_empty()) is not None:
+            say(empty)
+    missing = f", {len(faults.dropped)} missing" if faults.dropped else ""
+    solved = sum(bool(result.outcome.success) for result in results)
+    say(f"{plural(len(results), 'episode')} added, {solved} solved{missing}. Store: {settings.store}")
+    # Another process may have moved them aside in the meantime.
+    left = find_damaged(settings.store, [one.name for one in damaged], settings.output.verify) if damaged else []
+    lacking = [describe_missing(faults.dropped)] if faults.dropped else []
+    lacking += [what_to_do(settings.store, left)] if left else []
+    if lacking:
+        raise (EpisodesMissing if faults.dropped else DamagedEpisodesLeft)(" ".join(lacking))
+    return results
 
 
-def _policy_batch(settings: RunSettings, policy: Policy, device: str) -> int | None:
-    """Return the largest batch of policy calls, None for the number of simulators.
+def _plan_calls(settings: RunSettings, policy: Policy, protocol: Protocol, tasks: Sequence[Task]) -> Caller:
+    """Return what makes the run's policy calls.
+
+    What is known to be wrong with recording and interventions is an error now, before the first episode. tasks: of the
+    suite.
+    """
+    asked, instructions = settings.interventions, {task.task_id: task.instruction for task in tasks}
+    recording, note = plan_recording(settings.recording, policy, asked.noise.seed if asked.noise else protocol.seed)
+    if asked.changes_attention:
+        check_not_compiled(policy.identity())
+    changes = RunChanges(interventions_for(asked, policy), instructions, settings.allow_empty)
+    if changes.interventions.prompt is not None:
+        check_synonyms(changes.interventions.prompt, instructions.values())
+    changes.check_names(policy.sites)
+    if recording.effects is not None:
+        refuse_both(changes.interventions)
+    families = [(task.task_id, task.instruction, task.task_family) for task in tasks]
+    pictures = pictures_of(settings.recording.effects, policy, settings.suite.name)
+    if note:
+        say(note)
+    return Caller(policy, recording, changes, measurement_of(recording.effects, policy, families, say, pictures))
+
+
+def _policy_batch(settings: RunSettings, policy: Policy, device: str, num_envs: int) -> int:
+    """Return the largest batch of policy calls: without `--policy-batch` 1 on a processor, which does not gain by more.
 
     Raises:
         BadArgument: `--policy-batch` asks for more than 1, and policy or interventions need single calls.
     """
-    asked, single = settings.policy_batch, None
+    asked, single = settings.policy_batch, ""
     if not isinstance(policy, BatchPolicy):
         single = f": policies of the kind {policy.family} make one call"
     elif is_compiled(policy.identity()):
         single = " with --compile, whose calls are made one by one"
     elif settings.interventions.changes_attention:
         single = " with interventions on attention, whose calls are made one by one"
-    if single is None:
-        return default_policy_batch(device) if asked is None else asked
-    if asked is not None and asked > 1:
+    if single and asked is not None and asked > 1:
         raise BadArgument(f"Cannot use --policy-batch {asked}{single}; leave it out.")
-    return 1
+    return asked or (1 if single or device.startswith("cpu") else num_envs)
 
 
-def plan_changes(settings: RunSettings, policy: Policy, tasks: Sequence[Task]) -> RunChanges:
-    """Return the run's interventions; what is known to be wrong with them is an error now, before the first episode."""
-    instructions = {task.task_id: task.instruction for task in tasks}
-    if settings.interventions.changes_attention:
-        check_not_compiled(policy.identity())
-    changes = RunChanges(interventions_for(settings.interventions, policy), instructions, settings.allow_empty)
-    if changes.interventions.prompt is not None:
-        check_synonyms(changes.interventions.prompt, instructions.values())
-    changes.check_names(policy.sites)
-    return changes
-
-
-def _checkpoint_line(identity: PolicyIdentity) -> str:
-    facts = identity.config
-    precision = f", {facts['dtype']}" if "dtype" in facts else ""
-    labels = {"normalisation": "normalisation", "prompt_format": "prompt"}
-    details = [f"{label} {facts[name]}" for name, label in labels.items() if name in facts]
-    details.append(f"cameras {listing(f'{camera.name} = {camera.source}' for camera in identity.cameras)}")
-    return (
-        f"Checkpoint: {identity.family} in format {identity.checkpoint_format}{precision}, configuration: "
-        f"{facts['configuration']}; {', '.join(details)}."
-    )
-
-
-def _other_suite_line(identity: PolicyIdentity, suite: str) -> str:
-    """A warning where a checkpoint whose suites are known runs in one of another kind; empty elsewhere."""
-    known = family_of_kind(identity.family).trained_on.get(identity.checkpoint, ())
-    kinds = {name.partition("_")[0] for name in known}
-    if not known or suite.partition("_")[0] in kinds:
-        return ""
-    return (
-        f"WARNING: {identity.checkpoint} was trained on {listing(known)}; its numbers in {suite} say nothing about it."
-    )
-
-
-def _lines_on_source(attributes: RootAttributes) -> Iterator[str]:
-    """Lines on where the policy calls come from: the checkpoint, the protocol, and what is executed."""
-    identity, protocol = attributes.policy, attributes.protocol
+def _lines_on_source(identity: PolicyIdentity, protocol: Protocol) -> list[str]:
+    """Return lines on where the policy calls come from: the checkpoint, the protocol, and what is executed."""
+    lines, facts = [], identity.config
     if not identity.untrained:
-        yield _checkpoint_line(identity)
-    if line := _other_suite_line(identity, protocol.suite):
-        yield line
-    yield (
+        precision = f", {facts['dtype']}" if "dtype" in facts else ""
+        labels = {"normalisation": "normalisation", "prompt_format": "prompt"}
+        details = [f"{label} {facts[name]}" for name, label in labels.items() if name in facts]
+        details.append(f"cameras {listing(f'{camera.name} = {camera.source}' for camera in identity.cameras)}")
+        lines.append(
+            f"Checkpoint: {identity.family} in format {identity.checkpoint_format}{precision}, configuration: "
+            f"{facts['configuration']}; {', '.join(details)}."
+        )
+    trained_on = family_of_kind(identity.family).trained_on.get(identity.checkpoint, ())
+    if trained_on and protocol.suite.partition("_")[0] not in {name.partition("_")[0] for name in trained_on}:
+        unlike = f"its numbers in {protocol.suite} say nothing about it."
+        lines.append(f"WARNING: {identity.checkpoint} was trained on {listing(trained_on)}; {unlike}")
+    return [
+        *lines,
         f"Protocol: {protocol.name} (docs/protocol.md), seed {protocol.seed}, pictures of {protocol.image_size} "
-        f"pixels, {protocol.wait_steps} waiting steps, at most {protocol.max_steps} steps after them."
-    )
-    yield f"A policy call gives {identity.action_horizon} actions, of which {protocol.replan_steps} are executed."
+        f"pixels, {protocol.wait_steps} waiting steps, at most {protocol.max_steps} steps after them.",
+        f"A policy call gives {identity.action_horizon} actions, of which {protocol.replan_steps} are executed.",
+    ]

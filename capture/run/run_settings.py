@@ -112,14 +112,6 @@ def _task_ids(suite: Suite, chosen: Sequence[int | str]) -> tuple[int, ...]:
     return tuple(sorted(task_ids))
 
 
-def default_policy_batch(device: str) -> int | None:
-    """Return the largest batch without `--policy-batch`, None for the number of simulators.
-
-    It is 1 on a processor, which does not gain by larger ones.
-    """
-    return 1 if device.startswith("cpu") else None
-
-
 def default_num_envs() -> int:
     """Return the number of simulators without `--num-envs`: as many as there are cores, and as fit into memory."""
     return max(1, int(min(available_cores(), MOST_BY_DEFAULT, memory_left() / SIMULATOR_BYTES)))

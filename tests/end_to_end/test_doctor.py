@@ -34,6 +34,7 @@ def test_what_a_run_needs_and_lacks_is_exit_code_1(tmp_path, capfd, monkeypatch)
     assert capture(["doctor", "--task-suite", "libero_10", *lacking]) == 1
     said = capfd.readouterr().out
     found = lines_of(said)
+    assert found["LIBERO"][0] == "ok"
     assert found["assets"][0] == "MISSING"
     assert "lacks scenes" in found["assets"][1]
 

@@ -16,7 +16,7 @@ from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.jobs.status import store_status
 from vla_attention.capture.jobs.termination import EXIT_TERMINATED
-from vla_attention.capture.published.evaluate import evaluate_attention_ratio
+from vla_attention.capture.published.evaluate import evaluate
 from vla_attention.schemas.stores.locks import episode_locks
 
 pytestmark = [pytest.mark.simulator, pytest.mark.thorough]
@@ -79,18 +79,18 @@ def test_array_tasks_fill_one_store_and_the_analysis_comes_last(tmp_path, monkey
     short = ["--replan-steps", "4", "--max-steps", "8"]
     folder = tmp_path / "results/attention_ratio_robosuite"
     store = folder / "robosuite.zarr"
-    assert evaluate_attention_ratio([*arguments, *short, "--array-index", "0"]) == 0
+    assert evaluate("evaluate-attention-ratio", [*arguments, *short, "--array-index", "0"]) == 0
     assert not list(folder.glob("*.json"))
     assert [(task.task_id, task.committed, task.expected) for task in store_status(store).tasks] == [
         (0, 1, 1),
         (1, 0, 1),  # belongs to an array task that has not started
     ]
-    assert evaluate_attention_ratio([*arguments, "--stage", "analyze"]) == 0
+    assert evaluate("evaluate-attention-ratio", [*arguments, "--stage", "analyze"]) == 0
     assert "task 1 lacks 1 of 1 episodes: 0" in capsys.readouterr().out
-    assert evaluate_attention_ratio([*arguments, *short, "--array-index", "1"]) == 0
+    assert evaluate("evaluate-attention-ratio", [*arguments, *short, "--array-index", "1"]) == 0
     assert store_status(store).complete
     for layers in (("0",), ("1", "5")):
-        assert evaluate_attention_ratio([*arguments, "--stage", "analyze", "--layers", *layers]) == 0
+        assert evaluate("evaluate-attention-ratio", [*arguments, "--stage", "analyze", "--layers", *layers]) == 0
         name = "attention_ratio_results_robosuite.json"
         results = json.loads((folder / name).read_text())
         assert [item["task_id"] for item in results] == [0, 1]

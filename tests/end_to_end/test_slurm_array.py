@@ -20,7 +20,7 @@ import pytest
 
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.jobs.status import store_status
-from vla_attention.capture.published.evaluate import evaluate_attention_ratio
+from vla_attention.capture.published.evaluate import evaluate
 from vla_attention.schemas.stores.reader import open_store
 
 pytestmark = [
@@ -133,9 +133,9 @@ def test_an_array_interrupted_in_episodes_equals_a_single_process(tmp_path, monk
     for task in TASKS:
         arguments = ["--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--task-id", str(task)]
         arguments += ["--num-episodes", str(EPISODES), "--layers", "0", "2", "--output-dir", str(single), *ARGS.split()]
-        assert evaluate_attention_ratio([*arguments, "--stage", "capture"]) == 0
+        assert evaluate("evaluate-attention-ratio", [*arguments, "--stage", "capture"]) == 0
     arguments = ["--task-suite", "robosuite", "--checkpoint", "untrained-tiny", "--layers", "0", "2"]
-    assert evaluate_attention_ratio([*arguments, "--output-dir", str(single), "--stage", "analyze"]) == 0
+    assert evaluate("evaluate-attention-ratio", [*arguments, "--output-dir", str(single), "--stage", "analyze"]) == 0
     assert_same(store, single / "robosuite.zarr")
     name = "attention_ratio_results_robosuite.json"
     results = json.loads((output / name).read_text())

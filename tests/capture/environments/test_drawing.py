@@ -12,7 +12,7 @@ from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.environments.drawing import check_drawing, draw_or_say_what_mends
 from vla_attention.capture.environments.robosuite_installation import CannotDraw
 from vla_attention.capture.environments.suites import find_suite
-from vla_attention.capture.published.evaluate import evaluate_attention_ratio
+from vla_attention.capture.published.evaluate import evaluate
 from vla_attention.schemas.errors import MissingDependency
 
 CUBES = find_suite("cubes")
@@ -68,7 +68,7 @@ def test_it_is_said_before_the_model_is_loaded(environment, tmp_path: Path, capf
     if command == "capture":
         code = capture(["pi", *words, "--num-envs", "2", "--output", str(tmp_path / "a.zarr")])
     else:
-        code = evaluate_attention_ratio([*words, "--output-dir", str(tmp_path / "out")])
+        code = evaluate("evaluate-attention-ratio", [*words, "--output-dir", str(tmp_path / "out")])
     said = capfd.readouterr()
     assert code == 2
     assert "got 99 (RuntimeError)" in said.err

@@ -12,11 +12,7 @@ import pytest
 from vla_attention.capture.policies.cosmos.family import FAMILY as COSMOS
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.pi.family import FAMILY as PI
-from vla_attention.capture.published.evaluate import (
-    arguments_from_environment,
-    evaluate_attention_ratio,
-    evaluate_attention_ratio_cosmos,
-)
+from vla_attention.capture.published.evaluate import arguments_from_environment, evaluate
 from vla_attention.schemas.errors import BadArgument
 
 SCRIPTS = Path(__file__).resolve().parents[3] / "scripts"
@@ -110,11 +106,11 @@ def test_values_that_cannot_be(variables):
         (["--task-id", "3", "11"], "Task 11 does not exist"),
     ],
 )
-@pytest.mark.parametrize("main", [evaluate_attention_ratio, evaluate_attention_ratio_cosmos])
-def test_mistakes_in_the_commands(tmp_path, monkeypatch, capsys, main, words, expected):
+@pytest.mark.parametrize("program", ["evaluate-attention-ratio", "evaluate-attention-ratio-cosmos"])
+def test_mistakes_in_the_commands(tmp_path, monkeypatch, capsys, program, words, expected):
     monkeypatch.chdir(tmp_path)
     try:
-        code = main(words)
+        code = evaluate(program, words)
     except SystemExit as stopped:
         code = stopped.code
     said = capsys.readouterr().err

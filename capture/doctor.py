@@ -1,0 +1,165 @@
+"""`vla-attention capture doctor`: what a run needs, looked at one by one. No policy is loaded and nothing simulated.
+
+Each check returns how it stands and a text, which says what to do where something could be better. What is missing may
+also be a `UserError`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Literal
+
+from vla_attention.capture.environments.base import Suite
+from vla_attention.capture.environments.drawing import check_drawing
+from vla_attention.capture.environments.libero_installation import find_assets, package_folder
+from vla_attention.capture.environments.robosuite_installation import DEFAULT_GL, find_robosuite
+from vla_attention.capture.environments.suites import list_tasks
+from vla_attention.capture.machine import memory_limits
+from vla_attention.capture.run.run_settings import RunSettings, run_settings
+from vla_attention.capture.store.store_root import read_existing_root
+from vla_attention.schemas.command_line import describe_os_error, format_bytes
+from vla_attention.schemas.errors import INSTALL_CAPTURE, UserError, plural
+from vla_attention.schemas.safe_text import print_line
+from vla_attention.schemas.stores.root import episode_folders
+from vla_attention.schemas.stores.store_place import check_writable, room_at
+from vla_attention.schemas.threads import Threads
+
+#: How it stands (`ok`: as it should be; `note`: works, but could be better; `MISSING`: the run needs it), and a text.
+Finding = tuple[Literal["ok", "note", "MISSING"], str]
+
+
+def run_doctor(arguments: argparse.Namespace, threads: Threads) -> int:
+    """Print a line for everything that the run needs; returns 1 when something of it is missing, otherwise 0."""
+    settings = run_settings(arguments)
+    suite, assets = settings.suite, settings.libero_assets
+    missing = []
+
+    def look(what: str, check: Callable[[], Finding]) -> None:
+        try:
+            status, text = check()
+        except UserError as error:
+            status, text = "MISSING", str(error)
+        except OSError as error:  # a file without permission
+            status, text = "MISSING", describe_os_error(error)
+        print_line(f"{status:<8} {what:<11} {text}")
+        if status == "MISSING":
+            missing.append(what)
+
+    look("memory", lambda: find_memory(threads))
+    look("robosuite", _find_robosuite)
+    if suite.kind == "libero":
+        look("LIBERO", lambda: _find_libero(suite))
+        look("assets", lambda: ("ok", f"{find_assets(assets)}."))
+    if missing:
+        look("drawing", lambda: ("note", "Not tried before what is missing is there."))
+    else:
+        look("drawing", lambda: find_drawing(suite, assets))
+    look("disk", lambda: find_disk(settings))
+    try:
+        import torch
+    except ImportError as error:
+        said = f"torch cannot be loaded ({error}). Install it: {INSTALL_CAPTURE}."
+        look("torch", lambda: ("MISSING", said))  # what reads checkpoints needs it
+    else:
+        look("GPU", lambda: find_gpu(arguments.device, torch))
+        look("checkpoint", lambda: find_checkpoint(arguments))
+    print(
+        f"\nThe run cannot be made as described: {', '.join(missing)}."
+        if missing
+        else "\nNothing is missing for the run."
+    )
+    return int(bool(missing))
+
+
+def find_memory(threads: Threads) -> Finding:
+    """Return the memory that this process may still take, and the threads of the policy."""
+    of_policy = f"{plural(threads.number, 'thread')} for the policy ({threads.source})."
+    least = min(memory_limits(), key=lambda limit: limit.bytes, default=None)
+    if least is None:
+        return "note", f"This system does not say how much is available. {of_policy}"
+    return "ok", f"{format_bytes(least.bytes)} available, by what {least.by} leaves; {of_policy}"
+
+
+def _find_robosuite() -> Finding:
+    find_robosuite()
+    return "ok", f"robosuite {_version('robosuite')}, MuJoCo {_version('mujoco')}."
+
+
+def _find_libero(suite: Suite) -> Finding:
+    tasks = f"{len(list_tasks(suite))} tasks of {suite.name}"
+    return "ok", f"hf-libero {_version('hf-libero')}, {tasks} in {package_folder()}."
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:  # a copy of its sources
+        return "of an unknown version"
+
+
+def find_drawing(
+    suite: Suite, libero_assets: Path | None, draw: Callable[[Suite, Path | None], str] = check_drawing
+) -> Finding:
+    """Draw a picture without a display, in a process of its own."""
+    drawn = f"MUJOCO_GL={os.environ.get('MUJOCO_GL', DEFAULT_GL)} draws with {draw(suite, libero_assets)}."
+    if any(name in drawn.casefold() for name in ("llvmpipe", "softpipe")):
+        return "note", f"{drawn} That is the processor; on a node with a GPU, its EGL driver is faster."
+    return "ok", drawn
+
+
+def find_disk(settings: RunSettings) -> Finding:
+    """Return whether the store can be written where the run would write it, and the room there."""
+    store, held = settings.store, 0
+    if store.exists():
+        read_existing_root(store)
+        held = len(episode_folders(store))
+    check_writable(store.parent, "--output")
+    if held and settings.output.mode == "new":
+        to_do = "A run there needs --resume, which adds what is missing, or --overwrite, which begins again."
+        return "note", f"{store} holds {plural(held, 'episode')} already. {to_do}"
+    return "ok", f"{room_at(store).describe()} free for {store}."
+
+
+def find_gpu(device: str, torch: Any, driver: Path = Path("/proc/driver/nvidia/version")) -> Finding:
+    """Return the GPU that the run would use; it is missing where `device` (the value of `--device`) asks for one.
+
+    torch: the module. driver: a file that NVIDIA's driver makes.
+    """
+    asked = device.startswith("cuda")
+    if torch.cuda.is_available():
+        used = device if asked else "cuda"
+        free, total = torch.cuda.mem_get_info(used)
+        memory, build = f"{format_bytes(free)} of {format_bytes(total)} free", f"with CUDA {torch.version.cuda}"
+        unused = " --device cpu leaves it unused." if device == "cpu" else ""
+        return "ok", f"{torch.cuda.get_device_name(used)}, {memory}, torch {torch.__version__} {build}.{unused}"
+    if torch.version.cuda is None:
+        why = f"torch {torch.__version__} is built without CUDA"
+        to_do = "On Linux `pip install --force-reinstall torch` brings a build with CUDA."
+    elif driver.exists():
+        why = f"torch {torch.__version__} finds none, though there is a driver"
+        visible = os.environ.get("CUDA_VISIBLE_DEVICES", "not set")
+        to_do = f"Look at CUDA_VISIBLE_DEVICES ('{visible}') and at the driver's version (nvidia-smi)."
+    else:
+        why, to_do = "there is no NVIDIA driver", "In a batch job ask for one, for instance sbatch --gres=gpu:1."
+    if asked:
+        return "MISSING", f"None: {why}. --device {device} needs one. {to_do} Or use --device cpu."
+    return "note", f"None: {why}. The policy runs on the processor. {to_do}"
+
+
+def find_checkpoint(arguments: argparse.Namespace) -> Finding:
+    """Return whether the files of the checkpoint are there and are what they should be; no weights are read."""
+    name, path = arguments.checkpoint, Path(arguments.checkpoint).expanduser()
+    arguments.family.read(arguments).check_files()
+    if name in arguments.family.built_in:
+        return "ok", f"{name} comes with the program."
+    if not path.exists():
+        return (
+            "note",
+            f"{name} is no folder here: a run takes it from the caches of the hub and of openpi, or downloads it.",
+        )
+    files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
+    return "ok", f"{name}, {format_bytes(sum(file.stat().st_size for file in files))} of files."
