@@ -31,7 +31,7 @@ from vla_attention.schemas.stores.content_rules import (
     prompt_problems,
     shape_problems,
     site_shapes,
-    value_problem,
+    value_problems,
 )
 from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.durable_files import publish
@@ -168,26 +168,20 @@ class EpisodeWriter:
 
     def _broken_rules(self, arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int, ...]]) -> Iterator[str]:
         """What is wrong with arrays of the next replan; `shapes` has those that are known in advance."""
+        num_objects, replan = len(self.start.objects), len(self.records)
         for name, values in arrays.items():
-            if name in shapes:
-                yield from shape_problems(name, values.shape, shapes[name])
-            first = len(self.records)
-            problem = value_problem(
-                Block(self.run_as_computed, len(self.start.objects), name, values, arrays.__getitem__, first)
-            )
-            yield from () if problem is None else (problem,)
+            yield from shape_problems(name, values.shape, shapes.get(name, values.shape))
+            beside = arrays.__getitem__
+            yield from value_problems(Block(self.run_as_computed, num_objects, name, values, beside, replan))
 
     def _misfits(self, record: ReplanRecord) -> Iterator[str]:
         """Where a replan differs in form from the run's plan or the first one, so that arrays could not be stacked."""
         first = self.records[0] if self.records else record
         given, before = _shapes_of_replan(record), _shapes_of_replan(first)
-        for name in sorted(given.keys() ^ before.keys()):
-            yield f"it has {'a' if name in given else 'no'} {name}, other than the first replan"
-        for name, shape in given.items():
-            # A data set may have fewer actions at the end of its episode.
-            expected = before[name] if name != "dataset_actions" else (*shape[:1], *before[name][1:])
-            if shape != expected:
-                yield f"{name} has the shape {shape}; that of the first replan is {before[name]}"
+        for name in sorted(given.keys() | before.keys()):
+            here, there = (f"of the shape {of[name]}" if name in of else "not given" for of in (given, before))
+            if here != there:
+                yield f"{name} is {here}, at the first replan {there}"
         for name, (values, axes) in record.arrays.items():
             if values.ndim != len(axes) or (name == "dataset_actions" and not values.shape[1]):
                 yield f"{name} has the shape {values.shape[1:]}; expected {listing(axes[1:])}, of at least one step"
@@ -318,4 +312,6 @@ class EpisodeWriter:
 def _shapes_of_replan(record: ReplanRecord) -> dict[str, tuple[int, ...]]:
     """Shapes of what every replan of an episode has, or none."""
     shapes = {name: values.shape[1:] for name, (values, axes) in record.arrays.items() if axes[0] == "replan"}
+    if "dataset_actions" in shapes:  # fewer at the end of the data set's episode
+        shapes["dataset_actions"] = shapes["dataset_actions"][1:]
     return shapes if record.noise_seed is None else shapes | {"noise_seed": ()}

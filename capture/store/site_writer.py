@@ -36,26 +36,34 @@ from vla_attention.schemas.stores.store_format import (
 
 
 class ShardWriter:
-    """A float32 array (replan, layer, denoise, ...), whose file grows by blocks of replans."""
+    """A float32 array (replan, layer, denoise, ...), whose file grows by blocks of replans; one block is in memory."""
 
-    def __init__(self, group: zarr.Group, folder: Path, name: str, cells: tuple[int, ...], replans: int) -> None:
-        """Begin the array `name` of the episode's `group`, whose folder it is.
-
-        cells: its axes (layer, denoise, ...). replans: how many there are, or at least one block of them.
-        """
+    def __init__(self, group: zarr.Group, folder: Path, name: str, cells: tuple[int, ...]) -> None:
+        """Begin the array `name` of the episode's `group`, whose folder it is; `cells` are its axes (layer, ...)."""
         self.group = group
         self.name = name
         self.cells = cells
-        self.block = replans_per_block(4 * math.prod(cells[2:]), replans)
+        self.bytes_per_replan = 4 * math.prod(cells[2:])
+        self.block = replans_per_block(self.bytes_per_replan)
         self.file = folder / name / chunk_file(1 + len(cells))
         self.file.parent.mkdir()
         self.num_replans = 0
         self.digest = ArrayDigest()
+        self._pending: list[NDArray[np.float32]] = []
         self._index: list[tuple[int, int]] = []
         self._size = 0
 
     def append(self, values: NDArray[np.float32]) -> None:
-        """Write the next block, (replan, layer, denoise, ...); only the last may have fewer replans than `block`."""
+        """Add the next replan, (layer, denoise, ...)."""
+        self._pending.append(values)
+        if len(self._pending) == self.block:
+            self._flush()
+
+    def _flush(self) -> None:
+        values = np.stack(self._pending)
+        self._pending.clear()
+        if not self.num_replans:
+            self.block = replans_per_block(self.bytes_per_replan, len(values))
         # What a last block lacks is never read; it has the fill value, as zarr-python would write it.
         chunk = np.full((self.block, *self.cells[2:]), np.nan, dtype="<f4")
         with self.file.open("ab") as file:
@@ -71,6 +79,8 @@ class ShardWriter:
 
     def finish(self, axes: Sequence[str]) -> ArrayRecord:
         """Write the index (offset and length of every chunk, in the order of the chunk grid) and the metadata."""
+        if self._pending:
+            self._flush()
         index = np.array(self._index, dtype="<u8").tobytes()
         with self.file.open("ab") as file:
             file.write(_with_checksum(index))
@@ -105,13 +115,11 @@ class SiteWriter:
         self.layout = layout
         self.recording = recording
         self.shape = (len(recording.layers), len(recording.denoise_steps), len(recording.heads), recording.num_queries)
-        self.block = replans_per_block(4 * self.shape[2] * self.shape[3] * layout.num_keys)
-        self.rows: ShardWriter | None = None
-        self.pending: list[NDArray[np.float32]] = []
         self.masses: list[tuple[tuple[Segment, ...], NDArray[np.float32]]] = []
         self.others: list[dict[str, NDArray[Any]]] = []
         self.segments: tuple[Segment, ...] = ()
         group.create_group(layout.name, attributes=to_json(recording.axis_numbers))
+        self.rows = ShardWriter(group, folder, f"{layout.name}/rows", (*self.shape, layout.num_keys))
 
     def arrays(self, recorded: RecordedRows, key_role: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
         """Path in the episode -> values of one replan, with an axis of length 1 for it; `append` adds them."""
@@ -133,24 +141,14 @@ class SiteWriter:
         members = segment_members(self.layout, key_role[None], segments)[0]
         # Atoms and sums come from the rows as computed, so that the rounded rows can be compared with them.
         self.masses.append((segments, segment_masses(recorded.rows, members)))
+        self.rows.append(round_mantissa(recorded.rows, self.recording.mantissa_bits))
         arrays = self.arrays(recorded, key_role)
-        self.pending.append(round_mantissa(arrays.pop(f"{self.layout.name}/rows"), self.recording.mantissa_bits))
+        del arrays[f"{self.layout.name}/rows"]
         self.others.append(arrays)
-        if len(self.pending) == self.block:
-            self._flush()
-
-    def _flush(self) -> None:
-        rows = np.concatenate(self.pending)
-        self.pending.clear()
-        if self.rows is None:
-            self.rows = ShardWriter(self.group, self.folder, f"{self.layout.name}/rows", rows.shape[1:], len(rows))
-        self.rows.append(rows)
 
     def finish(self) -> dict[str, ArrayRecord]:
         """Write the last rows and all other arrays of the site; returns shape and digest of those in shards."""
-        if self.pending:
-            self._flush()
-        if self.rows is None:
+        if not self.others:
             raise ValueError("an episode without replans cannot be committed")
         name = self.layout.name
         self.segments = merge_segments(self.layout, (segments for segments, _ in self.masses))
@@ -183,12 +181,9 @@ class SiteWriter:
             first = uniform.take([0], axis=axis)
             uniform = first if (uniform == first).all() else uniform
         # In the layout of rows: masks may differ in as many ways, and an analysis reads its layers only.
-        shape = uniform.shape
-        shard = ShardWriter(self.group, self.folder, f"{self.layout.name}/uniform", shape[1:], len(uniform))
-        for first_replan in range(0, len(uniform), shard.block):
-            shard.append(uniform[first_replan : first_replan + shard.block])
+        shard = ShardWriter(self.group, self.folder, f"{self.layout.name}/uniform", uniform.shape[1:])
+        for of_replan in uniform:
+            shard.append(of_replan)
         # Axes of one name have one length in a group, or xarray does not open it.
-        lengths = (len(uniforms), *self.shape, self.layout.num_keys)
-        return shard.finish(
-            [axis if n == m else f"any_{axis}" for axis, n, m in zip(ROW_AXES, shape, lengths, strict=True)]
-        )
+        lengths = zip(ROW_AXES, uniform.shape, (len(uniforms), *self.shape, self.layout.num_keys), strict=True)
+        return shard.finish([axis if n == m else f"any_{axis}" for axis, n, m in lengths])

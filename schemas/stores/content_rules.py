@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -258,18 +259,15 @@ def prompt_problems(sites: Sequence[SiteLayout], prompt: Prompt) -> Iterator[str
     if not 0 <= first <= last <= length:
         yield f"the instruction stands at characters {first} to {last} of a prompt with {length}"
     spans = [span for site in sites for span in site.spans if span.kind == "text"]
-    keys = [piece.key for piece in prompt.pieces]
-    if not all(any(_holds(span, piece) for span in spans) for piece in prompt.pieces):
-        yield (
-            f"the prompt's pieces are keys {min(keys)} to {max(keys)}, which are not all text keys; those are "
-            f"{listing(f'{span.start} to {span.stop - 1}' for span in spans)}"
-        )
-    if len(set(keys)) != len(keys):
+    for piece in prompt.pieces:
+        if not any(_holds(span, piece) for span in spans):
+            existing = listing(f"{span.start} to {span.stop - 1}" for span in spans)
+            yield f"the prompt's piece {piece.text!r} is key {piece.key}, which is no text key; those are {existing}"
+        if not 0 <= piece.start <= piece.stop <= length:
+            covered = f"characters {piece.start} to {piece.stop} of a prompt with {length}"
+            yield f"the prompt's piece of key {piece.key} covers {covered}"
+    if len({piece.key for piece in prompt.pieces}) != len(prompt.pieces):
         yield "two pieces of the prompt are the same key"
-    outside = [piece for piece in prompt.pieces if not 0 <= piece.start <= piece.stop <= length]
-    if outside:
-        piece = outside[0]
-        yield f"the piece of key {piece.key} covers characters {piece.start} to {piece.stop} of a prompt with {length}"
 
 
 def piece_role_problems(
@@ -407,16 +405,17 @@ _RULES: dict[str, tuple[DTypeLike | None, Callable[[Block], Iterator[str]]]] = {
 }
 
 
-def value_problem(block: Block) -> str | None:
-    """The first rule that the numbers of an array break; None without any, and for arrays that have no rule.
+def value_problems(block: Block) -> Iterator[str]:
+    """The first rule that the numbers of an array break; nothing without any, and of arrays that have no rule.
 
     Raises:
         CorruptEpisode: an array beside it cannot be read.
     """
     group, _, kind = block.name.partition("/")
     of_site = any(site.name == group for site in block.root.sites)
-    keys = (f"SITE/{kind}" if of_site else block.name, f"{group}/*")
-    dtype, rule = next((_RULES[key] for key in keys if key in _RULES), (None, None))
-    if dtype is not None and block.values.dtype != np.dtype(dtype):
-        return f"{block.name} has the type {block.values.dtype}; expected {np.dtype(dtype)}"
-    return None if rule is None else next(rule(block), None)
+    for key in (f"SITE/{kind}" if of_site else block.name, f"{group}/*"):
+        dtype, rule = _RULES.get(key, (None, lambda _: iter(())))
+        if dtype is not None and block.values.dtype != np.dtype(dtype):
+            yield f"{block.name} has the type {block.values.dtype}; expected {np.dtype(dtype)}"
+        else:
+            yield from islice(rule(block), 1)

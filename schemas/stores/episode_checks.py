@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Set
 from contextlib import suppress
 from functools import cache
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from vla_attention.schemas.stores.content_rules import (
     prompt_problems,
     shape_problems,
     site_shapes,
-    value_problem,
+    value_problems,
 )
 from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.episode_files import metadata_problems
@@ -112,7 +113,7 @@ def _array_problems(
             raise CorruptEpisode(f"{beside} does not fit the episode")
         return episode.read(beside)
 
-    digest, problem = ArrayDigest(), None
+    digest, problems = ArrayDigest(), list[str]()
     step = episode.reading_step(name)
     for first in range(0, episode.shape_of(name)[0], step):
         values = episode.read(name, slice(first, first + step))
@@ -122,19 +123,18 @@ def _array_problems(
             # What uniform attention gives may be stored once for all replans.
             return whole(beside)[first : first + step] if len(whole(beside)) > 1 else whole(beside)
 
-        if problem is None:  # the first block with a fault names its place
+        if not problems:  # the first block with a fault names its place
             with suppress(CorruptEpisode):  # of an array beside it, which is reported where that one is read
-                problem = value_problem(Block(root, len(episode.attributes.objects), name, values, of_block, first))
+                problems += value_problems(Block(root, len(episode.attributes.objects), name, values, of_block, first))
     if digest.hexdigest() != sha256:
         yield f"the values of {name} are not those that were written (digest differs)"
-    if problem is not None:
-        yield problem
+    yield from problems
 
 
 def _token_problems(root: RootAttributes, episode: StoredEpisode) -> Iterator[str]:
     prompts = episode.attributes.prompts
     for prompt in prompts:
-        yield from prompt_problems(root.sites, prompt)
+        yield from islice(prompt_problems(root.sites, prompt), 1)
     index = episode.read("prompt_index")
     if not np.isin(index, np.arange(len(prompts))).all():
         yield "prompt_index names prompts that the attributes do not have"

@@ -14,7 +14,7 @@ from tests.kit.examples import examples
 from tests.kit.stores import StoreSpec, expected_arrays, reseal, root_attributes, small_steps, write_store
 from vla_attention.schemas.episode_steps import HAND, POSES, EpisodeSteps, TaskGoal
 from vla_attention.schemas.jsonable import from_json, to_json
-from vla_attention.schemas.stores.content_rules import Block, value_problem
+from vla_attention.schemas.stores.content_rules import Block, value_problems
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 
@@ -36,7 +36,7 @@ def test_poses_are_finite_and_turns_have_length_one():
     root = root_attributes(StoreSpec(plant_steps=small_steps))
 
     def problem(poses: np.ndarray, first: int = 0) -> str | None:
-        return value_problem(Block(root, 0, POSES, poses, {}.__getitem__, first))
+        return next(value_problems(Block(root, 0, POSES, poses, {}.__getitem__, first)), None)
 
     poses = np.zeros((3, 2, 7), np.float32)
     poses[..., 3] = 1

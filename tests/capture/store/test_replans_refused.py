@@ -162,7 +162,7 @@ UNSTORABLE: dict[str, tuple[Change, str]] = {
     ),
     "no site": (with_(rows={}), "it has rows of the sites none; expected joint"),
     "NaN state": (with_(state=np.array([np.nan] * 8)), "state holds numbers that are NaN or infinite"),
-    "no pictures": (with_(frames={}), "it has no frames/base_0_rgb, other than the first replan"),
+    "no pictures": (with_(frames={}), "frames/base_0_rgb is not given, at the first replan of the shape ("),
     "negative seed": (with_(noise_seed=-1), "noise_seed is -1; expected 0 or more"),
 }
 

@@ -59,12 +59,12 @@ def append(path: Path, spec: SiteStoreSpec, changes: dict[int, Change]) -> None:
         (
             SiteStoreSpec(),
             {1: lambda record: replace(record, state=None)},
-            "it has no state, other than the first replan",
+            "state is not given, at the first replan of the shape",
         ),
         (
             SiteStoreSpec(dataset_actions=0.5),
             {1: lambda record: replace(record, dataset_actions=np.zeros((3, 4)))},
-            r"dataset_actions has the shape \(3, 4\); that of the first replan is \(5, 3\)",
+            r"dataset_actions is of the shape \(4,\), at the first replan of the shape \(3,\)",
         ),
     ],
 )
