@@ -2,32 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import zarr
+from msgspec import structs
 from numpy.typing import NDArray
 
 from vla_attention.capture.store.codecs import write_whole
 from vla_attention.capture.store.replan_records import EpisodeStart, RecordedSteps, ReplanRecord
 from vla_attention.capture.store.site_writer import SiteWriter
 from vla_attention.capture.store.store_root import check_same_run, read_existing_root
-from vla_attention.schemas.effects import CHANGE, CUT, EpisodeEffects
+from vla_attention.schemas.effects import EpisodeEffects
 from vla_attention.schemas.errors import UserError, listing
 from vla_attention.schemas.jsonable import to_json
-from vla_attention.schemas.layout import Prompt, prompt_at
+from vla_attention.schemas.layout import Prompt
+from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS
+from vla_attention.schemas.segments import segments_of
 from vla_attention.schemas.stores.content_rules import (
-    camera_picture_problems,
+    Block,
     counter_problems,
-    coverage_problems,
-    cut_problems,
-    effect_problems,
-    picture_problems,
+    effect_shapes,
+    piece_role_problems,
     prompt_problems,
-    sites_with_text,
+    shape_problems,
+    site_shapes,
+    value_problems,
 )
 from vla_attention.schemas.stores.digest import ArrayDigest
 from vla_attention.schemas.stores.durable_files import publish
@@ -94,6 +98,9 @@ class EpisodeWriter:
     ) -> None:
         self.store = store
         self.run = run
+        # The rules are for rows as computed; they are rounded after that.
+        exact = structs.replace(run.recording, mantissa_bits=FLOAT32_MANTISSA_BITS)
+        self.run_as_computed = structs.replace(run, recording=exact)
         self.folder = folder
         self.start = start
         self.denoise_times = denoise_times
@@ -131,73 +138,60 @@ class EpisodeWriter:
         self.records.append(replace(record, rows={}))
 
     def _problems(self, record: ReplanRecord) -> Iterator[str]:
-        """What forbids adding a replan."""
-        replan, sites = len(self.records), self.run.sites
-        for what, given in (("rows", record.rows), ("key roles", record.key_role)):
+        """What forbids adding a replan. The first sentence counts: later ones may rest on what it says is broken."""
+        replan, sites, effects = len(self.records), self.run.sites, record.effects
+        cut = dict.fromkeys(self.sites) if effects is None else effects.cut
+        for what, given in (("rows", record.rows), ("key roles", record.key_role), ("effects", cut)):
             if set(given) != set(self.sites):
                 yield f"it has {what} of the sites {listing(given)}; expected {listing(self.sites)}"
-                return
-        yield from self._misfits(record)
-        only_site = len(sites_with_text(sites)) == 1
         for name, site in self.sites.items():
-            prompt = prompt_at(sites, site.layout, record.prompt)
-            yield from site.problems(record.rows[name], record.key_role[name], prompt, replan, only_site=only_site)
+            roles = record.key_role[name]
+            shapes = site_shapes(site.layout, site.recording, 1, 0)
+            yield from self._broken_rules({f"{name}/key_role": roles[None]}, shapes)
+            yield from piece_role_problems(sites, site.layout, roles, record.prompt, replan)
+            shapes = site_shapes(site.layout, site.recording, 1, len(segments_of(site.layout, roles)))
+            arrays, gram = site.arrays(record.rows[name], roles), f"{name}/contribution"
+            if (gram in shapes) is not (gram in arrays):
+                yield f"it has {'no' if gram in shapes else 'an unplanned'} {gram}"
+            yield from self._broken_rules(arrays, shapes)
         if record.prompt not in self.prompts:
             yield from prompt_problems(sites, record.prompt)
-        for camera, frame in record.frames.items():
-            yield from picture_problems(sites, camera, frame.shape, frame.dtype)
-        for camera, frame in record.camera_frames.items():
-            yield from camera_picture_problems(sites, camera, frame.shape, frame.dtype)
-        for camera, coverage in record.coverage.items():
-            yield from coverage_problems(sites, camera, coverage[None], len(self.start.objects), replan)
-        yield from self._effect_problems(record, replan)
+        shapes = {}
+        if effects is not None:
+            horizon = self.run.policy.action_horizon if record.actions is None else len(record.actions)
+            shapes = effect_shapes(sites, len(effects.measured), horizon, len(effects.units))
+        yield from self._broken_rules({name: values for name, (values, _) in record.arrays.items()}, shapes)
+        yield from self._misfits(record)
         steps = [*(earlier.env_step for earlier in self.records[-1:]), record.env_step]
         seeds = [] if record.noise_seed is None else [record.noise_seed]
         yield from counter_problems(np.array(steps), np.array(seeds, dtype=np.int64))
 
-    def _effect_problems(self, record: ReplanRecord, replan: int) -> Iterator[str]:
-        """Effects at the replans that the run says, of the conditions that the episode has."""
-        planned, given = self.run.recording.effects, record.effects
-        wanted = planned is not None and replan % planned.every == 0
-        if wanted is not (given is not None):
-            yield f"it has {'no ' if wanted else ''}effects, other than the run says"
-        if given is None:
-            return
-        first = next((earlier.effects for earlier in self.records if earlier.effects is not None), given)
-        if (given.conditions, given.units) != (first.conditions, first.units):
-            yield "its effects are of other conditions, or in other units, than those of the replans before it"
-        horizon = self.run.policy.action_horizon if record.actions is None else len(record.actions)
-        shapes: dict[str, tuple[NDArray[np.float32], tuple[int, ...]]]
-        shapes = {CHANGE: (given.change, (horizon, len(given.units)))}
-        shapes |= {f"{name}/{CUT}": (given.cut[name], (site.layout.num_keys,)) for name, site in self.sites.items()}
-        for name, (values, rest) in shapes.items():
-            expected = (len(given.measured), *rest)
-            if (values.shape, values.dtype) != (expected, np.dtype(np.float32)):
-                yield f"{name} has the shape {values.shape} and type {values.dtype}; expected {expected} and float32"
-            else:
-                yield from (effect_problems if name == CHANGE else cut_problems)(name, values)
+    def _broken_rules(self, arrays: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int, ...]]) -> Iterator[str]:
+        """What is wrong with arrays of the next replan; `shapes` has those that are known in advance."""
+        num_objects, replan = len(self.start.objects), len(self.records)
+        for name, values in arrays.items():
+            yield from shape_problems(name, values.shape, shapes.get(name, values.shape))
+            beside = arrays.__getitem__
+            yield from value_problems(Block(self.run_as_computed, num_objects, name, values, beside, replan))
 
     def _misfits(self, record: ReplanRecord) -> Iterator[str]:
-        """Where a replan differs in form from the first one, so that their arrays could not be stacked."""
+        """Where a replan differs in form from the run's plan or the first one, so that arrays could not be stacked."""
         first = self.records[0] if self.records else record
-        for what in ("frames", "camera_frames", "coverage"):
-            given, expected = list(getattr(record, what)), list(getattr(first, what))
-            if given != expected:
-                yield f"it has {what} of the cameras {listing(given)}, the first replan of {listing(expected)}"
-        for what in ("noise_seed", "state", "actions", "dataset_actions", "base_actions"):
-            values, before = getattr(record, what), getattr(first, what)
-            if (values is None) is not (before is None):
-                yield f"it has {'no' if values is None else 'a'} {what}, other than the first replan"
-            if values is None or before is None or what == "noise_seed":
-                continue
-            # A data set may have fewer actions at the end of its episode.
-            axes = slice(1, None) if what == "dataset_actions" else slice(None)
-            if values.shape[axes] != before.shape[axes] or values.ndim != before.ndim:
-                yield f"{what} has the shape {values.shape}; that of the first replan is {before.shape}"
-            if what == "dataset_actions" and (values.ndim != 2 or not len(values)):
-                yield f"{what} has the shape {values.shape}; expected (steps, action_dim) with at least one step"
-            if not np.isfinite(values).all():
-                yield f"{what} holds numbers that are NaN or infinite"
+        given, before = _shapes_of_replan(record), _shapes_of_replan(first)
+        for name in sorted(given.keys() | before.keys()):
+            here, there = (f"of the shape {of[name]}" if name in of else "not given" for of in (given, before))
+            if here != there:
+                yield f"{name} is {here}, at the first replan {there}"
+        for name, (values, axes) in record.arrays.items():
+            if values.ndim != len(axes) or (name == "dataset_actions" and not values.shape[1]):
+                yield f"{name} has the shape {values.shape[1:]}; expected {listing(axes[1:])}, of at least one step"
+        planned, effects = self.run.recording.effects, record.effects
+        wanted = planned is not None and len(self.records) % planned.every == 0
+        if wanted is not (effects is not None):
+            yield f"it has {'no ' if wanted else ''}effects, other than the run says"
+        earlier = next((one.effects for one in self.records if one.effects is not None), effects)
+        if effects and earlier and (effects.conditions, effects.units) != (earlier.conditions, earlier.units):
+            yield "its effects are of other conditions, or in other units, than those of the replans before it"
 
     def commit(self, success: bool | None, num_steps: int, steps: RecordedSteps | None = None) -> Path:
         """Finish, verify and publish the episode; returns its folder in the store.
@@ -216,19 +210,26 @@ class EpisodeWriter:
             self._check_lock()
             for site in self.sites.values():
                 self.digests |= site.finish()
-            self._write_side_arrays()
-            for name, (values, axes) in ({} if steps is None else steps.arrays).items():
+            for name, (values, axes) in (self._side_arrays() | ({} if steps is None else steps.arrays)).items():
                 self.write(name, values, axes)
             self.group.update_attributes(to_json(self._attributes(success, num_steps, steps)))
             run = read_run(self.store)[1]
             seal_episode(self.folder, self.name, run)
             self._read_back(run)
-            return self._publish()
+            self._check_store()
+            target = self.store / EPISODES_GROUP / self.name
+            try:
+                publish(self.folder, target, self.durable)
+            except OSError:
+                self._refuse_committed()
+                raise
+            return target
 
     def _attributes(self, success: bool | None, num_steps: int, steps: RecordedSteps | None) -> EpisodeAttributes:
         records = self.records
         constant = frozenset.intersection(*(record.constant_cameras for record in records))
         facts = {CONSTANT_CAMERAS: ", ".join(sorted(constant))} if constant else {}
+        measured = [(replan, of) for replan, record in enumerate(records) if (of := record.effects) is not None]
         return EpisodeAttributes(
             **vars(replace(self.start, provenance=self.start.provenance | facts)),
             success=success,
@@ -242,7 +243,14 @@ class EpisodeWriter:
             noise_seed=tuple(int(record.noise_seed) for record in records if record.noise_seed is not None),
             dataset_action_count=tuple(len(r.dataset_actions) for r in records if r.dataset_actions is not None),
             denoise_time=tuple(float(time) for time in self.denoise_times),
-            effects=self._effects(),
+            effects=None
+            if not measured
+            else EpisodeEffects(
+                measured[0][1].conditions,
+                measured[0][1].units,
+                tuple(replan for replan, of in measured for _ in of.measured),
+                tuple(number for _, of in measured for number in of.measured),
+            ),
             steps=None if steps is None else steps.attributes,
         )
 
@@ -275,16 +283,6 @@ class EpisodeWriter:
             raise StoreError(f"The store {self.store} has been removed.")
         check_same_run(self.store, read_existing_root(self.store), self.run)
 
-    def _publish(self) -> Path:
-        self._check_store()
-        target = self.store / EPISODES_GROUP / self.name
-        try:
-            publish(self.folder, target, self.durable)
-        except OSError:
-            self._refuse_committed()
-            raise
-        return target
-
     def write(self, name: str, values: NDArray[np.generic], axes: tuple[str, ...]) -> None:
         """Write one complete array of the episode and note its digest."""
         write_whole(self.group, name, values, axes)
@@ -292,55 +290,28 @@ class EpisodeWriter:
         digest.update(values)
         self.digests[name] = ArrayRecord(values.shape, digest.hexdigest())
 
-    def _write_side_arrays(self) -> None:
-        records, action_axes = self.records, ("replan", "horizon", "action_dim")
-        for name, axes in (("state", ("replan", "state_dim")), ("actions", action_axes), ("base_actions", action_axes)):
-            known = [values for record in records if (values := getattr(record, name)) is not None]
-            if known:
-                self.write(name, np.stack(known), axes)
-        self._write_effects()
-        self._write_dataset_actions([r.dataset_actions for r in records if r.dataset_actions is not None])
-        pixels = ("replan", "row", "column", "channel")
-        for what, group, names in (
-            ("frames", "frames", pixels),
-            ("camera_frames", "camera_frames", pixels),
-            ("coverage", "objects", ("replan", "patch", "object")),
-        ):
-            for camera in getattr(records[0], what):
-                self.write(f"{group}/{camera}", np.stack([getattr(record, what)[camera] for record in records]), names)
-
-    def _effects(self) -> EpisodeEffects | None:
-        """What the arrays of effects are of."""
-        if self.run.recording.effects is None:
-            return None
-        measured = [(replan, of) for replan, record in enumerate(self.records) if (of := record.effects) is not None]
-        first = measured[0][1]
-        entries = [(replan, number) for replan, of in measured for number in of.measured]
-        return EpisodeEffects(
-            first.conditions,
-            first.units,
-            tuple(replan for replan, _ in entries),
-            tuple(number for _, number in entries),
-        )
-
-    def _write_effects(self) -> None:
-        measured = [record.effects for record in self.records if record.effects is not None]
-        if not any(of.measured for of in measured):
-            return
-        self.write(CHANGE, np.concatenate([of.change for of in measured]), ("entry", "horizon", "action_dim"))
-        for site in self.run.sites:
-            cut = np.concatenate([of.cut[site.name] for of in measured])
-            self.write(f"{site.name}/{CUT}", cut, ("entry", "key"))
-
-    def _write_dataset_actions(self, actions: Sequence[NDArray[np.float64]]) -> None:
-        if not actions:
-            return
-        stacked = np.zeros((len(actions), max(map(len, actions)), actions[0].shape[1]))
-        for replan, steps in enumerate(actions):
-            stacked[replan, : len(steps)] = steps
-        self.write("dataset_actions", stacked, ("replan", "horizon", "action_dim"))
+    def _side_arrays(self) -> dict[str, tuple[NDArray[Any], tuple[str, ...]]]:
+        """`ReplanRecord.arrays` of all replans together."""
+        collected: dict[str, tuple[list[NDArray[Any]], tuple[str, ...]]] = {}
+        for record in self.records:
+            for name, (values, axes) in record.arrays.items():
+                collected.setdefault(name, ([], axes))[0].append(values)
+        if "dataset_actions" in collected:
+            actions, axes = collected["dataset_actions"]
+            longest = max(values.shape[1] for values in actions)
+            filled = [np.pad(values, ((0, 0), (0, longest - values.shape[1]), (0, 0))) for values in actions]
+            collected["dataset_actions"] = (filled, axes)
+        return {name: (np.concatenate(values), axes) for name, (values, axes) in collected.items()}
 
     def _read_back(self, run: str) -> None:
         """Read everything back from disk, with the checks of `vla-attention store verify`."""
         for problem in content_problems(self.run, StoredEpisode(self.folder, self.name, run)):
             raise CorruptEpisode(f"Episode {self.name}, read back from {self.folder}, is damaged: {problem.text}.")
+
+
+def _shapes_of_replan(record: ReplanRecord) -> dict[str, tuple[int, ...]]:
+    """Shapes of what every replan of an episode has, or none."""
+    shapes = {name: values.shape[1:] for name, (values, axes) in record.arrays.items() if axes[0] == "replan"}
+    if "dataset_actions" in shapes:  # fewer at the end of the data set's episode
+        shapes["dataset_actions"] = shapes["dataset_actions"][1:]
+    return shapes if record.noise_seed is None else shapes | {"noise_seed": ()}

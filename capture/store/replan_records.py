@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_attention.schemas.effects import CHANGE, CUT
 from vla_attention.schemas.episode_steps import EXECUTED, GRIPPER, POSES, EpisodeSteps
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import Interventions
@@ -86,6 +88,28 @@ class ReplanRecord:
     base_actions: NDArray[np.float64] | None = None
     constant_cameras: frozenset[str] = frozenset()
     effects: ReplanEffects | None = None
+
+    @property
+    def arrays(self) -> dict[str, tuple[NDArray[Any], tuple[str, ...]]]:
+        """Path in the episode -> values and names of their axes, the first of length 1; all but rows and roles.
+
+        Those of effects have an entry for each condition that was measured.
+        """
+        chunk, pixels = ("replan", "horizon", "action_dim"), ("replan", "row", "column", "channel")
+        given: list[tuple[str, NDArray[Any] | None, tuple[str, ...]]] = [
+            ("state", self.state, ("replan", "state_dim")),
+            ("actions", self.actions, chunk),
+            ("base_actions", self.base_actions, chunk),
+            ("dataset_actions", self.dataset_actions, chunk),
+            *((f"frames/{camera}", values, pixels) for camera, values in self.frames.items()),
+            *((f"camera_frames/{camera}", values, pixels) for camera, values in self.camera_frames.items()),
+            *((f"objects/{camera}", values, ("replan", "patch", "object")) for camera, values in self.coverage.items()),
+        ]
+        arrays = {name: (values[None], axes) for name, values, axes in given if values is not None}
+        if self.effects is not None and self.effects.measured:
+            arrays[CHANGE] = (self.effects.change, ("entry", "horizon", "action_dim"))
+            arrays |= {f"{site}/{CUT}": (cut, ("entry", "key")) for site, cut in self.effects.cut.items()}
+        return arrays
 
 
 @dataclass(frozen=True)

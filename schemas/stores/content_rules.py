@@ -1,22 +1,27 @@
-"""What the numbers of an episode must satisfy. The writer refuses a replan that breaks a rule; `verify` reports it.
+"""What the arrays of an episode must satisfy. The writer refuses a replan that breaks a rule; `verify` reports it.
 
-Every function yields sentences without a full stop. Arrays begin with the replan axis: the writer gives one replan, and
-`verify` blocks of them. Places are named by the recorded numbers of layers, denoise steps and heads; the first place is
-the one that the model computed first (denoise step by denoise step, layer by layer).
+Every rule yields sentences without a full stop, of which the first one counts: the later ones may rest on what it
+says is broken. Arrays begin with the replan axis: the writer gives one replan, and `verify` blocks of them. Places are
+named by the recorded numbers of layers, denoise steps and heads; the first place is the one that the model computed
+first (denoise step by denoise step, layer by layer).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
-from vla_attention.schemas.episode_steps import POSE, POSES
+from vla_attention.schemas.effects import CHANGE, CUT
+from vla_attention.schemas.episode_steps import EXECUTED, GRIPPER, POSE, POSES
 from vla_attention.schemas.errors import listing
 from vla_attention.schemas.layout import (
     INVALID_ROLES,
+    ROLE_DTYPE,
     ROLES_OF_KIND,
     Piece,
     Prompt,
@@ -25,10 +30,12 @@ from vla_attention.schemas.layout import (
     Span,
     camera_grids,
     picture_size,
+    prompt_at,
 )
-from vla_attention.schemas.precision import mass_error_bound
-from vla_attention.schemas.stores.store_format import Recording
+from vla_attention.schemas.precision import FLOAT32_MANTISSA_BITS, mass_error_bound
+from vla_attention.schemas.stores.store_format import Recording, RootAttributes
 
+_NOT_FINITE = "holds numbers that are NaN or infinite"
 #: Largest distance of a row's sum from 1. A float32 softmax over 5000 keys leaves 5e-7, a mean of rows less, weighted
 #: means in TF32 5e-4; rows that were rounded to bfloat16 would leave 2e-3.
 ROW_SUM_TOLERANCE = 1e-3
@@ -59,6 +66,82 @@ def add_up(rows: NDArray[np.float32], row_sum: NDArray[np.float32], mantissa_bit
     return bool((np.abs(sums - expected) <= most * expected).all())  # a NaN is in no bound
 
 
+@dataclass(frozen=True)
+class Block:
+    """Some replans (or entries, moments, steps) of one array of an episode, and what its rule needs beside them.
+
+    Attributes:
+        root: of the run.
+        num_objects: of the episode's scene.
+        name: of the array, for instance `joint/rows`.
+        values: the first axis is the replan.
+        beside: the same replans of another array of the episode, by its name.
+        first: number of the first replan in the episode.
+    """
+
+    root: RootAttributes
+    num_objects: int
+    name: str
+    values: NDArray[Any]
+    beside: Callable[[str], NDArray[Any]]
+    first: int = 0
+
+    @property
+    def site(self) -> SiteLayout:
+        """The site whose array it is."""
+        return self.root.site(self.name.partition("/")[0])
+
+    @property
+    def recording(self) -> Recording:
+        """What is recorded of the site."""
+        return self.root.recording_of(self.site.name)
+
+    def faults(
+        self, says: str, wrong: NDArray[np.bool_], *axes: str, found: NDArray[Any] | None = None
+    ) -> Iterator[str]:
+        """`_faults` of this array; without names of axes, `wrong` begins with those of rows."""
+        return _faults(self.name, says, wrong, axes or self.recording, self.first, found)
+
+
+def _faults(
+    name: str,
+    says: str,
+    wrong: NDArray[np.bool_],
+    axes: tuple[str, ...] | Recording,
+    first: int,
+    found: NDArray[Any] | None = None,
+) -> Iterator[str]:
+    """One sentence if anything is wrong: what it is, its first place, and how many places there are.
+
+    Args:
+        name: of the array.
+        says: what is wrong; `{}` in it stands for what `found` has at the first place.
+        wrong: where it is.
+        axes: names of the first axes of `wrong`; a recording: they are (replan, layer, denoise step, head, query), or
+            the first of these.
+        first: number of the first index along the first axis.
+        found: numbers, of the shape of `wrong`.
+
+    Yields:
+        For instance `NAME SAYS at replan 3, denoise step 9, layer 7, head 2, and at 143 of 288 places in all`.
+    """
+    if not wrong.any():
+        return
+    numbers: dict[str, Sequence[int]] = {}
+    if isinstance(axes, Recording):
+        several_queries = wrong.ndim > 4 and wrong.shape[4] > 1
+        wrong = wrong.swapaxes(1, 2)  # into the order of computation
+        found = None if found is None else found.swapaxes(1, 2)
+        numbers = {"denoise step": axes.denoise_steps, "layer": axes.layers, "head": axes.heads}
+        axes = ("replan", *numbers, *(["query"] if several_queries else []))
+    place = tuple(np.argwhere(wrong)[0].tolist())
+    known = zip(axes, (first + place[0], *place[1:]), strict=False)
+    words = ", ".join(f"{axis} {numbers[axis][index] if axis in numbers else index}" for axis, index in known)
+    count = int(wrong.sum())
+    said = says if found is None else says.format(found[place])
+    yield f"{name} {said} at {words}" + (f", and at {count} of {wrong.size} places in all" if count > 1 else "")
+
+
 def row_problems(
     name: str,
     values: NDArray[np.float32],
@@ -77,163 +160,96 @@ def row_problems(
         first_replan: number of the first replan of `values` in the episode.
     """
     sums = values.sum(axis=-1, dtype=np.float64)  # NaN or infinite where a number is
-    bad = ~np.isfinite(sums)
-    if bad.any():
-        yield f"{name} holds numbers that are NaN or infinite {_where(bad, recording, first_replan)}"
-    lowest = values.min(axis=-1, initial=0)
-    if (lowest < 0).any():
-        yield f"{name} holds negative numbers {_where(lowest < 0, recording, first_replan)}"
+    yield from _faults(name, _NOT_FINITE, ~np.isfinite(sums), recording, first_replan)
+    negative = values.min(axis=-1, initial=0) < 0
+    yield from _faults(name, "holds negative numbers", negative, recording, first_replan)
     expected = row_sum.astype(np.float64)
     bound = row_sum_bound(mantissa_bits)
     error = np.abs(sums - expected) / np.maximum(np.abs(expected), 1e-30)
     differs = np.isfinite(error) & (error > bound)
-    if differs.any():
-        yield (
-            f"{name} does not add up to the row sums: they differ by up to {error[differs].max():.2g} of them, allowed "
-            f"is {bound:.2g}, {_where(differs, recording, first_replan)}"
-        )
+    most = error.max(initial=0, where=differs)
+    says = f"does not add up to the row sums: they differ by up to {most:.2g} of them, allowed is {bound:.2g},"
+    yield from _faults(name, says, differs, recording, first_replan)
 
 
-def absent_problems(
-    layout: SiteLayout,
-    rows: NDArray[np.float32],
-    key_role: NDArray[np.integer],
-    recording: Recording,
-    first_replan: int = 0,
-) -> Iterator[str]:
-    """Rows (replan, layer, denoise, head, query, key) and roles (replan, key): a key that does not exist has no mass.
+def _stored_row_problems(block: Block) -> Iterator[str]:
+    """Rows as `row_problems` says, and no mass for a key that does not exist or that no query behind the row sees.
 
-    Does not exist: a key with the role `absent`, and with all queries stored, a key of a growing span that is generated
-    after the query.
+    A key does not exist that has the role `absent`, and with all queries stored, a key of a growing span that is
+    generated after the query.
     """
-    name = f"{layout.name}/rows"
-    absent = key_role == Role.ABSENT
-    for replan in np.flatnonzero(absent.any(axis=1)).tolist():
-        given = rows[replan][..., absent[replan]] != 0
-        if given.any():
-            yield f"{name} gives mass to a key with the role 'absent' at replan {first_replan + replan}"
-            return
-    growing = layout.growing_span
-    if growing is None or recording.queries != "all":
-        return
-    for query in range(rows.shape[4]):
-        later = rows[..., query, min(growing.start + query + growing.growing_offset, growing.stop) : growing.stop]
-        if (later != 0).any():
-            replan = int(np.argwhere(later.any(axis=(1, 2, 3, 4)))[0][0])
-            yield (
-                f"{name} gives query {query} mass of a key of the growing span '{growing.name}' that does not exist "
-                f"for it yet, at replan {first_replan + replan}"
-            )
-            return
+    site, recording, rows = block.site, block.recording, block.values
+    sums = block.beside(f"{site.name}/row_sum")
+    yield from row_problems(block.name, rows, sums, recording, recording.mantissa_bits, block.first)
+    absent = block.beside(f"{site.name}/key_role") == Role.ABSENT
+    given = _given(rows, absent[:, None, None, None, None])
+    yield from block.faults("gives mass to a key with the role 'absent'", given)
+    growing = site.growing_span
+    if growing is not None and recording.queries == "all":
+        keys = np.arange(site.num_keys)
+        first_later = growing.start + np.arange(rows.shape[4])[:, None] + growing.growing_offset
+        later = (keys >= first_later) & (keys < growing.stop)
+        says = f"gives mass to a key of the growing span '{growing.name}' that does not exist for the query yet,"
+        yield from block.faults(says, _given(rows, later[None, None, None, None]))
+    unseen = block.beside(f"{site.name}/uniform") == 0
+    says = f"gives mass to a key that no query sees, as {site.name}/uniform says,"
+    yield from block.faults(says, _given(rows, unseen))
 
 
-def uniform_problems(name: str, uniform: NDArray[np.float32], first_replan: int = 0) -> Iterator[str]:
+def _given(rows: NDArray[np.float32], never: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which rows (..., key) give mass to keys that may `never` have any; its axes but the last may have length 1."""
+    keys = np.flatnonzero(never.any(axis=tuple(range(never.ndim - 1))))
+    given: NDArray[np.bool_] = ((rows[..., keys] != 0) & never[..., keys]).any(axis=-1)
+    return given
+
+
+def _atom_problems(block: Block) -> Iterator[str]:
+    """Masses (replan, layer, denoise, head, query, segment) add up to the row sums, too."""
+    sums = block.beside(f"{block.site.name}/row_sum")
+    return row_problems(block.name, block.values, sums, block.recording, FLOAT32_MANTISSA_BITS, block.first)
+
+
+def _uniform_problems(block: Block) -> Iterator[str]:
     """What uniform attention gives (replan, layer, denoise, head, query, key): rows of a softmax, too."""
-    bad = ~np.isfinite(uniform) | (uniform < 0)
-    if bad.any():
-        replan = first_replan + int(np.argwhere(bad)[0][0])
-        yield f"{name} holds numbers that are NaN, infinite or negative, the first at replan {replan}"
-        return
-    sums = uniform.sum(axis=-1, dtype=np.float64)
-    far = np.abs(sums - 1) > ROW_SUM_TOLERANCE
-    if far.any():
-        replan = first_replan + int(np.argwhere(far)[0][0])
-        yield f"{name} sums to {sums[far][0]:.4g} instead of 1, the first time at replan {replan}"
+    yield from block.faults("holds numbers that are NaN or negative", ~(block.values >= 0), "replan")
+    sums = block.values.sum(axis=-1, dtype=np.float64)
+    far = ~(np.abs(sums - 1) <= ROW_SUM_TOLERANCE)
+    yield from block.faults("sums to {:.4g} instead of 1", far, "replan", found=sums)
 
 
-def unseen_problems(
-    name: str,
-    rows: NDArray[np.float32],
-    uniform: NDArray[np.float32],
-    recording: Recording,
-    first_replan: int = 0,
-) -> Iterator[str]:
-    """Rows (replan, layer, denoise, head, query, key): no mass for a key that no query behind the row sees.
-
-    uniform: what uniform attention gives; axes along which nothing changes have length 1.
-    """
-    unseen = uniform == 0
-    if not unseen.any():
-        return
-    if unseen.shape[1:-1] == (1, 1, 1, 1):
-        keys = np.flatnonzero(unseen.any(axis=(0, 1, 2, 3, 4)))
-        given = ((rows[..., keys] != 0) & unseen[..., keys]).any(axis=-1)
-    else:
-        given = ((rows != 0) & unseen).any(axis=-1)
-    if given.any():
-        yield (
-            f"{name} gives mass to a key that no query sees, as {name.rpartition('/')[0]}/uniform says, "
-            f"{_where(given, recording, first_replan)}"
-        )
-
-
-def row_sum_problems(
-    name: str, row_sum: NDArray[np.floating], recording: Recording, first_replan: int = 0
-) -> Iterator[str]:
+def _row_sum_problems(block: Block) -> Iterator[str]:
     """Row sums (replan, layer, denoise, head, query): a row is a softmax over all keys of its site and sums to 1."""
-    far = ~(np.abs(row_sum.astype(np.float64) - 1) <= ROW_SUM_TOLERANCE)  # also where it is NaN
-    if far.any():
-        values = row_sum[far]
-        worst = values[np.argmax(np.abs(values - 1))]
-        yield (
-            f"{name} is {worst:.4g} instead of 1 (allowed is a difference of {ROW_SUM_TOLERANCE:g}) "
-            f"{_where(far, recording, first_replan)}"
-        )
+    far = ~(np.abs(block.values.astype(np.float64) - 1) <= ROW_SUM_TOLERANCE)  # also where it is NaN
+    says = f"is {{:.4g}} instead of 1 (allowed is a difference of {ROW_SUM_TOLERANCE:g})"
+    return block.faults(says, far, found=block.values)
 
 
-def gram_problems(name: str, gram: NDArray[np.float32], recording: Recording, first_replan: int = 0) -> Iterator[str]:
+def _gram_problems(block: Block) -> Iterator[str]:
     """Contributions (replan, layer, denoise, part, part): inner products of vectors, thus positive semi-definite."""
-    matrices = gram.astype(np.float64)
+    matrices = block.values.astype(np.float64)
     bad = ~np.isfinite(matrices.sum(axis=(-2, -1)))
-    if bad.any():
-        yield f"{name} holds numbers that are NaN or infinite {_where(bad, recording, first_replan)}"
-        return
+    yield from block.faults(_NOT_FINITE, bad)
     diagonal = np.diagonal(matrices, axis1=-2, axis2=-1)
     allowed = _GRAM_TOLERANCE * np.abs(diagonal).sum(axis=-1)
     negative = (diagonal < -allowed[..., None]).any(axis=-1)
+    yield from block.faults("has negative squared norms on its diagonal", negative)
     asymmetry = np.abs(matrices - matrices.swapaxes(-2, -1)).max(axis=(-2, -1))
-    if negative.any():
-        yield f"{name} has negative squared norms on its diagonal {_where(negative, recording, first_replan)}"
-    elif (asymmetry > allowed).any():
-        yield f"{name} is not symmetric {_where(asymmetry > allowed, recording, first_replan)}"
-    else:
-        indefinite = np.linalg.eigvalsh(matrices)[..., 0] < -allowed
-        if indefinite.any():
-            where = _where(indefinite, recording, first_replan)
-            yield f"{name} holds no inner products of vectors (it has negative eigenvalues) {where}"
+    yield from block.faults("is not symmetric", asymmetry > allowed)
+    indefinite = np.linalg.eigvalsh(matrices)[..., 0] < -allowed
+    yield from block.faults("holds no inner products of vectors (it has negative eigenvalues)", indefinite)
 
 
-def _where(mask: NDArray[np.bool_], recording: Recording, first_replan: int) -> str:
-    """The first true place of (replan, layer, denoise[, head, query]) in the order of computation, and how many follow.
-
-    Returns for instance `at replan 3, denoise step 9, layer 7, head 2, and at 143 of 288 places in all`.
-    """
-    replan, denoise, layer, *rest = np.argwhere(mask.swapaxes(1, 2))[0]
-    words = [
-        f"replan {first_replan + replan}",
-        f"denoise step {recording.denoise_steps[denoise]}",
-        f"layer {recording.layers[layer]}",
-    ]
-    if rest:
-        words.append(f"head {recording.heads[rest[0]]}")
-        words += [f"query {rest[1]}"] if mask.shape[-1] > 1 else []
-    count = int(mask.sum())
-    return f"at {', '.join(words)}" + (f", and at {count} of {mask.size} places in all" if count > 1 else "")
-
-
-def role_problems(layout: SiteLayout, key_role: NDArray[np.integer], first_replan: int = 0) -> Iterator[str]:
+def _role_problems(block: Block) -> Iterator[str]:
     """Role codes (replan, key): each key has a role that a key of its span can have."""
-    for span in layout.spans:
+    roles = block.values
+    names = {role: f"the role '{role.label}'" for role in Role}
+    for span in block.site.spans:
         allowed = ROLES_OF_KIND[span.kind]
-        wrong = ~np.isin(key_role[:, span.start : span.stop], [int(role) for role in allowed])
-        if wrong.any():
-            replan, key = np.argwhere(wrong)[0]
-            code = int(key_role[replan, span.start + key])
-            given = f"the role '{Role(code).label}'" if code in set(Role) else f"the code {code}, which is no role,"
-            yield (
-                f"{layout.name}/key_role gives key {span.start + key} of span '{span.name}' {given} at replan "
-                f"{first_replan + replan}; expected one of {listing(role.label for role in allowed)}"
-            )
+        wrong = np.zeros(roles.shape, dtype=bool)
+        wrong[:, span.start : span.stop] = ~np.isin(roles[:, span.start : span.stop], [int(role) for role in allowed])
+        given = [names.get(code, f"the code {code}, which is no role") for code in roles[wrong][:1].tolist()]
+        says = f"gives a key of span '{span.name}' {listing(given)}; expected {listing(one.label for one in allowed)},"
+        yield from block.faults(says, wrong, "replan", "key")
 
 
 def prompt_problems(sites: Sequence[SiteLayout], prompt: Prompt) -> Iterator[str]:
@@ -243,163 +259,163 @@ def prompt_problems(sites: Sequence[SiteLayout], prompt: Prompt) -> Iterator[str
     if not 0 <= first <= last <= length:
         yield f"the instruction stands at characters {first} to {last} of a prompt with {length}"
     spans = [span for site in sites for span in site.spans if span.kind == "text"]
-    keys = [piece.key for piece in prompt.pieces]
-    if not all(any(_holds(span, piece) for span in spans) for piece in prompt.pieces):
-        yield (
-            f"the prompt's pieces are keys {min(keys)} to {max(keys)}, which are not all text keys; those are "
-            f"{listing(f'{span.start} to {span.stop - 1}' for span in spans)}"
-        )
-    if len(set(keys)) != len(keys):
+    for piece in prompt.pieces:
+        if not any(_holds(span, piece) for span in spans):
+            existing = listing(f"{span.start} to {span.stop - 1}" for span in spans)
+            yield f"the prompt's piece {piece.text!r} is key {piece.key}, which is no text key; those are {existing}"
+        if not 0 <= piece.start <= piece.stop <= length:
+            covered = f"characters {piece.start} to {piece.stop} of a prompt with {length}"
+            yield f"the prompt's piece of key {piece.key} covers {covered}"
+    if len({piece.key for piece in prompt.pieces}) != len(prompt.pieces):
         yield "two pieces of the prompt are the same key"
-    outside = [piece for piece in prompt.pieces if not 0 <= piece.start <= piece.stop <= length]
-    if outside:
-        piece = outside[0]
-        yield f"the piece of key {piece.key} covers characters {piece.start} to {piece.stop} of a prompt with {length}"
 
 
 def piece_role_problems(
-    layout: SiteLayout, key_role: NDArray[np.integer], prompt: Prompt, replan: int, *, only_site: bool = True
+    sites: Sequence[SiteLayout], site: SiteLayout, key_role: NDArray[np.integer], prompt: Prompt, replan: int
 ) -> Iterator[str]:
-    """Role codes (key,) of one replan and its prompt: a key that holds a piece of text is not padding.
+    """Role codes (key,) of one replan at a site, and its prompt: a key that holds a piece of text is not padding.
 
-    only_site: no other site has text. Of several, one may have all text masked: GR00T's blocks that read pictures.
+    Of several sites with text, one may have all of it masked: GR00T's blocks that read pictures.
     """
-    held = [piece for piece in prompt.pieces if any(_holds(span, piece) for span in layout.spans)]
-    if not only_site and all(key_role[piece.key] in INVALID_ROLES for piece in held):
-        return
-    for piece in held:
-        if key_role[piece.key] in INVALID_ROLES:
-            yield (
-                f"{layout.name}/key_role gives key {piece.key} the role '{Role(key_role[piece.key]).label}' at replan "
-                f"{replan}, but it holds the prompt's piece {piece.text!r}"
-            )
-            return
-
-
-def sites_with_text(sites: Sequence[SiteLayout]) -> list[str]:
-    """The names of the sites that have a span of text."""
-    return [site.name for site in sites if any(span.kind == "text" for span in site.spans)]
+    pieces = prompt_at(sites, site, prompt).pieces
+    held = [piece for piece in pieces if any(_holds(span, piece) for span in site.spans)]
+    hidden = [piece for piece in held if key_role[piece.key] in INVALID_ROLES]
+    only_site = sum(any(span.kind == "text" for span in one.spans) for one in sites) == 1
+    if hidden and (only_site or len(hidden) < len(held)):
+        key, text = hidden[0].key, hidden[0].text
+        yield (
+            f"{site.name}/key_role gives key {key} the role '{Role(key_role[key]).label}' at replan {replan}, but it "
+            f"holds the prompt's piece {text!r}"
+        )
 
 
 def _holds(span: Span, piece: Piece) -> bool:
     return span.kind == "text" and span.start <= piece.key < span.stop
 
 
-def picture_problems(
-    sites: Sequence[SiteLayout], camera: str, shape: tuple[int, ...], dtype: np.dtype[Any]
-) -> Iterator[str]:
-    """A camera's picture (row, column, channel): of a known camera, uint8, and of the size that its patches tile."""
-    if camera not in (cameras := _cameras(sites)):
-        yield f"frames/{camera} is of a camera that no site has; existing: {listing(cameras)}"
-        return
-    expected = (*picture_size(sites, camera), 3)
-    if (shape, dtype) != (expected, np.dtype(np.uint8)):
-        yield f"frames/{camera} has pictures of shape {shape} and type {dtype}; expected {expected} and uint8"
+def _camera_problems(block: Block) -> Iterator[str]:
+    """Pictures or coverage: of a camera that has patches at some site."""
+    cameras = dict.fromkeys(camera for site in block.root.sites for camera in site.pictured)
+    if block.name.partition("/")[2] not in cameras:
+        yield f"{block.name} is of a camera that no site has; existing: {listing(cameras)}"
 
 
-def camera_picture_problems(
-    sites: Sequence[SiteLayout], camera: str, shape: tuple[int, ...], dtype: np.dtype[Any]
-) -> Iterator[str]:
-    """A camera's own picture (row, column, channel), of any size: of a known camera, uint8, three channels."""
-    if camera not in (cameras := _cameras(sites)):
-        yield f"camera_frames/{camera} is of a camera that no site has; existing: {listing(cameras)}"
-    elif len(shape) != 3 or shape[-1] != 3 or dtype != np.dtype(np.uint8):
-        yield (
-            f"camera_frames/{camera} has pictures of shape {shape} and type {dtype}; expected (height, width, 3) and "
-            "uint8"
-        )
+def _picture_problems(block: Block) -> Iterator[str]:
+    """Pictures (replan, row, column, channel): the model's are of the size that its patches tile, others of any."""
+    yield from _camera_problems(block)
+    group, _, camera = block.name.partition("/")
+    size = picture_size(block.root.sites, camera) if group == "frames" else block.values.shape[1:3]
+    yield from shape_problems(block.name, block.values.shape, (len(block.values), *size, 3))
 
 
-def coverage_problems(
-    sites: Sequence[SiteLayout],
-    camera: str,
-    coverage: NDArray[np.floating],
-    num_objects: int,
-    first_replan: int = 0,
-) -> Iterator[str]:
-    """Coverage (replan, patch, object): of a known camera, float32; shares of each patch that sum to 1."""
-    name = f"objects/{camera}"
-    if camera not in (cameras := _cameras(sites)):
-        yield f"{name} is of a camera that no site has; existing: {listing(cameras)}"
-        return
-    grids = camera_grids(sites, camera)
-    expected = (sum(grid.num_patches for grid in grids), num_objects)
-    if (coverage.shape[1:], coverage.dtype) != (expected, np.dtype(np.float32)):
-        yield (
-            f"{name} has the shape {coverage.shape[1:]} and type {coverage.dtype}; expected {expected} and float32: "
-            f"the camera's {listing(grid.describe() for grid in grids)}, and the scene's objects"
-        )
-        return
-    inside = (coverage >= 0) & (coverage <= 1 + _COVERAGE_TOLERANCE)
-    if not inside.all():
-        replan, patch, number = np.argwhere(~inside)[0]
-        yield (
-            f"{name} gives object {number} the share {coverage[replan, patch, number]:.4g} of patch {patch} at replan "
-            f"{first_replan + replan}; expected 0 to 1"
-        )
-        return
-    total = coverage.sum(axis=-1, dtype=np.float64)
+def _coverage_problems(block: Block) -> Iterator[str]:
+    """Coverage (replan, patch, object): shares of each patch, which sum to 1."""
+    yield from _camera_problems(block)
+    values, grids = block.values, camera_grids(block.root.sites, block.name.partition("/")[2])
+    expected = (len(values), sum(grid.num_patches for grid in grids), block.num_objects)
+    for problem in shape_problems(block.name, values.shape, expected):
+        yield f"{problem}: the camera's {listing(grid.describe() for grid in grids)}, and the scene's objects"
+    outside = ~((values >= 0) & (values <= 1 + _COVERAGE_TOLERANCE))
+    yield from block.faults(
+        "has the share {:.4g}; expected 0 to 1,", outside, "replan", "patch", "object", found=values
+    )
+    total = values.sum(axis=-1, dtype=np.float64)
     far = np.abs(total - 1) > _COVERAGE_TOLERANCE
-    if far.any():
-        replan, patch = np.argwhere(far)[0]
-        yield (
-            f"the shares of {name} sum to {total[replan, patch]:.4g} instead of 1 at patch {patch} of replan "
-            f"{first_replan + replan}"
-        )
+    yield from block.faults("has shares that sum to {:.4g} instead of 1", far, "replan", "patch", found=total)
 
 
-def effect_problems(name: str, change: NDArray[np.float32], first_entry: int = 0) -> Iterator[str]:
-    """Changes of actions (entry, horizon, action dim): finite."""
-    bad = ~np.isfinite(change)
-    if bad.any():
-        entry = first_entry + int(np.argwhere(bad)[0][0])
-        yield f"{name} holds numbers that are NaN or infinite, the first in entry {entry}"
-
-
-def cut_problems(name: str, cut: NDArray[np.float32], first_entry: int = 0) -> Iterator[str]:
+def _cut_problems(block: Block) -> Iterator[str]:
     """Weights of the keys that were cut off (entry, key): 0 to 1."""
-    inside = (cut >= 0) & (cut <= 1)
-    if not inside.all():
-        entry, key = np.argwhere(~inside)[0]
-        given = cut[entry, key]
-        yield f"{name} gives key {key} the weight {given:.4g} in entry {first_entry + int(entry)}; expected 0 to 1"
+    outside = ~((block.values >= 0) & (block.values <= 1))
+    return block.faults("has the weight {:.4g}; expected 0 to 1,", outside, "entry", "key", found=block.values)
 
 
-def step_problems(name: str, values: NDArray[np.float32], first: int = 0) -> Iterator[str]:
-    """Poses (moment, body, 7), finger joints (moment, finger) or executed actions (step, action dim): numbers.
-
-    Of poses, quaternions have length 1.
-    """
-    if values.dtype != np.dtype(np.float32) or (name == POSES and values.shape[2:] != (POSE,)):
-        yield f"{name} has the shape {values.shape} and type {values.dtype}; expected float32, and {POSE} for a pose"
-        return
-    place = "step" if name.endswith("actions") else "moment"
-    bad = ~np.isfinite(values)
-    if bad.any():
-        number = first + int(np.argwhere(bad)[0][0])
-        yield f"{name} holds numbers that are NaN or infinite, the first at {place} {number}"
-        return
-    if name == POSES:
-        length = np.linalg.norm(values[..., 3:].astype(np.float64), axis=-1)
-        far = np.abs(length - 1) > _QUATERNION_TOLERANCE
-        if far.any():
-            moment, body = np.argwhere(far)[0]
-            yield (
-                f"{name} has a quaternion of length {length[moment, body]:.4g} instead of 1 for body {body} at moment "
-                f"{first + int(moment)}"
-            )
+def _pose_problems(block: Block) -> Iterator[str]:
+    """Poses (moment, body, 7): finite, and with quaternions of length 1."""
+    yield from _finite("moment", "body")(block)
+    length = np.linalg.norm(block.values[..., POSE - 4 :].astype(np.float64), axis=-1)
+    far = np.abs(length - 1) > _QUATERNION_TOLERANCE
+    yield from block.faults("has a quaternion of length {:.4g} instead of 1", far, "moment", "body", found=length)
 
 
-def _cameras(sites: Sequence[SiteLayout]) -> list[str]:
-    """The cameras that have patches at some site."""
-    return list(dict.fromkeys(camera for site in sites for camera in site.pictured))
+def _finite(*axes: str) -> Callable[[Block], Iterator[str]]:
+    """The rule of an array that may hold any numbers; places are named by its axes of these names."""
+    return lambda block: block.faults(_NOT_FINITE, ~np.isfinite(block.values), *axes)
 
 
 def counter_problems(env_step: NDArray[np.integer], noise_seed: NDArray[np.integer]) -> Iterator[str]:
     """Environment steps and noise seeds (replan,): steps increase, and neither is negative (-1 is a lost chunk)."""
-    if (env_step < 0).any():
-        yield f"env_step is {env_step.min()}; expected 0 or more"
+    for name, values in (("env_step", env_step), ("noise_seed", noise_seed)):
+        if (values < 0).any():
+            yield f"{name} is {values.min()}; expected 0 or more"
     for i in np.flatnonzero(np.diff(env_step) <= 0)[:1]:
         yield f"env_step does not increase: {env_step[i + 1]} follows {env_step[i]}"
-    if (noise_seed < 0).any():
-        yield f"noise_seed is {noise_seed.min()}; expected 0 or more"
+
+
+def site_shapes(site: SiteLayout, recording: Recording, replans: int, segments: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of the arrays of a site; `recording` is what is of the site, `segments` the episode's number of them."""
+    plan = (replans, len(recording.layers), len(recording.denoise_steps))
+    cells = (*plan, len(recording.heads), recording.num_queries)
+    shapes = {
+        "rows": (*cells, site.num_keys),
+        "row_sum": cells,
+        "atoms": (*cells, segments),
+        "key_role": (replans, site.num_keys),
+        "uniform": (*cells, site.num_keys),
+    }
+    if recording.contributions:
+        shapes["contribution"] = (*plan, segments + 1, segments + 1)
+    return {f"{site.name}/{kind}": shape for kind, shape in shapes.items()}
+
+
+def effect_shapes(sites: Sequence[SiteLayout], entries: int, horizon: int, dims: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of the arrays of effects; `dims` is the number of dimensions of an action."""
+    cuts: dict[str, tuple[int, ...]] = {f"{site.name}/{CUT}": (entries, site.num_keys) for site in sites}
+    return {CHANGE: (entries, horizon, dims)} | cuts
+
+
+def shape_problems(name: str, shape: tuple[int, ...], expected: tuple[int, ...]) -> Iterator[str]:
+    """Whether an array has another shape than it must have; a single length is that of the first axis."""
+    # Axes of `uniform` but the last have length 1 where nothing changes along them.
+    if name.endswith("/uniform") and len(shape) == len(expected) and shape[-1:] == expected[-1:]:
+        if not all(given in (1, length) for given, length in zip(shape, expected, strict=True)):
+            yield f"{name} has the shape {shape}; expected {expected}, or 1 in place of a length but the last"
+    elif (shape[:1] if len(expected) == 1 else shape) != expected:
+        yield f"{name} has the shape {shape}; expected {expected}"
+
+
+#: Arrays of an episode -> the type of their numbers (None: any), and what these must satisfy. SITE stands for the name
+#: of a site, `*` for that of a camera.
+_RULES: dict[str, tuple[DTypeLike | None, Callable[[Block], Iterator[str]]]] = {
+    "SITE/key_role": (ROLE_DTYPE, _role_problems),
+    "SITE/rows": (np.float32, _stored_row_problems),
+    "SITE/atoms": (np.float32, _atom_problems),
+    "SITE/row_sum": (np.float32, _row_sum_problems),
+    "SITE/uniform": (np.float32, _uniform_problems),
+    "SITE/contribution": (np.float32, _gram_problems),
+    f"SITE/{CUT}": (np.float32, _cut_problems),
+    CHANGE: (np.float32, _finite("entry")),
+    POSES: (np.float32, _pose_problems),
+    GRIPPER: (np.float32, _finite("moment")),
+    EXECUTED: (np.float32, _finite("step")),
+    "frames/*": (np.uint8, _picture_problems),
+    "camera_frames/*": (np.uint8, _picture_problems),
+    "objects/*": (np.float32, _coverage_problems),
+    **dict.fromkeys(("state", "actions", "dataset_actions", "base_actions"), (None, _finite("replan"))),
+}
+
+
+def value_problems(block: Block) -> Iterator[str]:
+    """The first rule that the numbers of an array break; nothing without any, and of arrays that have no rule.
+
+    Raises:
+        CorruptEpisode: an array beside it cannot be read.
+    """
+    group, _, kind = block.name.partition("/")
+    of_site = any(site.name == group for site in block.root.sites)
+    for key in (f"SITE/{kind}" if of_site else block.name, f"{group}/*"):
+        dtype, rule = _RULES.get(key, (None, lambda _: iter(())))
+        if dtype is not None and block.values.dtype != np.dtype(dtype):
+            yield f"{block.name} has the type {block.values.dtype}; expected {np.dtype(dtype)}"
+        else:
+            yield from islice(rule(block), 1)

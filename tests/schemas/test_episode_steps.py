@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.kit.examples import examples
-from tests.kit.stores import StoreSpec, expected_arrays, reseal, small_steps, write_store
+from tests.kit.stores import StoreSpec, expected_arrays, reseal, root_attributes, small_steps, write_store
 from vla_attention.schemas.episode_steps import HAND, POSES, EpisodeSteps, TaskGoal
 from vla_attention.schemas.jsonable import from_json, to_json
-from vla_attention.schemas.stores.content_rules import step_problems
+from vla_attention.schemas.stores.content_rules import Block, value_problems
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 
@@ -33,18 +33,19 @@ def test_what_was_touched_is_in_the_order_of_the_touches(moments):
 
 
 def test_poses_are_finite_and_turns_have_length_one():
+    root = root_attributes(StoreSpec(plant_steps=small_steps))
+
+    def problem(poses: np.ndarray, first: int = 0) -> str | None:
+        return next(value_problems(Block(root, 0, POSES, poses, {}.__getitem__, first)), None)
+
     poses = np.zeros((3, 2, 7), np.float32)
     poses[..., 3] = 1
-    assert list(step_problems(POSES, poses)) == []
+    assert problem(poses) is None
     poses[2, 1, 3] = 0.9
-    assert list(step_problems(POSES, poses, 10)) == [
-        "steps/poses has a quaternion of length 0.9 instead of 1 for body 1 at moment 12"
-    ]
+    assert problem(poses, 10) == "steps/poses has a quaternion of length 0.9 instead of 1 at moment 12, body 1"
     poses[1, 0, 0] = np.nan
-    assert list(step_problems(POSES, poses)) == [
-        "steps/poses holds numbers that are NaN or infinite, the first at moment 1"
-    ]
-    assert "expected float32, and 7 for a pose" in next(step_problems(POSES, poses[..., :6]))
+    assert problem(poses) == "steps/poses holds numbers that are NaN or infinite at moment 1, body 0"
+    assert "float64; expected float32" in str(problem(poses.astype(np.float64)))
 
 
 @pytest.fixture
