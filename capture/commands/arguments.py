@@ -12,7 +12,6 @@ from vla_attention.capture.effects.arguments import add_effect_options
 from vla_attention.capture.engine.settings import RecordingSettings
 from vla_attention.capture.environments.suites import ALL_SUITES, STANDARD_SUITES, SUITES, find_suite, list_tasks
 from vla_attention.capture.interventions.arguments import InterventionSettings
-from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import default_family, policy_families
 from vla_attention.capture.policies.family import PolicyFamily, PublishedScript
 from vla_attention.capture.replay.arguments import REPLAY_EXAMPLES, add_replay_arguments
@@ -22,6 +21,7 @@ from vla_attention.capture.run.run_settings import CaptureOutput, RunSettings
 from vla_attention.schemas.command_line import OneSentenceParser
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.options import add_options, option
+from vla_attention.schemas.stop_signals import Termination
 from vla_attention.schemas.stores import verify_command
 from vla_attention.schemas.stores.verify_command import VERIFY_HELP
 from vla_attention.schemas.threads import use_threads

@@ -8,9 +8,9 @@ import signal
 import sys
 from collections.abc import Callable
 
-from vla_attention.capture.jobs.termination import EXIT_TERMINATED, Terminated, Termination, listening_for_sigterm
 from vla_attention.schemas.command_line import run_command
 from vla_attention.schemas.errors import INSTALL_CAPTURE, MissingDependency, UserError
+from vla_attention.schemas.stop_signals import EXIT_TERMINATED, Terminated, Termination, listening_for_sigterm
 
 #: Modules of the extra [capture] that are imported without a sentence of their own.
 _OF_CAPTURE = ("torch", "safetensors", "sentencepiece")

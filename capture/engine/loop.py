@@ -26,13 +26,13 @@ from vla_attention.capture.engine.faults import EPISODE_FAULTS, Faults, Simulato
 from vla_attention.capture.engine.progress import EpisodeProgress, Progress, Unit
 from vla_attention.capture.engine.source import Committed, Episode, EpisodeJob, Outcome, Source, SourceLost
 from vla_attention.capture.engine.writing import EpisodeInBackground, WritingThread
-from vla_attention.capture.jobs.termination import Terminated, Termination
 from vla_attention.capture.jobs.worker_log import PlannedTask, WorkerLog
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.store.episode_writer import EpisodeTaken
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import listing, plural
+from vla_attention.schemas.stop_signals import Terminated, Termination
 from vla_attention.schemas.stores.locks import Held, Holder
 from vla_attention.schemas.stores.store_format import StoreExists
 from vla_attention.schemas.stores.store_place import room_at

@@ -19,13 +19,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vla_attention.capture.commands.command_line import run_capture_command
-from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.run.command import run_analysis
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.layers import select_layers
 from vla_attention.schemas.options import read_options
+from vla_attention.schemas.stop_signals import Termination
 from vla_attention.schemas.threads import Threads, use_threads
 
 if TYPE_CHECKING:

@@ -10,12 +10,12 @@ from pathlib import Path
 from vla_attention.capture.effects.arguments import add_effect_options
 from vla_attention.capture.engine.settings import RecordingSettings, StoreOutput
 from vla_attention.capture.interventions.arguments import InterventionSettings
-from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.policies.family import ModelSettings, PolicyFamily
 from vla_attention.capture.policies.robot import NONE
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.options import add_options, option
+from vla_attention.schemas.stop_signals import Termination
 from vla_attention.schemas.threads import use_threads
 
 REPLAY_EXAMPLES = """\

@@ -5,12 +5,12 @@ from __future__ import annotations
 import argparse
 
 from vla_attention.capture.engine.progress import say
-from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.machine import load_torch
 from vla_attention.capture.replay.arguments import is_policy_file
 from vla_attention.capture.replay.policy_file import check_policy_file, load_policy_file
 from vla_attention.capture.replay.replay_plan import plan_replay
 from vla_attention.schemas.errors import plural
+from vla_attention.schemas.stop_signals import Termination
 from vla_attention.schemas.threads import Threads
 
 

@@ -18,7 +18,6 @@ from vla_attention.capture.engine.plan import announce
 from vla_attention.capture.engine.settings import StoreOutput
 from vla_attention.capture.engine.source import EpisodeJob, Source
 from vla_attention.capture.environments.base import Task
-from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.jobs.worker_log import plan_of
 from vla_attention.capture.policies.robot import RobotData, read_camera_choices
 from vla_attention.capture.replay.arguments import ReplaySettings
@@ -31,6 +30,7 @@ from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.options import read_options
 from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.safe_text import file_part
+from vla_attention.schemas.stop_signals import Termination
 from vla_attention.schemas.stores.root import episode_folders
 from vla_attention.schemas.stores.store_format import (
     DataSetSource,

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 from vla_attention.capture.effects.arguments import add_effect_options
 from vla_attention.capture.engine.settings import RecordingSettings, StoreOutput
 from vla_attention.capture.interventions.arguments import InterventionSettings
-from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.families import family_of_kind
 from vla_attention.schemas.errors import BadArgument, UnknownName, UserError
 from vla_attention.schemas.options import add_options, option, task_option
+from vla_attention.schemas.stop_signals import Termination
 from vla_attention.schemas.threads import use_threads
 
 if TYPE_CHECKING:

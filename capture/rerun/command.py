@@ -11,7 +11,6 @@ from vla_attention.capture.engine.plan import plan_recording
 from vla_attention.capture.engine.progress import say
 from vla_attention.capture.engine.settings import RecordingSettings, recording_settings
 from vla_attention.capture.interventions.resolution import check_not_compiled, check_places, interventions_for
-from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.machine import describe_machine, load_torch
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.identity import downloads_of
@@ -26,6 +25,7 @@ from vla_attention.schemas.errors import BadArgument, plural
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.options import read_options
 from vla_attention.schemas.safe_text import file_part
+from vla_attention.schemas.stop_signals import Termination
 from vla_attention.schemas.stores.reader import Store
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX
 from vla_attention.schemas.stores.store_url import local_path

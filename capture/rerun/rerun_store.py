@@ -22,7 +22,6 @@ from vla_attention.capture.engine.progress import Progress, say
 from vla_attention.capture.engine.source import Episode, EpisodeJob, Outcome, Source, episode_start
 from vla_attention.capture.environments.base import Task
 from vla_attention.capture.interventions.run_changes import RunChanges
-from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.jobs.worker_log import plan_of
 from vla_attention.capture.policies.policy import Policy, stored_picture_sizes
 from vla_attention.capture.rerun.base_store import families_of, instructions_of
@@ -32,6 +31,7 @@ from vla_attention.capture.store.disk_estimate import describe, estimate_disk
 from vla_attention.capture.store.replan_records import EpisodeStart
 from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run, remove_without_episodes
 from vla_attention.schemas.interventions import Interventions, RerunSource
+from vla_attention.schemas.stop_signals import Termination
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import (
     CorruptEpisode,

@@ -20,7 +20,6 @@ from vla_attention.capture.environments.suites import list_tasks
 from vla_attention.capture.interventions.prompts import check_synonyms
 from vla_attention.capture.interventions.resolution import check_not_compiled, interventions_for
 from vla_attention.capture.interventions.run_changes import RunChanges
-from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.jobs.worker_log import plan_of, planned_episodes, read_logs
 from vla_attention.capture.machine import POLICY_BATCH, describe_machine
 from vla_attention.capture.policies.families import family_of_kind
@@ -30,6 +29,7 @@ from vla_attention.capture.run.run_settings import RunSettings, default_num_envs
 from vla_attention.capture.store.disk_estimate import estimate_disk
 from vla_attention.capture.store.store_writer import open_run
 from vla_attention.schemas.errors import BadArgument, listing, plural
+from vla_attention.schemas.stop_signals import Termination
 from vla_attention.schemas.stores.store_format import PolicyIdentity, Protocol
 from vla_attention.schemas.stores.verify import DamagedEpisodesLeft, find_damaged, what_to_do
 

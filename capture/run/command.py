@@ -9,8 +9,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from vla_attention.capture.jobs.termination import Termination
 from vla_attention.capture.policies.family import PolicyFamily
+from vla_attention.schemas.stop_signals import Termination
 from vla_attention.schemas.threads import use_threads
 
 

@@ -15,8 +15,8 @@ import pytest
 from vla_attention.analyze.__main__ import main as analyze
 from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.jobs.status import store_status
-from vla_attention.capture.jobs.termination import EXIT_TERMINATED
 from vla_attention.capture.published.evaluate import evaluate
+from vla_attention.schemas.stop_signals import EXIT_TERMINATED
 from vla_attention.schemas.stores.locks import episode_locks
 
 pytestmark = [pytest.mark.simulator, pytest.mark.thorough]

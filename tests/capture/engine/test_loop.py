@@ -16,10 +16,10 @@ from vla_attention.capture.engine.progress import Unit
 from vla_attention.capture.engine.simulation import SimulationFailed
 from vla_attention.capture.engine.source import Committed, Episode, EpisodeJob, Outcome, Source
 from vla_attention.capture.environments.base import Task
-from vla_attention.capture.jobs.termination import Terminated, Termination
 from vla_attention.capture.jobs.worker_log import plan_of, read_logs
 from vla_attention.capture.recording.finite_numbers import NumbersNotFinite
 from vla_attention.capture.store.store_writer import RunStore, open_run
+from vla_attention.schemas.stop_signals import Terminated, Termination
 from vla_attention.schemas.stores.locks import episode_locks
 from vla_attention.schemas.stores.reader import open_store
 

@@ -22,8 +22,8 @@ from vla_attention.capture.__main__ import main as capture
 from vla_attention.capture.engine.call import Caller
 from vla_attention.capture.engine.loop import EpisodeLoop
 from vla_attention.capture.jobs.status import store_status
-from vla_attention.capture.jobs.termination import EXIT_TERMINATED
 from vla_attention.capture.rerun.base_store import machine_differences
+from vla_attention.schemas.stop_signals import EXIT_TERMINATED
 from vla_attention.schemas.stores.locks import episode_locks
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.worker import Worker

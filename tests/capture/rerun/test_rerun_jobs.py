@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from vla_attention.capture.__main__ import main
-from vla_attention.capture.jobs.termination import EXIT_TERMINATED, Terminated, Termination
 from vla_attention.capture.jobs.worker_log import read_logs
+from vla_attention.schemas.stop_signals import EXIT_TERMINATED, Terminated, Termination
 
 EPISODES = ["task000_episode000", "task000_episode001", "task001_episode000", "task001_episode001"]
 

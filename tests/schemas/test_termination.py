@@ -6,7 +6,7 @@ import signal
 
 import pytest
 
-from vla_attention.capture.jobs.termination import Terminated, Termination
+from vla_attention.schemas.stop_signals import Terminated, Termination
 
 
 def test_during_an_episode_a_signal_takes_effect_at_the_next_check() -> None:
