@@ -101,12 +101,7 @@ class SiteWriter:
     """Collects one site's replans; has at most one block of rows in memory."""
 
     def __init__(
-        self,
-        group: zarr.Group,
-        folder: Path,
-        write: WriteArray,
-        layout: SiteLayout,
-        recording: Recording,
+        self, group: zarr.Group, folder: Path, write: WriteArray, layout: SiteLayout, recording: Recording
     ) -> None:
         """Begin the site's group in the episode's `group`, whose folder it is; `recording` is what is of the site."""
         self.group = group
