@@ -29,7 +29,8 @@ def test_a_jax_checkpoint_without_its_arrays_is_missing(tmp_path: Path, monkeypa
     monkeypatch.setenv("OPENPI_DATA_HOME", str(tmp_path))
     address = "gs://openpi-assets/checkpoints/mine"
     folder = tmp_path / address.removeprefix("gs://")
-    assert checkpoint_of("pi", "--checkpoint", address)[0] == "missing"
+    with pytest.raises(UserError, match="is not in openpi's cache"):
+        checkpoint_of("pi", "--checkpoint", address)
     shutil.copytree(GOLDEN / "pi0_batch2" / "checkpoint", folder)
     words = ["--model-config", str(GOLDEN / "pi0_batch2" / "case.json")]
     words += ["--tokenizer", str(train_small_tokenizer(tmp_path / "small.model"))]
