@@ -145,7 +145,7 @@ def _add_doctor_arguments(parser: argparse.ArgumentParser, given: Sequence[str])
 def _run_doctor(arguments: argparse.Namespace, termination: Termination) -> int:
     threads = use_threads(arguments.threads)  # before torch is loaded
 
-    from vla_attention.capture.doctor import run_doctor
+    from vla_attention.capture.run.doctor import run_doctor
 
     return run_doctor(arguments, threads)
 

@@ -12,10 +12,10 @@ from tests.kit.cosmos_checkpoint import WEIGHTS_NAME, write_dummy_folder
 from tests.kit.pi_golden import GOLDEN
 from tests.kit.small_tokenizer import train_small_tokenizer
 from vla_attention.capture.commands.arguments import build_parser
-from vla_attention.capture.doctor import Finding, find_checkpoint, find_drawing, find_gpu
 from vla_attention.capture.environments.suites import find_suite
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG
 from vla_attention.capture.policies.cosmos.locate import EMBEDDINGS_NAME, VAE_NAME, VAE_REPOSITORY
+from vla_attention.capture.run.doctor import Finding, find_checkpoint, find_drawing, find_gpu
 from vla_attention.schemas.errors import UserError
 
 
