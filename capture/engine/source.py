@@ -20,6 +20,7 @@ from vla_attention.capture.environments.base import Task
 from vla_attention.capture.store.replan_records import EpisodeStart, RecordedSteps
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.stores.store_format import episode_name
+from vla_attention.schemas.stores.store_place import bytes_below
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ class Committed:
     @property
     def num_bytes(self) -> int:
         """Bytes of its files."""
-        return sum(file.stat().st_size for file in self.folder.rglob("*") if file.is_file())
+        return bytes_below(self.folder)
 
 
 class Episode(ABC):

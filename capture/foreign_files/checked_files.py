@@ -1,4 +1,4 @@
-"""Files from elsewhere: regular ones only, and JSON of limited size, nesting and numbers.
+"""Files from elsewhere: regular ones only, and JSON of limited size.
 
 A pipe would wait for ever, a device gives bytes without end, and a link may lead out of its folder.
 """

@@ -17,6 +17,7 @@ from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.locks import Holder, episode_locks
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import is_episode_name, parse_episode_name
+from vla_attention.schemas.stores.store_place import bytes_below
 from vla_attention.schemas.stores.store_url import local_path
 from vla_attention.schemas.stores.verify import DamagedEpisode, look_at
 
@@ -137,7 +138,7 @@ def store_status(path: Path, expected: int | None = None, verify: bool = False) 
         task.committed += 1
         task.success += stored.attributes.success is True
         task.unknown += stored.attributes.success is None
-        task.bytes += sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+        task.bytes += bytes_below(folder)
         commit = commits.get(stored.name)
         at = commit.at if commit else datetime.fromtimestamp(folder.stat().st_mtime, UTC).isoformat(timespec="seconds")
         if at > task.last_at:

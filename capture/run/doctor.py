@@ -25,7 +25,7 @@ from vla_attention.schemas.command_line import describe_os_error, format_bytes
 from vla_attention.schemas.errors import INSTALL_CAPTURE, UserError, plural
 from vla_attention.schemas.safe_text import print_line
 from vla_attention.schemas.stores.root import episode_folders
-from vla_attention.schemas.stores.store_place import check_writable, room_at
+from vla_attention.schemas.stores.store_place import bytes_below, check_writable, room_at
 from vla_attention.schemas.threads import Threads
 
 #: How it stands (`ok`: as it should be; `note`: works, but could be better; `MISSING`: the run needs it), and a text.
@@ -161,5 +161,5 @@ def find_checkpoint(arguments: argparse.Namespace) -> Finding:
             "note",
             f"{name} is no folder here: a run takes it from the caches of the hub and of openpi, or downloads it.",
         )
-    files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]
-    return "ok", f"{name}, {format_bytes(sum(file.stat().st_size for file in files))} of files."
+    size = path.stat().st_size if path.is_file() else bytes_below(path)
+    return "ok", f"{name}, {format_bytes(size)} of files."

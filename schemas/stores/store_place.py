@@ -1,4 +1,4 @@
-"""Where a store may be made, the room there, and where nothing else may be written."""
+"""Where a store may be made, the room there and what is taken, and where nothing else may be written."""
 
 from __future__ import annotations
 
@@ -76,6 +76,11 @@ def room_at(path: Path) -> Room:
     # Some file systems (btrfs, many network ones) say 0 of 0: they make inodes as they need them.
     counts = os.statvfs(place) if hasattr(os, "statvfs") else None
     return Room(shutil.disk_usage(place).free, counts.f_favail if counts is not None and counts.f_files else None)
+
+
+def bytes_below(folder: Path) -> int:
+    """Return the bytes of all files in a folder and below."""
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
 
 
 def why_refused(error: OSError, path: Path) -> str:
