@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -35,16 +36,24 @@ NODE = Worker("node7-11-ab", "node7", 11, "1", "pid:[1]", "99", "98_2")
 
 
 class Deadly(StillScene):
-    """Ends its process at the second step after the waiting steps of an episode, as often as `lives` says."""
+    """Ends its process at the second step after the waiting steps of episode 1, as often as `lives` says.
+
+    Episode 0 goes on when that is over: no simulator is idle when episode 1 begins again.
+    """
 
     lives: list[int]
+    over: threading.Event
 
     def reset(self, initial_state_index: int, seed: int) -> None:
         super().reset(initial_state_index, seed)
         self.index, self.steps = initial_state_index, 0
+        if self.index == 1 and self.lives[0] == 0:
+            self.over.set()
 
     def step(self, action: np.ndarray, observe: bool) -> Any:
         self.steps += 1
+        if self.index == 0:
+            self.over.wait(60)
         if self.index == 1 and self.steps == 12 and self.lives[0] > 0:
             self.lives[0] -= 1
             raise SystemExit  # as if the process ended: its end of the connection closes without an answer
@@ -71,7 +80,7 @@ def test_more_simulators_give_the_same_episodes(scene, tmp_path, capsys):
 def test_an_episode_whose_simulator_died_begins_again(scene, tmp_path, capsys):
     words = ["--task-id", "0", "--num-episodes", "3"]
     assert record(tmp_path / "one.zarr", 1, *words) == 0
-    Deadly.lives = [2]
+    Deadly.lives, Deadly.over = [2], threading.Event()
     scene.make = Deadly
     assert record(tmp_path / "a.zarr", 2, *words) == 0
     assert Deadly.lives == [0]
