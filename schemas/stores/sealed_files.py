@@ -1,8 +1,7 @@
 """Files of an episode as its seal lists them: bytes that are not those that were sealed are never returned.
 
 Of a shard (a file of compressed chunks with an index of their places at its end, Zarr's codec `sharding_indexed`)
-single chunks are read: the index is compared with the digest in the seal, a chunk with the checksum in the seal and
-with its own.
+single chunks are read: the index is compared with the digest in the seal, and a chunk with the checksum at its end.
 """
 
 from __future__ import annotations
@@ -88,14 +87,12 @@ class SealedFiles:
             CorruptEpisode: its index is not the one in the seal, or the file cannot be read.
         """
         record, size = self.record(file), index_size(chunks)
-        checksums = bytes.fromhex(record.chunks)
         with _reading(file):
             # One byte more: a file that has grown is not the one that was sealed.
             stored = self.source.part(file, max(0, record.size - size), size + 1)
-        if bytes_digest(stored) != record.index or len(checksums) != CHECKSUM_BYTES * chunks:
+        if bytes_digest(stored) != record.index:
             raise CorruptEpisode(f"{_differs(file)}: its index was changed, or it has another size", file)
-        sealed = [checksums[i : i + CHECKSUM_BYTES] for i in range(0, len(checksums), CHECKSUM_BYTES)]
-        return SealedShard(self.source, file, list(zip(index_places(stored), sealed, strict=True)))
+        return SealedShard(self.source, file, index_places(stored))
 
     def problems(self) -> dict[str, str]:
         """What is wrong, by file: it is missing, or has another size than in the seal. Reads none of them."""
@@ -122,16 +119,16 @@ class SealedFiles:
 
 @dataclass(frozen=True)
 class SealedShard:
-    """One shard's file, whose index agrees with the seal. places: offset and length of each chunk, sealed checksum."""
+    """One shard's file, whose index agrees with the seal. places: offset and length of each chunk."""
 
     source: ByteSource
     file: str
-    places: Sequence[tuple[tuple[int, int], bytes]]
+    places: Sequence[tuple[int, int]]
 
     @property
     def longest(self) -> int:
         """Bytes of the longest chunk, with its checksum."""
-        return max((length for (_, length), _ in self.places), default=0)
+        return max((length for _, length in self.places), default=0)
 
     def chunk(self, number: int, memory: Memory | None = None) -> Memory:
         """The encoded bytes of one chunk, without the checksum that follows them in the file.
@@ -140,10 +137,9 @@ class SealedShard:
         half a megabyte takes longer than to read it from the system's cache.
 
         Raises:
-            CorruptEpisode: the chunk is missing, or its checksum is another one than in the seal or than that of its
-                bytes.
+            CorruptEpisode: the chunk is missing, or its checksum is not that of its bytes.
         """
-        (offset, length), sealed = self.places[number]
+        offset, length = self.places[number]
         if length < 0:
             raise CorruptEpisode(f"its {self.file} lacks chunk {number}: it is missing", self.file)
         stored = np.empty(length, np.uint8) if memory is None else memory[:length]
@@ -152,8 +148,6 @@ class SealedShard:
         if count != length:
             raise CorruptEpisode(f"its {self.file} ends in chunk {number}", self.file)
         chunk, checksum = stored[:-CHECKSUM_BYTES], stored[-CHECKSUM_BYTES:].tobytes()
-        if checksum != sealed:
-            raise CorruptEpisode(f"chunk {number} of its {self.file} does not agree with its seal", self.file)
         if crc32c(chunk) != int.from_bytes(checksum, "little"):
             raise CorruptEpisode(f"the checksum of chunk {number} of its {self.file} does not fit", self.file)
         return chunk

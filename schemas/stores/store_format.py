@@ -407,15 +407,12 @@ def is_episode_name(name: str) -> bool:
 class FileRecord(Document, frozen=True):
     """Size in bytes and sha256 of a file of an episode.
 
-    Of a shard, from which parts are read: `index` is the sha256 of the index at its end, with the index's checksum, and
-    `chunks` has the crc32c of every chunk, the 4 bytes at the chunk's end, in the index's order: 8 hexadecimal digits
-    each, `00000000` for a chunk that was not written. A file of another episode may have an index of the same bytes.
+    `index` is the sha256 of the index at the end of a shard, from which single chunks are read, with the index's checksum.
     """
 
     size: int
     sha256: str
     index: str = ""
-    chunks: str = ""
 
 
 class EpisodeSeal(Document, frozen=True):

@@ -1,4 +1,4 @@
-"""An array of an episode: its chunks are compared with the seal, decoded, and put together.
+"""An array of an episode: its chunks are compared with their checksums, decoded, and put together.
 
 A chunk is read alone where the array's file is a shard of them. zarr-python is not needed: passing chunks through its
 event loop takes as long as decoding them.
