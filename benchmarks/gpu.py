@@ -7,8 +7,8 @@ that fails or finds no time takes nothing from the others. The weights are rando
 pi05_libero; drawn on the GPU). Without a GPU it says so and ends with exit code 2.
 
 Parts: calls in bfloat16 as they are and recorded (all layers and heads; first and last denoise step, all ten; with and
-without contributions) and in the usual way, in turn; the same with compiled denoise steps; largest memory of each kind
-of call; the rows of bfloat16 against those of float32 on the same weights.
+without contributions) and in the usual way, in turn; largest memory of each kind of call; the rows of bfloat16 against
+those of float32 on the same weights.
 """
 
 from __future__ import annotations
@@ -108,19 +108,6 @@ def main() -> int:
     note = "bfloat16, random weights. Recorded calls end with their rows on the processor."
     print(write_rows("gpu", {"eager": timed_table(calls_of(policy, wait), arguments.rounds, half, note)}), flush=True)
 
-    from vla_attention.capture.policies.pi.compiled import compile_steps
-
-    if time.perf_counter() < half + 60:
-        began = time.perf_counter()
-        compile_steps(policy.model)
-        wanted = ("plain", "all ten steps", "all ten steps, contributions")
-        calls = {kind: call for kind, call in calls_of(policy, wait).items() if kind in wanted}
-        for call in calls.values():
-            call()
-        took = f"{note} Compiling the graphs took {time.perf_counter() - began:.0f} s."
-        table = timed_table(calls, arguments.rounds, end - 60, took)
-        print(write_rows("gpu", {"compiled": table}), flush=True)
-        policy.model.compiled_steps = None
     if time.perf_counter() < end:
         wide = make_policy("full", arguments.device, "float32")
         for ours, theirs in zip(wide.model.parameters(), policy.model.parameters(), strict=True):

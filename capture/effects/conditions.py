@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from vla_attention.capture.effects.arguments import EffectSettings
 from vla_attention.capture.interventions.condition_name import condition_name, knockout_of_group
-from vla_attention.capture.policies.policy import Policy, PolicyInput, UnitsPolicy, VariantPolicy, is_compiled
+from vla_attention.capture.policies.policy import Policy, PolicyInput, UnitsPolicy, VariantPolicy
 from vla_attention.schemas.effects import EffectReaders, EffectsRecorded
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.groupings.builtin_groupings import TEXT_KEYS
@@ -39,11 +39,6 @@ UNCHANGED = Interventions("unchanged")
 
 def check_effects(planned: EffectsRecorded, policy: Policy) -> None:
     """Raise `BadArgument` if the policy has no effects that can be measured like this."""
-    if is_compiled(policy.identity()):
-        raise BadArgument(
-            "Cannot measure effects with compiled denoise steps (--compile), which no change of attention reaches; "
-            "capture without --compile."
-        )
     if not isinstance(policy, UnitsPolicy):
         raise BadArgument(f"Cannot measure effects of {policy.family}: it does not say what a unit of its actions is.")
     if planned.denoise_steps < policy.num_denoise_steps and not isinstance(policy, VariantPolicy):

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from vla_attention.capture.interventions.attention_edits import SiteEdit, SiteEditor
-from vla_attention.capture.policies.policy import Policy, is_compiled
+from vla_attention.capture.policies.policy import Policy
 from vla_attention.schemas.errors import BadArgument, unknown_name
 from vla_attention.schemas.groupings.resolve import EmptyGroup
 from vla_attention.schemas.groupings.selector_weights import check_selector, selector_weights
@@ -51,15 +51,6 @@ def check_places(interventions: Interventions, policy: Policy | PolicyIdentity) 
     for change in interventions.images:
         if change.camera not in (names := [camera.name for camera in policy.cameras]):
             raise unknown_name("camera", change.camera, names)
-
-
-def check_not_compiled(identity: PolicyIdentity) -> None:
-    """Raise `BadArgument` if the policy's denoise steps are compiled, which nothing changes attention in."""
-    if is_compiled(identity):
-        raise BadArgument(
-            f"Cannot change the attention of '{identity.name}' with compiled denoise steps (--compile), which no "
-            "intervention reaches; capture without --compile, and rerun such a store."
-        )
 
 
 def interventions_for(interventions: Interventions, policy: Policy) -> Interventions:

@@ -159,11 +159,6 @@ class Policy(ModelSizes, Protocol):
         """
 
 
-def is_compiled(identity: PolicyIdentity) -> bool:
-    """Return whether denoise steps go through torch.compile: they are made call by call, and nothing changes them."""
-    return identity.config.get("denoise_steps") == "compiled"
-
-
 @runtime_checkable
 class BatchPolicy(Protocol):
     """A policy that can make several calls at a time."""

@@ -62,30 +62,6 @@ class RecordingPlan:
 
 
 @dataclass
-class StepRequest:
-    """What a compiled denoise step gives the recorder; `AttentionRecorder.step_request` makes it.
-
-    layers: recorded layers, in the order of the model. heads: planned heads on the device, or None for all in their
-    order. mean: whether the mean over the action queries is recorded. pools: (pool, action query), or None. members:
-    (part, key) float32, or None without contributions; parts without keys fill it up to a multiple of 8, so that
-    prompts with other numbers of parts need no other graph.
-    """
-
-    layers: tuple[int, ...]
-    heads: Tensor | None
-    mean: bool
-    pools: Tensor | None
-    members: Tensor | None
-
-    def reduced(self, rows: Tensor) -> Tensor:
-        """Return what is recorded (head, query, key) of the rows (head, action query, key)."""
-        chosen = rows if self.heads is None else rows.index_select(0, self.heads)
-        if self.mean:
-            return chosen.mean(dim=1, keepdim=True)
-        return chosen if self.pools is None else torch.matmul(self.pools, chosen)
-
-
-@dataclass
 class AttentionRecorder(RowCollector):
     """Collects the rows of one site during one replan (batch 1). Every replan needs a new one.
 
@@ -115,10 +91,6 @@ class AttentionRecorder(RowCollector):
     _rows_seen: Counter[Cell] = field(default_factory=Counter, init=False, repr=False)
     _updates_seen: Counter[Cell] = field(default_factory=Counter, init=False, repr=False)
     _contributions: CallContributions | None = field(default=None, init=False, repr=False)
-    #: What compiled steps are asked for, and what they gave, (cell, ...).
-    _request: StepRequest | None = field(default=None, init=False, repr=False)
-    _step_rows: Tensor | None = field(default=None, init=False, repr=False)
-    _step_grams: Tensor | None = field(default=None, init=False, repr=False)
     #: Rows (1, head, action query, key) of all heads and the value products, kept until the update of the call arrives.
     _awaited: Tensor | None = field(default=None, init=False, repr=False)
     _pieces: Sequence[Tensor] | None = field(default=None, init=False, repr=False)
@@ -240,37 +212,6 @@ class AttentionRecorder(RowCollector):
         large = math.prod(shape) * of_actions.element_size() > _LARGEST_BUFFER
         return torch.empty(shape, device="cpu" if large else device)
 
-    def step_request(self, denoise_step: int, device: torch.device) -> StepRequest | None:
-        """Return what a compiled denoise step shall give `take_step`; None if nothing of it is recorded.
-
-        device: of the model.
-        """
-        if denoise_step not in self.plan.denoise_steps:
-            return None
-        if self._request is None:
-            self._request = StepRequest(
-                tuple(sorted(self.plan.layers)),
-                torch.tensor(self.plan.heads, device=device),
-                self.plan.queries == "mean",
-                None if self.plan.queries != "steps" else torch.from_numpy(self._given_pools()).float().to(device),
-                None if self.parts is None else torch.from_numpy(_filled_up(self.parts)).to(device),
-            )
-        return self._request
-
-    def take_step(self, denoise_step: int, rows: Tensor, grams: Tensor | None) -> None:
-        """Take what a compiled step gave for the request's layers: rows (layer, head, query, key), Gram matrices."""
-        if rows.shape[-1] != self.num_keys:
-            raise ValueError(
-                f"site '{self.plan.site}' has {self.num_keys} keys, but the model gave rows of {rows.shape[-1]}"
-            )
-        layers = sorted(self.plan.layers)
-        places = [self._cells[layer, denoise_step] for layer in layers]
-        self._step_rows = _placed(self._step_rows, rows, places, len(self._cells))
-        if grams is not None:
-            self._step_grams = _placed(self._step_grams, grams, places, len(self._cells))
-        self._rows_seen.update((layer, denoise_step) for layer in layers)
-        self._updates_seen.update((layer, denoise_step) for layer in layers if grams is not None)
-
     def finish(self) -> RecordedRows:
         """Return the rows of the whole plan; raise `SiteNotRecorded` if a call is missing or was recorded twice."""
         with torch.inference_mode():
@@ -285,14 +226,6 @@ class AttentionRecorder(RowCollector):
         It is called once, after the model.
         """
         self._check(self._rows_seen, "rows")
-        if self._step_rows is not None:
-            if self.parts is None:
-                return [self._step_rows]
-            self._check(self._updates_seen, "updates")
-            assert self._step_grams is not None
-            last = self._step_grams.shape[-1] - 1
-            kept = torch.tensor([*range(self.parts.shape[1]), last], device=self._step_grams.device)
-            return [self._step_rows, self._step_grams[:, kept[:, None], kept]]
         assert self._buffer is not None
         if self.plan.queries == "mean":
             self._buffer.div_(self._num_queries)
@@ -321,27 +254,6 @@ class AttentionRecorder(RowCollector):
                 f"{len(self._cells)} pairs of layer and denoise step, but passed on {'; '.join(faults[:6])}"
                 f"{' ...' if len(faults) > 6 else ''}."
             )
-
-
-def _filled_up(parts: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return the members (part, key) of parts (key, part), with empty parts up to a multiple of 8."""
-    keys, count = parts.shape
-    members = np.zeros((-(-count // 8) * 8, keys), dtype=np.float32)
-    members[:count] = parts.T
-    return members
-
-
-def _placed(buffer: Tensor | None, values: Tensor, places: Sequence[int], count: int) -> Tensor:
-    """Copy values (layer, ...) to their places in a buffer (cell, ...), which is made first if there is none."""
-    if buffer is None:
-        buffer = values.new_empty(count, *values.shape[1:])
-    step = places[1] - places[0] if len(places) > 1 else 1
-    if list(places) == list(range(places[0], places[-1] + 1, step)) and step > 0:
-        buffer[places[0] : places[-1] + 1 : step].copy_(values)
-    else:
-        for place, value in zip(places, values, strict=True):
-            buffer[place].copy_(value)
-    return buffer
 
 
 def _of_queries(tensor: Tensor, axis: int, queries: slice) -> Tensor:

@@ -10,7 +10,7 @@ from vla_attention.capture.effects.mean_pictures import pictures_of
 from vla_attention.capture.engine.plan import plan_recording
 from vla_attention.capture.engine.progress import say
 from vla_attention.capture.engine.settings import RecordingSettings, recording_settings
-from vla_attention.capture.interventions.resolution import check_not_compiled, check_places, interventions_for
+from vla_attention.capture.interventions.resolution import check_places, interventions_for
 from vla_attention.capture.machine import describe_machine, load_torch
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.identity import downloads_of
@@ -38,7 +38,6 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
     recording = recording_settings(arguments)
     base = open_base(arguments.base, settings.tasks, settings.num_episodes)
     if settings.series is not None:
-        check_not_compiled(base.attributes.policy)
         series = SeriesRun.planned(arguments, base)
         rerun = _prepare(arguments, recording, base, threads, termination)
         series.write(rerun, rerun.check(settings.check))
@@ -47,8 +46,6 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
     _refuse_options_of_series(settings, output)
     interventions = rerun_interventions(arguments)
     check_may_change(base, interventions)
-    if interventions.changes_attention:
-        check_not_compiled(base.attributes.policy)
     # All mistakes that need no model are errors now, before the minutes for loading one. Those of the changes come
     # first: whoever asks for a layer that there is not would not be helped by another place for the store.
     check_places(interventions, base.attributes.policy)

@@ -18,13 +18,13 @@ from vla_attention.capture.environments.base import EnvironmentSettings, Task, c
 from vla_attention.capture.environments.episode_protocol import WAIT_STEPS, EvaluationProtocol
 from vla_attention.capture.environments.suites import list_tasks
 from vla_attention.capture.interventions.prompts import check_synonyms
-from vla_attention.capture.interventions.resolution import check_not_compiled, interventions_for
+from vla_attention.capture.interventions.resolution import interventions_for
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.jobs.worker_log import plan_of, planned_episodes, read_logs
 from vla_attention.capture.machine import POLICY_BATCH, describe_machine
 from vla_attention.capture.policies.families import family_of_kind
 from vla_attention.capture.policies.identity import downloads_of
-from vla_attention.capture.policies.policy import BatchPolicy, Policy, is_compiled, stored_picture_sizes
+from vla_attention.capture.policies.policy import BatchPolicy, Policy, stored_picture_sizes
 from vla_attention.capture.run.run_settings import RunSettings, default_num_envs
 from vla_attention.capture.store.disk_estimate import estimate_disk
 from vla_attention.capture.store.store_writer import open_run
@@ -130,8 +130,6 @@ def _plan_calls(settings: RunSettings, policy: Policy, protocol: Protocol, tasks
     """
     asked, instructions = settings.interventions, {task.task_id: task.instruction for task in tasks}
     recording, note = plan_recording(settings.recording, policy, asked.noise.seed if asked.noise else protocol.seed)
-    if asked.changes_attention:
-        check_not_compiled(policy.identity())
     changes = RunChanges(interventions_for(asked, policy), instructions, settings.allow_empty)
     if changes.interventions.prompt is not None:
         check_synonyms(changes.interventions.prompt, instructions.values())
@@ -154,8 +152,6 @@ def _policy_batch(settings: RunSettings, policy: Policy, device: str, num_envs: 
     asked, single = settings.policy_batch, ""
     if not isinstance(policy, BatchPolicy):
         single = f": policies of the kind {policy.family} make one call"
-    elif is_compiled(policy.identity()):
-        single = " with --compile, whose calls are made one by one"
     elif settings.interventions.changes_attention:
         single = " with interventions on attention, whose calls are made one by one"
     if single and asked is not None and asked > 1:

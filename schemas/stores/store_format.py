@@ -407,7 +407,7 @@ def is_episode_name(name: str) -> bool:
 class FileRecord(Document, frozen=True):
     """Size in bytes and sha256 of a file of an episode.
 
-    `index` is the sha256 of the index at the end of a shard, from which single chunks are read, with the index's checksum.
+    Of a shard, from which single chunks are read, `index` is the sha256 of the index at its end, with its checksum.
     """
 
     size: int

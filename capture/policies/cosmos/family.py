@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from argparse import SUPPRESS
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,7 +15,6 @@ from vla_attention.capture.policies.family import (
     PublishedScript,
     checkpoint_option,
 )
-from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.options import option
 
 if TYPE_CHECKING:
@@ -67,7 +65,6 @@ class CosmosSettings(ModelSettings):
     num_denoising_steps_action: int | None = option("denoise steps (default: 5)", None)
     chunk_size: int | None = option("actions of a call (default: 16)", None)
     num_open_loop_steps: int | None = option("actions executed per call (default: the chunk)", None)
-    compile: bool = option(SUPPRESS, False)  # refused in `_build`
     query_frame: str = option(
         "whose queries are recorded (default: %(default)s)",
         "action",
@@ -98,8 +95,6 @@ class CosmosSettings(ModelSettings):
         """Load the policy; see `build_cosmos_policy`."""
         from vla_attention.capture.policies.cosmos.loading import build_cosmos_policy
 
-        if self.compile:
-            raise BadArgument("Cannot use --compile with a Cosmos policy: so far only pi models have it; leave it out.")
         return build_cosmos_policy(self, device)
 
     def analysis_arguments(self) -> list[str]:

@@ -80,9 +80,6 @@ class PiSettings(ModelSettings):
     tokenizer: str | None = option("sentencepiece model of the policy's language model", None, metavar="PATH")
     paligemma_variant: str | None = option("checked against the checkpoint (gemma_2b ...)", None)
     action_expert_variant: str | None = option("checked against the checkpoint (gemma_300m ...)", None)
-    compile: bool = option(
-        "denoise steps through torch.compile, as CUDA graphs on a GPU; the first call takes minutes", False
-    )
     num_image_tokens: int | None = option("checked against the policy's layout", None)
     robot_data: RobotData | None = None
     robot: Robot | None = None
@@ -116,8 +113,6 @@ class PiSettings(ModelSettings):
             same = {"camera": [f"{name}={sources.get(name, NONE)}" for name in slots]}
         same |= {name: Path(facts[name]) for name in ("model_config", "norm_stats") if name in facts}
         same |= {name: facts[name] for name in ("asset_id",) if name in facts}
-        if "denoise_steps" in facts:
-            same["compile"] = True
         if identity.checkpoint_format == "seeded":
             return {"checkpoint": identity.name, **same}
         settings = {"checkpoint": identity.checkpoint, "dtype": identity.config["dtype"], **same}

@@ -13,7 +13,6 @@ from vla_attention.capture.policies.checkpoints import UnsupportedCheckpoint
 from vla_attention.capture.policies.family import UNTRAINED, UNTRAINED_TINY
 from vla_attention.capture.policies.hub import downloads, hub_version
 from vla_attention.capture.policies.identity import PolicySource
-from vla_attention.capture.policies.pi.compiled import compile_steps
 from vla_attention.capture.policies.pi.config import (
     CAMERA_SLOTS,
     GEMMA_VARIANTS,
@@ -246,8 +245,7 @@ _UNTRAINED = {UNTRAINED: embedded_policy, UNTRAINED_TINY: dummy_policy}
 def build_pi_policy(settings: PiSettings, device: str) -> PiPolicy:
     """Build the policy and check the settings against it.
 
-    Raises `BadArgument` if a variant or the number of image tokens contradicts the policy, or if nothing can be
-    compiled here.
+    Raises `BadArgument` if a variant or the number of image tokens contradicts the policy.
     """
     checkpoint, robot, data = settings.checkpoint, settings.robot, settings.robot_data
     named = (settings.paligemma_variant, settings.action_expert_variant)
@@ -298,8 +296,6 @@ def build_pi_policy(settings: PiSettings, device: str) -> PiPolicy:
             f"--num-image-tokens {settings.num_image_tokens} contradicts the layout: each of the cameras "
             f"{listing(config.cameras)} has {config.siglip.num_tokens} keys; leave the option out."
         )
-    if settings.compile:
-        compile_steps(policy.model)
     return policy
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -22,9 +21,6 @@ from vla_attention.capture.policies.pi.gemma import AttentionCalls, GemmaModel, 
 from vla_attention.capture.policies.pi.siglip import Projector, VisionTower
 from vla_attention.capture.policies.weights import Shapes, check_shapes, fill, make_empty, shapes_of
 from vla_attention.capture.recording.attention import AttentionEditor, RowCollector
-
-if TYPE_CHECKING:
-    from vla_attention.capture.policies.pi.compiled import CompiledSteps
 
 
 @dataclass(frozen=True)
@@ -118,8 +114,6 @@ class PiModel(nn.Module):
             self.action_time_mlp_out = nn.Linear(expert, expert)
         self._place_precision(dtype)
         self.eval()
-        #: Set by `compile_steps`: makes the denoise steps of a single call through torch.compile.
-        self.compiled_steps: CompiledSteps | None = None
 
     def _place_precision(self, dtype: torch.dtype) -> None:
         if dtype not in (torch.float32, torch.bfloat16):
@@ -272,8 +266,7 @@ class PiModel(nn.Module):
         Returns:
             (batch, horizon, action dim) float32, still normalised.
         """
-        config, compiled = self.config, self.compiled_steps
-        through_compiled = compiled is not None and compiled.takes(noise, recorder, editor)
+        config = self.config
         prefix = self.encode_prefix(*self.embed_prefix(images, image_masks, tokens, token_mask), editor)
         suffix_positions = torch.arange(config.suffix_len, device=noise.device)
         valid = prefix.valid.to(noise.device)
@@ -297,8 +290,6 @@ class PiModel(nn.Module):
             min_period=config.min_period,
             max_period=config.max_period,
         ).to(noise.device)
-        if compiled is not None and through_compiled:
-            return compiled.integrate(noise, all_waves, denoising, recorder)
         x = noise
         for step, waves in enumerate(all_waves):
             x = x + (-1.0 / steps) * self.velocity(x, step, waves, denoising, recorder, editor)

@@ -120,8 +120,6 @@ class PiPolicy:
             "long_prompts": "cut" if self.processing.cut_long_prompts else "refused",
             "tokenizer_digest": self.tokenizer.digest,
         }
-        if self.model.compiled_steps is not None:
-            facts["denoise_steps"] = "compiled"
         if not self.robot.turned:
             facts["robot"] = to_json(self.robot)
         return describe_policy(self, self.source, self._digest, facts)
@@ -255,10 +253,7 @@ class PiPolicy:
         noise_seeds: Sequence[int],
         recorders: Sequence[Mapping[str, RowCollector]],
     ) -> list[NDArray[np.float64]]:
-        """Make several calls as one batch; see `BatchPolicy`. Compiled denoise steps are made call by call."""
-        if self.model.compiled_steps is not None:
-            calls = zip(policy_inputs, noise_seeds, recorders, strict=True)
-            return [self.act(given, seed, call_recorders) for given, seed, call_recorders in calls]
+        """Make several calls as one batch; see `BatchPolicy`."""
         site = self.sites[0].name
         tensors = {name: torch.cat([each.tensors[name] for each in policy_inputs]) for name in policy_inputs[0].tensors}
         collector = BatchCollector([each[site] for each in recorders]) if all(site in r for r in recorders) else None
