@@ -13,7 +13,6 @@ from typing import Any
 
 import google_crc32c
 import numpy as np
-import zarr
 from numcodecs import blosc
 
 #: The first two episodes of a task; arrays of both have the same shapes.
@@ -46,17 +45,6 @@ def exchange_index_entries(shard: Path, one: int, other: int, chunks: int) -> No
     index = np.frombuffer(content[-size:-4], dtype="<u8").reshape(-1, 2).copy()
     index[[one, other]] = index[[other, one]]
     shard.write_bytes(content[:-size] + with_checksum(index.tobytes()))
-
-
-def permute_chunks(shard: Path, order: list[int]) -> None:
-    """Write a shard anew with its chunks in another order: a whole shard, as its writer might have written it."""
-    content = shard.read_bytes()
-    size = 16 * len(order) + 4
-    index = np.frombuffer(content[-size:-4], dtype="<u8").reshape(-1, 2)
-    chunks = [content[int(start) : int(start + length)] for start, length in index[order]]
-    starts = np.cumsum([0, *(len(chunk) for chunk in chunks[:-1])])
-    written = np.array([(start, len(chunk)) for start, chunk in zip(starts, chunks, strict=True)], dtype="<u8")
-    shard.write_bytes(b"".join(chunks) + with_checksum(written.tobytes()))
 
 
 def with_checksum(content: bytes) -> bytes:
@@ -98,12 +86,12 @@ def _sums_of(frame: bytes, keys: int) -> np.ndarray | None:
     return sums if (rows >= 0).all() and (sums <= 1.5).all() else None
 
 
-def encode_again(episode: Path, array: str) -> None:
-    """Store other values of the same kind, with right checksums: the replans in reverse order, or numbers plus 1."""
-    stored = zarr.open_array(episode / array)
-    values = stored[...]
-    other = values[::-1] if values.shape[0] > 1 and not np.array_equal(values, values[::-1]) else values + 1
-    stored[...] = other
+def flip_bit(episode: Path, array: str) -> None:
+    """Flip a bit in the first chunk of an array."""
+    file = files_of(episode, array)[0]
+    content = bytearray(file.read_bytes())
+    content[20] ^= 1
+    file.write_bytes(content)
 
 
 def root_leaves(path: Path) -> dict[str, tuple[Any, ...]]:
@@ -157,18 +145,15 @@ def attacks(arrays: list[str]) -> dict[str, Attack]:
         found[f"{array} of another store"] = lambda path, other, array=array: exchange(
             *(store / "episodes" / FIRST / array for store in (path, other))
         )
-        found[f"{array} encoded again"] = lambda path, other, array=array: encode_again(first(path), array)
+        found[f"{array} with another bit"] = lambda path, other, array=array: flip_bit(first(path), array)
     for one, two_ in (("frames/base_0_rgb", "frames/left_wrist_0_rgb"), ("joint/row_sum", "joint/atoms")):
         found[f"{one} exchanged with {two_}"] = lambda path, other, pair=(one, two_): exchange(
             *(files_of(first(path), array)[0] for array in pair)
         )
     for what, one_, other_ in (("layers", 0, 2), ("denoise steps", 0, 1), ("replans", 0, 4)):
-        order = list(range(12))
-        order[one_], order[other_] = other_, one_
         found[f"index of rows: {what} exchanged"] = lambda path, other, pair=(one_, other_): exchange_index_entries(
             shard(path), *pair, 12
         )
-        found[f"chunks of rows: {what} exchanged"] = lambda path, other, order=order: permute_chunks(shard(path), order)
     found["chunks of rows: other bits of the same crc32c"] = lambda path, other: shard(path).write_bytes(
         forge_chunk(shard(path).read_bytes(), 3, 12, 39)
     )

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from math import gcd
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from vla_attention.analyze.core import measure
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.question_settings import settings_from_keywords
-from vla_attention.capture.store import codecs as store_codecs
+from vla_attention.capture.store import site_writer
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 
@@ -45,7 +46,7 @@ def originals(tmp_path_factory) -> tuple[Path, Path]:
     """Two stores of other seeds, with equal shapes; rows are in three blocks."""
     folder = tmp_path_factory.mktemp("originals")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(store_codecs, "TARGET_CHUNK_BYTES", 1)
+        patch.setattr(site_writer, "replans_per_block", lambda size, count=None: 8 // gcd(8, size // 4))
         return write_store(folder / "a.zarr", spec=SPEC), write_store(folder / "b.zarr", spec=SPEC, seed=3)
 
 

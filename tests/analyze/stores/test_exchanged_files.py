@@ -5,19 +5,20 @@ from __future__ import annotations
 import re
 import shutil
 from collections.abc import Callable
+from math import gcd
 from pathlib import Path
 
 import polars as pl
 import pytest
 
 import vla_attention as va
-from tests.kit.attacks import attacks, edit_root, encode_again, first, root_leaves
+from tests.kit.attacks import attacks, edit_root, first, flip_bit, root_leaves
 from tests.kit.stores import StoreSpec, reseal_root, write_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.api import OpenStores
 from vla_attention.analyze.store.copying import copy_store
-from vla_attention.capture.store import codecs as store_codecs
+from vla_attention.capture.store import site_writer
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import CorruptEpisode
 from vla_attention.schemas.stores.verify import verify_store
@@ -58,7 +59,7 @@ def originals(tmp_path_factory) -> tuple[Path, Path]:
     """Two stores of other seeds, with equal shapes."""
     folder = tmp_path_factory.mktemp("originals")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(store_codecs, "TARGET_CHUNK_BYTES", 1)
+        patch.setattr(site_writer, "replans_per_block", lambda size, count=None: 8 // gcd(8, size // 4))
         return write_store(folder / "a.zarr", spec=SPEC), write_store(folder / "b.zarr", spec=SPEC, seed=3)
 
 
@@ -153,7 +154,7 @@ COMMANDS = {
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_ends_with_one_sentence_that_names_the_episode(stores, tmp_path, capsys, command):
     words, array = COMMANDS[command]
-    encode_again(first(stores[0]), array)
+    flip_bit(first(stores[0]), array)
     output = tmp_path / ("out.html" if command == "report" else "out")
     name, *more = command.split()
     assert main([name, str(stores[0]), *more, *words, "--output", str(output)]) == 2
