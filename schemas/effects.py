@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from typing import Literal
 
+from msgspec import field
+
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.jsonable import Document, Number
@@ -17,8 +19,8 @@ CHANGE = "effects/change"
 CUT = "cut"
 #: What is taken away, one at a time. `text`: every word of the instruction, every part of the prompt, and all of it.
 #: `cameras`: every camera's picture, and all of them. `objects`: the patches of every object. `tokens`: every key of
-#: the prompt that is no piece of a word.
-EffectItems = Literal["text", "cameras", "objects", "tokens"]
+#: the prompt that is no piece of a word. `groups`: every group of a grouping, and everything but the group.
+EffectItems = Literal["text", "cameras", "objects", "tokens", "groups"]
 #: Whose queries no longer read it. `all`: nobody reads it. `action`: the action queries alone. `pictures`, `text`: the
 #: tokens of pictures, or of the prompt, before the denoise steps.
 EffectReaders = Literal["all", "action", "pictures", "text"]
@@ -28,7 +30,7 @@ class EffectsRecorded(Document, frozen=True):
     """Which effects a run measures.
 
     `every`: at every so many replans, from the first on. `denoise_steps`: network evaluations of a changed call.
-    `seed`: of the random keys, and of the other noise.
+    `seed`: of the random keys, and of the other noise. `groups`: the selector of each group, by name.
     """
 
     items: tuple[EffectItems, ...]
@@ -36,6 +38,7 @@ class EffectsRecorded(Document, frozen=True):
     every: int
     denoise_steps: int
     seed: int
+    groups: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check that something is measured, and the numbers."""

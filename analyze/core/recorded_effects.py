@@ -191,8 +191,8 @@ def recorded_effects(
 _NOT_SHOWN = "No effect that {} holds can be shown. {}"
 
 
-def described(given: Interventions) -> dict[str, str | None]:
-    """What a condition changes: kind, item, item_kind, selector and reader."""
+def described(given: Interventions, groups: Mapping[str, str]) -> dict[str, str | None]:
+    """What a condition changes: kind, item, item_kind, selector and reader. groups: name -> selector, of the run."""
     changed = [bool(given.keys), bool(given.attention), given.prompt is not None, bool(given.images), bool(given.noise)]
     kind, item, item_kind = "several", visible(given.describe()), "other"
     selector = reader = None
@@ -206,6 +206,9 @@ def described(given: Interventions) -> dict[str, str | None]:
         knockout = given.keys[0]
         kind = "random" if knockout.random_seed is not None else "only" if knockout.keep else "without"
         item, item_kind = _item_of(knockout.selector)
+        of_group = [name for name, selector in groups.items() if selector == knockout.selector]
+        if of_group and "_group_" in given.name:  # a group that is one of the other items has the name of that
+            item, item_kind = visible(of_group[0]), "group"
         others = {"only": f"all but the {item.removeprefix('all ')}", "random": f"random keys, as many as {item}"}
         item, selector, reader = others.get(kind, item), visible(knockout.selector), _reader_of(knockout)
     elif given.prompt is not None:
@@ -345,7 +348,9 @@ def _rows(one: _Episode) -> pl.DataFrame:
     item, arrays, measured = one
     effects = item.episode.attributes.effects
     assert effects is not None
-    named = [{"condition": visible(given.name), **described(given)} for given in effects.conditions]
+    recorded = item.store.attributes.recording.effects
+    groups = {} if recorded is None else recorded.groups
+    named = [{"condition": visible(given.name), **described(given, groups)} for given in effects.conditions]
     conditions = pl.DataFrame(named, schema=dict.fromkeys(NAMES, pl.String))[arrays["condition"]]
     keys = episode_columns(item, _EPISODE, len(conditions))
     place = {name: arrays[name] for name in ("replan", "env_step", "begin", "end")}

@@ -4,24 +4,31 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass, fields
-from typing import cast, get_args
+from typing import get_args
 
-from vla_attention.schemas.effects import EffectItems, EffectReaders
+from vla_attention.schemas.effects import EffectReaders
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
 from vla_attention.schemas.options import add_options, option, read_options
 from vla_attention.schemas.stores.store_url import StorePlace, store_place
+
+#: Beginning of the item that names a grouping.
+GROUPING = "grouping:"
+#: What effects can be of, as it is typed.
+ITEMS = ("text", "cameras", "objects", "tokens", f"{GROUPING}FILE")
 
 
 @dataclass(frozen=True)
 class EffectSettings:
     """Which effects are measured; see `EffectsRecorded`. denoise_steps: None takes those of the policy.
 
+    items: of `EffectItems`, and `grouping:NAME` or `grouping:FILE.toml` for the groups of a grouping.
     pictures: the store of whose pictures cameras get the mean; None: in a rerun that of the base, else grey.
     """
 
-    items: tuple[EffectItems, ...] = option(
-        f"{', '.join(get_args(EffectItems))}, with commas between, or none (default). Each call is made again without "
-        "each of them; text,cameras takes the time of 7 calls with a small pi, of 17 with a large one",
+    items: tuple[str, ...] = option(
+        f"{', '.join(ITEMS)} (the groups of a built-in grouping or TOML file), with commas between, or none (default). "
+        "Each call is made again without each of them; text,cameras takes the time of 7 calls with a small pi, of 17 "
+        "with a large one",
         group="effects: the action without a word, a part, a picture (docs/effects.md)",
         name="effects",
         nargs=None,  # words with commas between
@@ -51,13 +58,22 @@ class EffectSettings:
 
     def __post_init__(self) -> None:
         """Check the words, and bring them into their order."""
-        for name, known in (("items", get_args(EffectItems)), ("readers", get_args(EffectReaders))):
+        groupings = tuple(dict.fromkeys(word for word in self.items if word.startswith(GROUPING)))
+        if len(groupings) > 1:
+            raise BadArgument(f"Effects take the groups of one grouping, not of {listing(groupings)}.")
+        for name, known in (("items", (*ITEMS[:-1], *groupings)), ("readers", get_args(EffectReaders))):
             words = getattr(self, name)
             for word in words:
                 if word not in known:
-                    near = did_you_mean(word, known)
-                    raise BadArgument(f"Effects have no {name[:-1]} '{word}'; expected {listing(known)}.{near}")
+                    expected = ITEMS if name == "items" else known
+                    near = did_you_mean(word, expected)
+                    raise BadArgument(f"Effects have no {name[:-1]} '{word}'; expected {listing(expected)}.{near}")
             object.__setattr__(self, name, tuple(word for word in known if word in words))
+
+    @property
+    def grouping(self) -> str | None:
+        """Name or file of the grouping whose groups are measured."""
+        return next((word.removeprefix(GROUPING) for word in self.items if word.startswith(GROUPING)), None)
 
 
 def add_effect_options(parser: argparse.ArgumentParser) -> None:
@@ -83,5 +99,5 @@ def settings_of(effects: str | EffectSettings | None) -> EffectSettings | None:
     return EffectSettings(_items(effects)) if isinstance(effects, str) else effects
 
 
-def _items(words: str) -> tuple[EffectItems, ...]:
-    return cast("tuple[EffectItems, ...]", tuple(word.strip() for word in words.split(",")))
+def _items(words: str) -> tuple[str, ...]:
+    return tuple(word.strip() for word in words.split(","))

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import get_args
 
 from msgspec.structs import replace
 
 from vla_attention.capture.effects.arguments import EffectSettings
-from vla_attention.capture.interventions.condition_name import condition_name, knockout_of_group
+from vla_attention.capture.interventions.condition_name import condition_name, knockout_of_group, plain
+from vla_attention.capture.interventions.resolution import run_vocabularies
 from vla_attention.capture.policies.policy import Policy, PolicyInput, UnitsPolicy, VariantPolicy
-from vla_attention.schemas.effects import EffectReaders, EffectsRecorded
-from vla_attention.schemas.errors import BadArgument, listing
-from vla_attention.schemas.groupings.builtin_groupings import TEXT_KEYS
+from vla_attention.schemas.effects import EffectItems, EffectReaders, EffectsRecorded
+from vla_attention.schemas.errors import BadArgument, UserError, listing, plural
+from vla_attention.schemas.groupings.builtin_groupings import TEXT_KEYS, find_grouping
+from vla_attention.schemas.groupings.grouping import REST
 from vla_attention.schemas.groupings.selector_weights import selector_weights
-from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
+from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, SceneObject, Vocabulary
 from vla_attention.schemas.groupings.words import Word, split_words, words_of
 from vla_attention.schemas.interventions import (
     ImageChange,
@@ -62,17 +66,21 @@ def planned_effects(settings: EffectSettings | None, policy: Policy, seed: int) 
         return None
     steps = policy.num_denoise_steps if settings.denoise_steps is None else settings.denoise_steps
     other = seed + 1 if seed + 1 < 2**63 else seed - 1
-    planned = EffectsRecorded(settings.items, settings.readers, settings.every, steps, other)
+    named = settings.grouping is not None
+    items = tuple(item for item in get_args(EffectItems) if item in settings.items or (named and item == "groups"))
+    groups = _groups_of(settings.grouping, policy) if settings.grouping is not None else {}
+    planned = EffectsRecorded(items, settings.readers, settings.every, steps, other, groups)
     check_effects(planned, policy)
     return planned
 
 
 def describe_effects(planned: EffectsRecorded) -> str:
     """Return the line that is printed before a run."""
+    items = [item if item != "groups" else f"{plural(len(planned.groups), 'group')}" for item in planned.items]
     readers = {"all": "for all queries", "action": "for the action queries", "pictures": "by the pictures"}
     by = listing((readers | {"text": "by the prompt"})[reader] for reader in planned.readers)
     often = "every replan" if planned.every == 1 else f"one replan in {planned.every}"
-    return f"Effects of {listing(planned.items)}, {by}, at {often} (docs/effects.md)."
+    return f"Effects of {listing(items)}, {by}, at {often} (docs/effects.md)."
 
 
 def refuse_both(interventions: Interventions) -> None:
@@ -90,31 +98,35 @@ def conditions_of(
     policy_input: PolicyInput,
     tokens: Mapping[str, EpisodeTokens],
     vocabularies: Mapping[str, Vocabulary],
+    objects: Sequence[SceneObject],
     siblings: Sequence[str],
     with_mean: Collection[str] = (),
 ) -> tuple[Interventions, ...]:
     """Return the conditions of an episode, from its first call: the unchanged call, other noise, then every item.
 
-    tokens, vocabularies: by site. siblings: the instructions of the other tasks of the task's family. with_mean: the
-    cameras of which a mean picture is known; the others become grey.
+    tokens, vocabularies: by site. objects: of the scene. siblings: the instructions of the other tasks of the task's
+    family. with_mean: the cameras of which a mean picture is known; the others become grey.
     """
     words = words_of(policy_input.prompt)
-    groups = dict(_groups(planned, policy, tokens, vocabularies, words))
+    groups: dict[str, _Group] = {}
+    for group in _groups(planned, policy, tokens, vocabularies, objects, words):
+        # A group of a grouping may be one of the other items: it is measured once.
+        known = groups.setdefault(group.selector, group)
+        groups[group.selector] = _Group(known.name, group.selector, alone=known.alone or group.alone)
+    controlled = _controlled(planned, words)
     # Calls that are made one by one are the same to the bit: only a batch needs the unchanged one among them.
     conditions = [UNCHANGED] if isinstance(policy, VariantPolicy) else []
     conditions.append(Interventions("noise", noise=NoiseChange(planned.seed)))
     for reader in planned.readers:
         queries, query_selector = _READERS[reader]
-        for name, (selector, with_alone) in groups.items():
+        for selector, group in groups.items():
             knockout = KeyKnockout(selector, queries=queries, query_selector=query_selector)
-            conditions.append(knockout_of_group("without", name, knockout))
-            if with_alone and queries != "prefix":
-                conditions.append(knockout_of_group("only", name, replace(knockout, keep=True)))
-        for name in _controlled(planned, words):
-            random = KeyKnockout(
-                groups[name][0], queries=queries, query_selector=query_selector, random_seed=planned.seed
-            )
-            conditions.append(knockout_of_group("random", name, random))
+            conditions.append(knockout_of_group("without", group.name, knockout))
+            if group.alone and queries != "prefix":
+                conditions.append(knockout_of_group("only", group.name, replace(knockout, keep=True)))
+        for selector in controlled:
+            random = KeyKnockout(selector, queries=queries, query_selector=query_selector, random_seed=planned.seed)
+            conditions.append(knockout_of_group("random", groups[selector].name, random))
     if "text" in planned.items:
         conditions += [_named(Interventions(prompt=change)) for change in exchanges(words, siblings)]
     if "cameras" in planned.items:
@@ -128,23 +140,31 @@ def _named(interventions: Interventions) -> Interventions:
     return replace(interventions, name=condition_name(interventions))
 
 
+@dataclass(frozen=True)
+class _Group:
+    """Keys that are cut off. alone: everything but them is cut off, too."""
+
+    name: str
+    selector: str
+    alone: bool = False
+
+
 def _groups(
     planned: EffectsRecorded,
     policy: Policy,
     tokens: Mapping[str, EpisodeTokens],
     vocabularies: Mapping[str, Vocabulary],
+    objects: Sequence[SceneObject],
     words: Sequence[Word],
-) -> Iterator[tuple[str, tuple[str, bool]]]:
-    """Groups of keys by name: a selector, and whether everything but the group is cut off, too."""
-
+) -> Iterator[_Group]:
     def has_keys(selector: str) -> bool:
         weights = selector_weights(selector, tokens, vocabularies)
         return any((group[0] * tokens[site].valid[0]).any() for site, group in weights.items())
 
     if "text" in planned.items:
-        yield "linguistic", (TEXT_KEYS, True)
-        yield from ((part, (f"role:{part}", False)) for part in _PARTS if has_keys(f"role:{part}"))
-        yield from ((_word_name(text), (f'word:"{text}"', False)) for text in dict.fromkeys(_texts(words)))
+        yield _Group("linguistic", TEXT_KEYS, alone=True)
+        yield from (_Group(part, f"role:{part}") for part in _PARTS if has_keys(f"role:{part}"))
+        yield from (_Group(f"word_{text}", _of_word(text)) for text in dict.fromkeys(_texts(words)))
     if "tokens" in planned.items:
         of_words = {key for word in words for key in word.keys}
         for site, of_site in tokens.items():
@@ -152,14 +172,33 @@ def _groups(
                 prompt_keys = [piece.key for piece in of_site.prompts[0].pieces if piece.key not in of_words]
                 # Another site has keys of the same numbers, which are others.
                 within = "" if len(tokens) == 1 else f"{_text_spans(of_site)} & "
-                yield from ((f"{site}_key_{key}", (f"{within}keys:{key}-{key}", False)) for key in prompt_keys)
+                yield from (_Group(f"{site}_key_{key}", f"{within}keys:{key}-{key}") for key in prompt_keys)
     if "cameras" in planned.items:
-        yield "visual", ("role:image", True)
-        cameras = [camera.name for camera in policy.cameras]
-        yield from ((f"camera_{name}", (f"camera:{name}", False)) for name in cameras)
+        yield _Group("visual", "role:image", alone=True)
+        yield from (_Group(f"camera_{camera.name}", f"camera:{camera.name}") for camera in policy.cameras)
     if "objects" in planned.items:
-        names = dict.fromkeys(name for vocabulary in vocabularies.values() for name in vocabulary.objects)
-        yield from ((f"object_{name}", (f'object:"{name}"', False)) for name in names)
+        yield from (_Group(f"object_{thing.name}", f'object:"{thing.name}"') for thing in objects)
+    for name, selector in planned.groups.items():
+        yield _Group(f"group_{plain(name)}", selector, alone=True)
+
+
+def _groups_of(grouping: str, policy: Policy) -> dict[str, str]:
+    """Return the selector of each group of a grouping, at all sites that it fits, without the group of the rest."""
+    groups: dict[str, str] = {}
+    problems: list[UserError] = []
+    for vocabulary in run_vocabularies(policy.sites, (), ()).values():
+        try:
+            known = find_grouping(grouping, vocabulary)
+        except UserError as error:
+            problems.append(error)
+            continue
+        for name, selectors in known.groups.items():
+            if not any(selector.strip() == REST for selector in selectors):
+                joined = " | ".join(f"({selector})" for selector in selectors) if len(selectors) > 1 else selectors[0]
+                groups.setdefault(name, joined)
+    if not groups:
+        raise problems[0] if problems else BadArgument(f"The grouping '{grouping}' has no group but that of the rest.")
+    return groups
 
 
 def _text_spans(tokens: EpisodeTokens) -> str:
@@ -171,19 +210,18 @@ def _texts(words: Sequence[Word]) -> list[str]:
     return [word.text.casefold() for word in words]
 
 
-def _word_name(text: str) -> str:
-    return f"word_{text}"
+def _of_word(text: str) -> str:
+    return f'word:"{text}"'
 
 
 def _controlled(planned: EffectsRecorded, words: Sequence[Word]) -> list[str]:
-    """The groups that random keys are drawn for: the word with the most keys, and the whole instruction."""
-    if "text" not in planned.items or not words:
-        return []
+    """The selectors that random keys are drawn for: the word with the most keys, the instruction, every group."""
     counts: dict[str, int] = {}
-    for word in words:
-        name = _word_name(word.text.casefold())
-        counts[name] = counts.get(name, 0) + len(word.keys)
-    return [max(counts, key=lambda name: counts[name]), "instruction"]
+    for word in words if "text" in planned.items else ():
+        text = word.text.casefold()
+        counts[text] = counts.get(text, 0) + len(word.keys)
+    of_text = [_of_word(max(counts, key=lambda text: counts[text])), "role:instruction"] if counts else []
+    return list(dict.fromkeys([*of_text, *planned.groups.values()]))
 
 
 def exchanges(words: Sequence[Word], siblings: Sequence[str]) -> list[PromptChange]:

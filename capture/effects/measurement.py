@@ -23,13 +23,14 @@ from vla_attention.capture.interventions.resolution import (
     run_vocabularies,
     site_tokens,
 )
+from vla_attention.capture.interventions.run_changes import RunChanges, named_objects
 from vla_attention.capture.policies.policy import CallVariant, Policy, PolicyInput, UnitsPolicy, VariantPolicy
 from vla_attention.capture.store.replan_records import ReplanEffects
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.effects import EffectsRecorded
 from vla_attention.schemas.errors import BadArgument, UserError, plural
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
-from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.interventions import Interventions, KeyKnockout
 from vla_attention.schemas.stores.store_format import episode_name
 
 #: Calls that are made at a time, at most; a family takes fewer where its model is large. With 32, effects take 8 %
@@ -51,6 +52,7 @@ class EffectMeasurement:
         siblings: by task id, the instructions of the other tasks of its family, whose words are exchanged for its own.
         say: takes a line for the person at the terminal; each is said once.
         pictures: the mean pictures that cameras' own are exchanged for; None for grey ones.
+        instructions: of the run's tasks; groups may name their words.
     """
 
     policy: Policy
@@ -58,6 +60,7 @@ class EffectMeasurement:
     siblings: Mapping[int, Sequence[str]]
     say: Callable[[str], None]
     pictures: MeanPictures | None = None
+    instructions: Sequence[str] = ()
     #: Said where no word has another one that could stand in its place.
     no_siblings: str = "No other task of a family has other words in the same places: none is exchanged."
     #: Said where no mean pictures are known; empty where nothing could be done about it.
@@ -168,8 +171,19 @@ def measurement_of(
     say: Callable[[str], None],
     pictures: MeanPictures | None = None,
 ) -> EffectMeasurement | None:
-    """Return what measures a run's effects, None for none; tasks: number, instruction and family."""
-    return None if planned is None else EffectMeasurement(policy, planned, siblings_of(tasks), say, pictures)
+    """Return what measures a run's effects, None for none; tasks: number, instruction and family.
+
+    Raises:
+        SelectorError: a group names something that no task has.
+    """
+    if planned is None:
+        return None
+    known = list(tasks)
+    instructions = {number: text for number, text, _ in known}
+    if known and planned.groups:
+        groups = Interventions(keys=tuple(KeyKnockout(selector) for selector in planned.groups.values()))
+        RunChanges(groups, instructions).check_names(policy.sites)
+    return EffectMeasurement(policy, planned, siblings_of(known), say, pictures, tuple(instructions.values()))
 
 
 @dataclass
@@ -197,12 +211,21 @@ class EpisodeEffectsMeasured:
         )
         # The words of the first call stay known where the instruction changes: they have no keys then.
         self.instruction = self.instruction or policy_input.prompt.instruction_text
-        instructions = [self.instruction, policy_input.prompt.instruction_text]
-        vocabularies = run_vocabularies(policy.sites, instructions, context.objects)
+        instructions = [self.instruction, policy_input.prompt.instruction_text, *self.run.instructions]
+        # A group may name an object of another task's scene: it has no keys here.
+        objects = [*context.objects, *named_objects(planned.groups.values())]
+        vocabularies = run_vocabularies(policy.sites, instructions, objects)
         if self.conditions is None:
             siblings = self.run.siblings.get(context.task_id, ())
             self.conditions = conditions_of(
-                planned, policy, policy_input, tokens, vocabularies, siblings, context.mean_pictures
+                planned,
+                policy,
+                policy_input,
+                tokens,
+                vocabularies,
+                context.objects,
+                siblings,
+                context.mean_pictures,
             )
             if "text" in planned.items and not any(condition.prompt for condition in self.conditions):
                 self.run.say_once(self.run.no_siblings)

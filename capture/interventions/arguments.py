@@ -21,7 +21,7 @@ from vla_attention.schemas.interventions import (
 from vla_attention.schemas.options import option, read_options
 
 #: Who does not read what is knocked out, unless the command line says it.
-DEFAULT_QUERIES = "action"
+DEFAULT_QUERIES = "all"
 _QUERIES = ("action", "all", "prefix", "prefix:SELECTOR")
 _PROMPTS = ("empty", "shuffled", "shuffled:SEED", "task:N", "text:TEXT", "synonyms:FILE")
 _IMAGES = ("blank", "noise", "noise:SEED", "rotated", "shifted:ROWS,COLUMNS", "masked:OBJECT", "filled:OBJECT")
@@ -44,9 +44,9 @@ class InterventionSettings:
     )
     keep: str | None = option("knock out all other valid keys, but no action keys", None, metavar="SELECTOR")
     knockout_queries: str | None = option(
-        "who does not read them: action (the action queries, the default but for the words of a series), all (every "
-        "query that could carry the information on), prefix (pi: pictures and prompt only) or prefix:SELECTOR (those "
-        "tokens of it)",
+        "who does not read them: all (every query that could carry the information on, the default), action (the "
+        "action queries alone: what other tokens have read of them stays), prefix (pi: pictures and prompt only) or "
+        "prefix:SELECTOR (those tokens of it)",
         None,
         metavar="QUERIES",
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -55,7 +55,7 @@ class RunChanges:
             for task_id, text in instructions.items()
             if prompt is not None
         ]
-        known = self._named_objects() if objects is None else objects
+        known = named_objects(selectors_of(self.interventions)) if objects is None else objects
         check_selectors(self.interventions, self._vocabularies(sites, known, *changed))
 
     def editors(
@@ -78,7 +78,7 @@ class RunChanges:
         objects, place = context.objects, ReplanPlace(context.task_id, context.episode_index, context.replan)
         tokens = site_tokens(sites, policy_input.key_role, policy_input.prompt, objects, context.coverage)
         # Where empty groups are allowed, an object may also be one of another task's scene.
-        known = [*objects, *self._named_objects()] if self.allow_empty else objects
+        known = [*objects, *named_objects(selectors_of(self.interventions))] if self.allow_empty else objects
         vocabularies = self._vocabularies(sites, known, policy_input.prompt.instruction_text)
         self.num_empty += has_empty_group(self.interventions, tokens, vocabularies, place, allow_empty=self.allow_empty)
         return make_editors(self.interventions, tokens, vocabularies, place) or None
@@ -97,10 +97,12 @@ class RunChanges:
     ) -> dict[str, Vocabulary]:
         return run_vocabularies(sites, [*self.instructions.values(), *further], objects)
 
-    def _named_objects(self) -> list[SceneObject]:
-        atoms = [atom for text in selectors_of(self.interventions) for atom in atoms_of(parse_selector(text))]
-        names = dict.fromkeys(atom.argument for atom in atoms if atom.kind == "object")
-        return [SceneObject(name, "object", of_interest=False) for name in names]
+
+def named_objects(selectors: Iterable[str]) -> list[SceneObject]:
+    """Return the objects that selectors name."""
+    atoms = [atom for text in selectors for atom in atoms_of(parse_selector(text))]
+    names = dict.fromkeys(atom.argument for atom in atoms if atom.kind == "object")
+    return [SceneObject(name, "object", of_interest=False) for name in names]
 
 
 def check_stored_replans(interventions: Interventions, store: Store, *, allow_empty: bool = False) -> int:

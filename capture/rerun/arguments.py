@@ -26,28 +26,15 @@ RERUN_EXAMPLES = """\
   vla-attention capture rerun runs/libero_10.zarr --knockout camera:base_0_rgb       without one camera
   vla-attention capture rerun runs/libero_10.zarr --keep role:instruction        with the words of the instruction alone
   vla-attention capture rerun runs/libero_10.zarr --prompt empty --image left_wrist_0_rgb=blank
-  vla-attention capture rerun runs/libero_10.zarr --series default --words           every group and word, with controls
+  vla-attention capture rerun runs/libero_10.zarr --effects text,grouping:default    every word and group, with controls
   vla-attention capture rerun runs/libero_10.zarr --output more.zarr --layers 0 1 2 --queries all
 """
 
 
 @dataclass(frozen=True)
 class RerunSettings:
-    """Which calls of a store are made again, alone or as a series of conditions."""
+    """Which calls of a store are made again."""
 
-    series: str | None = option(
-        "for every group of a built-in grouping or TOML file: without it, with it alone, and without as many random "
-        "keys; and once with another noise seed",
-        None,
-        group="a series of reruns, with --knockout-queries and the like for all of them",
-        metavar="GROUPING",
-    )
-    words: bool = option(
-        "with --series: every word of the instructions, too; they are cut for all queries unless --knockout-queries is "
-        "given",
-        False,
-    )
-    objects: bool = option("with --series: every object of the scenes, too", False)
     tasks: tuple[int | str, ...] | None = task_option("tasks of the store", group="which policy calls")
     num_episodes: int | None = option("the first N episodes of each task (default: all)", None, least=1)
     check: int | None = option(
@@ -82,11 +69,7 @@ def add_rerun_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -
     add_effect_options(parser)
     if root is not None:
         _take_recording_of(root, parser)
-    place = (
-        "the store to write, NAME.zarr (default: beside the base, with the name of the condition); with --series the "
-        "folder of the stores, one for each condition, of which those that are whole are skipped (default: the base's "
-        "name and _reruns, beside it)"
-    )
+    place = "the store to write, NAME.zarr (default: beside the base, with the name of the condition)"
     add_options(parser, RerunOutput, store=place)
     parser.set_defaults(command=_run)
 

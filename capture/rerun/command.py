@@ -18,7 +18,6 @@ from vla_attention.capture.rerun.arguments import RerunOutput, RerunSettings
 from vla_attention.capture.rerun.base_store import check_may_change, check_same_policy, open_base
 from vla_attention.capture.rerun.interventions_of_rerun import check_on_store, rerun_interventions
 from vla_attention.capture.rerun.rerun_store import Rerun
-from vla_attention.capture.rerun.series import SeriesRun
 from vla_attention.capture.rerun.stored_calls import check_has_inputs
 from vla_attention.capture.store.store_writer import check_target
 from vla_attention.schemas.errors import BadArgument, plural
@@ -37,13 +36,6 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
     settings, output = read_options(RerunSettings, arguments), read_options(RerunOutput, arguments)
     recording = recording_settings(arguments)
     base = open_base(arguments.base, settings.tasks, settings.num_episodes)
-    if settings.series is not None:
-        series = SeriesRun.planned(arguments, base)
-        rerun = _prepare(arguments, recording, base, threads, termination)
-        series.write(rerun, rerun.check(settings.check))
-        rerun.faults.raise_missing()
-        return 0
-    _refuse_options_of_series(settings, output)
     interventions = rerun_interventions(arguments)
     check_may_change(base, interventions)
     # All mistakes that need no model are errors now, before the minutes for loading one. Those of the changes come
@@ -80,26 +72,16 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
     return 0
 
 
-def _refuse_options_of_series(settings: RerunSettings, output: RerunOutput) -> None:
-    for option, given in (
-        ("--words", settings.words),
-        ("--objects", settings.objects),
-        ("--output-dir", output.output_dir is not None),
-    ):
-        if given:
-            raise BadArgument(f"{option} belongs to a series; give --series GROUPING too, for instance default.")
-
-
 def _target(output: RerunOutput, base: Store, interventions: Interventions, *, effects: bool) -> Path | None:
     """Return the store to write; None if only the check was asked for."""
     if output.store is not None:
         target = output.store
-    elif interventions.is_none and not effects:
+    elif interventions.is_none and not effects and output.output_dir is None:
         return None
-    elif interventions.is_none:
-        target = local_path(base.path).with_name(f"{base.path.stem}_effects{STORE_SUFFIX}")
     else:
-        target = local_path(base.path).with_name(f"{base.path.stem}_{file_part(interventions.name)}{STORE_SUFFIX}")
+        name = "effects" if effects and interventions.is_none else file_part(interventions.name) or "rerun"
+        folder = output.output_dir or local_path(base.path).parent
+        target = folder / f"{base.path.stem}_{name}{STORE_SUFFIX}"
     if target.resolve() == base.path.resolve():
         raise BadArgument(f"Cannot write the rerun of {base.path} into the store itself; give another --output.")
     return target

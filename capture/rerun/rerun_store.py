@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -117,10 +116,6 @@ def _reading_the_base() -> Iterator[None]:
         raise BaseDamaged(str(error)) from error
 
 
-#: Which episodes a rerun takes.
-EpisodeFilter = Callable[[StoredEpisode], bool]
-
-
 @dataclass(frozen=True)
 class Rerun:
     """A loaded policy and the store whose calls it makes again.
@@ -154,17 +149,17 @@ class Rerun:
     def _caller(self, interventions: Interventions, *, allow_empty: bool) -> Caller:
         return Caller(self.policy, self.recording, RunChanges(interventions, self.instructions, allow_empty))
 
-    def check(self, limit: int | None) -> float | None:
+    def check(self, limit: int | None) -> None:
         """Make calls of the first episode again as they were, and print how far they are from the stored ones.
 
-        limit: so many calls at most; None: all of the episode. Returns the seconds of a call; None for a limit of 0.
+        limit: so many calls at most; None: all of the episode.
         """
         if limit == 0:
             say("No policy call was checked, as --check 0 says.")
-            return None
+            return
         calls = read_calls(self.base.episodes[0])
         count = calls.num_replans if limit is None else min(limit, calls.num_replans)
-        progress, begun_at = Progress(1, count, "call"), time.monotonic()
+        progress = Progress(1, count, "call")
         episode = progress.begin(calls.episode.name, count)
 
         def report(done: int) -> None:
@@ -178,14 +173,12 @@ class Rerun:
             progress.close()
         for line in result.describe().splitlines():
             say(line)
-        return (time.monotonic() - begun_at) / count
 
     def write(
         self,
         target: Path,
         mode: WriteMode,
         interventions: Interventions,
-        wanted: EpisodeFilter = lambda episode: True,
         *,
         allow_empty: bool = False,
     ) -> int:
@@ -197,7 +190,6 @@ class Rerun:
             target: the store.
             mode: what to do if it exists.
             interventions: what is changed, with block indices for layers.
-            wanted: which episodes.
             allow_empty: leave calls unchanged in which a group has no key, or an object is out of view.
 
         Raises:
@@ -206,7 +198,7 @@ class Rerun:
         """
         of_base, is_new = self.base.attributes.interventions, not target.exists()
         store = open_run(target, self._attributes(of_base if interventions.is_none else interventions), mode)
-        episodes = {episode.name: episode for episode in self.base.episodes if wanted(episode)}
+        episodes = {episode.name: episode for episode in self.base.episodes}
         jobs = [job_of(self.base, episode) for episode in episodes.values()]
         todo = [job for job in jobs if not store.has(job.task.task_id, job.episode_index)]
         if len(todo) < len(jobs):

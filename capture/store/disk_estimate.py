@@ -117,8 +117,9 @@ def _bytes_of_effects(effects: EffectsRecorded, horizon: int, sites: Sequence[Si
     """Bytes of the effects of one replan, with `_MOST_ITEMS` of each kind."""
     cameras = sum(len(site.cameras) for site in sites)
     tokens = sum(span.num_keys for site in sites for span in site.spans if span.kind == "text")
-    counts = {"text": _MOST_ITEMS, "cameras": 2 + 2 * cameras, "objects": _MOST_ITEMS, "tokens": tokens}
-    entries = len(effects.readers) * sum(counts[item] for item in effects.items) + _MOST_ITEMS
+    # Each group is cut off, kept alone, and has a control.
+    counts = {"cameras": 2 + 2 * cameras, "tokens": tokens, "groups": 3 * len(effects.groups)}
+    entries = len(effects.readers) * sum(counts.get(item, _MOST_ITEMS) for item in effects.items) + _MOST_ITEMS
     of_entry = 4 * horizon * _ACTION_DIMENSIONS * _INCOMPRESSIBLE + sum(site.num_keys for site in sites) / 8
     return entries * of_entry / effects.every
 

@@ -93,7 +93,7 @@ def _check(interventions: Interventions) -> None:
         if edit.queries != "action":
             raise BadArgument(
                 f"Cannot record with {edit.describe()}: a layout knows the action queries of a call only; use the "
-                "queries 'action'."
+                "queries 'action' (--knockout-queries action)."
             )
         if isinstance(edit, KeyKnockout) and edit.random_seed is not None:
             raise BadArgument(

@@ -20,7 +20,7 @@ MORE, OPEN, LESS, FEW, UNTESTED, NO_NOISE = (
 )  # fmt: skip
 _SHOWN_KINDS = ("without", "only", "prompt", "image")
 #: In the order of tables and pictures.
-_KINDS = ("word", "pictures", "camera", "object", "text", "part", "exchange")
+_KINDS = ("word", "pictures", "camera", "object", "group", "text", "part", "exchange")
 _READERS = ("total", "direct", "pictures", "text")
 _ALWAYS = ("item", "than_noise")
 UNIT = "standard deviations of the run's actions"

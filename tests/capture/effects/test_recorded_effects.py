@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import vla_attention as va
 from tests.capture.rerun.conftest import capture
 from tests.capture.rerun.conftest import pi_store as pi_store
 from tests.kit.stores import reseal
@@ -19,9 +20,26 @@ from vla_attention.schemas.stores.verify import verify_store
 EFFECTS = ("--effects", "text,cameras", "--effects-readers", "all", "action", "pictures", "text")
 
 
+#: Two groups of two selectors; of the second one no task but the first has a key.
+GROUPS = """
+[groups]
+sight = "role:image"
+start = ["role:bos", "role:template"]
+first = ["word:lift", "object:elsewhere"]
+rest = "*"
+"""
+
+
 @pytest.fixture(scope="module")
 def with_effects(tmp_path_factory) -> Path:
     return capture(tmp_path_factory.mktemp("effects") / "pi.zarr", "pi", *EFFECTS)
+
+
+@pytest.fixture(scope="module")
+def with_groups(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("groups")
+    (folder / "mine.toml").write_text(GROUPS)
+    return capture(folder / "pi.zarr", "pi", "--effects", f"cameras,grouping:{folder / 'mine.toml'}")
 
 
 def changes(store: Store, condition: str) -> dict[str, np.ndarray]:
@@ -49,8 +67,8 @@ def test_the_robot_executes_what_it_would_without_them(pi_store, with_effects):
 @pytest.mark.parametrize(
     ("condition", "words"),
     [
-        ("without_word_cube_queries_all", ["--knockout", 'word:"cube"', "--knockout-queries", "all"]),
-        ("only_visual", ["--keep", "role:image"]),
+        ("without_word_cube_queries_all", ["--knockout", 'word:"cube"']),
+        ("only_visual", ["--keep", "role:image", "--knockout-queries", "action"]),
         (
             "without_instruction_queries_prefix_of_role_image",
             ["--knockout", "role:instruction", "--knockout-queries", "prefix:role:image"],
@@ -67,6 +85,46 @@ def test_a_rerun_of_one_condition_gives_the_same(with_effects, tmp_path, conditi
     for episode in rerun.episodes:
         expected = episode.read("actions") - episode.read("base_actions")
         np.testing.assert_allclose(recorded[episode.name], expected, atol=1e-5)
+
+
+def test_groups_are_cut_kept_and_controlled(with_groups, tmp_path):
+    """A group that is an item already is measured once, with its random keys; the rest is no group."""
+    store = open_store(with_groups)
+    recorded = store.attributes.recording.effects
+    assert list(recorded.groups) == ["sight", "start", "first"]
+    for episode in store.episodes:
+        names = [one.name for one in episode.attributes.effects.conditions]
+        assert len(set(names)) == len(names)
+        of_groups = {name.removesuffix("_queries_all") for name in names if "group" in name or "visual" in name}
+        alone = {f"{kind}_group_{name}" for kind in ("without", "only", "random") for name in ("start", "first")}
+        assert of_groups == {*alone, "without_visual", "only_visual", "random_visual"}
+    selector = recorded.groups["start"]
+    options = {
+        "without_group_start_queries_all": ["--knockout", selector],
+        "only_group_start": ["--keep", selector, "--knockout-queries", "action"],
+        "random_group_start_queries_all": ["--knockout", selector, "--random-keys", str(recorded.seed)],
+    }
+    for condition, words in options.items():
+        target = tmp_path / f"{condition}.zarr"
+        assert main(["rerun", str(with_groups), "--output", str(target), "--check", "0", *words]) == 0
+        for episode in open_store(target).episodes:
+            expected = episode.read("actions") - episode.read("base_actions")
+            np.testing.assert_allclose(changes(store, condition)[episode.name], expected, atol=1e-5)
+
+
+def test_items_of_groups_have_their_names(with_groups):
+    rows = va.open(with_groups).effects()["effects_items"]
+    kinds = dict(rows.select("item", "item_kind").iter_rows())
+    assert kinds["start"] == "group"
+    assert kinds["all pictures"] == "pictures"
+
+
+def test_a_group_that_no_task_has_is_refused_before_the_first_episode(tmp_path, capsys):
+    (tmp_path / "typo.toml").write_text('[groups]\na = "word:lifft"\nb = "role:image"\n')
+    words = ["pi", "--checkpoint", "untrained-tiny", "--task-suite", "robosuite", "--output", str(tmp_path / "a.zarr")]
+    assert main([*words, "--effects", f"grouping:{tmp_path / 'typo.toml'}"]) == 2
+    assert "lifft" in capsys.readouterr().err
+    assert not (tmp_path / "a.zarr").exists()
 
 
 def test_a_rerun_adds_effects_to_stored_calls(pi_store, with_effects, tmp_path, capsys):

@@ -55,8 +55,8 @@ def test_attention():
         "--attention", "word:bowl=0.5", "--attention", "keys:1-4 = uniform", "--knockout-steps", "9", "--allow-empty"
     )
     assert given.attention == (
-        AttentionScale("word:bowl", 0.5, denoise_steps=(9,)),
-        AttentionUniform("keys:1-4", denoise_steps=(9,)),
+        AttentionScale("word:bowl", 0.5, queries="all", denoise_steps=(9,)),
+        AttentionUniform("keys:1-4", queries="all", denoise_steps=(9,)),
     )
 
 

@@ -41,9 +41,9 @@ def assert_applied_again(target, capsys) -> None:
 def test_a_knockout_is_exact_stored_and_applied_again(pi_store, tmp_path, capsys):
     target = tmp_path / "without.zarr"
     store = rerun(pi_store, target, "--knockout", "camera:base_0_rgb", "--knockout-layers", "0", "1")
-    knockout = KeyKnockout("camera:base_0_rgb", layers=(0, 1))
+    knockout = KeyKnockout("camera:base_0_rgb", queries="all", layers=(0, 1))
     assert store.attributes.interventions.keys == (knockout,)
-    assert store.attributes.interventions.name == "without_camera_base_0_rgb_layers_0_1"
+    assert store.attributes.interventions.name == "without_camera_base_0_rgb_queries_all_layers_0_1"
     assert store.attributes.rerun_of.run == open_store(pi_store).run
     [old], [new] = open_store(pi_store).episodes[:1], store.episodes
     (span,) = store.attributes.sites[0].camera_spans("base_0_rgb")
