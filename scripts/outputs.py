@@ -85,7 +85,7 @@ def commands(folder: Path) -> Iterator[tuple[str, list[str]]]:
     rerun = ["vla-capture", "rerun", cubes, "--check", "1", "--threads", "1"]
     yield "rerun", [*rerun, "--noise-seed", "3", "--output", "stores/noise.zarr"]
     yield "rerun_knockout", [*rerun, "--knockout", "role:instruction", "--output", "stores/unread.zarr"]
-    yield "rerun_series", [*rerun, "--series", "default", "--words", "--output-dir", "stores/series"]
+    yield "rerun_groups", [*rerun, "--effects", "text,grouping:default", "--output", "stores/groups.zarr"]
     replay = ["vla-capture", "replay", "data", "--checkpoint", "untrained-tiny", "--threads", "1", "--every", "3"]
     replay += ["--camera", "base_0_rgb=front", "--camera", "left_wrist_0_rgb=none"]
     yield "replay", [*replay, "--output", "stores/replay.zarr"]

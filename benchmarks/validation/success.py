@@ -14,12 +14,12 @@ from benchmarks.validation.policies import KnownPolicy, record, success
 CONDITIONS: dict[str, tuple[str, ...]] = {
     "nothing changed": (),
     "prompt empty": ("--prompt", "empty"),
-    "without the instruction's words": ("--knockout", "role:instruction"),
-    "... for all queries": ("--knockout", "role:instruction", "--knockout-queries", "all"),
+    "without the instruction's words": ("--knockout", "role:instruction", "--knockout-queries", "action"),
+    "... for all queries": ("--knockout", "role:instruction"),
     "another colour named": ("--prompt", "synonyms:{synonyms}"),
-    "without the agent camera, all queries": ("--knockout", "camera:{first}", "--knockout-queries", "all"),
+    "without the agent camera, all queries": ("--knockout", "camera:{first}"),
     "agent camera blank": ("--image", "{first}=blank"),
-    "without the wrist camera, all queries": ("--knockout", "camera:{last}", "--knockout-queries", "all"),
+    "without the wrist camera, all queries": ("--knockout", "camera:{last}"),
     "wrist camera blank": ("--image", "{last}=blank"),
 }
 #: Of controls, and of their first seed, only these: they say on what success depends.

@@ -33,7 +33,7 @@ def make_stores(folder: Path) -> None:
         cosmos = ("--max-steps", "20", "--query-frame", "curr_last", "--no-frames")
         _run("cosmos", *_WHERE, *cosmos, "--output", str(folder / "cosmos.zarr"))
     _record(folder / "library.zarr")
-    changes = ("--check", "0", "--knockout", "camera:base_0_rgb")
+    changes = ("--check", "0", "--knockout", "camera:base_0_rgb", "--knockout-queries", "action")
     _run("rerun", str(folder / "joint.zarr"), *changes, "--output", str(folder / "rerun.zarr"))
     effects = ("--effects", "text,objects", "--effects-readers", "all", "action", "pictures", "text", "--check", "0")
     little = ("--layers", "0", "--denoise", "last", "--no-frames", "--no-contributions")

@@ -4,8 +4,8 @@ What is not named stays as it is: a change that means to alter numbers names the
 tests/golden/tables/stores were captured once, with one thread:
 
     cubes, cubes_one_colour: as scripts/make_example_stores.py has them, but with two threads and without effects
-    cubes_reruns: capture rerun cubes.zarr --series (role:image, role:instruction) --num-episodes 1 --no-frames
-        --no-contributions --precision 7
+    cubes_reruns: capture rerun cubes.zarr --knockout or --keep role:image or role:instruction, some with --random-keys,
+        --knockout-queries action --num-episodes 1 --no-frames --no-contributions --precision 7
     vla-attention capture pi --task-suite cubes --task-id 0 1 5 6 10 13 --num-episodes 1 --max-steps 25 --no-frames
         --no-contributions --precision 7 --effects text,cameras --effects-readers all action pictures text
     vla-attention capture pi --checkpoint untrained-tiny --task-suite libero_spatial --task-id 0 1 3 --num-episodes 1
