@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.effects.conditions import UNCHANGED, conditions_of
 from vla_attention.capture.effects.mean_pictures import MeanPictures
-from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys, SiteEditor
 from vla_attention.capture.interventions.changed_inputs import CallContext, changed_inputs
+from vla_attention.capture.interventions.factors import QueryWithoutKeys, SiteEditor
 from vla_attention.capture.interventions.resolution import (
     ReplanPlace,
     TooFewKeys,

@@ -10,7 +10,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from vla_attention.capture.interventions.attention_edits import SiteEdit, SiteEditor
+from vla_attention.capture.interventions.factors import SiteEdit, SiteEditor
 from vla_attention.capture.policies.policy import Policy
 from vla_attention.schemas.errors import BadArgument, unknown_name
 from vla_attention.schemas.groupings.resolve import EmptyGroup

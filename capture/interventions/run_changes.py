@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vla_attention.capture.interventions.attention_edits import SiteEditor
 from vla_attention.capture.interventions.changed_inputs import CallContext
+from vla_attention.capture.interventions.factors import SiteEditor
 from vla_attention.capture.interventions.prompts import changed_instruction
 from vla_attention.capture.interventions.resolution import (
     ReplanPlace,

@@ -146,24 +146,34 @@ class RowCollector(Protocol):
         return None
 
 
+@dataclass(frozen=True)
+class CallKeys:
+    """Whose queries an attention call of a site has, and which keys.
+
+    Attributes:
+        action_queries: positions of the action queries on the query axis.
+        own_keys: positions on the key axis of the tokens that the queries belong to, in their order; None if these
+            tokens are no keys of the call.
+        numbers: the site's keys that the call's keys are, (key,) int64; None: all of them, in their order.
+        in_prefix: whether the call comes before the first denoise step.
+    """
+
+    action_queries: slice
+    own_keys: slice | None
+    numbers: NDArray[np.int64] | None = None
+    in_prefix: bool = False
+
+    @classmethod
+    def of_prefix(cls, tokens: NDArray[np.int64]) -> CallKeys:
+        """The call whose queries and keys are these keys of the site, (token,)."""
+        return cls(slice(0, 0), slice(0, len(tokens)), tokens, in_prefix=True)
+
+
 class AttentionEditor(Protocol):
     """Changes the attention of one site during one replan. A model asks it for a change at every block."""
 
-    def step_change(
-        self, layer: int, denoise_step: int, action_queries: slice, own_keys: slice | None
-    ) -> LogitChange | None:
-        """Return the change of a call of a denoise step, or None if nothing changes there.
-
-        action_queries: positions of the action queries on the query axis. own_keys: the keys of the tokens that the
-        queries belong to, in their order; None if these tokens are no keys of the site.
-        """
-        ...
-
-    def prefix_change(self, layer: int, tokens: Tensor) -> LogitChange | None:
-        """Return the change of a call before the first denoise step, whose queries and keys are the same tokens.
-
-        tokens: the keys of the site that these tokens are at the denoise steps, (token,) int64.
-        """
+    def change(self, layer: int, denoise_step: int | None, call: CallKeys) -> LogitChange | None:
+        """Return the change of a call, or None if nothing changes there; denoise_step: None in the prefix."""
         ...
 
 
@@ -174,19 +184,8 @@ class FactorEditor(AttentionEditor, Protocol):
     def changes_prefix(self) -> bool:
         """Whether anything changes in the calls before the first denoise step."""
 
-    def prefix_factors(self, tokens: NDArray[np.int64]) -> NDArray[np.float64] | None:
-        """Return the factors (query, key) in a call before the first denoise step; None where nothing changes.
-
-        tokens: the keys that the tokens are, (token,); they are the queries, too.
-        """
-
-    def step_factors(
-        self, queries: int, action_queries: slice, own_keys: slice | None, num_keys: int
-    ) -> NDArray[np.float64] | None:
-        """Return the factors (query, key) in a call of a denoise step; None where nothing changes.
-
-        queries: their number. action_queries, own_keys: as of `AttentionEditor.step_change`. num_keys: of the site.
-        """
+    def factors(self, queries: int, call: CallKeys) -> NDArray[np.float64] | None:
+        """Return the factors (query, key) in a call with `numbers` and so many queries; None where nothing changes."""
 
 
 @dataclass(frozen=True)

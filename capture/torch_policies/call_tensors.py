@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
+from vla_attention.capture.interventions.factors import QueryWithoutKeys
 from vla_attention.capture.torch_policies.attention_calls import (
     MASKED_BELOW,
     CallShape,

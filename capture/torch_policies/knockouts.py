@@ -9,16 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.interventions.attention_edits import (
-    SiteEdit,
-    log_factors,
-    stays_at_step,
-    stays_in_prefix,
-)
-from vla_attention.capture.interventions.resolution import (
-    selectors_of,
-)
+from vla_attention.capture.interventions.factors import SiteEdit, logit_bias
+from vla_attention.capture.interventions.resolution import selectors_of
 from vla_attention.capture.interventions.run_changes import RunChanges
+from vla_attention.capture.recording.attention import CallKeys
 from vla_attention.capture.torch_policies.attention_calls import CallShape
 from vla_attention.capture.torch_policies.call_order import CallPlace
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
@@ -134,37 +128,6 @@ def edits_at(edits: Sequence[SiteEdit], place: CallPlace) -> list[SiteEdit]:
     ]
 
 
-def logit_bias(
-    edits: Sequence[SiteEdit], place: CallPlace, shape: CallShape, own_keys: slice | None = None
-) -> NDArray[np.float32]:
-    """Return what edits add to the logits of one call of a site, (head or 1, query, key).
-
-    own_keys: the keys of the call's own queries, where it has them; others than action queries keep theirs.
-    """
-    factors = []
-    for edit in edits:
-        values = edit.values if place.keys is None else edit.values[place.keys]
-        stays = stays_at_step(edit, shape.queries, place.queries, own_keys, shape.keys)
-        factors.append(np.where(stays, 1.0, values))
-    return _log_of(edits, factors, shape)
-
-
-def prefix_bias(edits: Sequence[SiteEdit], tokens: NDArray[np.int64], shape: CallShape) -> NDArray[np.float32]:
-    """Return what edits add to the logits of a call whose queries and keys are the site's keys `tokens`."""
-    factors = [np.where(stays_in_prefix(edit, tokens), 1.0, edit.values[tokens]) for edit in edits]
-    return _log_of(edits, factors, shape)
-
-
-def _log_of(edits: Sequence[SiteEdit], factors: Sequence[NDArray[np.float64]], shape: CallShape) -> NDArray[np.float32]:
-    """Sum the logarithms of factors (query, key), -infinity where they are 0, over edits: (head or 1, query, key)."""
-    heads = shape.heads if any(edit.heads is not None for edit in edits) else 1
-    total = np.zeros((heads, shape.queries, shape.keys), dtype=np.float32)
-    for edit, of_edit in zip(edits, factors, strict=True):
-        chosen = slice(None) if edit.heads is None else list(edit.heads)
-        total[chosen] += np.where(of_edit == 0, -np.inf, log_factors(of_edit)).astype(np.float32)
-    return total
-
-
 @dataclass
 class CallBias:
     """What edits add to the logits of the attention calls of one row; see `LogitBias`. Without edits, zeros.
@@ -190,10 +153,12 @@ class CallBias:
         sizes = shape.heads, shape.queries, shape.keys, place.queries.start, place.queries.stop, token
         call = place.rule, place.site, tuple(id(edit) for edit in edits), *sizes
         if call not in self._known:
-            if place.site is None:
-                self._known[call] = prefix_bias(edits, self._tokens(rule.tokens or "", shape), shape)
-            else:
-                self._known[call] = logit_bias(edits, place, shape, self._own_keys(place.site, shape))
+            keys = (
+                CallKeys.of_prefix(self._tokens(rule.tokens or "", shape))
+                if place.site is None
+                else CallKeys(place.queries, self._own_keys(place.site, shape), place.keys)
+            )
+            self._known[call] = logit_bias(edits, shape.heads, shape.queries, keys)
         return self._known[call]
 
     def _tokens(self, site: str, shape: CallShape) -> NDArray[np.int64]:

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from vla_attention.capture.effects.arguments import EffectSettings, settings_of
 from vla_attention.capture.effects.measurement import MOST_DIFFERENCE, EffectMeasurement
-from vla_attention.capture.interventions.attention_edits import SiteEdit, SiteEditor
 from vla_attention.capture.interventions.changed_inputs import GREY
+from vla_attention.capture.interventions.factors import SiteEdit, SiteEditor
 from vla_attention.capture.policies.noise import noise_seed
 from vla_attention.capture.policies.policy import CallVariant, GivenInputs, Policy, PolicyInput, VariantMemory
 from vla_attention.capture.torch_policies.added_updates import OutputWay

@@ -30,7 +30,7 @@ def make_toy_policy(checkpoint: str, size: int) -> Any:
     from vla_attention.capture.policies.identity import PolicySource, describe_policy
     from vla_attention.capture.policies.noise import initial_noise, noise_seed
     from vla_attention.capture.policies.policy import GivenInputs, PolicyInput, camera_frame
-    from vla_attention.capture.recording.attention import attend
+    from vla_attention.capture.recording.attention import CallKeys, attend
     from vla_attention.schemas.layout import PatchGrid, Piece, Prompt, Role, SiteLayout, Span, roles_from_spans
     from vla_attention.schemas.stores.store_format import PolicyCameraView
 
@@ -85,7 +85,7 @@ def make_toy_policy(checkpoint: str, size: int) -> Any:
             collector = (recorders or {}).get("joint")
             rows_to = collector.sink(0, 0, slice(0, size)) if collector is not None else None
             editor = (editors or {}).get("joint")
-            change = editor.step_change(0, 0, slice(0, size), None) if editor is not None else None
+            change = editor.change(0, 0, CallKeys(slice(0, size), None)) if editor is not None else None
             mixed = attend(query, keys, keys, None, 0.5, change=change, rows_to=rows_to)
             return np.repeat(mixed[0, 0, :, :1].numpy().astype(np.float64), 7, axis=1)
 

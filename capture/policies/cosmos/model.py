@@ -19,7 +19,14 @@ from vla_attention.capture.policies.cosmos.latents import SELF, condition_mask, 
 from vla_attention.capture.policies.cosmos.preprocess import pixels
 from vla_attention.capture.policies.cosmos.sampler import flow_time, noise_levels, sample, seeded_noise
 from vla_attention.capture.policies.cosmos.vae import CausalEncoder
-from vla_attention.capture.recording.attention import AttentionEditor, LogitChange, RowCollector, RowSink, UpdateSink
+from vla_attention.capture.recording.attention import (
+    AttentionEditor,
+    CallKeys,
+    LogitChange,
+    RowCollector,
+    RowSink,
+    UpdateSink,
+)
 from vla_attention.capture.recording.contributions import Projection
 
 
@@ -93,7 +100,7 @@ class CallEditor:
         count = self.tokens_per_frame
         action_queries = slice(0, count if frame == self.query_frame else 0)
         own_keys = slice(frame * count, (frame + 1) * count) if site == SELF else None
-        return editor.step_change(layer, self.denoise_step, action_queries, own_keys)
+        return editor.change(layer, self.denoise_step, CallKeys(action_queries, own_keys))
 
 
 PROPRIO_FRAME = "proprio"

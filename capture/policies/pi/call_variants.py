@@ -14,11 +14,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from vla_attention.capture.interventions.factors import log_factors
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.flow_time import denoise_times, embed_times
 from vla_attention.capture.policies.pi.gemma import KeysValues, Rotation
 from vla_attention.capture.policies.pi.model import Denoising, PiModel
-from vla_attention.capture.recording.attention import FactorEditor, LogitChange
+from vla_attention.capture.recording.attention import CallKeys, FactorEditor, LogitChange
 
 #: Bytes of the logits of one block that a batch may have: beyond it, larger batches gain nothing.
 _MOST_LOGITS = 1 << 28
@@ -129,10 +130,12 @@ class _Group:
         config = model.config
         self.model, self.inputs, self.real, self.num_steps = model, inputs, real, num_steps
         self.places = torch.from_numpy(real).to(model.device)
-        #: The keys of a denoise step: those of the prefix, then those of the suffix's own tokens.
-        self.keys = np.concatenate([real, np.arange(config.prefix_len, config.prefix_len + config.suffix_len)])
-        self.own_keys = slice(config.prefix_len, config.prefix_len + config.suffix_len)
-        self.action_queries = slice(config.first_action_query, config.suffix_len)
+        #: A call of a denoise step: its keys are those of the prefix, then those of the suffix's own tokens.
+        self.step = CallKeys(
+            slice(config.first_action_query, config.suffix_len),
+            slice(len(real), len(real) + config.suffix_len),
+            np.concatenate([real, np.arange(config.prefix_len, config.prefix_len + config.suffix_len)]),
+        )
         self.unchanged: dict[int, tuple[KeysValues, ...]] = {}
         positions = torch.tensor([[len(real)]], device=model.device) + torch.arange(
             config.suffix_len, device=model.device
@@ -151,7 +154,7 @@ class _Group:
         model = self.model
         state = torch.cat([self.inputs.states[prefix.number] for prefix in prefixes])
         mask = model.suffix_mask(torch.ones(1, len(self.real), dtype=torch.bool, device=model.device))
-        changed = _Changed.by([self._step_factors(call.editor) for call in calls], model.device)
+        changed = _Changed.by([call.editor for call in calls], model.config.suffix_len, self.step, model.device)
         if changed.allowed is not None:
             mask = mask & changed.allowed
         denoising = Denoising(state, self.rotation, mask, self._cache(prefixes), None)
@@ -159,13 +162,6 @@ class _Group:
         for step, waves in enumerate(self.waves):
             x = x + (-1.0 / self.num_steps) * model.velocity(x, step, waves, denoising, None, changed.editor)
         return x
-
-    def _step_factors(self, editor: FactorEditor | None) -> NDArray[np.float64] | None:
-        if editor is None:
-            return None
-        config = self.model.config
-        factors = editor.step_factors(config.suffix_len, self.action_queries, self.own_keys, self.own_keys.stop)
-        return None if factors is None else factors[:, self.keys]
 
     def _cache(self, prefixes: Sequence[_Prefix]) -> tuple[KeysValues, ...]:
         """Return the keys and values of the prefix of each call, by block."""
@@ -191,8 +187,8 @@ class _Group:
 
     def _encoded(self, prefixes: Sequence[_Prefix]) -> tuple[KeysValues, ...]:
         embedded = torch.cat([self.inputs.embedded[prefix.number][:, self.places] for prefix in prefixes])
-        factors = [None if prefix.editor is None else prefix.editor.prefix_factors(self.real) for prefix in prefixes]
-        changed = _Changed.by(factors, self.model.device)
+        editors = [prefix.editor for prefix in prefixes]
+        changed = _Changed.by(editors, len(self.real), CallKeys.of_prefix(self.real), self.model.device)
         valid = torch.ones(embedded.shape[:2], dtype=torch.bool)
         tokens = torch.from_numpy(self.real)
         return self.model.encode_prefix(embedded, valid, changed.editor, tokens, changed.allowed).cache
@@ -217,14 +213,15 @@ class _Changed:
     editor: _Everywhere | None
 
     @classmethod
-    def by(cls, factors: Sequence[NDArray[np.float64] | None], device: torch.device) -> _Changed:
-        """Return it for factors (query, key) of each call, None where one changes nothing."""
+    def by(cls, editors: Sequence[FactorEditor | None], queries: int, call: CallKeys, device: torch.device) -> _Changed:
+        """Return it for the editor of each variant of a call with so many queries; None changes nothing."""
+        factors = [None if editor is None else editor.factors(queries, call) for editor in editors]
         shape = next((given.shape for given in factors if given is not None), None)
         if shape is None:
             return cls(None, None)
         stacked = np.stack([np.ones(shape) if given is None else given for given in factors])
-        left = np.where(stacked > 0, stacked, 1.0)
-        bias = torch.from_numpy(np.log(left).astype(np.float32)).to(device)[:, None] if (left != 1).any() else None
+        added = log_factors(stacked)
+        bias = torch.from_numpy(added).to(device)[:, None] if added.any() else None
         return cls(torch.from_numpy(stacked > 0).to(device), None if bias is None else _Everywhere(bias.add))
 
 
@@ -232,14 +229,8 @@ class _Changed:
 class _Everywhere:
     """An editor with one change for all blocks, of a batch of prefix passes or of denoise steps."""
 
-    change: LogitChange
+    added: LogitChange
 
-    def step_change(
-        self, layer: int, denoise_step: int, action_queries: slice, own_keys: slice | None
-    ) -> LogitChange | None:
-        """Return the change."""
-        return self.change
-
-    def prefix_change(self, layer: int, tokens: Tensor) -> LogitChange | None:
-        """Return the change."""
-        return self.change
+    def change(self, layer: int, denoise_step: int | None, call: CallKeys) -> LogitChange:
+        """See `AttentionEditor`."""
+        return self.added

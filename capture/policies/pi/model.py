@@ -20,7 +20,7 @@ from vla_attention.capture.policies.pi.flow_time import denoise_times, embed_tim
 from vla_attention.capture.policies.pi.gemma import AttentionCalls, GemmaModel, KeysValues, Rotation
 from vla_attention.capture.policies.pi.siglip import Projector, VisionTower
 from vla_attention.capture.policies.weights import Shapes, check_shapes, fill, make_empty, shapes_of
-from vla_attention.capture.recording.attention import AttentionEditor, RowCollector
+from vla_attention.capture.recording.attention import AttentionEditor, CallKeys, RowCollector
 
 
 @dataclass(frozen=True)
@@ -206,9 +206,10 @@ class PiModel(nn.Module):
         x = embedded
         cache = []
         *earlier, last = self._vlm.blocks
-        keys = torch.arange(embedded.shape[1]) if tokens is None else tokens
+        numbers = np.arange(embedded.shape[1]) if tokens is None else tokens.cpu().numpy()
+        call = CallKeys.of_prefix(numbers)
         for layer, block in enumerate(earlier):
-            change = editor.prefix_change(layer, keys) if editor is not None else None
+            change = editor.change(layer, None, call) if editor is not None else None
             x, keys_values = block(x, mask, rotation, calls=None if change is None else AttentionCalls(change=change))
             cache.append(keys_values)
         cache.append(last.keys_values(x, rotation))
@@ -310,7 +311,7 @@ class PiModel(nn.Module):
         """
         config = self.config
         action_queries = slice(config.first_action_query, config.suffix_len)
-        suffix_keys = slice(config.prefix_len, config.prefix_len + config.suffix_len)
+        call = CallKeys(action_queries, slice(config.prefix_len, config.prefix_len + config.suffix_len))
         tokens, condition = self._embed_suffix(denoising.state, x, waves)
         hidden = tokens.to(self.dtype)
         for layer, block in enumerate(self._expert.blocks):
@@ -323,7 +324,7 @@ class PiModel(nn.Module):
                 before=denoising.cache[layer],
                 condition=condition,
                 calls=AttentionCalls(
-                    editor.step_change(layer, step, action_queries, suffix_keys) if editor is not None else None,
+                    editor.change(layer, step, call) if editor is not None else None,
                     recorder.sink(layer, step, action_queries) if recorder is not None else None,
                     denoising.pieces,
                     recorder.piece_sink(layer, step, action_queries) if recorder is not None else None,

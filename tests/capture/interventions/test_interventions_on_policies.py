@@ -10,7 +10,7 @@ import torch
 
 from tests.kit.cosmos_helpers import INSTRUCTION, recorders_of
 from tests.kit.policy_inputs import KeepAll, make_observation
-from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
+from vla_attention.capture.interventions.factors import QueryWithoutKeys
 from vla_attention.capture.interventions.resolution import (
     ReplanPlace,
     interventions_for,

@@ -10,7 +10,7 @@ from torch import nn
 from tests.kit.small_torch_policy import HORIZON, SmallPolicy, given, small_layout
 from tests.kit.small_torch_variants import TokenPolicy, token_layout
 from vla_attention.capture.__main__ import main as vla_capture
-from vla_attention.capture.interventions.attention_edits import QueryWithoutKeys
+from vla_attention.capture.interventions.factors import QueryWithoutKeys
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.resolve import EmptyGroup

@@ -13,7 +13,7 @@ more still reads itself, as nothing is passed on by that.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vla_attention.capture.recording.attention import MASKED_LOGIT, FactorEditor, LogitChange
+from vla_attention.capture.recording.attention import MASKED_LOGIT, CallKeys, FactorEditor, LogitChange
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Queries
 
@@ -60,6 +60,34 @@ class SiteEdit:
         """Whether no key has another factor than 1, or a weight in the group."""
         return bool((self.values == (1.0 if self.kind == "factor" else 0.0)).all())
 
+    def reaches(self, call: CallKeys) -> bool:
+        """Whether some query of a call is one whose attention changes."""
+        if call.in_prefix:
+            return self.queries != "action"
+        has_actions = call.action_queries.stop > call.action_queries.start
+        return self.queries == "all" or (self.queries == "action" and has_actions)
+
+    def values_at(self, call: CallKeys) -> NDArray[np.float64]:
+        """The values of a call's keys, (key,)."""
+        return self.values if call.numbers is None else self.values[call.numbers]
+
+    def changed(self, queries: int, call: CallKeys) -> NDArray[np.bool_]:
+        """Where the edit may change something in a call with so many queries, (query, key)."""
+        is_action = np.zeros(queries, dtype=bool)
+        is_action[call.action_queries] = True
+        changed = np.ones((queries, len(self.values_at(call))), dtype=bool)
+        if self.queries == "action":
+            changed[~is_action] = False
+        elif call.own_keys is not None:
+            changed[np.arange(queries), np.arange(call.own_keys.start, call.own_keys.stop)] = is_action
+        if call.in_prefix and self.readers is not None:
+            changed[~self.readers[call.numbers]] = False
+        return changed
+
+    def factors(self, queries: int, call: CallKeys) -> NDArray[np.float64]:
+        """The factors of a call with so many queries, (query, key); of an edit that has factors."""
+        return np.where(self.changed(queries, call), self.values_at(call), 1.0)
+
 
 @dataclass(frozen=True)
 class _Operands:
@@ -86,62 +114,30 @@ class SiteEditor(FactorEditor):
     #: By the edit's number and the kind of call, which are the same at every layer and denoise step.
     _operands: dict[tuple[int, object], _Operands] = field(default_factory=dict, init=False, repr=False)
 
-    def step_change(
-        self, layer: int, denoise_step: int, action_queries: slice, own_keys: slice | None
-    ) -> LogitChange | None:
-        """Return the change of a call of a denoise step, or None if nothing changes there."""
+    def change(self, layer: int, denoise_step: int | None, call: CallKeys) -> LogitChange | None:
+        """See `AttentionEditor`."""
         numbers = [
             number
-            for number, edit in self._at_layer(layer)
-            if edit.queries != "prefix"
-            and (edit.denoise_steps is None or denoise_step in edit.denoise_steps)
-            and (edit.queries == "all" or action_queries.stop > action_queries.start)
+            for number, edit in enumerate(self.edits)
+            if not edit.changes_nothing
+            and edit.reaches(call)
+            and (edit.layers is None or layer in edit.layers)
+            and (denoise_step is None or edit.denoise_steps is None or denoise_step in edit.denoise_steps)
         ]
         if not numbers:
             return None
         where = f"layer {layer}, denoise step {denoise_step}"
-        kind = (action_queries.start, action_queries.stop, None if own_keys is None else own_keys.start)
-
-        def operands(number: int, logits: Tensor) -> _Operands:
-            heads, count, keys = logits.shape[1:]
-            stays = stays_at_step(self.edits[number], count, action_queries, own_keys, keys)
-            return _operands_of(self.edits[number], self.edits[number].values, stays, heads, logits.device)
-
-        return self._change(numbers, ("step", kind), operands, where)
-
-    def prefix_change(self, layer: int, tokens: Tensor) -> LogitChange | None:
-        """Return the change of a call before the first denoise step, or None if nothing changes there."""
-        numbers = [number for number, edit in self._at_layer(layer) if edit.queries != "action"]
-        if not numbers:
-            return None
-
-        def operands(number: int, logits: Tensor) -> _Operands:
-            edit, keys = self.edits[number], tokens.cpu().numpy()
-            return _operands_of(edit, edit.values[keys], stays_in_prefix(edit, keys), logits.shape[1], logits.device)
-
-        return self._change(numbers, ("prefix", len(tokens)), operands, f"the prefix's layer {layer}")
+        return self._change(numbers, call, f"the prefix's layer {layer}" if denoise_step is None else where)
 
     @property
     def changes_prefix(self) -> bool:
         """See `FactorEditor`."""
         return any(edit.queries != "action" for edit in self._everywhere())
 
-    def prefix_factors(self, tokens: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    def factors(self, queries: int, call: CallKeys) -> NDArray[np.float64] | None:
         """See `FactorEditor`."""
-        edits = [edit for edit in self._everywhere() if edit.queries != "action"]
-        factors = [np.where(stays_in_prefix(edit, tokens), 1.0, edit.values[tokens]) for edit in edits]
-        return np.prod(factors, axis=0) if factors else None
-
-    def step_factors(
-        self, queries: int, action_queries: slice, own_keys: slice | None, num_keys: int
-    ) -> NDArray[np.float64] | None:
-        """See `FactorEditor`."""
-        edits = [edit for edit in self._everywhere() if edit.queries != "prefix"]
-        factors = [
-            np.where(stays_at_step(edit, queries, action_queries, own_keys, num_keys), 1.0, edit.values)
-            for edit in edits
-        ]
-        return np.prod(factors, axis=0) if factors else None
+        found = [edit.factors(queries, call) for edit in self._everywhere() if edit.reaches(call)]
+        return np.prod(found, axis=0) if found else None
 
     def _everywhere(self) -> list[SiteEdit]:
         """The edits, if all are factors at every layer, head and denoise step."""
@@ -150,21 +146,15 @@ class SiteEditor(FactorEditor):
                 raise ValueError(f"{edit.group}: no factor that is the same at all layers, heads and denoise steps")
         return [edit for edit in self.edits if not edit.changes_nothing]
 
-    def _at_layer(self, layer: int) -> list[tuple[int, SiteEdit]]:
-        return [
-            (number, edit)
-            for number, edit in enumerate(self.edits)
-            if not edit.changes_nothing and (edit.layers is None or layer in edit.layers)
-        ]
+    def _change(self, numbers: Sequence[int], call: CallKeys, where: str) -> LogitChange:
+        own = None if call.own_keys is None else call.own_keys.start
+        kind = (call.in_prefix, call.action_queries.start, call.action_queries.stop, own)
 
-    def _change(
-        self, numbers: Sequence[int], kind: object, operands: Callable[[int, Tensor], _Operands], where: str
-    ) -> LogitChange:
         def change(logits: Tensor) -> Tensor:
             had_keys = logits.amax(-1) > _LOWEST_LOGIT
             for number in numbers:
                 if (number, kind) not in self._operands:
-                    self._operands[number, kind] = operands(number, logits)
+                    self._operands[number, kind] = _operands_of(self.edits[number], call, logits)
                 logits = _applied(self._operands[number, kind], logits)
             self._check_keys_left(numbers, had_keys, logits, where)
             return logits
@@ -183,42 +173,20 @@ class SiteEditor(FactorEditor):
             )
 
 
-def stays_at_step(
-    edit: SiteEdit, count: int, action_queries: slice, own_keys: slice | None, num_keys: int
-) -> NDArray[np.bool_]:
-    """Return where an edit changes nothing in a call of a denoise step, (query, key)."""
-    is_action = np.zeros(count, dtype=bool)
-    is_action[action_queries] = True
-    stays = np.zeros((count, num_keys), dtype=bool)
-    if edit.queries == "action":
-        stays[~is_action] = True
-    elif own_keys is not None:
-        stays[np.arange(count), np.arange(own_keys.start, own_keys.stop)] = ~is_action
-    return stays
-
-
-def stays_in_prefix(edit: SiteEdit, tokens: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return where an edit changes nothing in the prefix, (query, key); both are the tokens."""
-    stays = np.eye(len(tokens), dtype=bool)
-    if edit.readers is not None:
-        stays[~edit.readers[tokens]] = True
-    return stays
-
-
-def _operands_of(
-    edit: SiteEdit, values: NDArray[np.float64], stays: NDArray[np.bool_], heads: int, device: torch.device
-) -> _Operands:
-    """Return the operands of an edit with these values (key,); `stays` (query, key) are places that do not change."""
-    changes = ~stays[None]
+def _operands_of(edit: SiteEdit, call: CallKeys, logits: Tensor) -> _Operands:
+    """Return the operands of an edit in a call with these logits (batch, head, query, key)."""
+    heads, queries, _ = logits.shape[1:]
+    changes = edit.changed(queries, call)[None]
     if edit.heads is not None:
         changes = changes & np.isin(np.arange(heads), edit.heads)[:, None, None]
     # Axes along which all is the same have length 1.
     changes = changes[:, :1] if (changes == changes[:, :1]).all() else changes
+    values = edit.values_at(call)
     if edit.kind == "uniform":
-        return _Operands(members=torch.from_numpy(np.where(changes, values, 0.0).astype(np.float32)).to(device))
+        return _Operands(members=torch.from_numpy(np.where(changes, values, 0.0).astype(np.float32)).to(logits.device))
     factors = np.where(changes, values, 1.0)
-    bias = torch.from_numpy(log_factors(factors)).to(device) if not np.isin(factors, (0.0, 1.0)).all() else None
-    dead = torch.from_numpy(factors == 0).to(device) if (factors == 0).any() else None
+    bias = torch.from_numpy(log_factors(factors)).to(logits.device) if not np.isin(factors, (0.0, 1.0)).all() else None
+    dead = torch.from_numpy(factors == 0).to(logits.device) if (factors == 0).any() else None
     return _Operands(bias, dead)
 
 
@@ -236,6 +204,20 @@ def _applied(operands: _Operands, logits: Tensor) -> Tensor:
 def log_factors(factors: NDArray[np.float64]) -> NDArray[np.float32]:
     """Return what is added to logits for these factors of the weights before normalising; 0 for factors 0 and 1."""
     return np.log(np.where(factors > 0, factors, 1.0)).astype(np.float32)
+
+
+def logit_bias(edits: Sequence[SiteEdit], heads: int, queries: int, call: CallKeys) -> NDArray[np.float32]:
+    """Return what edits that have factors add to the logits of a call, (head or 1, query, key); -inf for a factor 0.
+
+    heads, queries: of the call. One head stands for all where no edit has heads of its own.
+    """
+    bias = np.zeros((heads if any(edit.heads is not None for edit in edits) else 1, queries, 1), np.float32)
+    for edit in edits:
+        factors = edit.factors(queries, call)
+        added = np.where(factors == 0, -np.inf, log_factors(factors)).astype(np.float32)
+        chosen = np.isin(np.arange(len(bias)), edit.heads)[:, None, None] if edit.heads is not None else True
+        bias = bias + np.where(chosen, added, np.float32(0))
+    return bias
 
 
 def make_uniform(logits: Tensor, weights: Tensor) -> Tensor:

@@ -8,13 +8,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vla_attention.capture.interventions.attention_edits import (
+from vla_attention.capture.interventions.factors import (
     QueryWithoutKeys,
     SiteEdit,
     SiteEditor,
     make_uniform,
 )
-from vla_attention.capture.recording.attention import MASKED_LOGIT, attend
+from vla_attention.capture.recording.attention import MASKED_LOGIT, CallKeys, attend
 
 KEYS, QUERIES, HEADS = 9, 5, 4
 
@@ -54,7 +54,7 @@ def editor(*edits: SiteEdit) -> SiteEditor:
 
 
 def change_of(*edits: SiteEdit, action=slice(0, QUERIES), own=None, layer=0, step=0):
-    return editor(*edits).step_change(layer, step, action, own)
+    return editor(*edits).change(layer, step, CallKeys(action, own))
 
 
 def factor(*values: float, **fields) -> SiteEdit:
@@ -144,16 +144,16 @@ def test_all_queries_but_a_token_that_is_no_action_reads_itself():
 
 def test_the_prefix():
     """Queries and keys are the same tokens; those that do not exist are left out of the computation."""
-    tokens = torch.tensor([0, 1, 3, 4, 5])
+    tokens = np.array([0, 1, 3, 4, 5])
     logits = torch.randn(1, HEADS, 5, 5, generator=torch.Generator().manual_seed(1))
     edit = factor(1, 0, 0, 0.5, 1, 1, 1, 1, 1, queries="all")
     assert change_of(edit) is not None
-    change = editor(edit).prefix_change(0, tokens)
+    change = editor(edit).change(0, None, CallKeys.of_prefix(tokens))
     expected = torch.exp(logits.double()).numpy()
     values = np.array([1, 0, 0.5, 1, 1])
     expected *= np.where(np.eye(5, dtype=bool), 1.0, values)
     np.testing.assert_allclose(torch.softmax(change(logits), -1).numpy(), normalised(expected), atol=1e-6)
-    assert editor(factor(*FACTORS)).prefix_change(0, tokens) is None  # the action queries only
+    assert editor(factor(*FACTORS)).change(0, None, CallKeys.of_prefix(tokens)) is None  # the action queries only
 
 
 def test_chosen_queries_of_the_prefix():
@@ -161,8 +161,8 @@ def test_chosen_queries_of_the_prefix():
     readers[[3, 4]] = True
     edit = factor(0, 0, *[1.0] * 7, queries="prefix", readers=readers)
     assert change_of(edit) is None
-    tokens, logits = torch.tensor([0, 1, 3, 4, 5]), torch.zeros(1, 1, 5, 5)
-    rows = torch.softmax(editor(edit).prefix_change(0, tokens)(logits), -1)[0, 0].numpy()
+    tokens, logits = np.array([0, 1, 3, 4, 5]), torch.zeros(1, 1, 5, 5)
+    rows = torch.softmax(editor(edit).change(0, None, CallKeys.of_prefix(tokens))(logits), -1)[0, 0].numpy()
     np.testing.assert_array_equal(rows[[0, 1, 4]], np.full((3, 5), np.float32(0.2)))
     np.testing.assert_allclose(rows[[2, 3]], [[0, 0, 1 / 3, 1 / 3, 1 / 3]] * 2, rtol=1e-6)
 
