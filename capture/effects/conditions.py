@@ -27,6 +27,7 @@ from vla_attention.schemas.interventions import (
     PromptChange,
     Queries,
 )
+from vla_attention.schemas.layout import SiteLayout
 
 #: Whose attention a reader is, as of `KeyKnockout`.
 _READERS: dict[EffectReaders, tuple[Queries, str]] = {
@@ -66,12 +67,19 @@ def planned_effects(settings: EffectSettings | None, policy: Policy, seed: int) 
         return None
     steps = policy.num_denoise_steps if settings.denoise_steps is None else settings.denoise_steps
     other = seed + 1 if seed + 1 < 2**63 else seed - 1
-    named = settings.grouping is not None
-    items = tuple(item for item in get_args(EffectItems) if item in settings.items or (named and item == "groups"))
-    groups = _groups_of(settings.grouping, policy) if settings.grouping is not None else {}
-    planned = EffectsRecorded(items, settings.readers, settings.every, steps, other, groups)
+    planned = effects_recorded(settings, policy.sites, steps, other)
     check_effects(planned, policy)
     return planned
+
+
+def effects_recorded(
+    settings: EffectSettings, sites: Sequence[SiteLayout], denoise_steps: int, seed: int
+) -> EffectsRecorded:
+    """Return the effects of settings at these sites, with the selectors of the grouping's groups."""
+    items: list[EffectItems] = [item for item in get_args(EffectItems) if item in settings.items]
+    groups = {} if settings.grouping is None else _groups_of(settings.grouping, sites)
+    items += ["groups"] if groups else []
+    return EffectsRecorded(tuple(items), settings.readers, settings.every, denoise_steps, seed, groups)
 
 
 def describe_effects(planned: EffectsRecorded) -> str:
@@ -182,11 +190,11 @@ def _groups(
         yield _Group(f"group_{plain(name)}", selector, alone=True)
 
 
-def _groups_of(grouping: str, policy: Policy) -> dict[str, str]:
+def _groups_of(grouping: str, sites: Sequence[SiteLayout]) -> dict[str, str]:
     """Return the selector of each group of a grouping, at all sites that it fits, without the group of the rest."""
     groups: dict[str, str] = {}
     problems: list[UserError] = []
-    for vocabulary in run_vocabularies(policy.sites, (), ()).values():
+    for vocabulary in run_vocabularies(sites, (), ()).values():
         try:
             known = find_grouping(grouping, vocabulary)
         except UserError as error:

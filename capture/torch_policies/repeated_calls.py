@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vla_attention.capture.effects.arguments import EffectSettings, settings_of
+from vla_attention.capture.effects.conditions import effects_recorded
 from vla_attention.capture.effects.measurement import MOST_DIFFERENCE, EffectMeasurement
 from vla_attention.capture.interventions.changed_inputs import GREY
 from vla_attention.capture.interventions.factors import SiteEdit, SiteEditor
@@ -78,7 +79,7 @@ def effects_of_layout(effects: str | EffectSettings | None, layout: PolicyLayout
             f"are passes over {calls}, in which keys would be cut off too. Say it with CallRule(..., tokens=SITE), or "
             "use EffectSettings(..., readers=('action',)), as --effects-readers action."
         )
-    return EffectsRecorded(settings.items, settings.readers, settings.every, layout.num_denoise_steps, _SEED)
+    return effects_recorded(settings, [site.keys for site in layout.sites], layout.num_denoise_steps, _SEED)
 
 
 @dataclass(frozen=True)

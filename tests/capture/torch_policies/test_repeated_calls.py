@@ -270,6 +270,14 @@ def test_replans_between_and_resuming(tmp_path):
             fill(tmp_path / "a.zarr", SamplingPolicy(), effects=other, resume=True)
 
 
+def test_groups_of_a_grouping(tmp_path):
+    settings = va.EffectSettings(("text", "grouping:default"), ("action",))
+    store, _, _ = fill(tmp_path / "a.zarr", SamplingPolicy(), effects=settings)
+    found = changes_of(store)
+    assert {"without_linguistic", "only_linguistic", "without_group_visual", "only_group_visual"} <= set(found)
+    assert not any("group_linguistic" in name for name in found)  # it is the item 'linguistic'
+
+
 def test_objects_are_cut_by_the_share_that_they_cover(tmp_path, monkeypatch):
     policy = SamplingPolicy()
     share = np.array([[0.25, 0.75], [1, 0], [0, 1], [0, 1]], dtype=np.float32)
