@@ -86,7 +86,7 @@ class VideoFile:
             raise UndecodableVideo(f"'{path}' holds no pictures.")
         self._stream = streams[0]
         self._size = (self._stream.codec_context.height, self._stream.codec_context.width)
-        self.times: NDArray[np.float64] = self._stamps * float(self._stream.time_base)
+        self.times: NDArray[np.float64] = self._stamps.astype(np.float64) * float(self._stream.time_base)
         self._decoded: Iterator[Any] = iter(())
         self._current: Any = None
 
