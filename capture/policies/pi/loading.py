@@ -26,7 +26,7 @@ from vla_attention.capture.policies.pi.data_set_robot import asset_name, lerobot
 from vla_attention.capture.policies.pi.embedded import dummy_policy, embedded_policy
 from vla_attention.capture.policies.pi.family import SHIPPED, PiSettings
 from vla_attention.capture.policies.pi.formats import CheckpointFormat, detect_format
-from vla_attention.capture.policies.pi.lerobot import load_lerobot, load_lerobot_weights
+from vla_attention.capture.policies.pi.lerobot import load_lerobot
 from vla_attention.capture.policies.pi.lerobot_config import read_lerobot_config
 from vla_attention.capture.policies.pi.lerobot_pipeline import read_lerobot_pipeline
 from vla_attention.capture.policies.pi.locate import find_checkpoint, find_tokenizer, would_be_fetched
@@ -64,9 +64,12 @@ def load_pi_model(
     dtype: torch.dtype = torch.float32,
     device: str | torch.device = "cpu",
 ) -> tuple[PiModel, CheckpointFormat]:
-    """Return the model and the format of the folder; `config` overrides the sizes of the checkpoint."""
+    """Return the model and the format of the folder; `config` overrides the sizes of the checkpoint.
+
+    Of a LeRobot checkpoint only the tensors are read, so that it needs a `config`; see `load_lerobot`.
+    """
     detected = detect_format(folder, checkpoint_format)
-    load = {"openpi_torch": load_openpi_torch, "openpi_jax": load_openpi_jax, "lerobot": load_lerobot_weights}[detected]
+    load = load_openpi_jax if detected == "openpi_jax" else load_openpi_torch
     return load(folder, config=config, dtype=dtype, device=device), detected
 
 
