@@ -24,7 +24,7 @@ from vla_attention.capture.policies.cosmos.locate import (
 )
 from vla_attention.capture.policies.cosmos.model import CosmosModel
 from vla_attention.capture.policies.cosmos.policy import CosmosPolicy
-from vla_attention.capture.policies.cosmos.preprocess import read_statistics
+from vla_attention.capture.policies.cosmos.preprocess import read_ranges
 from vla_attention.capture.policies.cosmos.sampler import noise_levels
 from vla_attention.capture.policies.cosmos.t5_pickle import read_embeddings
 from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
@@ -49,10 +49,12 @@ def load_cosmos_policy(settings: CosmosSettings, device: str | torch.device = "c
     # Small files first: if one is missing, the minutes for loading the weights are saved.
     weights_path = find_weights(place)
     statistics_path = find_beside(place, settings.dataset_stats_path, STATISTICS_NAME)
-    statistics = read_statistics(statistics_path, base.action_dim, base.proprio_dim)
+    statistics = read_ranges(statistics_path, base.action_dim, base.proprio_dim)
     embeddings_path = find_beside(place, settings.t5_text_embeddings_path, EMBEDDINGS_NAME)
     embeddings = read_embeddings(embeddings_path)
     encoder = T5Encoder(settings.t5_encoder) if settings.t5_encoder is not None else None
+    for instruction in settings.instructions if encoder is None else ():
+        embeddings.find(instruction)
     # The folder of an encoder also has the tokenizer.
     tokenizer_path = find_t5_tokenizer(place, settings.t5_tokenizer or settings.t5_encoder)
     if tokenizer_path is None:

@@ -111,7 +111,7 @@ class LerobotProcessing:
             else "raw-instruction"
         )
 
-    def model_picture(self, frame: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], Tensor]:
+    def pictures_of_frame(self, frame: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], Tensor]:
         """Resize in float32; the stored picture is the same, rounded to whole grey levels."""
         image = lerobot_image(frame, size, turned=self.robot.turned)
         kept = ((image[0].permute(1, 2, 0) + 1.0) * 127.5).round().clamp(0, 255).to(torch.uint8)
