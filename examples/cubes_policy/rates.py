@@ -11,8 +11,8 @@ import math
 from collections.abc import Iterable
 from pathlib import Path
 
-from vla_attention.capture.environments.cubes.scene import COLOURS, find_target
-from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS
+from vla_attention.capture.environments.cubes.scene import find_target
+from vla_attention.capture.environments.cubes.tasks import COLOURS, CUBE_TASKS
 from vla_attention.schemas.episode_steps import HAND, POSES
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.reader import StoredEpisode, open_store
@@ -48,9 +48,9 @@ def touched_named_first(episode: StoredEpisode) -> bool:
     cubes = [f"{colour}_cube" for colour in COLOURS if f"{colour}_cube" in steps.bodies]
     places = episode.read(POSES)[0, [steps.bodies.index(cube) for cube in cubes], :2]
     named = cubes[find_target(CUBE_TASKS[episode.attributes.task_id].target, places)]
-    moments = dict(zip(steps.bodies, steps.first_touch, strict=True))
-    others = [moment for body, moment in moments.items() if body not in (HAND, named) and moment is not None]
-    return moments[named] is not None and moments[named] < min(others, default=math.inf)
+    moments = {body: moment for body, moment in zip(steps.bodies, steps.first_touch, strict=True) if moment is not None}
+    others = [moment for body, moment in moments.items() if body not in (HAND, named)]
+    return named in moments and moments[named] < min(others, default=math.inf)
 
 
 def wilson_interval(successes: int, count: int) -> tuple[float, float]:

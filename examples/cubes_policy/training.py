@@ -220,10 +220,13 @@ def train(
         step, now = training.step, time.monotonic()
         training.seconds = now - before
         if step % settings.log_every == 0 or step == last:
-            row = {"step": step, "seconds": round(training.seconds, 1)}
-            row |= {f"train_{name}": np.mean([one[name] for one in collected]).round(5) for name in collected[0]}
+            row: dict[str, float] = {"step": step, "seconds": round(training.seconds, 1)}
+            row |= {
+                f"train_{name}": round(float(np.mean([one[name] for one in collected])), 5) for name in collected[0]
+            }
             if step % settings.evaluate_every == 0 or step == last:
-                row |= {f"held_out_{name}": round(value, 5) for name, value in training.measure(kept_out).items()}
+                measured = training.measure(kept_out)
+                row |= {f"held_out_{name}": round(value, 5) for name, value in measured.items()}
             collected.clear()
             with (output / LOG).open("a", newline="", encoding="utf-8") as file:
                 csv.DictWriter(file, _COLUMNS).writerow(row)

@@ -31,7 +31,7 @@ from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
 from vla_attention.capture.policies.cosmos.text import PieceTokenizer, PrecomputedText, T5Encoder
 from vla_attention.capture.policies.cosmos.vae import build_encoder, infer_vae_config
 from vla_attention.capture.policies.family import UNTRAINED, UNTRAINED_TINY
-from vla_attention.capture.policies.hub import downloads, hub_version
+from vla_attention.capture.policies.hub import downloads, lasting_name
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.weights import DTYPES
 from vla_attention.schemas.errors import BadArgument
@@ -87,11 +87,9 @@ def load_cosmos_policy(settings: CosmosSettings, device: str | torch.device = "c
         build_dit(config.dit, weights, dtype=dtype, device=device),
         build_encoder(config.vae, vae_state, dtype=dtype, device=device),
     )
-    version = hub_version(place) if from_hub else None
     source = PolicySource(
         name="cosmos",
-        # A name on the hub stands for other files tomorrow; with the commit it does not.
-        checkpoint=str(version or checkpoint),
+        checkpoint=lasting_name(checkpoint, place),
         checkpoint_format=weights_path.suffix.removeprefix("."),
         untrained=False,
         configuration=settings.config_name,

@@ -20,7 +20,7 @@ from torch import Tensor
 from vla_attention.capture.foreign_files.checked_files import check_folder
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint, read_json_object
 from vla_attention.capture.policies.hub import first_line
-from vla_attention.capture.policies.pi.config import PiConfig, find_config
+from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.formats import detect_format
 from vla_attention.capture.policies.pi.jax_weights import merge_lora, plan_leaves
 from vla_attention.capture.policies.pi.model import PiModel, build_model, expected_shapes, expected_tensors
@@ -134,15 +134,14 @@ def import_tensorstore() -> Any:
 def load_openpi_jax(
     folder: str | Path,
     *,
-    config: PiConfig | None = None,
+    config: PiConfig,
     dtype: torch.dtype = torch.float32,
     device: str | torch.device = "cpu",
 ) -> PiModel:
     """Load a checkpoint in openpi's JAX format.
 
-    Such a checkpoint does not state its configuration. Without `config` openpi's pi05_libero is taken, or pi0_libero if
-    there is a state projection. All shapes are checked against it; the action horizon is in none of them. LoRA arrays
-    are merged into the weights that they adapt.
+    Such a checkpoint does not state its configuration. All shapes are checked against the given one; the action horizon
+    is in none of them. LoRA arrays are merged into the weights that they adapt.
     """
     folder = Path(folder)
     detect_format(folder, "openpi_jax")
@@ -150,8 +149,6 @@ def load_openpi_jax(
     leaves = list_leaves(params)
     plans, pairs = plan_leaves(leaf.path for leaf in leaves)
     check_folder(params, UnreadableCheckpoint)  # the library opens the files by itself
-    if config is None:
-        config = find_config(implied_config_name(leaf.path for leaf in leaves))
     stored = {leaf.path: OpenLeaf(params, leaf) for leaf in leaves}
     shapes: Shapes = {}
     for path, plan in plans.items():
@@ -182,8 +179,3 @@ def load_openpi_jax(
         for i, (w, *ab) in enumerate(zip(stored[path].layers(), *factors, strict=True)):
             keep(plan.layer(i, merge_lora(path, w, *ab) if ab else w))
     return build_model(config, state, state.__getitem__, dtype=dtype, device=device)
-
-
-def implied_config_name(paths: Iterator[str]) -> str:
-    """Return openpi's LIBERO configuration for a tree of these leaves."""
-    return "pi0_libero" if any(path.startswith("state_proj/") for path in paths) else "pi05_libero"
