@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
+
+from msgspec import Meta
 
 from vla_attention.capture.foreign_files.checked_files import check_regular, read_object
 from vla_attention.schemas.errors import UserError
@@ -18,6 +20,10 @@ MAX_SIZE = 1_000_000
 MAX_BLOCKS = 500
 #: Steps, actions of a chunk, text slots: no tensor has their number, so that none is compared with it.
 MAX_STEPS = 10_000
+#: The same as types of fields, for `read_typed`.
+Size = Annotated[int, Meta(ge=1, le=MAX_SIZE)]
+Blocks = Annotated[int, Meta(ge=1, le=MAX_BLOCKS)]
+Steps = Annotated[int, Meta(ge=1, le=MAX_STEPS)]
 
 
 class CheckpointNotFound(UserError, FileNotFoundError):

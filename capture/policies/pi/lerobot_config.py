@@ -13,8 +13,8 @@ import msgspec
 from msgspec import Meta
 
 from vla_attention.capture.policies.checkpoints import (
-    MAX_SIZE,
-    MAX_STEPS,
+    Size,
+    Steps,
     UnsupportedCheckpoint,
     read_json_object,
     read_typed,
@@ -38,8 +38,6 @@ MAX_CAMERAS = 64
 STATE_FEATURE, ACTION_FEATURE = "observation.state", "action"
 IMAGES = "observation.images."
 
-Size = Annotated[int, Meta(ge=1, le=MAX_SIZE)]
-Steps = Annotated[int, Meta(ge=1, le=MAX_STEPS)]
 Period = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
 
 

@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from vla_attention.capture.policies.checkpoints import MAX_BLOCKS, CheckpointNotFound, read_json_object, read_typed
+from vla_attention.capture.policies.checkpoints import CheckpointNotFound, Size, Steps, read_json_object, read_typed
 from vla_attention.capture.policies.pi.config import CAMERA_SLOTS, GemmaConfig, PiConfig, SiglipConfig
-from vla_attention.capture.policies.pi.lerobot_config import MAX_CAMERAS, Size, Steps
+from vla_attention.capture.policies.pi.lerobot_config import MAX_CAMERAS
 from vla_attention.schemas.safe_text import check_name, check_text
 
 #: File beside a checkpoint that states its sizes; parity cases (`tests/kit/pi_parity.py`) have one.
@@ -18,32 +18,11 @@ CASE_FILE = "case.json"
 #: File of a checkpoint in openpi's PyTorch format that may state the sizes, in the form of a case.json.
 CONFIG_FILE = "config.json"
 
-# Blocks and steps are in no tensor's shape.
-Blocks = Annotated[int, Meta(ge=1, le=MAX_BLOCKS)]
-
-
-class _Gemma(msgspec.Struct, frozen=True):
-    width: Size
-    depth: Blocks
-    mlp_dim: Size
-    num_heads: Size
-    num_kv_heads: Size
-    head_dim: Size
-
-
-class _Siglip(msgspec.Struct, frozen=True):
-    width: Size
-    depth: Blocks
-    mlp_dim: Size
-    num_heads: Size
-    patch_size: Size
-    image_size: Size
-
 
 class _Sizes(msgspec.Struct, frozen=True):
-    paligemma: _Gemma
-    action_expert: _Gemma
-    siglip: _Siglip
+    paligemma: GemmaConfig
+    action_expert: GemmaConfig
+    siglip: SiglipConfig
     vocab_size: Size
     action_dim: Size
     action_horizon: Steps
@@ -72,9 +51,9 @@ def read_config(path: Path) -> PiConfig:
         check_name("camera", camera)
     given = case.config
     return PiConfig(
-        paligemma=GemmaConfig(**msgspec.structs.asdict(given.paligemma)),
-        action_expert=GemmaConfig(**msgspec.structs.asdict(given.action_expert)),
-        siglip=SiglipConfig(**msgspec.structs.asdict(given.siglip)),
+        paligemma=given.paligemma,
+        action_expert=given.action_expert,
+        siglip=given.siglip,
         vocab_size=given.vocab_size,
         action_dim=given.action_dim,
         action_horizon=given.action_horizon,
