@@ -15,7 +15,7 @@ docs/data-sets.md describes both.
 
 from __future__ import annotations
 
-from vla_attention.capture.replay.data_tables import DataSetError
+from vla_attention.capture.replay.data_set_files import DataSetError
 from vla_attention.capture.replay.lerobot_dataset import DataSetEpisode, DataSetFrame, LeRobotDataset
 from vla_attention.capture.replay.lerobot_dataset import open_dataset as open
 from vla_attention.capture.replay.policy_file import ReplayPolicy

@@ -3,8 +3,7 @@
 `SimulatorProcess` is its other end, in the process of the policy. The process begins anew instead of being forked: an
 OpenGL context does not survive a fork. Every process draws with a context and one thread of its own.
 
-What is sent first decides what the process does: with a `SimulatorSetup` it simulates for a policy; with another
-`Setup` it may run whole episodes, as those of `examples/cubes_policy` do.
+What is sent first decides what the process does: with a `SimulatorSetup` it simulates for a policy.
 """
 
 from __future__ import annotations

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
+
+from msgspec import Meta
 
 from vla_attention.capture.foreign_files.checked_files import check_regular, read_object
 from vla_attention.schemas.errors import UserError
+from vla_attention.schemas.jsonable import MalformedDocument, from_json
+
+T = TypeVar("T")
 
 #: Size of an axis, or a number of parts, that a checkpoint states. The largest of the models here is a vocabulary of
 #: 257,152.
@@ -17,9 +20,10 @@ MAX_SIZE = 1_000_000
 MAX_BLOCKS = 500
 #: Steps, actions of a chunk, text slots: no tensor has their number, so that none is compared with it.
 MAX_STEPS = 10_000
-
-#: What values of wrong types raise when they are used.
-_WRONG_VALUES = (TypeError, ValueError, KeyError, IndexError, AttributeError, ArithmeticError, RecursionError)
+#: The same as types of fields, for `read_typed`.
+Size = Annotated[int, Meta(ge=1, le=MAX_SIZE)]
+Blocks = Annotated[int, Meta(ge=1, le=MAX_BLOCKS)]
+Steps = Annotated[int, Meta(ge=1, le=MAX_STEPS)]
 
 
 class CheckpointNotFound(UserError, FileNotFoundError):
@@ -54,17 +58,12 @@ def check_checkpoint_file(path: Path) -> int:
         raise UnreadableCheckpoint(f"There is no '{path}', which the checkpoint needs.") from None
 
 
-@contextmanager
-def values_of(path: Path) -> Iterator[None]:
-    """Turn what values of wrong types raise into an `UnreadableCheckpoint` that names their file."""
+def read_typed(path: Path, declared: type[T]) -> T:
+    """Read a JSON file into a msgspec struct; `UnsupportedCheckpoint` names the value that it does not take."""
     try:
-        yield
-    except UserError:
-        raise
-    except _WRONG_VALUES as error:
-        raise UnreadableCheckpoint(
-            f"'{path}' has values of other types or sizes than a checkpoint's ({type(error).__name__}: {error})."
-        ) from error
+        return from_json(declared, read_json_object(path), f"'{path}' at $")
+    except MalformedDocument as error:
+        raise UnsupportedCheckpoint(str(error)) from None
 
 
 def check_size(what: str, value: object, most: int = MAX_SIZE, *, least: int = 1) -> int:

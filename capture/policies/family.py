@@ -33,7 +33,11 @@ def checkpoint_option(text: str, default: str = UNTRAINED, **more: Any) -> Any:
 
 @dataclass(frozen=True)
 class ModelSettings:
-    """Which model is loaded, in which precision and where. A family's own class says what it takes as a checkpoint."""
+    """Which model is loaded, in which precision and where. A family's own class says what it takes as a checkpoint.
+
+    instructions: what the policy will be told, as far as it is known; what it cannot read is an error of `build` before
+    the weights are loaded.
+    """
 
     checkpoint: str = checkpoint_option("checkpoint folder")
     config_name: str | None = option("name of the configuration", None)
@@ -42,6 +46,8 @@ class ModelSettings:
     threads: int | None = option(
         "processor threads of the policy (default: OMP_NUM_THREADS, else the cores that this process may use)", None
     )
+
+    instructions: tuple[str, ...] = ()
 
     def build(self, device: str) -> Policy:
         """Load the policy onto a device of torch."""

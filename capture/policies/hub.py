@@ -84,6 +84,30 @@ def split_hub_name(name: str) -> tuple[str, str | None] | None:
     return None if match is None else (match[1], match[2])
 
 
+def local_or_fetched(name: str, patterns: Sequence[str]) -> Path | None:
+    """Return a checkpoint: an existing path, or the files of `ORG/NAME` or `ORG/NAME@REVISION`; None for other names.
+
+    Raises what `fetch_from_hub` raises.
+    """
+    path, on_hub = Path(name).expanduser(), split_hub_name(name)
+    if path.exists() or on_hub is None:
+        return path if path.exists() else None
+    how = (
+        f"fetch it where there is a network with `hf download {on_hub[0]}`, copy the folder here and give its path "
+        "(there is no such local folder)"
+    )
+    return fetch_from_hub(on_hub[0], patterns, how, revision=on_hub[1])
+
+
+def lasting_name(name: str, place: Path) -> str:
+    """Return a checkpoint's name with the commit that `place` is of, where it names a repository of the hub.
+
+    Such a name stands for other files tomorrow; with the commit it does not.
+    """
+    version = None if Path(name).expanduser().exists() else hub_version(place)
+    return name if version is None else str(version)
+
+
 def fetch_from_hub(
     repository: str,
     patterns: Sequence[str],

@@ -141,6 +141,7 @@ def _capture(
 
     say(threads.describe())
     device = load_torch(arguments.device, threads.number)
+    arguments.instructions = [told for settings in suites for told in settings.instructions()]
     policy = arguments.family.read(arguments).build(device)
     # A layer that does not exist is an error before the capture, not after it.
     select_layers(arguments.layers, policy.num_layers, policy.family)

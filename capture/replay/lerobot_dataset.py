@@ -15,16 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.foreign_files.bounded import BoundedProcess
-from vla_attention.capture.replay.data_set_episodes import EpisodeEntry
-from vla_attention.capture.replay.data_set_files import INFO, META_FILES, Feature, read_info
+from vla_attention.capture.replay.data_set_files import (
+    INFO,
+    META_FILES,
+    DamagedDataSet,
+    DataSetNotFound,
+    EpisodeEntry,
+    Feature,
+    read_info,
+)
 from vla_attention.capture.replay.data_set_reader import (
-    numeric_columns,
+    open_episode,
     read_numbers,
     read_pictures,
     read_video_picture,
-    rows_of_episode,
 )
-from vla_attention.capture.replay.data_tables import DamagedDataSet, DataSetNotFound
 from vla_attention.schemas.errors import BadArgument, UnknownName, listing, unknown_name
 
 #: How far the time of a picture may be from the time of its row, as a part of the time between two frames. LeRobot
@@ -89,22 +94,24 @@ class LeRobotDataset:
         return self.info.tasks
 
     @property
+    def episode_numbers(self) -> list[int]:
+        """The numbers of all episodes, ascending."""
+        return self.info.rows["episode_index"].to_list()
+
+    @property
     def episodes(self) -> tuple[EpisodeEntry, ...]:
         """Every episode, as the meta files describe it, in the order of their numbers."""
-        return tuple(self.info.episodes.values())
+        return tuple(self.info.entry(row) for row in range(len(self.info.rows)))
 
     @cached_property
     def digest(self) -> str:
         """SHA-256 (hex) of version, columns, tasks and episodes: it names the data set wherever it lies."""
         info = self.info
-        features = [(feature.name, feature.dtype, feature.shape) for feature in self.features.values()]
-        # Of Python's text of all this in one tuple, whose last part is the list of a million episodes.
-        content = repr((info.version, info.fps, sorted(features), sorted(info.tasks.items())))
-        digest = hashlib.sha256(f"{content[:-1]}, [".encode())
-        for number, episode in enumerate(info.episodes.lengths_and_tasks()):
-            digest.update(f"{', ' if number else ''}{episode!r}".encode())
-        digest.update(b"])")
-        return digest.hexdigest()
+        features = sorted((feature.name, feature.dtype, feature.shape) for feature in self.features.values())
+        rows = info.rows.select("episode_index", "length", "tasks").iter_rows()
+        episodes = [(index, length, tuple(tasks)) for index, length, tasks in rows]
+        content = repr((info.version, info.fps, features, sorted(info.tasks.items()), episodes))
+        return hashlib.sha256(content.encode()).hexdigest()
 
     def feature(self, name: str) -> Feature:
         """Return the column of that name; `UnknownName` lists those that exist."""
@@ -131,12 +138,14 @@ class LeRobotDataset:
 
     def entry(self, index: int) -> EpisodeEntry:
         """Return what the meta files say of one episode; `UnknownName` says which exist."""
-        if index not in self.info.episodes:
-            numbers = list(self.info.episodes)
-            is_range = numbers == list(range(len(numbers)))
-            existing = f"0 to {len(numbers) - 1}" if is_range and numbers else listing(numbers)
-            raise UnknownName(f"The data set '{self.name}' has no episode {index}; its episodes are {existing}.")
-        return self.info.episodes[index]
+        numbers = self.info.rows["episode_index"]
+        row = int(numbers.search_sorted(index))
+        if row == len(numbers) or numbers[row] != index:
+            existing = self.episode_numbers
+            is_range = existing == list(range(len(existing)))
+            words = f"0 to {len(existing) - 1}" if is_range and existing else listing(existing)
+            raise UnknownName(f"The data set '{self.name}' has no episode {index}; its episodes are {words}.")
+        return self.info.entry(row)
 
     def check_files(self, episodes: Iterable[int], cameras: Sequence[str]) -> None:
         """Raise `DataSetNotFound` unless the files of episodes are there; files on the hub are fetched first."""
@@ -165,7 +174,7 @@ class DataSetEpisode:
         self.length = entry.length
         self._what = f"episode {entry.index} of '{dataset.name}'"
         self._table = dataset.folder / entry.data
-        self._rows = dataset.process.call(self._table, rows_of_episode, self._table, entry.index)
+        self._rows, self._columns = dataset.process.call(self._table, open_episode, self._table, entry.index)
         if len(self._rows) != self.length or not np.array_equal(
             self._index_column("frame_index"), np.arange(self.length)
         ):
@@ -174,24 +183,16 @@ class DataSetEpisode:
                 f"files say frames 0 to {self.length - 1}, one after the other."
             )
         self.seconds = self._index_column("timestamp")
-        self._check_rate()
         self.task_indices = self._index_column("task_index").astype(np.int64)
-        unknown = [task for task in np.unique(self.task_indices).tolist() if task not in dataset.tasks]
+        unknown = set(self.task_indices.tolist()) - set(dataset.tasks)
         if unknown:
-            raise DamagedDataSet(
-                f"Episode {self.index} of '{dataset.name}' has the task {unknown[0]}, which the meta files do not name."
-            )
-
-    def _check_rate(self) -> None:
-        """Raise `DamagedDataSet` if the time stamps are of another frame rate than the meta files say."""
-        if self.length < 2:
-            return
-        apart, fps = float(np.median(np.diff(self.seconds))), self.dataset.fps
-        if not abs(apart * fps - 1) <= RATE_TOLERANCE:
+            raise DamagedDataSet(f"In {self._what} is the task {min(unknown)}, which the meta files do not name.")
+        apart = float(np.median(np.diff(self.seconds))) if self.length > 1 else 1 / dataset.fps
+        if not abs(apart * dataset.fps - 1) <= RATE_TOLERANCE:
             rate = f" ({1 / apart:.4g} frames per second)" if apart > 0 else ""
             raise DamagedDataSet(
-                f"The frames of {self._what} are {apart:.4g} s apart{rate}, and "
-                f"{INFO} says fps {fps:g}. Correct the one that is wrong: it says when the policy is called."
+                f"The frames of {self._what} are {apart:.4g} s apart{rate}, and {INFO} says fps {dataset.fps:g}. "
+                "Correct the one that is wrong: it says when the policy is called."
             )
 
     def _index_column(self, name: str) -> NDArray[np.float64]:
@@ -214,7 +215,7 @@ class DataSetEpisode:
             DamagedDataSet: a number is missing or not finite, or there are not as many as the meta files say.
         """
         feature = self.dataset.feature(name)
-        if feature.dtype in ("image", "video"):
+        if feature.is_picture:
             raise BadArgument(f"The column '{name}' of '{self.dataset.name}' holds {feature.dtype}, not numbers.")
         values = self._finite(name)
         stated = math.prod(feature.shape)
@@ -231,15 +232,14 @@ class DataSetEpisode:
             raise BadArgument(
                 f"The column '{name}' of '{self.dataset.name}' holds {values}, not as many numbers in each frame."
             )
-        numbers = _as_floats(values)
-        if not np.isfinite(numbers).all():
+        if not np.isfinite(values).all():
             raise DamagedDataSet(
                 f"The column '{name}' of {self._what} has numbers that are NaN or infinite, the first at frame "
-                f"{int(np.argmin(np.isfinite(numbers).all(axis=1)))}."
+                f"{int(np.argmin(np.isfinite(values).all(axis=1)))}."
             )
-        return numbers
+        return values
 
-    def _numbers(self, columns: Sequence[str]) -> dict[str, NDArray[np.generic] | str]:
+    def _numbers(self, columns: Sequence[str]) -> dict[str, NDArray[np.float64] | str]:
         return self.dataset.process.call(self._table, read_numbers, self._table, columns, self._rows)
 
     def frames(self, every: int = 1, cameras: Sequence[str] | None = None) -> Iterator[DataSetFrame]:
@@ -249,7 +249,7 @@ class DataSetEpisode:
         whose time is that of the row, within a quarter of the time between two frames.
 
         Raises:
-            MissingDependency: PyAV, or pillow for pictures that are no video, is not installed.
+            MissingDependency: PyAV is not installed, and there are videos.
             UndecodableVideo, DamagedDataSet: see `VideoFile.picture`.
         """
         if every < 1:
@@ -258,7 +258,9 @@ class DataSetEpisode:
         for name in names:
             if not self.dataset.feature(name).is_camera:
                 raise BadArgument(f"The column '{name}' of '{self.dataset.name}' holds no colour pictures.")
-        numbers = self._values()
+        of_numbers = [name for name, it in self.dataset.features.items() if not it.is_picture and name in self._columns]
+        # Texts and lists of several lengths are nothing that a policy reads as numbers.
+        numbers = {name: it for name, it in self._numbers(of_numbers).items() if not isinstance(it, str)}
         self.dataset.fetch([self.entry.videos[name].path for name in names if name in self.entry.videos])
         for frame in range(0, self.length, every):
             images = self._pictures(names, frame)
@@ -270,16 +272,8 @@ class DataSetEpisode:
                 task_index=task,
                 instruction=self.dataset.tasks[task],
                 images={name: images[name] for name in names},
-                values={name: _as_floats(values[frame]) for name, values in numbers.items()},
+                values={name: values[frame] for name, values in numbers.items()},
             )
-
-    def _values(self) -> dict[str, NDArray[np.generic]]:
-        """Every column that has as many numbers in each frame, (frame, number), as it is stored."""
-        numeric = self.dataset.process.call(self._table, numeric_columns, self._table)
-        pictures = {name for name, feature in self.dataset.features.items() if feature.dtype in ("image", "video")}
-        numbers = self._numbers([name for name in self.dataset.features if name in numeric and name not in pictures])
-        # Lists of several lengths are nothing that a policy reads as numbers.
-        return {name: values for name, values in numbers.items() if not isinstance(values, str)}
 
     def _pictures(self, names: Sequence[str], frame: int) -> dict[str, NDArray[np.uint8]]:
         call, folder = self.dataset.process.call, self.dataset.folder
@@ -294,11 +288,6 @@ class DataSetEpisode:
             path, seconds = folder / video.path, video.begins_at + float(self.seconds[frame])
             images[name] = call(path, read_video_picture, path, seconds, TIME_TOLERANCE / self.dataset.fps)
         return images
-
-
-def _as_floats(values: NDArray[np.generic]) -> NDArray[np.float64]:
-    with np.errstate(invalid="ignore"):  # numpy would warn of some of the numbers that are none
-        return values.astype(np.float64)
 
 
 def open_dataset(name: str | Path) -> LeRobotDataset:

@@ -156,7 +156,7 @@ def announce_replay(
     todo = tuple(index for index in plan.wanted if index not in done)
     calls = [plan.calls(index, every) for index in todo]
     lines = [
-        f"Data set: {plan.data.name}, LeRobotDataset {info.version}, {plural(len(info.episodes), 'episode')} of "
+        f"Data set: {plan.data.name}, LeRobotDataset {info.version}, {plural(len(info.rows), 'episode')} of "
         f"{plural(len(info.tasks), 'task')} at {info.fps:g} frames per second, robot {info.robot_type}."
     ]
     if source is not None:
@@ -195,7 +195,7 @@ def chosen_episodes(data: LeRobotDataset, settings: ReplaySettings) -> tuple[int
         UnknownName: an episode does not exist.
         BadArgument: there are none.
     """
-    chosen = data.info.episodes if settings.episodes is None else settings.episodes
+    chosen = data.episode_numbers if settings.episodes is None else settings.episodes
     numbers = tuple(data.entry(index).index for index in sorted(set(chosen)))
     if not numbers:
         raise BadArgument(f"The data set '{data.name}' has no episodes.")

@@ -100,6 +100,7 @@ def _prepare(
     say(threads.describe())
     device = load_torch(arguments.device, threads.number)
     family: PolicyFamily = arguments.family
+    arguments.instructions = [episode.attributes.instruction for episode in base.episodes]
     policy = family.read(arguments).build(device)
     identity = policy.identity()
     check_same_policy(base, identity, policy.sites)

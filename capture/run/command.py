@@ -38,6 +38,7 @@ def run_capture_of_family(arguments: argparse.Namespace, termination: Terminatio
     say(threads.describe())
     device = load_torch(arguments.device, threads.number)
     family: PolicyFamily = arguments.family
+    arguments.instructions = settings.instructions()
     policy = family.read(arguments).build(device)
     run_capture(settings, policy, device, termination)
     if arguments.output_dir is None and not arguments.save_viz:

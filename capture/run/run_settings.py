@@ -80,6 +80,21 @@ class RunSettings:
     allow_empty: bool = False
     array_task_ids: tuple[int, ...] = ()
 
+    def instructions(self) -> tuple[str, ...]:
+        """What the policy is told in the episodes."""
+        # Here, as it needs numpy, which no --help needs.
+        from vla_attention.capture.interventions.prompts import changed_instruction
+
+        known, change = {task.task_id: task.instruction for task in list_tasks(self.suite)}, self.interventions.prompt
+        told = [
+            known[task]
+            if change is None
+            else changed_instruction(known[task], change, task_id=task, episode_index=episode, instructions=known)
+            for task in self.task_ids or known
+            for episode in range(1 if change is None else self.num_episodes)
+        ]
+        return tuple(dict.fromkeys(told))
+
 
 def run_settings(given: argparse.Namespace) -> RunSettings:
     """Return the settings of parsed arguments; checks everything that needs no policy."""

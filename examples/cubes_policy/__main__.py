@@ -19,8 +19,7 @@ COMMANDS: dict[str, str] = {
     "demonstrate": "record demonstrations of scripted experts",
     "train": "train the policy, or a control, on demonstrations",
     "export": "write a training's averaged weights as a checkpoint folder for vla-attention capture pi",
-    "controls": "make all policies whose dependence is known: demonstrations, trainings, checkpoints",
-    "evaluate": "measure how often a policy solves the tasks",
+    "rates": "how often the episodes of a store solved their tasks, and what they touched first",
 }
 
 #: What a command says after Ctrl-C.
@@ -28,8 +27,7 @@ IF_STOPPED: dict[str, str] = {
     "demonstrate": "the parts that are whole are kept, run the same command again to go on.",
     "train": "the last checkpoint is kept, continue with --resume.",
     "export": "no checkpoint was written.",
-    "controls": "what is whole is kept, run the same command again to go on.",
-    "evaluate": "episodes in the file of --output are kept, run the same command again to go on.",
+    "rates": "nothing was written.",
 }
 
 

@@ -7,8 +7,6 @@ batches.
 from __future__ import annotations
 
 import hashlib
-import zipfile
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal, get_args
@@ -18,7 +16,7 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.environments.cubes.scene import paste_mark, verb_index
 from vla_attention.capture.environments.cubes.tasks import MARK_INSTRUCTION
-from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
+from vla_attention.schemas.errors import BadArgument, UserError, listing
 from vla_attention.schemas.stores.store_place import refuse_in_store
 
 #: What a policy can learn from. `words`: the instruction alone decides. `redundant`: a mark in the picture says the
@@ -98,7 +96,7 @@ def new_folder(folder: Path, content: str) -> None:
         ) from error
 
 
-def read_demonstrations(folder: str | Path, say: Callable[[str], None] = lambda line: None) -> Demonstrations:
+def read_demonstrations(folder: str | Path) -> Demonstrations:
     """Read all parts of a folder into memory, about 25 kB a sample.
 
     Raises `UnusableDemonstrations`, which names the part and the array that does not fit.
@@ -112,54 +110,20 @@ def read_demonstrations(folder: str | Path, say: Callable[[str], None] = lambda 
             "python -m examples.cubes_policy demonstrate FOLDER."
         )
     digest = hashlib.sha256(index.read_bytes())
-    lengths = []
+    read: dict[str, list[np.ndarray]] = {field.name: [] for field in fields(Samples)}
     for part in parts:
         digest.update(f"{part.name} {part.stat().st_size}\n".encode())
-        with _opened(part) as arrays:
-            lengths.append(len(_array(part, arrays, "task")))
-    names = [field.name for field in fields(Samples)]
-    whole: dict[str, np.ndarray] = {}
-    stops = np.cumsum(lengths)
-    for part, start, stop in zip(parts, stops - lengths, stops, strict=True):
-        with _opened(part) as arrays:
-            for name in names:
-                array = _array(part, arrays, name)
-                if array.shape != (stop - start, *_SHAPES.get(name, ())):
-                    raise UnusableDemonstrations(
-                        f"'{name}' of '{part}' has shape {array.shape}; expected "
-                        f"{(stop - start, *_SHAPES.get(name, ()))}."
-                    )
-                if name not in whole:
-                    whole[name] = np.empty((stops[-1], *array.shape[1:]), dtype=array.dtype)
-                whole[name][start:stop] = array
-        say(f"read {part.name}: {stop} of {stops[-1]} samples")
-    return Demonstrations(Samples(**whole), digest.hexdigest())
-
-
-def _opened(part: Path) -> np.lib.npyio.NpzFile:
-    try:
-        opened: np.lib.npyio.NpzFile = np.load(part, allow_pickle=False)
-    except Exception as error:  # a damaged zip raises almost anything
-        raise UnusableDemonstrations(f"'{part}' cannot be read ({error}); make it again.") from error
-    return opened
-
-
-def _array(part: Path, arrays: np.lib.npyio.NpzFile, name: str) -> np.ndarray:
-    if name not in arrays:
-        raise UnusableDemonstrations(f"'{part}' has no array '{name}'; it has {listing(sorted(arrays))}.")
-    try:
-        array: np.ndarray = arrays[name]
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise UnusableDemonstrations(f"'{name}' of '{part}' cannot be read ({error}); make it again.") from error
-    return array
-
-
-def find_control(name: str) -> Control:
-    """Return the control of that name; `UnknownName` lists them."""
-    for known in CONTROLS:
-        if known == name:
-            return known
-    raise unknown_name("control", name, CONTROLS)
+        try:
+            with np.load(part, allow_pickle=False) as stored:
+                arrays = {name: stored[name] for name in read}
+        except Exception as error:  # a damaged zip raises almost anything
+            raise UnusableDemonstrations(f"'{part}' cannot be read ({error}); make it again.") from error
+        for name, array in arrays.items():
+            expected = (len(arrays["task"]), *_SHAPES.get(name, ()))
+            if array.shape != expected:
+                raise UnusableDemonstrations(f"'{name}' of '{part}' has shape {array.shape}; expected {expected}.")
+            read[name].append(array)
+    return Demonstrations(Samples(**{name: np.concatenate(found) for name, found in read.items()}), digest.hexdigest())
 
 
 def split_scenes(samples: Samples, seed: int = 0) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -22,18 +23,19 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from examples.cubes_policy.dataset import INDEX_FILE, new_folder
-from examples.cubes_policy.engine import begin_episode, cubes_protocol, share_among_processes
 from examples.cubes_policy.experts import CLOSED, OPEN, expert_action, move_to, read_state
+from vla_attention.capture.engine.simulation import Simulation
 from vla_attention.capture.environments.base import EnvironmentSettings, Observation
 from vla_attention.capture.environments.cubes.environment import CubesEnvironment
 from vla_attention.capture.environments.cubes.scene import TRAINING
 from vla_attention.capture.environments.cubes.tasks import COLOURS, CUBE_TASKS, NUM_BASE_TASKS, CubeTask
-from vla_attention.capture.environments.episode_protocol import CAMERAS
+from vla_attention.capture.environments.episode_protocol import CAMERAS, OPENPI, WAIT_STEPS
 from vla_attention.capture.environments.suites import find_suite, list_tasks
 from vla_attention.capture.foreign_files.checked_files import read_object
 from vla_attention.capture.policies.pi.preprocess import libero_state, model_image
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.stores.store_format import Protocol
 
 #: Height and width of the pictures, in pixels, and length of the action chunks.
 PICTURE_SIZE, HORIZON = 64, 10
@@ -88,7 +90,16 @@ class Demonstrator:
 
     def __init__(self, settings: DemonstrationSettings) -> None:
         self.settings = settings
-        self._protocol = cubes_protocol("cubes_harder", settings.seed, settings.picture_every, settings.max_steps)
+        #: as in a capture of `cubes`, but for the numbers that are given
+        self._protocol = Protocol(
+            name=OPENPI.name,
+            suite="cubes_harder",
+            seed=settings.seed,
+            wait_steps=WAIT_STEPS,
+            replan_steps=settings.picture_every,
+            max_steps=settings.max_steps,
+            image_size=OPENPI.image_size,
+        )
         tasks = list_tasks(find_suite(self._protocol.suite))  # all tasks
         numbers = {task.num_cubes: number for number, task in enumerate(CUBE_TASKS)}
         self._environments = {
@@ -130,7 +141,10 @@ class Demonstrator:
         generator = np.random.default_rng([settings.seed, episode])
         number, task = self._draw_task(generator)
         environment = self._environments[task.num_cubes]
-        simulation, waited = begin_episode(environment, task, episode, self._protocol)
+        environment.give_task(task)
+        simulation = Simulation(environment, self._protocol, cameras=())
+        simulation.begin(episode, f"episode {episode} of task {task.name}")
+        waited = simulation.wait()
         noise = _Noise(settings, generator)
         detour = int(generator.integers(*settings.detour_steps, endpoint=True))
         detour = detour if generator.random() < settings.detour_episodes else 0
@@ -280,33 +294,31 @@ def run(arguments: argparse.Namespace) -> int:
     new_folder(folder, "demonstrations")
     _check_same(folder, settings)
     missing = [number for number in range(arguments.parts) if not part_path(folder, number).exists()]
-    samples: list[int] = []
-    episodes = settings.episodes_per_part
-    done = (arguments.parts - len(missing)) * episodes
-    with tqdm(total=arguments.parts * episodes, initial=done, unit="episode", disable=None) as bar:
-        begin = partial(_demonstrating, folder, settings)
-        complete = share_among_processes(begin, missing, arguments.workers, samples.append, bar)
+    samples = 0
+    # New processes: an OpenGL context does not survive a fork.
+    context = multiprocessing.get_context("spawn")
+    with (
+        tqdm(total=arguments.parts, initial=arguments.parts - len(missing), unit="part", disable=None) as bar,
+        ProcessPoolExecutor(arguments.workers, context) as pool,
+    ):
+        for done in as_completed([pool.submit(make_part, folder, settings, number) for number in missing]):
+            samples += done.result()
+            bar.update()
     size = sum(file.stat().st_size for file in folder.glob("part_*.npz"))
-    print(f"{sum(samples)} samples added; {folder} has {format_bytes(size)}.")
-    if complete:
-        print(f"Next: python -m examples.cubes_policy train {folder} OUTPUT")
-    return 0 if complete else 1
+    print(f"{samples} samples added; {folder} has {format_bytes(size)}.")
+    print(f"Next: python -m examples.cubes_policy train {folder} OUTPUT")
+    return 0
 
 
-@contextmanager
-def _demonstrating(folder: Path, settings: DemonstrationSettings) -> Iterator[Callable[[int], Iterator[int]]]:
-    """Give what records a part and tells after every episode how many samples it gave, in a process of its own."""
-    demonstrator = Demonstrator(settings)
+#: A process keeps its simulators for all of its parts.
+_demonstrator = lru_cache(maxsize=1)(Demonstrator)
 
-    def record(part: int) -> Iterator[int]:
-        episodes = []
-        for samples in demonstrator.episodes(part):
-            episodes.append(samples)
-            yield len(samples)
-        write_part(folder, part, join_episodes(part, episodes, settings))
 
-    with closing(demonstrator):
-        yield record
+def make_part(folder: Path, settings: DemonstrationSettings, part: int) -> int:
+    """Record a part; returns the number of its samples."""
+    arrays = join_episodes(part, list(_demonstrator(settings).episodes(part)), settings)
+    write_part(folder, part, arrays)
+    return len(arrays["task"])
 
 
 def _check_same(folder: Path, settings: DemonstrationSettings) -> None:

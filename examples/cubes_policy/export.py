@@ -50,7 +50,7 @@ def export(training: Path, folder: Path, name: str) -> dict[str, Any]:
     """Write the checkpoint folder of a training; returns its card. An existing folder is refused."""
     if folder.exists():
         raise BadArgument(f"'{folder}' exists already; give another folder for the checkpoint.")
-    weights, step, seconds, schedule = read_average(training)
+    weights, step, seconds = read_average(training)
     facts = read_settings(training)
     config = small_config(PromptTokenizer(training / TOKENIZER).vocab_size)
     card = {
@@ -62,11 +62,9 @@ def export(training: Path, folder: Path, name: str) -> dict[str, Any]:
         "seed": facts["seed"],
         "batch_size": facts["batch_size"],
         "steps": step,
-        "schedule": schedule,
         "training_minutes": round(seconds / 60, 1),
         "demonstrations": facts["demonstrations"],
         "samples": facts["samples"],
-        "earlier_demonstrations": facts.get("earlier", []),
         "instructions": facts["instructions"],
     }
     partial = folder.with_name(folder.name + ".partial")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import os
 import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +18,8 @@ from torch import Tensor, nn
 
 from examples.cubes_policy.batches import Batches, number_ids
 from examples.cubes_policy.dataset import Control, Demonstrations, new_folder, split_scenes, usable_samples
-from examples.cubes_policy.loss_log import LossLog
 from examples.cubes_policy.network import initial_model, small_config
-from examples.cubes_policy.objectives import Heads, losses, total
+from examples.cubes_policy.objectives import WEIGHTS, Heads, losses, total
 from examples.cubes_policy.vocabulary import make_tokenizer
 from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS
 from vla_attention.capture.foreign_files.checked_files import read_object
@@ -30,7 +30,7 @@ from vla_attention.capture.policies.pi.preprocess import Statistics
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
 from vla_attention.schemas.errors import BadArgument, UserError
 
-CHECKPOINT, TOKENIZER, SETTINGS = "checkpoint.pt", "tokenizer.model", "settings.json"
+CHECKPOINT, TOKENIZER, SETTINGS, LOG = "checkpoint.pt", "tokenizer.model", "settings.json", "log.csv"
 
 PEAK_RATE, LAST_RATE, WARM_UP = 1e-3, 3e-5, 50
 BETAS, WEIGHT_DECAY, CLIP = (0.9, 0.95), 0.01, 1.0
@@ -72,13 +72,8 @@ class TrainingSettings:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """What must be equal when a training goes on; the number of steps may be changed on the way."""
-        return {
-            "seed": self.seed,
-            "control": self.control,
-            "num_tasks": self.num_tasks,
-            "batch_size": self.batch_size,
-        }
+        """What must be equal when a training goes on; the number of steps may be another one."""
+        return {name: getattr(self, name) for name in ("seed", "control", "num_tasks", "batch_size")}
 
 
 def learning_rate(step: int, steps: int) -> float:
@@ -97,18 +92,12 @@ def state_statistics(state: np.ndarray) -> Statistics:
     return Statistics(mean=state.mean(axis=0), std=state.std(axis=0), q01=low, q99=high)
 
 
-def _as_statistics(numbers: Mapping[str, list[float]]) -> Statistics:
-    return Statistics(**{name: np.array(values) for name, values in numbers.items()})
-
-
 class Training:
     """A training in memory: the model, its moving average, the heads and the optimiser."""
 
     def __init__(self, settings: TrainingSettings, config: PiConfig, number_tokens: Iterable[int]):
         self.settings, self.config = settings, config
         self.step, self.seconds = 0, 0.0
-        #: numbers of steps that were planned, each from the step on at which it was set
-        self.schedule: list[list[int]] = [[0, settings.steps]]
         self.model: PiModel = initial_model(config, list(number_tokens), settings.seed)
         self.heads = Heads(config.paligemma.width, settings.seed + _HEADS)
         self.average: PiModel = initial_model(config, list(number_tokens), settings.seed).requires_grad_(False)
@@ -151,24 +140,19 @@ class Training:
 
     def state(self) -> dict[str, Any]:
         """Return everything that a continuation needs, for `torch.save`."""
-        return {
-            "step": self.step,
-            "seconds": self.seconds,
-            "schedule": self.schedule,
-            "model": self.model.state_dict(),
-            "heads": self.heads.state_dict(),
-            "average": self.average.state_dict(),
-            "average_heads": self.average_heads.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
+        return {"step": self.step, "seconds": self.seconds} | {
+            part: getattr(self, part).state_dict() for part in _PARTS
         }
 
     def load(self, state: dict[str, Any]) -> None:
-        """Go back to a `state`; a changed number of steps holds from there on."""
-        self.step, self.seconds, self.schedule = state["step"], state["seconds"], state["schedule"]
-        if self.schedule[-1][1] != self.settings.steps:
-            self.schedule.append([self.step, self.settings.steps])
-        for part in ("model", "heads", "average", "average_heads", "optimiser"):
+        """Go back to a `state`."""
+        self.step, self.seconds = state["step"], state["seconds"]
+        for part in _PARTS:
             getattr(self, part).load_state_dict(state[part])
+
+
+#: What of a training is in its checkpoint, besides the numbers of steps and seconds.
+_PARTS = ("model", "heads", "average", "average_heads", "optimiser")
 
 
 def _decay_groups(*modules: nn.Module) -> list[dict[str, Any]]:
@@ -186,15 +170,13 @@ def train(
     settings: TrainingSettings,
     *,
     resume: bool = False,
-    new_demonstrations: bool = False,
     say: Callable[[str], None] = print,
     stop_at: int | None = None,
 ) -> Training:
-    """Train in the folder `output`: checkpoints, log.csv, loss.png and what `export` needs.
+    """Train in the folder `output`: checkpoints, log.csv and what `export` needs.
 
-    instructions: of each task. resume: go on from the folder's checkpoint, if there is one. new_demonstrations: go on
-    with others than before; the statistics of the states stay. stop_at: end before this step, as a kill would after a
-    checkpoint.
+    instructions: of each task. resume: go on from the folder's checkpoint, if there is one. stop_at: end before this
+    step, as a kill would after a checkpoint.
     """
     new_folder(output, "training")
     tokenizer_file = output / TOKENIZER
@@ -202,115 +184,97 @@ def train(
     tokenizer = PromptTokenizer(tokenizer_file)
     config = small_config(tokenizer.vocab_size)
     samples = demonstrations.samples
-    training_part, held_out = split_scenes(samples)
     usable = usable_samples(samples, settings.control, settings.num_tasks)
-    training_part, held_out = training_part[usable[training_part]], held_out[usable[held_out]]
+    training_part, held_out = (part[usable[part]] for part in split_scenes(samples))
     if not len(training_part) or not len(held_out):
         raise BadArgument(
             f"The control '{settings.control}' can use {len(training_part)} samples for training and {len(held_out)} "
             "of scenes that are held out; record more demonstrations."
         )
-    measured = state_statistics(samples.state[training_part])
+    statistics = state_statistics(samples.state[training_part])
     facts = {
         **settings.identity,
         "instructions": list(instructions),
         "demonstrations": demonstrations.digest,
         "samples": {"training": len(training_part), "held_out": len(held_out)},
-        "state": {name: getattr(measured, name).tolist() for name in ("mean", "std", "q01", "q99")},
+        "state": {name: getattr(statistics, name).tolist() for name in ("mean", "std", "q01", "q99")},
     }
     training = Training(settings, config, number_ids(tokenizer).tolist())
-    facts = _begin(training, output, facts, resume=resume, new_demonstrations=new_demonstrations, say=say)
+    _begin(training, output, facts, resume=resume)
     say(
         f"trains {sum(parameter.numel() for parameter in training.model.parameters()):,} parameters on "
-        f"{len(training_part):,} samples to step {settings.steps}, with {len(held_out):,} samples of other scenes held "
-        f"out; a line every {settings.log_every} steps"
+        f"{len(training_part):,} samples from step {training.step} to step {settings.steps}, with {len(held_out):,} "
+        f"samples of other scenes held out; a line every {settings.log_every} steps"
     )
-    statistics = _as_statistics(facts["state"])
-
-    def batches(part: np.ndarray, seed: int, jitter: bool) -> Batches:
-        return Batches(
+    drawn, kept_out = (
+        Batches(
             samples, part, instructions, tokenizer, config, statistics, settings.control,
             batch_size=settings.batch_size, seed=seed, jitter=jitter,
-        )  # fmt: skip
-
-    drawn = batches(training_part, settings.seed, jitter=True)
-    kept_out = batches(held_out, _HELD_OUT, jitter=False)
-    log = LossLog(output, training.step, say)
-    saved_at = began = time.monotonic()
-    seconds_before, last = training.seconds, min(settings.steps, stop_at or settings.steps)
+        )
+        for part, seed, jitter in ((training_part, settings.seed, True), (held_out, _HELD_OUT, False))
+    )  # fmt: skip
+    saved_at, before, collected = time.monotonic(), time.monotonic() - training.seconds, []
+    last = min(settings.steps, stop_at or settings.steps)
     while training.step < last:
-        found = training.advance(drawn)
-        log.add(found)
+        collected.append(training.advance(drawn))
         step, now = training.step, time.monotonic()
-        training.seconds = seconds_before + now - began
+        training.seconds = now - before
         if step % settings.log_every == 0 or step == last:
-            losses_now = training.measure(kept_out) if step % settings.evaluate_every == 0 or step == last else None
-            log.write(step, settings.steps, training.seconds, learning_rate(step - 1, settings.steps), losses_now)
+            row: dict[str, float] = {"step": step, "seconds": round(training.seconds, 1)}
+            row |= {
+                f"train_{name}": round(float(np.mean([one[name] for one in collected])), 5) for name in collected[0]
+            }
+            if step % settings.evaluate_every == 0 or step == last:
+                measured = training.measure(kept_out)
+                row |= {f"held_out_{name}": round(value, 5) for name, value in measured.items()}
+            collected.clear()
+            with (output / LOG).open("a", newline="", encoding="utf-8") as file:
+                csv.DictWriter(file, _COLUMNS).writerow(row)
+            say(", ".join(f"{name} {value}" for name, value in row.items()))
         if now - saved_at >= 60.0 * settings.checkpoint_minutes or step == last:
             save(training, output)
-            log.draw()
             saved_at = time.monotonic()
     return training
 
 
-def _begin(
-    training: Training,
-    output: Path,
-    facts: dict[str, Any],
-    *,
-    resume: bool,
-    new_demonstrations: bool,
-    say: Callable[[str], None],
-) -> dict[str, Any]:
-    """Write the settings of a new training, or check them and load the checkpoint of one that goes on; returns them."""
-    checkpoint, settings_file = output / CHECKPOINT, output / SETTINGS
+_COLUMNS = ("step", "seconds", *(f"{of}_{part}" for of in ("train", "held_out") for part in ("total", *WEIGHTS)))
+
+
+def _begin(training: Training, output: Path, facts: dict[str, Any], *, resume: bool) -> None:
+    """Write settings and the log of a new training, or check them and load the checkpoint of one that goes on."""
+    checkpoint, log, rows = output / CHECKPOINT, output / LOG, list[dict[str, str]]()
     if checkpoint.is_file() and not resume:
         raise BadArgument(f"'{output}' already has a training; go on with --resume, or give another folder.")
-    if resume and checkpoint.is_file():
+    if checkpoint.is_file():
         before = read_settings(output)
-        fixed = (*training.settings.identity, "instructions")
-        changed = [f"{name} was {before.get(name)!r}" for name in fixed if before.get(name) != facts[name]]
+        changed = [f"{name} was {before.get(name)!r}" for name in facts if before.get(name) != facts[name]]
         if changed:
             raise UnusableTraining(
-                f"The training in '{output}' had other settings than these: {'; '.join(changed)[:600]}; give the same "
-                "ones, or another folder."
+                f"The training in '{output}' had other settings or demonstrations than these: "
+                f"{'; '.join(changed)[:600]}; give the same ones, or another folder."
             )
         training.load(_read_checkpoint(checkpoint))
-        if before["demonstrations"] != facts["demonstrations"]:
-            if not new_demonstrations:
-                raise UnusableTraining(
-                    f"The training in '{output}' had other demonstrations ({before['samples']['training']} samples, "
-                    f"now {facts['samples']['training']}); give --new-demonstrations to go on with these."
-                )
-            earlier = {name: before[name] for name in ("demonstrations", "samples")} | {"until_step": training.step}
-            facts = {**facts, "earlier": [*before.get("earlier", []), earlier]}
-        elif "earlier" in before:
-            facts = {**facts, "earlier": before["earlier"]}
-        facts = {**facts, "state": before["state"]}
-        say(f"goes on at step {training.step} of {training.settings.steps}")
-    content = {"training": facts, "schedule": training.schedule, "config": asdict(training.config)}
-    partial = settings_file.with_suffix(".partial")
-    partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    os.replace(partial, settings_file)
-    return facts
+        with log.open(newline="", encoding="utf-8") as file:  # what came after the checkpoint is made again
+            rows = [row for row in csv.DictReader(file) if int(row["step"]) <= training.step]
+    with log.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, _COLUMNS)
+        writer.writeheader()
+        writer.writerows(rows)
+    (output / SETTINGS).write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
 
 
 def read_settings(output: Path) -> dict[str, Any]:
     """Return the settings of a training; `UnusableTraining` if its folder does not have them."""
-    path = output / SETTINGS
     try:
-        found = read_object(path, UnusableTraining)["training"]
-    except (FileNotFoundError, KeyError):
-        found = None
-    if not isinstance(found, dict):
-        raise UnusableTraining(f"There are no settings of a training in '{path}'.")
-    return found
+        return read_object(output / SETTINGS, UnusableTraining)
+    except FileNotFoundError:
+        raise UnusableTraining(f"There are no settings of a training in '{output / SETTINGS}'.") from None
 
 
 def _read_checkpoint(path: Path) -> dict[str, Any]:
     """Read a checkpoint of a training; `UnusableTraining` for one that is damaged or something else."""
     state = load_torch(path, UnusableTraining)
-    if not isinstance(state, dict) or not {"average", "step", "seconds", "schedule"} <= state.keys():
+    if not isinstance(state, dict) or not {"average", "step", "seconds"} <= state.keys():
         raise UnusableTraining(f"'{path}' is no checkpoint of a training.")
     return state
 
@@ -322,10 +286,10 @@ def save(training: Training, output: Path) -> None:
     os.replace(partial, output / CHECKPOINT)
 
 
-def read_average(output: Path) -> tuple[dict[str, Tensor], int, float, list[list[int]]]:
-    """Return the averaged weights by name, the number of steps, the seconds, and the schedule of a checkpoint."""
+def read_average(output: Path) -> tuple[dict[str, Tensor], int, float]:
+    """Return the averaged weights by name, the number of steps, and the seconds of a checkpoint."""
     checkpoint = output / CHECKPOINT
     if not checkpoint.is_file():
         raise UnusableTraining(f"'{output}' has no {CHECKPOINT}; train with `train DEMONSTRATIONS {output}` first.")
     state = _read_checkpoint(checkpoint)
-    return state["average"], state["step"], state["seconds"], state["schedule"]
+    return state["average"], state["step"], state["seconds"]

@@ -22,9 +22,9 @@ from vla_attention.capture.policies.cosmos.config import (
 )
 from vla_attention.capture.policies.cosmos.dit import Attention, Dit
 from vla_attention.capture.policies.cosmos.dit_weights import build_dit, dit_tensors, infer_dit_config
-from vla_attention.capture.policies.cosmos.latents import condition_mask, read_actions, read_value
+from vla_attention.capture.policies.cosmos.latents import actions_of_frame, condition_mask, read_value
 from vla_attention.capture.policies.cosmos.model import CallTrace, CosmosModel
-from vla_attention.capture.policies.cosmos.preprocess import make_statistics, model_picture
+from vla_attention.capture.policies.cosmos.preprocess import compressed_picture, make_ranges
 from vla_attention.capture.policies.cosmos.sampler import sample, seeded_noise
 from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
 from vla_attention.capture.policies.cosmos.vae import build_encoder
@@ -284,11 +284,11 @@ def _run_policy(case: CosmosCase, device: str) -> ParityReport:
             wanted = expected[stage] if frames is None else expected[stage][:, :, frames]
             report.compare(stage, ours, wanted, tolerance)
 
-    pictures = [model_picture(inputs[name], config.image_size) for name in ("wrist_image", "primary_image")]
+    pictures = [compressed_picture(inputs[name], config.image_size) for name in ("wrist_image", "primary_image")]
     compare("preprocessed_images", np.stack(pictures), PICTURES)
     if case.facts.get("pillow") != PIL.__version__ and "preprocessed_images" in expected:
         pictures = list(expected["preprocessed_images"])  # so that later stages do not depend on the JPEG decoder
-    statistics = make_statistics(inputs, f"of the case '{case.name}'", config.action_dim, config.proprio_dim)
+    statistics = make_ranges(inputs, f"of the case '{case.name}'", config.action_dim, config.proprio_dim)
     proprio = statistics.normalise_proprio(inputs["proprio"])
     compare("proprio_normalized", proprio, OUTPUTS)
     given, count = model.given_latents(pictures, proprio), config.frames.num_conditioned
@@ -305,7 +305,7 @@ def _run_policy(case: CosmosCase, device: str) -> ParityReport:
         _compare_call(report, case, config.frames.index("action"), call, trace, observers[call])
     compare("final_latent", latents, OUTPUTS)
     action_frame = latents[0, :, config.frames.index("action")]
-    actions = read_actions(action_frame, config.chunk_size, config.action_dim).cpu().numpy()
+    actions = actions_of_frame(action_frame, config.chunk_size, config.action_dim).cpu().numpy()
     compare("actions_normalized", actions, ACTIONS)
     compare("actions", statistics.environment_actions(actions), ACTIONS)
     compare("value", np.asarray(read_value(latents[0, :, config.frames.index("value")])), ACTIONS)

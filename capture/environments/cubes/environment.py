@@ -121,11 +121,6 @@ class CubesEnvironment(SimulatedEnvironment):
         self._cube_task = task
         self._simulator.task = task
 
-    def switch_task(self, task: CubeTask) -> None:
-        """Ask for another task from now on, in the middle of an episode; nothing counts as touched before."""
-        self.give_task(task)
-        self._simulator.begin_task()
-
     @property
     def named_cube(self) -> str:
         """Name of the cube that the task asks for in this episode."""

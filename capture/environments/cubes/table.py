@@ -82,10 +82,7 @@ class CubeTable(SingleArmEnv):  # type: ignore[misc]  # robosuite has no types
             pose = [x, y, TABLE_HEIGHT + HALF_SIZE + 0.001, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
             self.sim.data.set_joint_qpos(cube.joints[0], np.array(pose))
         self._beginning = np.column_stack([scene.positions, np.full(len(scene.positions), TABLE_HEIGHT + HALF_SIZE)])
-        self.begin_task()
-
-    def begin_task(self) -> None:
-        """Begin the task: which cube it means depends on the places at the beginning of the episode."""
+        # Which cube is meant depends on the places at the beginning of the episode.
         places, task = self._beginning, self.task
         self._touched_first = []
         self.target = find_target(task.target, places)

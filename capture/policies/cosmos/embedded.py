@@ -18,7 +18,7 @@ from vla_attention.capture.policies.cosmos.config import CosmosConfig, DitConfig
 from vla_attention.capture.policies.cosmos.dit_weights import build_dit, expected_shapes
 from vla_attention.capture.policies.cosmos.model import CosmosModel
 from vla_attention.capture.policies.cosmos.policy import ACTION_FRAME, CosmosPolicy
-from vla_attention.capture.policies.cosmos.preprocess import Statistics, make_statistics
+from vla_attention.capture.policies.cosmos.preprocess import Ranges, make_ranges
 from vla_attention.capture.policies.cosmos.text import PieceTokenizer, SeededText
 from vla_attention.capture.policies.cosmos.vae import build_encoder, expected_vae_shapes
 from vla_attention.capture.policies.identity import PolicySource
@@ -53,9 +53,9 @@ BUILTIN_RANGES: Mapping[str, object] = {
 _FLATTEST, _SHARPEST = 1.5, 4.0
 
 
-def builtin_statistics() -> Statistics:
+def builtin_ranges() -> Ranges:
     """Return the made-up ranges as statistics."""
-    return make_statistics(BUILTIN_RANGES, "that come with the program", action_dim=7, proprio_dim=9)
+    return make_ranges(BUILTIN_RANGES, "that come with the program", action_dim=7, proprio_dim=9)
 
 
 def random_dit_weights(config: DitConfig, seed: int) -> dict[str, Tensor]:
@@ -132,7 +132,7 @@ def random_policy(
     return CosmosPolicy(
         build_random_model(config, seed, device),
         text,
-        builtin_statistics(),
+        builtin_ranges(),
         PolicySource(name=name, checkpoint=f"random weights, seed {seed}", checkpoint_format="seeded", untrained=True),
         open_loop_steps=config.chunk_size if open_loop_steps is None else open_loop_steps,
         query_frame=query_frame,

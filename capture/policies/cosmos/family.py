@@ -135,7 +135,7 @@ class CosmosSettings(ModelSettings):
             find_vae,
             find_weights,
         )
-        from vla_attention.capture.policies.cosmos.preprocess import read_statistics
+        from vla_attention.capture.policies.cosmos.preprocess import read_ranges
         from vla_attention.capture.policies.cosmos.t5_pickle import read_embeddings
         from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
         from vla_attention.capture.policies.hub import split_hub_name
@@ -145,7 +145,7 @@ class CosmosSettings(ModelSettings):
         if name not in UNTRAINED_POLICIES and not on_hub:
             folder = find_checkpoint(name)
             weights = find_weights(folder)
-            read_statistics(find_beside(folder, self.dataset_stats_path, STATISTICS_NAME))
+            read_ranges(find_beside(folder, self.dataset_stats_path, STATISTICS_NAME))
             read_embeddings(find_beside(folder, self.t5_text_embeddings_path, EMBEDDINGS_NAME))
             for file in (weights, find_vae(folder, self.vae_path)):
                 read_tensors(file)  # mapped into memory: the numbers are not read

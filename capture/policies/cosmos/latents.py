@@ -81,7 +81,7 @@ def fill_frame(values: Tensor, shape: tuple[int, int, int]) -> Tensor:
     return values.repeat(copies)[:elements].reshape(shape)
 
 
-def read_actions(frame: Tensor, chunk_size: int, action_dim: int) -> Tensor:
+def actions_of_frame(frame: Tensor, chunk_size: int, action_dim: int) -> Tensor:
     """Return the actions (step, dim) that a frame (channel, row, column) holds: the mean over its whole copies."""
     size = chunk_size * action_dim
     copies = frame.numel() // size

@@ -24,14 +24,14 @@ from vla_attention.capture.policies.cosmos.locate import (
 )
 from vla_attention.capture.policies.cosmos.model import CosmosModel
 from vla_attention.capture.policies.cosmos.policy import CosmosPolicy
-from vla_attention.capture.policies.cosmos.preprocess import read_statistics
+from vla_attention.capture.policies.cosmos.preprocess import read_ranges
 from vla_attention.capture.policies.cosmos.sampler import noise_levels
 from vla_attention.capture.policies.cosmos.t5_pickle import read_embeddings
 from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
 from vla_attention.capture.policies.cosmos.text import PieceTokenizer, PrecomputedText, T5Encoder
 from vla_attention.capture.policies.cosmos.vae import build_encoder, infer_vae_config
 from vla_attention.capture.policies.family import UNTRAINED, UNTRAINED_TINY
-from vla_attention.capture.policies.hub import downloads, hub_version
+from vla_attention.capture.policies.hub import downloads, lasting_name
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.weights import DTYPES
 from vla_attention.schemas.errors import BadArgument
@@ -49,10 +49,12 @@ def load_cosmos_policy(settings: CosmosSettings, device: str | torch.device = "c
     # Small files first: if one is missing, the minutes for loading the weights are saved.
     weights_path = find_weights(place)
     statistics_path = find_beside(place, settings.dataset_stats_path, STATISTICS_NAME)
-    statistics = read_statistics(statistics_path, base.action_dim, base.proprio_dim)
+    statistics = read_ranges(statistics_path, base.action_dim, base.proprio_dim)
     embeddings_path = find_beside(place, settings.t5_text_embeddings_path, EMBEDDINGS_NAME)
     embeddings = read_embeddings(embeddings_path)
     encoder = T5Encoder(settings.t5_encoder) if settings.t5_encoder is not None else None
+    for instruction in settings.instructions if encoder is None else ():
+        embeddings.find(instruction)
     # The folder of an encoder also has the tokenizer.
     tokenizer_path = find_t5_tokenizer(place, settings.t5_tokenizer or settings.t5_encoder)
     if tokenizer_path is None:
@@ -85,11 +87,9 @@ def load_cosmos_policy(settings: CosmosSettings, device: str | torch.device = "c
         build_dit(config.dit, weights, dtype=dtype, device=device),
         build_encoder(config.vae, vae_state, dtype=dtype, device=device),
     )
-    version = hub_version(place) if from_hub else None
     source = PolicySource(
         name="cosmos",
-        # A name on the hub stands for other files tomorrow; with the commit it does not.
-        checkpoint=str(version or checkpoint),
+        checkpoint=lasting_name(checkpoint, place),
         checkpoint_format=weights_path.suffix.removeprefix("."),
         untrained=False,
         configuration=settings.config_name,

@@ -12,7 +12,7 @@ from vla_attention.capture.policies.checkpoints import (
     UnsupportedCheckpoint,
     check_checkpoint_file,
 )
-from vla_attention.capture.policies.hub import fetch_from_hub, in_hub_cache, split_hub_name
+from vla_attention.capture.policies.hub import in_hub_cache, local_or_fetched
 from vla_attention.schemas.errors import BadArgument, listing
 
 POLICY_REPOSITORY = "nvidia/Cosmos-Policy-LIBERO-Predict2-2B"
@@ -32,24 +32,13 @@ def find_checkpoint(name: str) -> Path:
     It is a local path, or `ORG/NAME` or `ORG/NAME@COMMIT` of the hub. Files that are not in the hub's cache
     are downloaded; `CheckpointUnavailable` if that fails.
     """
-    path = Path(name).expanduser()
-    if path.exists():
-        return path
-    on_hub = split_hub_name(name)
-    if on_hub is not None:
-        return _from_hub(on_hub[0], ["*.pt", STATISTICS_NAME, EMBEDDINGS_NAME], on_hub[1])
-    raise CheckpointNotFound(
-        f"There is no checkpoint at '{path}'; give a folder with a .pt file, {STATISTICS_NAME} and {EMBEDDINGS_NAME}, "
-        f"or {POLICY_REPOSITORY}."
-    )
-
-
-def _from_hub(repository: str, patterns: list[str], revision: str | None = None) -> Path:
-    how = (
-        f"fetch {listing(patterns)} of it where there is a network (`hf download {repository}`), copy the folder here "
-        "and give its path (there is no such local folder)"
-    )
-    return fetch_from_hub(repository, patterns, how, revision=revision)
+    found = local_or_fetched(name, ["*.pt", STATISTICS_NAME, EMBEDDINGS_NAME])
+    if found is None:
+        raise CheckpointNotFound(
+            f"There is no checkpoint at '{Path(name).expanduser()}'; give a folder with a .pt file, {STATISTICS_NAME} "
+            f"and {EMBEDDINGS_NAME}, or {POLICY_REPOSITORY}."
+        )
+    return found
 
 
 def find_weights(checkpoint: Path) -> Path:
@@ -88,8 +77,9 @@ def find_vae(checkpoint: Path, given: str | None, *, from_hub: bool = False) -> 
     for place in places:
         if place.is_file():
             return place
-    if from_hub and given is None:
-        return _from_hub(VAE_REPOSITORY, [VAE_NAME]) / VAE_NAME
+    fetched = local_or_fetched(VAE_REPOSITORY, [VAE_NAME]) if from_hub and given is None else None
+    if fetched is not None:
+        return fetched / VAE_NAME
     raise CheckpointNotFound(
         f"The image encoder was not found at {listing(places)}; it is published separately from the policy: fetch it "
         f"with `hf download {VAE_REPOSITORY} {VAE_NAME}` and give --vae-path."

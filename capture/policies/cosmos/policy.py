@@ -17,14 +17,14 @@ from vla_attention.capture.policies.cosmos.latents import (
     CROSS,
     SELF,
     action_shares,
+    actions_of_frame,
     cameras,
     query_pools,
-    read_actions,
     read_value,
     self_roles,
 )
 from vla_attention.capture.policies.cosmos.model import CosmosModel, Recorders
-from vla_attention.capture.policies.cosmos.preprocess import Statistics, model_picture, proprio_of, upright
+from vla_attention.capture.policies.cosmos.preprocess import Ranges, compressed_picture, proprio_of, upright
 from vla_attention.capture.policies.cosmos.sampler import flow_time
 from vla_attention.capture.policies.cosmos.text import TextSource
 from vla_attention.capture.policies.identity import PolicySource, describe_policy
@@ -59,7 +59,7 @@ class CosmosPolicy:
         self,
         model: CosmosModel,
         text: TextSource,
-        statistics: Statistics,
+        statistics: Ranges,
         source: PolicySource,
         *,
         open_loop_steps: int = 16,
@@ -142,7 +142,7 @@ class CosmosPolicy:
         `given` (1, channel, frame, row, column) latents and `text` (1, position, width).
         """
         frames = {
-            camera.name: model_picture(upright(camera_frame(observation, camera.source)), self.config.image_size)
+            camera.name: compressed_picture(upright(camera_frame(observation, camera.source)), self.config.image_size)
             for camera in self.cameras
         }
         proprio = proprio_of(observation.gripper_qpos, observation.eef_pos, observation.eef_quat)
@@ -207,7 +207,7 @@ class CosmosPolicy:
         tensors = policy_input.tensors
         clean = self.model.sample_latents(tensors["given"], tensors["text"], noise_seed, wanted)[0].cpu()
         frame = clean[:, config.frames.index(ACTION_FRAME)]
-        actions = read_actions(frame, config.chunk_size, config.action_dim).numpy()
+        actions = actions_of_frame(frame, config.chunk_size, config.action_dim).numpy()
         return Prediction(
             actions=self.statistics.environment_actions(actions),
             value=read_value(clean[:, config.frames.index(VALUE_FRAME)]),

@@ -51,7 +51,7 @@ def crop_and_enlarge(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return large[0].round().clamp(0, 255).to(torch.uint8).permute(1, 2, 0).numpy()
 
 
-def model_picture(picture: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
+def compressed_picture(picture: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
     """Return the model's image (size, size, 3) uint8 of an upright picture: JPEG, bicubic resize, middle crop."""
     resized = Image.fromarray(compress(picture)).resize((size, size))
     return crop_and_enlarge(np.asarray(resized))
@@ -69,7 +69,7 @@ def pixels(picture: NDArray[np.uint8], dtype: torch.dtype, device: torch.device)
 
 
 @dataclass(frozen=True)
-class Statistics:
+class Ranges:
     """Ranges of the training data's actions and proprioception, each (dim,) float64."""
 
     actions_min: NDArray[np.float64]
@@ -95,7 +95,7 @@ class Statistics:
 _FIELDS = ("actions_min", "actions_max", "proprio_min", "proprio_max")
 
 
-def make_statistics(content: Mapping[str, object], where: str, action_dim: int, proprio_dim: int) -> Statistics:
+def make_ranges(content: Mapping[str, object], where: str, action_dim: int, proprio_dim: int) -> Ranges:
     """Check ranges and return them; `UnreadableCheckpoint` names the entry that is missing or of the wrong length.
 
     where: completes the sentence "The dataset statistics ..." in an error."""
@@ -119,10 +119,10 @@ def make_statistics(content: Mapping[str, object], where: str, action_dim: int, 
         raise UnreadableCheckpoint(
             f"The dataset statistics {where} have a 'proprio_max' that is not above 'proprio_min'."
         )
-    return Statistics(**arrays)
+    return Ranges(**arrays)
 
 
-def read_statistics(path: str | Path, action_dim: int = 7, proprio_dim: int = 9) -> Statistics:
+def read_ranges(path: str | Path, action_dim: int = 7, proprio_dim: int = 9) -> Ranges:
     """Read a file of dataset statistics (JSON)."""
     path = Path(path)
     try:
@@ -132,7 +132,7 @@ def read_statistics(path: str | Path, action_dim: int = 7, proprio_dim: int = 9)
             f"There are no dataset statistics at '{path}'; give --dataset-stats-path (libero_dataset_statistics.json "
             "of the checkpoint)."
         ) from None
-    return make_statistics(content, f"in '{path}'", action_dim, proprio_dim)
+    return make_ranges(content, f"in '{path}'", action_dim, proprio_dim)
 
 
 def proprio_of(

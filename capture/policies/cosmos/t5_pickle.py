@@ -22,6 +22,9 @@ from vla_attention.capture.foreign_files.torch_files import reason_of, tensor_pr
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
 from vla_attention.schemas.errors import UnknownName, listing
 
+#: The command that adds sentences to such a file.
+ENCODE_PROMPTS = "vla_attention.capture.policies.cosmos.encode_prompts"
+
 
 def _load_storage(content: bytes) -> Any:
     """Read a storage with PyTorch's own restricted reader, on the CPU; replaces the pickle's `_load_from_bytes`."""
@@ -64,15 +67,18 @@ class TextEmbeddings:
         return positions, width
 
     def find(self, instruction: str) -> Tensor:
-        """Return the embedding of an instruction; `UnknownName` lists the nearest instructions."""
+        """Return the embedding of an instruction, zeros for an empty one without; `UnknownName` lists the nearest."""
         if instruction in self.by_instruction:
             return self.by_instruction[instruction]
+        if not instruction:
+            return torch.zeros_like(next(iter(self.by_instruction.values())))
         near = difflib.get_close_matches(instruction, list(self.by_instruction), n=3, cutoff=0.5)
         nearest = listing(f"'{name}'" for name in near) if near else "none of them is near"
         raise UnknownName(
             f"There is no text embedding of '{instruction}' among the {len(self.by_instruction)} of '{self.path}'; "
-            f"nearest: {nearest}. Precompute it and give the file as --t5-text-embeddings-path, or give --t5-encoder "
-            "PATH."
+            f"nearest: {nearest}. Give --t5-encoder FOLDER, or encode it where there is one: `python -m "
+            f"{ENCODE_PROMPTS} {self.path} NEW.pkl --t5-encoder FOLDER --prompt '{instruction}'`, and give "
+            "--t5-text-embeddings-path NEW.pkl."
         )
 
 

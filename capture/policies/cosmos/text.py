@@ -154,9 +154,8 @@ class PrecomputedText:
         self._encoded: dict[str, Tensor] = {}
 
     def _embedding(self, instruction: str) -> Tensor:
-        if not instruction and "" not in self.embeddings.by_instruction:
-            return torch.zeros_like(next(iter(self.embeddings.by_instruction.values())))
-        if instruction in self.embeddings.by_instruction or self.encoder is None or self.tokenizer is None:
+        in_file = not instruction or instruction in self.embeddings.by_instruction
+        if in_file or self.encoder is None or self.tokenizer is None:
             return self.embeddings.find(instruction)
         if instruction not in self._encoded:
             ids = self.tokenizer.token_ids(instruction)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 
+from vla_attention.capture.policies.checkpoints import Blocks, Size
 from vla_attention.capture.policies.pi.flow_time import MAX_PERIOD, MIN_PERIOD, TimeConvention
 from vla_attention.schemas.errors import BadArgument, unknown_name
 
@@ -19,24 +20,24 @@ PALIGEMMA_VOCABULARY = 257_152
 class GemmaConfig:
     """Sizes of one Gemma transformer: the vision-language model or the action expert."""
 
-    width: int
-    depth: int
-    mlp_dim: int
-    num_heads: int = 8
-    num_kv_heads: int = 1
-    head_dim: int = 256
+    width: Size
+    depth: Blocks
+    mlp_dim: Size
+    num_heads: Size = 8
+    num_kv_heads: Size = 1
+    head_dim: Size = 256
 
 
 @dataclass(frozen=True)
 class SiglipConfig:
     """Sizes of the image encoder; the defaults are So400m/14."""
 
-    width: int = 1152
-    depth: int = 27
-    mlp_dim: int = 4304
-    num_heads: int = 16
-    patch_size: int = 14
-    image_size: int = 224
+    width: Size = 1152
+    depth: Blocks = 27
+    mlp_dim: Size = 4304
+    num_heads: Size = 16
+    patch_size: Size = 14
+    image_size: Size = 224
 
     @property
     def grid(self) -> int:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from vla_attention.capture.policies.checkpoints import (
     CheckpointNotFound,
@@ -15,7 +16,6 @@ from vla_attention.capture.policies.checkpoints import (
 from vla_attention.schemas.errors import listing
 
 CheckpointFormat = Literal["openpi_torch", "openpi_jax", "lerobot"]
-CHECKPOINT_FORMATS: tuple[CheckpointFormat, ...] = get_args(CheckpointFormat)
 
 #: The weights of both PyTorch formats: one file, or several with an index.
 WEIGHTS = "model.safetensors"
@@ -24,24 +24,14 @@ WEIGHTS_INDEX = "model.safetensors.index.json"
 ADAPTER = "adapter_config.json"
 #: How far below a folder checkpoints are looked for: LeRobot's are in RUN/checkpoints/STEP/pretrained_model.
 _SEARCH_DEPTH = 3
+#: What LeRobot saves beside a policy, and the types of its policies that are read.
+PREPROCESSOR, _LEROBOT_TYPES = "policy_preprocessor.json", ("pi0", "pi05")
 
 #: Name of each format in messages, with the files that it consists of.
 FORMAT_TITLES: dict[CheckpointFormat, str] = {
     "openpi_torch": "openpi's PyTorch format (model.safetensors)",
     "openpi_jax": "openpi's JAX format (params/_METADATA)",
     "lerobot": "LeRobot's format (config.json with a type, model.safetensors and policy_preprocessor.json)",
-}
-
-#: Words in the configuration of a transformers checkpoint, and the model that each of them names.
-_OTHER_FAMILIES = {
-    "openvla": "OpenVLA",
-    "gr00t": "GR00T",
-    "groot": "GR00T",
-    "smolvla": "SmolVLA",
-    "smolvlm": "SmolVLM",
-    "paligemma": "PaliGemma (the vision-language model alone)",
-    "gemma": "Gemma (the language model alone)",
-    "siglip": "SigLIP (the image encoder alone)",
 }
 
 
@@ -57,22 +47,22 @@ def detect_format(folder: str | Path, wanted: CheckpointFormat | None = None) ->
         raise CheckpointNotFound(f"There is no checkpoint folder at '{folder}'.")
     if _has(folder / ADAPTER):
         raise UnsupportedCheckpoint(_adapter(folder))
-    has_params = _has(folder / "params" / "_METADATA")
-    has_config = _has(folder / "config.json")
+    has_params, has_config = _has(folder / "params" / "_METADATA"), _has(folder / "config.json")
     has_tensors = _has(folder / WEIGHTS) or _has(folder / WEIGHTS_INDEX)
+    names = sorted(path.name for path in folder.iterdir())
     if wanted is not None:
         has = {"openpi_jax": has_params, "openpi_torch": has_tensors, "lerobot": has_tensors and has_config}
         if not has[wanted]:
-            content = listing(sorted(path.name for path in folder.iterdir()))
-            raise UnsupportedCheckpoint(f"'{folder}' is not in {FORMAT_TITLES[wanted]}: it holds {content}.")
+            raise UnsupportedCheckpoint(f"'{folder}' is not in {FORMAT_TITLES[wanted]}: it holds {listing(names)}.")
         return wanted
     if has_params:
         return "openpi_jax"
-    if has_tensors and has_config:
-        return _format_of_config(folder, read_json_object(folder / "config.json"))
-    if has_tensors and not _has(folder / "policy_preprocessor.json"):
-        return "openpi_torch"  # as its training leaves it
-    raise UnsupportedCheckpoint(_what_it_is(folder))
+    family = _stated_family(read_json_object(folder / "config.json")) if has_config else None
+    if has_tensors and family in _LEROBOT_TYPES:
+        return "lerobot"
+    if has_tensors and family is None and (has_config or PREPROCESSOR not in names):
+        return "openpi_torch"  # without a config.json: as its training leaves it
+    raise UnsupportedCheckpoint(_what_it_is(folder, names, family))
 
 
 def _has(file: Path) -> bool:
@@ -83,51 +73,28 @@ def _has(file: Path) -> bool:
     return True
 
 
-def _format_of_config(folder: Path, config: dict[str, Any]) -> CheckpointFormat:
-    kind = config.get("type")
-    if kind in ("pi0", "pi05"):
-        return "lerobot"
-    if kind is not None:
-        raise UnsupportedCheckpoint(
-            f"'{folder}' is a LeRobot checkpoint of another model family: type '{kind}', not pi0 or pi05."
-        )
-    family = _transformers_family(config)
-    if family is not None:
-        raise UnsupportedCheckpoint(f"'{folder}' is a checkpoint of another model family: {family}, not pi0 or pi0.5.")
-    return "openpi_torch"
-
-
-def _transformers_family(config: dict[str, Any]) -> str | None:
-    """Name the model of a transformers configuration, or None for a configuration of another kind."""
-    if "model_type" not in config and "architectures" not in config:
-        return None
+def _stated_family(config: Mapping[str, Any]) -> str | None:
+    """The model that a config.json of LeRobot or transformers names."""
     architectures = config.get("architectures")
-    named = [config.get("model_type"), *(architectures if isinstance(architectures, list) else [architectures])]
-    words = [str(word) for word in named if word]
-    for part, family in _OTHER_FAMILIES.items():
-        if any(part in word.casefold() for word in words):
-            return family
-    return f"a transformers model '{words[0] if words else 'without a name'}'"
+    named = architectures[0] if isinstance(architectures, list) and architectures else architectures
+    family = config.get("type") or config.get("model_type") or named
+    return None if family is None else str(family)
 
 
-def _what_it_is(folder: Path) -> str:
+def _what_it_is(folder: Path, names: Sequence[str], family: str | None) -> str:
     """Return a sentence: why a folder is no pi checkpoint, and if possible what to give instead."""
-    names = sorted(path.name for path in folder.iterdir())
     if folder.name == "params" and "_METADATA" in names:
         return f"'{folder}' is the params folder of a checkpoint; give its parent '{folder.parent}'."
     if inner := _checkpoints_in(folder):
         return f"'{folder}' holds checkpoints rather than being one; give one of its folders {listing(inner)}."
-    if "config.json" in names:
-        config = read_json_object(folder / "config.json")
-        if config.get("type") in ("pi0", "pi05"):
-            return f"'{folder}' is a LeRobot checkpoint without its {WEIGHTS}: found {listing(names)}."
-        family = config.get("type") or _transformers_family(config)
-        if family:
-            return f"'{folder}' is a checkpoint of another model family: {family}, not pi0 or pi0.5."
-    if "policy_preprocessor.json" in names:
+    if family in _LEROBOT_TYPES:
+        return f"'{folder}' is a LeRobot checkpoint without its {WEIGHTS}: found {listing(names)}."
+    if family is None and any("cosmos" in name.casefold() for name in names):
+        family = "Cosmos Policy"
+    if family is not None:
+        return f"'{folder}' is a checkpoint of another model family: {family!r}, not pi0 or pi0.5."
+    if PREPROCESSOR in names:
         return f"'{folder}' is a LeRobot checkpoint without its config.json: found {listing(names)}."
-    if any("cosmos" in name.casefold() for name in names):
-        return f"'{folder}' is a checkpoint of another model family: Cosmos Policy, not pi0 or pi0.5."
     return (
         f"'{folder}' is not a pi checkpoint: expected {FORMAT_TITLES['openpi_torch']}, {FORMAT_TITLES['openpi_jax']} "
         f"or {FORMAT_TITLES['lerobot']}, found {listing(names)}."

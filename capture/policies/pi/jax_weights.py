@@ -18,64 +18,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch
+from vla_attention.capture.policies.pi.sizes import EXPERT, LANGUAGE, PALIGEMMA, VISION
 from vla_attention.capture.policies.weights import Shapes
 from vla_attention.schemas.errors import listing
 
-_LORA = re.compile(r"(.*[/_])lora_([ab])\Z")
-
-
-@dataclass(frozen=True)
-class LoraPair:
-    """The paths of the two factors that adapt one leaf."""
-
-    a: str
-    b: str
-
-
-def find_lora_pairs(paths: Iterable[str]) -> dict[str, LoraPair]:
-    """Return adapted leaf -> its pair. A single factor, or one without a leaf to adapt, is in no pair."""
-    known = set(paths)
-    pairs = {}
-    for path in known:
-        match = _LORA.fullmatch(path)
-        if match is None or match[2] != "a":
-            continue
-        # Attention: .../q_einsum/{w, lora_a, lora_b}. Feed-forward: .../{gating_einsum, gating_einsum_lora_a, ...}.
-        base = match[1] + "w" if match[1].endswith("/") else match[1][:-1]
-        other = f"{match[1]}lora_b"
-        if base in known and other in known:
-            pairs[base] = LoraPair(path, other)
-    return pairs
-
-
-def merge_lora(path: str, w: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return one layer of the leaf `path` with its LoRA factors merged, in float32.
-
-    w: (..., in, out); a: (..., in, rank); b: (..., rank, out), with the same leading axes (heads, or gate and up).
-    """
-    fits = w.shape[:-1] == a.shape[:-1] and (*w.shape[:-2], a.shape[-1], w.shape[-1]) == b.shape
-    if not fits:
-        raise CheckpointMismatch(
-            f"The LoRA arrays of {path} have shapes {a.shape} and {b.shape}, which do not fit its {w.shape} (one layer "
-            "each)."
-        )
-    a, b = np.asarray(a, dtype=np.float32), np.asarray(b, dtype=np.float32)
-    update = np.einsum("nhl,ld->nhd", a, b.sum(axis=0)) if "/attn_vec_einsum" in path else a @ b
-    return np.asarray(w + update, dtype=np.float32)
-
-
-VISION = "paligemma_with_expert.paligemma.model.vision_tower.vision_model."
-PROJECTOR = "paligemma_with_expert.paligemma.model.multi_modal_projector.linear."
-LANGUAGE = "paligemma_with_expert.paligemma.model.language_model."
-EXPERT = "paligemma_with_expert.gemma_expert.model."
-
-Convert = Callable[[np.ndarray], np.ndarray]
-
+_PROJECTOR = PALIGEMMA + "model.multi_modal_projector.linear."
 #: Appended to the error if the arrays of a pi model are missing.
-OTHER_OPENPI_MODEL = (
+_OTHER_OPENPI_MODEL = (
     " It has no action expert of a pi0 or pi0.5 model: it is of another model family (openpi's pi0-FAST, which writes "
     "actions as text, or PaliGemma alone)."
 )
+
+Convert = Callable[[np.ndarray], np.ndarray]
 
 
 def _same(w: np.ndarray) -> np.ndarray:
@@ -105,80 +59,52 @@ def _per_head(w: np.ndarray) -> np.ndarray:
     return w.transpose(0, 2, 1).reshape(-1, w.shape[1])
 
 
-def _first(convert: Convert) -> Convert:
-    return lambda w: convert(w[0])
-
-
-def _second(convert: Convert) -> Convert:
-    return lambda w: convert(w[1])
-
-
-def _third(convert: Convert) -> Convert:
-    return lambda w: convert(w[2])
-
-
-#: leaf -> (torch name, conversion); one entry per leaf that is not stacked
-_IMAGE: dict[str, tuple[str, Convert]] = {
-    "embedding/kernel": (VISION + "embeddings.patch_embedding.weight", lambda w: w.transpose(3, 2, 0, 1)),
-    "embedding/bias": (VISION + "embeddings.patch_embedding.bias", _same),
-    "pos_embedding": (VISION + "embeddings.position_embedding.weight", lambda w: w[0]),
-    "Transformer/encoder_norm/scale": (VISION + "post_layernorm.weight", _same),
-    "Transformer/encoder_norm/bias": (VISION + "post_layernorm.bias", _same),
-    "head/kernel": (PROJECTOR + "weight", _transposed),
-    "head/bias": (PROJECTOR + "bias", _same),
+#: Leaf -> its conversion, and the torch tensors that it becomes: several where its first axis counts them.
+_Table = dict[str, tuple[Convert, tuple[str, ...]]]
+_IMAGE: _Table = {
+    "embedding/kernel": (lambda w: w.transpose(3, 2, 0, 1), (VISION + "embeddings.patch_embedding.weight",)),
+    "embedding/bias": (_same, (VISION + "embeddings.patch_embedding.bias",)),
+    "pos_embedding": (lambda w: w[0], (VISION + "embeddings.position_embedding.weight",)),
+    "Transformer/encoder_norm/scale": (_same, (VISION + "post_layernorm.weight",)),
+    "Transformer/encoder_norm/bias": (_same, (VISION + "post_layernorm.bias",)),
+    "head/kernel": (_transposed, (_PROJECTOR + "weight",)),
+    "head/bias": (_same, (_PROJECTOR + "bias",)),
 }
 _ATTENTION = "MultiHeadDotProductAttention_0/"
-#: leaf below the image encoder's blocks -> (name below a torch layer, conversion of one layer)
-_IMAGE_BLOCK: dict[str, tuple[str, Convert]] = {
-    "LayerNorm_0/scale": ("layer_norm1.weight", _same),
-    "LayerNorm_0/bias": ("layer_norm1.bias", _same),
-    "LayerNorm_1/scale": ("layer_norm2.weight", _same),
-    "LayerNorm_1/bias": ("layer_norm2.bias", _same),
-    _ATTENTION + "query/kernel": ("self_attn.q_proj.weight", _into_heads),
-    _ATTENTION + "query/bias": ("self_attn.q_proj.bias", _flat),
-    _ATTENTION + "key/kernel": ("self_attn.k_proj.weight", _into_heads),
-    _ATTENTION + "key/bias": ("self_attn.k_proj.bias", _flat),
-    _ATTENTION + "value/kernel": ("self_attn.v_proj.weight", _into_heads),
-    _ATTENTION + "value/bias": ("self_attn.v_proj.bias", _flat),
-    _ATTENTION + "out/kernel": ("self_attn.out_proj.weight", _out_of_heads),
-    _ATTENTION + "out/bias": ("self_attn.out_proj.bias", _same),
-    "MlpBlock_0/Dense_0/kernel": ("mlp.fc1.weight", _transposed),
-    "MlpBlock_0/Dense_0/bias": ("mlp.fc1.bias", _same),
-    "MlpBlock_0/Dense_1/kernel": ("mlp.fc2.weight", _transposed),
-    "MlpBlock_0/Dense_1/bias": ("mlp.fc2.bias", _same),
+#: Below the blocks of the image encoder.
+_IMAGE_BLOCK: _Table = {
+    _ATTENTION + "out/kernel": (_out_of_heads, ("self_attn.out_proj.weight",)),
+    _ATTENTION + "out/bias": (_same, ("self_attn.out_proj.bias",)),
 }
-#: leaf below the Gemma blocks -> every (name below a torch layer, conversion of one layer) made from it
-_GEMMA_BLOCK: dict[str, list[tuple[str, Convert]]] = {
-    "attn/q_einsum/w": [("self_attn.q_proj.weight", _per_head)],
-    "attn/kv_einsum/w": [
-        ("self_attn.k_proj.weight", _first(_per_head)),
-        ("self_attn.v_proj.weight", _second(_per_head)),
-    ],
-    # as many key heads as query heads: one array for all three
-    "attn/qkv_einsum/w": [
-        ("self_attn.q_proj.weight", _first(_per_head)),
-        ("self_attn.k_proj.weight", _second(_per_head)),
-        ("self_attn.v_proj.weight", _third(_per_head)),
-    ],
-    "attn/attn_vec_einsum/w": [("self_attn.o_proj.weight", _out_of_heads)],
-    "mlp/gating_einsum": [
-        ("mlp.gate_proj.weight", _first(_transposed)),
-        ("mlp.up_proj.weight", _second(_transposed)),
-    ],
-    "mlp/linear": [("mlp.down_proj.weight", _transposed)],
-    "pre_attention_norm/scale": [("input_layernorm.weight", _same)],
-    "pre_attention_norm/Dense_0/kernel": [("input_layernorm.dense.weight", _transposed)],
-    "pre_attention_norm/Dense_0/bias": [("input_layernorm.dense.bias", _same)],
-    "pre_ffw_norm/scale": [("post_attention_layernorm.weight", _same)],
-    "pre_ffw_norm/Dense_0/kernel": [("post_attention_layernorm.dense.weight", _transposed)],
-    "pre_ffw_norm/Dense_0/bias": [("post_attention_layernorm.dense.bias", _same)],
+for _name in ("query", "key", "value"):
+    _IMAGE_BLOCK[f"{_ATTENTION}{_name}/kernel"] = (_into_heads, (f"self_attn.{_name[0]}_proj.weight",))
+    _IMAGE_BLOCK[f"{_ATTENTION}{_name}/bias"] = (_flat, (f"self_attn.{_name[0]}_proj.bias",))
+for _i in (0, 1):
+    _IMAGE_BLOCK[f"LayerNorm_{_i}/scale"] = (_same, (f"layer_norm{_i + 1}.weight",))
+    _IMAGE_BLOCK[f"LayerNorm_{_i}/bias"] = (_same, (f"layer_norm{_i + 1}.bias",))
+    _IMAGE_BLOCK[f"MlpBlock_0/Dense_{_i}/kernel"] = (_transposed, (f"mlp.fc{_i + 1}.weight",))
+    _IMAGE_BLOCK[f"MlpBlock_0/Dense_{_i}/bias"] = (_same, (f"mlp.fc{_i + 1}.bias",))
+_Q, _K, _V = (f"self_attn.{name}_proj.weight" for name in "qkv")
+#: Below the blocks of the two Gemma transformers.
+_GEMMA_BLOCK: _Table = {
+    "attn/q_einsum/w": (_per_head, (_Q,)),
+    "attn/kv_einsum/w": (_per_head, (_K, _V)),
+    "attn/qkv_einsum/w": (_per_head, (_Q, _K, _V)),  # as many key heads as query heads
+    "attn/attn_vec_einsum/w": (_out_of_heads, ("self_attn.o_proj.weight",)),
+    "mlp/gating_einsum": (_transposed, ("mlp.gate_proj.weight", "mlp.up_proj.weight")),
+    "mlp/linear": (_transposed, ("mlp.down_proj.weight",)),
 }
-_GEMMA: dict[str, tuple[str, Convert]] = {
-    "embedder/input_embedding": ("embed_tokens.weight", _same),
-    "final_norm/scale": ("norm.weight", _same),
-    "final_norm/Dense_0/kernel": ("norm.dense.weight", _transposed),
-    "final_norm/Dense_0/bias": ("norm.dense.bias", _same),
-}
+_GEMMA: _Table = {"embedder/input_embedding": (_same, ("embed_tokens.weight",))}
+for _table, _jax, _torch in (
+    (_GEMMA_BLOCK, "pre_attention_norm", "input_layernorm"),
+    (_GEMMA_BLOCK, "pre_ffw_norm", "post_attention_layernorm"),
+    (_GEMMA, "final_norm", "norm"),
+):
+    _table[f"{_jax}/scale"] = (_same, (f"{_torch}.weight",))
+    _table[f"{_jax}/Dense_0/kernel"] = (_transposed, (f"{_torch}.dense.weight",))
+    _table[f"{_jax}/Dense_0/bias"] = (_same, (f"{_torch}.dense.bias",))
+
+_LORA = re.compile(r"(.*[/_])lora_([ab])\Z")
 #: "_1" at the end of a path component of the language model marks the action expert
 _EXPERT_MARK = re.compile(r"_1(?=/|$)")
 _PROJECTION = re.compile(r"((?:action|state|time)\w*)/(kernel|bias)")
@@ -186,22 +112,26 @@ _PROJECTION = re.compile(r"((?:action|state|time)\w*)/(kernel|bias)")
 
 @dataclass(frozen=True)
 class LeafPlan:
-    """Conversion of one JAX leaf: every torch tensor that is made from it, as (name, conversion).
+    """Conversion of one JAX leaf. names: of the torch tensors, after `before`.
 
-    layers: the torch prefix of the layers if the leaf is stacked (its first axis is the layer), else None.
+    is_stacked: the first axis of the leaf is the layer, whose number follows `before` in the names.
     """
 
-    targets: tuple[tuple[str, Convert], ...]
-    layers: str | None = None
+    convert: Convert
+    names: tuple[str, ...]
+    before: str
+    is_stacked: bool
 
-    def layer(self, index: int, array: np.ndarray) -> dict[str, np.ndarray]:
-        """Convert one layer of a stacked leaf."""
-        return {f"{self.layers}{index}.{name}": convert(array) for name, convert in self.targets}
+    def layer(self, index: int | None, array: np.ndarray) -> dict[str, np.ndarray]:
+        """Convert one layer of a stacked leaf, or (None) a leaf that is not stacked."""
+        before = self.before if index is None else f"{self.before}{index}."
+        parts = array if len(self.names) > 1 else [array]
+        return {before + name: self.convert(part) for name, part in zip(self.names, parts, strict=True)}
 
     def whole(self, leaf: np.ndarray) -> dict[str, np.ndarray]:
         """Convert a whole leaf."""
-        if self.layers is None:
-            return {name: convert(leaf) for name, convert in self.targets}
+        if not self.is_stacked:
+            return self.layer(None, leaf)
         return {name: array for i, one in enumerate(leaf) for name, array in self.layer(i, one).items()}
 
     def shapes(self, leaf_shape: tuple[int, ...]) -> Shapes:
@@ -210,45 +140,65 @@ class LeafPlan:
         return {name: tuple(array.shape) for name, array in self.whole(empty).items()}
 
 
-def plan_leaf(path: str) -> LeafPlan | None:
+def _plan_leaf(path: str) -> LeafPlan | None:
     """Return the conversion of a JAX leaf by its path, or None for a leaf that no pi model has."""
-    image_block, image, language = "PaliGemma/img/Transformer/encoderblock/", "PaliGemma/img/", "PaliGemma/llm/"
-    if path.startswith(image_block):
-        place = _IMAGE_BLOCK.get(path.removeprefix(image_block))
-        return None if place is None else LeafPlan((place,), VISION + "encoder.layers.")
-    if path.startswith(image):
-        return _single("", _IMAGE.get(path.removeprefix(image)))
-    if path.startswith(language):
-        below, marks = _EXPERT_MARK.subn("", path.removeprefix(language))
-        model = EXPERT if marks else LANGUAGE
-        several = _GEMMA_BLOCK.get(below.removeprefix("layers/"))
-        return _single(model, _GEMMA.get(below)) if several is None else LeafPlan(tuple(several), model + "layers.")
+    below, marks = _EXPERT_MARK.subn("", path) if path.startswith("PaliGemma/llm/") else (path, 0)
+    model = EXPERT if marks else LANGUAGE
+    for place, table, before, is_stacked in (
+        ("PaliGemma/img/Transformer/encoderblock/", _IMAGE_BLOCK, VISION + "encoder.layers.", True),
+        ("PaliGemma/img/", _IMAGE, "", False),
+        ("PaliGemma/llm/layers/", _GEMMA_BLOCK, model + "layers.", True),
+        ("PaliGemma/llm/", _GEMMA, model, False),
+    ):
+        if below.startswith(place):
+            found = table.get(below.removeprefix(place))
+            return None if found is None else LeafPlan(*found, before, is_stacked)
     projection = _PROJECTION.fullmatch(path)
     if projection is None:
         return None
-    kernel = projection[2] == "kernel"
-    return _single(projection[1], (".weight", _transposed) if kernel else (".bias", _same))
+    convert, name = (_transposed, "weight") if projection[2] == "kernel" else (_same, "bias")
+    return LeafPlan(convert, (name,), projection[1] + ".", False)
 
 
-def _single(before: str, found: tuple[str, Convert] | None) -> LeafPlan | None:
-    return None if found is None else LeafPlan(((before + found[0], found[1]),))
-
-
-def plan_leaves(paths: Iterable[str]) -> tuple[dict[str, LeafPlan], dict[str, LoraPair]]:
-    """Return the conversion of every leaf of a checkpoint, and the LoRA pairs that are merged into leaves.
+def plan_leaves(paths: Iterable[str]) -> tuple[dict[str, LeafPlan], dict[str, tuple[str, str]]]:
+    """Return the conversion of every leaf of a checkpoint, and leaf -> the two LoRA leaves that are merged into it.
 
     `CheckpointMismatch` lists the leaves that no pi model has; these include LoRA leaves without a pair.
     """
-    paths = list(paths)
-    pairs = find_lora_pairs(paths)
-    merged = {path for pair in pairs.values() for path in (pair.a, pair.b)}
-    plans = {path: plan_leaf(path) for path in paths if path not in merged}
-    unknown = sorted(path for path, plan in plans.items() if plan is None)
-    if unknown:
-        family = "" if any(path.startswith("action_in_proj/") for path in paths) else OTHER_OPENPI_MODEL
+    known = dict.fromkeys(paths)
+    pairs = {}
+    for path in known:
+        match = _LORA.fullmatch(path)
+        if match is not None and match[2] == "a" and f"{match[1]}lora_b" in known:
+            # Attention: .../q_einsum/{w, lora_a, lora_b}. Feed-forward: .../{gating_einsum, gating_einsum_lora_a, ...}.
+            adapted = match[1] + "w" if match[1].endswith("/") else match[1][:-1]
+            if adapted in known:
+                pairs[adapted] = (path, f"{match[1]}lora_b")
+    merged = {path for pair in pairs.values() for path in pair}
+    found = {path: _plan_leaf(path) for path in known if path not in merged}
+    plans = {path: plan for path, plan in found.items() if plan is not None}
+    is_pi = "action_in_proj/kernel" in plans
+    if len(plans) < len(found):
+        unknown = sorted(found.keys() - plans.keys())
         raise CheckpointMismatch(
-            f"The checkpoint has {len(unknown)} arrays that a pi model does not have: {listing(unknown, 40)}.{family}"
+            f"The checkpoint has {len(unknown)} arrays that a pi model does not have: {listing(unknown, 40)}."
+            f"{'' if is_pi else _OTHER_OPENPI_MODEL}"
         )
-    if "action_in_proj/kernel" not in plans:
-        raise CheckpointMismatch(f"The checkpoint has no action_in_proj.{OTHER_OPENPI_MODEL}")
-    return {path: plan for path, plan in plans.items() if plan is not None}, pairs
+    if not is_pi:
+        raise CheckpointMismatch(f"The checkpoint has no action_in_proj.{_OTHER_OPENPI_MODEL}")
+    return plans, pairs
+
+
+def merge_lora(path: str, w: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return one layer of the leaf `path` with its LoRA factors merged, in float32.
+
+    w: (..., in, out); a: (..., in, rank); b: (..., rank, out), with the same leading axes (heads, or gate and up).
+    """
+    if w.shape[:-1] != a.shape[:-1] or (*w.shape[:-2], a.shape[-1], w.shape[-1]) != b.shape:
+        raise CheckpointMismatch(
+            f"The LoRA arrays of {path} have shapes {a.shape} and {b.shape}, which do not fit its {w.shape} (one layer "
+            "each)."
+        )
+    a, b = np.asarray(a, dtype=np.float32), np.asarray(b, dtype=np.float32)
+    update = np.einsum("nhl,ld->nhd", a, b.sum(axis=0)) if "/attn_vec_einsum" in path else a @ b
+    return np.asarray(w + update, dtype=np.float32)

@@ -20,15 +20,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vla_attention.capture.environments.episode_protocol import LEROBOT
-from vla_attention.capture.policies.checkpoints import CheckpointMismatch
+from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnsupportedCheckpoint
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.formats import detect_format
-from vla_attention.capture.policies.pi.lerobot_config import (
-    IMAGES,
-    LerobotConfig,
-    UnsupportedLerobotFeature,
-    read_lerobot_config,
-)
+from vla_attention.capture.policies.pi.lerobot_config import IMAGES, LerobotConfig, read_lerobot_config
 from vla_attention.capture.policies.pi.lerobot_pipeline import LerobotPipeline, read_lerobot_pipeline
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.openpi_torch import TensorFile, open_tensors
@@ -99,7 +94,7 @@ class LerobotProcessing:
             ("action", config.action_dim, self.robot.action_dim),
         ):
             if given != needed:
-                raise UnsupportedLerobotFeature(
+                raise UnsupportedCheckpoint(
                     f"The policy has {what}s of {given} numbers, and those of the environments have {needed}: it was "
                     "made for another robot."
                 )
@@ -116,7 +111,7 @@ class LerobotProcessing:
             else "raw-instruction"
         )
 
-    def model_picture(self, frame: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], Tensor]:
+    def pictures_of_frame(self, frame: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], Tensor]:
         """Resize in float32; the stored picture is the same, rounded to whole grey levels."""
         image = lerobot_image(frame, size, turned=self.robot.turned)
         kept = ((image[0].permute(1, 2, 0) + 1.0) * 127.5).round().clamp(0, 255).to(torch.uint8)
@@ -140,26 +135,6 @@ class LerobotProcessing:
             "relative_actions": False,
             "image_resize": "torch bilinear without antialiasing",
         }
-
-
-def load_lerobot_weights(
-    folder: str | Path,
-    *,
-    config: PiConfig | None = None,
-    dtype: torch.dtype | None = None,
-    device: str | torch.device = "cpu",
-) -> PiModel:
-    """Load the weights of a LeRobot checkpoint; `config` replaces the sizes of config.json and the tensors.
-
-    Without `dtype` the model has the precision of config.json. Unsupported features are refused in either case.
-    """
-    folder = Path(folder)
-    detect_format(folder, "lerobot")
-    stated = read_lerobot_config(folder)
-    with open_tensors(folder) as tensors:
-        if config is None:
-            config = model_config(stated, tensors, {}, None)
-        return tensors.build(config, dtype=dtype or DTYPES[stated.dtype], device=device)
 
 
 def load_lerobot(
@@ -204,18 +179,26 @@ def model_config(
             f"The checkpoint's config.json says type '{names[stated.pi05]}', but its tensors are those of "
             f"{names[not stated.pi05]}."
         )
-    base = sizes or infer_config(shapes, stated.raw, action_horizon="chunk_size", action_dim="max_action_dim")
-    if base.siglip.image_size != stated.image_size:
+    base = sizes or infer_config(
+        shapes,
+        {
+            "action_horizon": stated.chunk_size,
+            "action_dim": stated.max_action_dim,
+            "paligemma_variant": stated.paligemma_variant,
+            "action_expert_variant": stated.action_expert_variant,
+        },
+    )
+    if base.siglip.image_size != stated.image_resolution[0]:
         raise CheckpointMismatch(
-            f"The checkpoint's config.json says image_resolution {stated.image_size}, but its tensors take images of "
-            f"{base.siglip.image_size} pixels."
+            f"The checkpoint's config.json says image_resolution {stated.image_resolution}, but its tensors take "
+            f"images of {base.siglip.image_size} pixels."
         )
     return dataclasses.replace(
         base,
         pi05=stated.pi05,
         action_horizon=stated.chunk_size,
         action_dim=stated.max_action_dim,
-        max_token_len=stated.tokenizer_max_length,
+        max_token_len=stated.max_token_len,
         num_denoise_steps=stated.num_inference_steps,
         discrete_state_input=stated.pi05,
         cameras=tuple(slots(stated, rename, robot, chosen_cameras)),

@@ -6,29 +6,19 @@ unknown step is an error with its name: it could change the inputs or actions of
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
-from vla_attention.capture.policies.checkpoints import (
-    UnreadableCheckpoint,
-    UnsupportedCheckpoint,
-    read_json_object,
-    values_of,
-)
-from vla_attention.capture.policies.pi.lerobot_config import (
-    ACTION_FEATURE,
-    STATE_FEATURE,
-    LerobotConfig,
-    UnsupportedLerobotFeature,
-    texts_by_name,
-)
-from vla_attention.capture.policies.safetensors_file import SafetensorsFile, open_safetensors
+from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint, UnsupportedCheckpoint, read_typed
+from vla_attention.capture.policies.pi.lerobot_config import ACTION_FEATURE, STATE_FEATURE, LerobotConfig
+from vla_attention.capture.policies.safetensors_file import open_safetensors
 from vla_attention.schemas.errors import listing
 
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
@@ -43,6 +33,33 @@ _AFTER = _NOTHING | {_UNNORMALIZE, _ABSOLUTE}
 
 #: Statistics of each mode of normalisation.
 _NEEDED = {"IDENTITY": (), "MEAN_STD": ("mean", "std"), "QUANTILES": ("q01", "q99")}
+
+
+class _Settings(msgspec.Struct, frozen=True):
+    """Settings of all steps that are read, with LeRobot's defaults."""
+
+    rename_map: dict[str, str] | None = None
+    enabled: bool | None = None
+    norm_map: dict[str, str] | None = None
+    normalize_observation_keys: list[str] | None = None
+    eps: Annotated[float, Meta(ge=0, lt=1)] = 1e-8
+    max_length: int | None = None
+    padding_side: str = "right"
+    padding: str = "max_length"
+    task_key: str = "task"
+    truncation: bool = True
+
+
+class _Step(msgspec.Struct, frozen=True):
+    registry_name: str | None = None
+    #: of a step that is no registered one
+    class_: str | None = msgspec.field(name="class", default=None)
+    config: _Settings = _Settings()
+    state_file: str | None = None
+
+
+class _Pipeline(msgspec.Struct, frozen=True):
+    steps: list[_Step]
 
 
 @dataclass(frozen=True)
@@ -96,126 +113,91 @@ def read_lerobot_pipeline(folder: Path, config: LerobotConfig) -> LerobotPipelin
     """Read both pipelines of a checkpoint folder; an error names an unsupported step or setting."""
     before, after = _steps(folder, PREPROCESSOR, _BEFORE), _steps(folder, POSTPROCESSOR, _AFTER)
     for steps, name, where in ((before, _RELATIVE, PREPROCESSOR), (after, _ABSOLUTE, POSTPROCESSOR)):
-        if _settings(steps, name).get("enabled"):
-            raise UnsupportedLerobotFeature(
+        if name in steps and steps[name].config.enabled:
+            raise UnsupportedCheckpoint(
                 f"'{folder / where}' has {name} enabled: actions relative to the state are not supported."
             )
     state_in_prompt, new_line = _STATE_PROMPT in before, _NEW_LINE in before
     if state_in_prompt != config.pi05 or (new_line and config.pi05):
-        raise UnsupportedLerobotFeature(
+        raise UnsupportedCheckpoint(
             f"'{folder / PREPROCESSOR}' makes its prompt with "
             f"{listing(n for n in (_NEW_LINE, _STATE_PROMPT) if n in before)}, but a "
             f"{'pi05' if config.pi05 else 'pi0'} policy has {_STATE_PROMPT if config.pi05 else _NEW_LINE}."
         )
+    tokenizer = before.get(_TOKENIZE, _Step()).config
+    for setting, given, wanted in (
+        ("max_length", tokenizer.max_length or config.max_token_len, config.max_token_len),
+        ("padding_side", tokenizer.padding_side, "right"),
+        ("padding", tokenizer.padding, "max_length"),
+        ("task_key", tokenizer.task_key, "task"),
+    ):
+        if given != wanted:
+            raise UnsupportedCheckpoint(
+                f"'{folder / PREPROCESSOR}' tokenizes with {setting} {given!r}; expected {wanted!r}."
+            )
     return LerobotPipeline(
-        rename=texts_by_name(
-            _settings(before, _RENAME).get("rename_map"), f"'{folder / PREPROCESSOR}' has the rename_map"
-        ),
+        rename=before.get(_RENAME, _Step()).config.rename_map or {},
         state_in_prompt=state_in_prompt,
         new_line=new_line,
-        cut_long_prompts=_tokenizer_cuts(folder, before, config),
-        state=_normaliser(folder, PREPROCESSOR, before, _NORMALIZE, "STATE", STATE_FEATURE, config),
-        action=_normaliser(folder, POSTPROCESSOR, after, _UNNORMALIZE, "ACTION", ACTION_FEATURE, config),
+        cut_long_prompts=tokenizer.truncation,
+        state=_normaliser(folder / PREPROCESSOR, before.get(_NORMALIZE), "STATE", STATE_FEATURE, config),
+        action=_normaliser(folder / POSTPROCESSOR, after.get(_UNNORMALIZE), "ACTION", ACTION_FEATURE, config),
     )
 
 
-def _steps(folder: Path, name: str, known: set[str]) -> dict[str, dict[str, Any]]:
+def _steps(folder: Path, name: str, known: set[str]) -> dict[str, _Step]:
     path = folder / name
     if not path.is_file():
         raise UnsupportedCheckpoint(
             f"'{folder}' has no {name}, which says how a LeRobot policy normalises; a checkpoint saved before LeRobot "
             "kept its pipelines must be migrated with LeRobot's script first."
         )
-    steps = read_json_object(path).get("steps")
-    by_name: dict[str, dict[str, Any]] = {}
-    for step in steps if isinstance(steps, list) else ():
-        registered = step.get("registry_name") if isinstance(step, dict) else None
-        if not isinstance(registered, str) or registered not in known:
-            called = registered or (step.get("class") if isinstance(step, dict) else step)
-            raise UnsupportedLerobotFeature(f"'{path}' has a step that is not supported: {called!r}.")
-        if registered in by_name and registered not in _NOTHING:
-            raise UnsupportedLerobotFeature(f"'{path}' has the step {registered} twice.")
-        if not isinstance(step.get("config", {}), dict):
-            raise UnsupportedLerobotFeature(f"'{path}' has the step {registered} with settings that are no table.")
-        by_name[registered] = step
+    by_name: dict[str, _Step] = {}
+    for step in read_typed(path, _Pipeline).steps:
+        if step.registry_name is None or step.registry_name not in known:
+            called = step.registry_name or step.class_
+            raise UnsupportedCheckpoint(f"'{path}' has a step that is not supported: {called!r}.")
+        if step.registry_name in by_name and step.registry_name not in _NOTHING:
+            raise UnsupportedCheckpoint(f"'{path}' has the step {step.registry_name} twice.")
+        by_name[step.registry_name] = step
     return by_name
 
 
-def _settings(steps: Mapping[str, Mapping[str, Any]], name: str) -> Mapping[str, Any]:
-    settings: Mapping[str, Any] = steps.get(name, {}).get("config", {})
-    return settings
-
-
-def _tokenizer_cuts(folder: Path, steps: Mapping[str, Mapping[str, Any]], config: LerobotConfig) -> bool:
-    """Check the tokenizer step's settings; returns whether it cuts prompts that are too long."""
-    given = _settings(steps, _TOKENIZE)
-    wanted = {
-        "max_length": config.tokenizer_max_length,
-        "padding_side": "right",
-        "padding": "max_length",
-        "task_key": "task",
-    }
-    for name, value in wanted.items():
-        if given.get(name, value) != value:
-            raise UnsupportedLerobotFeature(
-                f"'{folder / PREPROCESSOR}' tokenizes with {name} {given[name]!r}; expected {value!r}."
-            )
-    return bool(given.get("truncation", True))
-
-
-def _normaliser(
-    folder: Path,
-    name: str,
-    steps: Mapping[str, Mapping[str, Any]],
-    registered: str,
-    kind: str,
-    feature: str,
-    config: LerobotConfig,
-) -> LerobotNormaliser:
-    path, step = folder / name, steps.get(registered)
+def _normaliser(path: Path, step: _Step | None, kind: str, feature: str, config: LerobotConfig) -> LerobotNormaliser:
     if step is None:
-        raise UnsupportedCheckpoint(f"'{path}' has no step {registered}, so it does not say how to normalise.")
-    settings = _settings(steps, registered)
-    modes = {**config.normalization, **texts_by_name(settings.get("norm_map"), f"'{path}' has the norm_map")}
+        raise UnsupportedCheckpoint(f"'{path}' has no step that says how to normalise {feature}.")
+    modes = {**(config.normalization_mapping or {}), **(step.config.norm_map or {})}
+    keys, mode = step.config.normalize_observation_keys, modes.get(kind, "IDENTITY")
     if modes.get("VISUAL", "IDENTITY") != "IDENTITY":
-        raise UnsupportedLerobotFeature(f"'{path}' normalises images by {modes['VISUAL']}; supported is IDENTITY.")
-    keys = settings.get("normalize_observation_keys")
-    if keys is not None and not isinstance(keys, list):
-        raise UnsupportedLerobotFeature(f"'{path}' has normalize_observation_keys {keys!r}; expected a list.")
-    mode = "IDENTITY" if keys is not None and kind == "STATE" and feature not in keys else modes.get(kind, "IDENTITY")
+        raise UnsupportedCheckpoint(f"'{path}' normalises images by {modes['VISUAL']}; supported is IDENTITY.")
+    if keys is not None and kind == "STATE" and feature not in keys:
+        mode = "IDENTITY"
     if mode not in _NEEDED:
-        raise UnsupportedLerobotFeature(f"'{path}' normalises {kind} by {mode}; supported are {listing(_NEEDED)}.")
+        raise UnsupportedCheckpoint(f"'{path}' normalises {kind} by {mode}; supported are {listing(_NEEDED)}.")
     dim = config.state_dim if kind == "STATE" else config.action_dim
-    statistics = _statistics(folder, step.get("state_file"), feature, _NEEDED[mode], dim)
-    with values_of(path):
-        eps = float(settings.get("eps", 1e-8))
-    if not 0 <= eps < 1:
-        raise UnsupportedLerobotFeature(f"'{path}' has eps {eps}; expected a small number of at least 0.")
-    return LerobotNormaliser(mode, statistics, eps)
+    statistics = _statistics(path.parent, step.state_file or "", feature, _NEEDED[mode], dim)
+    return LerobotNormaliser(mode, statistics, step.config.eps)
 
 
 def _statistics(
-    folder: Path, state_file: object, feature: str, needed: Sequence[str], dim: int
+    folder: Path, state_file: str, feature: str, needed: Sequence[str], dim: int
 ) -> dict[str, NDArray[np.float32]]:
     if not needed:
         return {}
-    path = folder / str(state_file)
+    path = folder / state_file
     # A name with folders in it could lead out of the checkpoint.
-    if not isinstance(state_file, str) or Path(state_file).name != state_file or not os.path.lexists(path):
+    if not state_file or Path(state_file).name != state_file or not path.exists():
         raise UnreadableCheckpoint(f"The statistics of '{feature}' should be in '{path}', which is not there.")
+    values: dict[str, NDArray[np.float32]] = {}
     with open_safetensors(path) as stored:
-        present = set(stored.names())
-        missing = [f"{feature}.{key}" for key in needed if f"{feature}.{key}" not in present]
-        if missing:
-            raise UnreadableCheckpoint(f"'{path}' lacks {listing(missing)}; it has {listing(sorted(present))}.")
-        return {key: _vector(stored, path, f"{feature}.{key}", dim) for key in needed}
-
-
-def _vector(stored: SafetensorsFile, path: Path, name: str, dim: int) -> NDArray[np.float32]:
-    shape = stored.shape(name)
-    if shape != (dim,):
-        raise UnreadableCheckpoint(f"The statistics '{name}' of '{path}' have shape {shape}; {dim} numbers are needed.")
-    values: NDArray[np.float32] = stored.read(name).float().numpy()
-    if not np.isfinite(values).all():
-        raise UnreadableCheckpoint(f"The statistics '{name}' of '{path}' hold NaN or infinity.")
+        for key in needed:
+            name = f"{feature}.{key}"
+            shape = stored.shape(name) if name in stored.names() else "none"
+            if shape != (dim,):
+                raise UnreadableCheckpoint(
+                    f"The statistics '{name}' of '{path}' have shape {shape}; {dim} numbers are needed."
+                )
+            values[key] = stored.read(name).float().numpy()
+            if not np.isfinite(values[key]).all():
+                raise UnreadableCheckpoint(f"The statistics '{name}' of '{path}' hold NaN or infinity.")
     return values

@@ -11,7 +11,7 @@ import torch
 from vla_attention.capture.environments.episode_protocol import CAMERAS
 from vla_attention.capture.policies.checkpoints import UnsupportedCheckpoint
 from vla_attention.capture.policies.family import UNTRAINED, UNTRAINED_TINY
-from vla_attention.capture.policies.hub import downloads, hub_version
+from vla_attention.capture.policies.hub import downloads, lasting_name
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.pi.config import (
     CAMERA_SLOTS,
@@ -26,12 +26,12 @@ from vla_attention.capture.policies.pi.data_set_robot import asset_name, lerobot
 from vla_attention.capture.policies.pi.embedded import dummy_policy, embedded_policy
 from vla_attention.capture.policies.pi.family import SHIPPED, PiSettings
 from vla_attention.capture.policies.pi.formats import CheckpointFormat, detect_format
-from vla_attention.capture.policies.pi.lerobot import load_lerobot, load_lerobot_weights
+from vla_attention.capture.policies.pi.lerobot import load_lerobot
 from vla_attention.capture.policies.pi.lerobot_config import read_lerobot_config
 from vla_attention.capture.policies.pi.lerobot_pipeline import read_lerobot_pipeline
 from vla_attention.capture.policies.pi.locate import find_checkpoint, find_tokenizer, would_be_fetched
 from vla_attention.capture.policies.pi.model import PiModel
-from vla_attention.capture.policies.pi.openpi_jax import OpenLeaf, implied_config_name, list_leaves, load_openpi_jax
+from vla_attention.capture.policies.pi.openpi_jax import OpenLeaf, list_leaves, load_openpi_jax
 from vla_attention.capture.policies.pi.openpi_torch import load_openpi_torch, open_tensors
 from vla_attention.capture.policies.pi.policy import PiPolicy
 from vla_attention.capture.policies.pi.preprocess import RELATIVE_ACTIONS, read_norm_stats
@@ -64,10 +64,15 @@ def load_pi_model(
     dtype: torch.dtype = torch.float32,
     device: str | torch.device = "cpu",
 ) -> tuple[PiModel, CheckpointFormat]:
-    """Return the model and the format of the folder; `config` overrides the sizes of the checkpoint."""
+    """Return the model and the format of the folder; `config` overrides the sizes of the checkpoint.
+
+    Of a LeRobot checkpoint only the tensors are read, so that it needs a `config`; see `load_lerobot`.
+    """
     detected = detect_format(folder, checkpoint_format)
-    load = {"openpi_torch": load_openpi_torch, "openpi_jax": load_openpi_jax, "lerobot": load_lerobot_weights}[detected]
-    return load(folder, config=config, dtype=dtype, device=device), detected
+    if detected != "openpi_jax":
+        return load_openpi_torch(folder, config=config, dtype=dtype, device=device), detected
+    config = config or find_config("pi05_libero" if _is_pi05(Path(folder), detected) else "pi0_libero")
+    return load_openpi_jax(folder, config=config, dtype=dtype, device=device), detected
 
 
 #: The folder of openpi's statistics of DROID, in `assets/`.
@@ -184,20 +189,24 @@ def choose_config(
         BadArgument: settings contradict each other or the format.
         UnsupportedCheckpoint: nothing states the configuration.
     """
-    if settings.config_name is not None and settings.model_config is not None:
-        raise BadArgument("Give --config-name or --model-config, not both.")
-    if found == "lerobot" and (settings.config_name is not None or settings.discrete_state_input):
-        raise BadArgument(
+    of_config = settings.config_name is not None or settings.discrete_state_input
+    of_statistics = settings.norm_stats is not None or settings.asset_id is not None
+    for is_wrong, said in (
+        (settings.config_name and settings.model_config, "Give --config-name or --model-config, not both."),
+        (settings.norm_stats and settings.asset_id, "Give --norm-stats or --asset-id, not both."),
+        (
+            found == "lerobot" and of_config,
             "A LeRobot checkpoint states its configuration in config.json; leave --config-name and "
-            "--discrete-state-input out."
-        )
-    if settings.norm_stats is not None and settings.asset_id is not None:
-        raise BadArgument("Give --norm-stats or --asset-id, not both.")
-    if found == "lerobot" and (settings.norm_stats is not None or settings.asset_id is not None):
-        raise BadArgument(
+            "--discrete-state-input out.",
+        ),
+        (
+            found == "lerobot" and of_statistics,
             "A LeRobot checkpoint has its statistics in its saved pipelines (policy_preprocessor.json); leave "
-            "--norm-stats and --asset-id out."
-        )
+            "--norm-stats and --asset-id out.",
+        ),
+    ):
+        if is_wrong:
+            raise BadArgument(said)
     if settings.config_name is not None:
         return ChosenConfig.named(settings.config_name, stated=True)
     if settings.model_config is not None:
@@ -209,14 +218,13 @@ def choose_config(
     if found == "openpi_torch" and states_sizes(folder / CONFIG_FILE):
         return ChosenConfig(read_config(folder / CONFIG_FILE), CONFIG_FILE)
     if of_data_set and found != "lerobot" and (settings.asset_id or asset_name(folder)) == DROID_ASSET:
-        name = _droid_config_name(folder, found)
+        name = "pi05_droid" if _is_pi05(folder, found) else "pi0_droid"
         return ChosenConfig.named(name, f" (its statistics are those of '{DROID_ASSET}')")
     if found == "openpi_jax":
-        name = implied_config_name(leaf.path for leaf in list_leaves(folder / "params"))
+        name = "pi05_libero" if _is_pi05(folder, found) else "pi0_libero"
         return ChosenConfig.named(name, " (not stated by the checkpoint)")
     if not (folder / CONFIG_FILE).is_file():
-        with open_tensors(folder) as tensors:
-            is_pi05(tensors.shapes)  # whatever else it may be comes first
+        _is_pi05(folder, found)  # whatever else it may be comes first
         raise UnsupportedCheckpoint(
             f"'{folder}' has no {CONFIG_FILE}, as openpi's train_pytorch.py leaves it, so that nothing states its "
             f"heads and the actions of a call. Give --config-name NAME (openpi's {listing(NAMED_CONFIGS)}), or "
@@ -225,13 +233,12 @@ def choose_config(
     return ChosenConfig(None, "config.json and the tensors")
 
 
-def _droid_config_name(folder: Path, found: CheckpointFormat) -> str:
+def _is_pi05(folder: Path, found: CheckpointFormat) -> bool:
+    """Whether a checkpoint is pi0.5's; of openpi's JAX format, one without a projection of the state."""
     if found == "openpi_jax":
-        pi05 = implied_config_name(leaf.path for leaf in list_leaves(folder / "params")) == "pi05_libero"
-    else:
-        with open_tensors(folder) as tensors:
-            pi05 = is_pi05(tensors.shapes)
-    return "pi05_droid" if pi05 else "pi0_droid"
+        return not any(leaf.path.startswith("state_proj/") for leaf in list_leaves(folder / "params"))
+    with open_tensors(folder) as tensors:
+        return is_pi05(tensors.shapes)
 
 
 def _check_state_input(config: PiConfig) -> None:
@@ -273,14 +280,11 @@ def build_pi_policy(settings: PiSettings, device: str) -> PiPolicy:
         detect_format(path, settings.checkpoint_format)  # a folder without a checkpoint is reported first
         tokenizer_path = find_tokenizer(path, settings.tokenizer)
         policy = load_pi_policy(path, tokenizer_path, settings, device=device)
-        policy.source = dataclasses.replace(policy.source, downloads=downloads(path, tokenizer_path))
-        version = hub_version(path)
-        if version is not None and not Path(checkpoint).expanduser().exists():
-            # A name on the hub stands for other files tomorrow; with the commit it does not.
-            policy.source = dataclasses.replace(policy.source, checkpoint=str(version))
-        if checkpoint in SHIPPED:
-            # Where the package is installed differs between machines; its name does not.
-            policy.source = dataclasses.replace(policy.source, checkpoint=checkpoint)
+        # Where the package is installed differs between machines; the name of what it ships does not.
+        lasting = checkpoint if checkpoint in SHIPPED else lasting_name(checkpoint, path)
+        policy.source = dataclasses.replace(
+            policy.source, downloads=downloads(path, tokenizer_path), checkpoint=lasting
+        )
     config = policy.model.config
     for option, given, actual in (
         ("--paligemma-variant", variants[0], config.paligemma),

@@ -12,8 +12,8 @@ from pathlib import Path
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound
 from vla_attention.capture.policies.hub import (
     CheckpointUnavailable,
-    fetch_from_hub,
     in_hub_cache,
+    local_or_fetched,
     snapshots_folder,
     split_hub_name,
 )
@@ -50,17 +50,11 @@ def find_checkpoint(name: str) -> Path:
     """
     if name.startswith("gs://"):
         return _from_openpi_cache(name.rstrip("/"))
-    path = Path(name).expanduser()
-    if path.exists():
-        return path
-    on_hub = split_hub_name(name)
-    if on_hub is None:
+    found = local_or_fetched(name, HUB_FILES)
+    if found is None:
+        path = Path(name).expanduser()
         raise CheckpointNotFound(f"There is no checkpoint folder at '{path}'.{_where_else(path)}")
-    how = (
-        f"fetch it where there is a network with `hf download {on_hub[0]}`, copy the folder here and give its path "
-        "(there is no such local folder)"
-    )
-    return fetch_from_hub(on_hub[0], HUB_FILES, how, revision=on_hub[1])
+    return found
 
 
 def would_be_fetched(name: str) -> bool:

@@ -20,7 +20,7 @@ from torch import Tensor
 from vla_attention.capture.foreign_files.checked_files import check_folder
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint, read_json_object
 from vla_attention.capture.policies.hub import first_line
-from vla_attention.capture.policies.pi.config import PiConfig, find_config
+from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.formats import detect_format
 from vla_attention.capture.policies.pi.jax_weights import merge_lora, plan_leaves
 from vla_attention.capture.policies.pi.model import PiModel, build_model, expected_shapes, expected_tensors
@@ -28,8 +28,6 @@ from vla_attention.capture.policies.pi.sizes import check_jax_heads
 from vla_attention.capture.policies.weights import Shapes, check_shapes
 from vla_attention.schemas.errors import MissingDependency, listing
 
-#: Arrays of a checkpoint; a pi model has about fifty.
-MAX_LEAVES = 10_000
 #: Types of weights. Whole numbers and 8 bits need scales, without which they would be other weights.
 _FLOATS = ("float64", "float32", "float16", "bfloat16")
 
@@ -50,21 +48,14 @@ def list_leaves(params: Path) -> list[Leaf]:
     The saved tree starts with "params", and runs of openpi's training end every path with "value"; both are removed.
     """
     metadata = read_json_object(params / "_METADATA")
-    if not metadata.get("tree_metadata"):
-        raise UnreadableCheckpoint(f"'{params / '_METADATA'}' does not describe a tree of arrays.")
     driver = "zarr3" if metadata.get("use_zarr3") else "zarr"
     complete = bool(metadata.get("store_array_data_equal_to_fill_value"))
     try:
         keys = [[str(part["key"]) for part in leaf["key_metadata"]] for leaf in metadata["tree_metadata"].values()]
-    except (KeyError, TypeError, AttributeError) as error:
+        paths = [parts[1:] if parts[0] == "params" else parts for parts in keys]
+    except (KeyError, TypeError, AttributeError, IndexError) as error:
         raise UnreadableCheckpoint(f"'{params / '_METADATA'}' does not describe a tree of arrays.") from error
-    if not all(keys) or len(keys) > MAX_LEAVES:
-        raise UnreadableCheckpoint(
-            f"'{params / '_METADATA'}' describes {len(keys)} arrays, {sum(not p for p in keys)} of them without "
-            f"a name; expected at most {MAX_LEAVES}, each with one."
-        )
     stored = [".".join(parts) for parts in keys]
-    paths = [parts[1:] if parts[0] == "params" else parts for parts in keys]
     if all(path[-1:] == ["value"] for path in paths):
         paths = [path[:-1] for path in paths]
     return [Leaf("/".join(path), store_key, driver, complete) for path, store_key in zip(paths, stored, strict=True)]
@@ -93,13 +84,9 @@ class OpenLeaf:
                 f"The array '{leaf.path}' of '{params}' has numbers of type {array.dtype.name}; expected one of "
                 f"{listing(_FLOATS)}: use the checkpoint before it was quantized."
             )
-        rows_of_a_chunk = chunk[0] if array.rank else 1
         #: One chunk often holds all layers; it is kept while its layers are read one by one.
-        self._cache_bytes = 0
-        if self.shape and rows_of_a_chunk > 1:
-            self._cache_bytes = int(
-                1.1 * self.size * array.dtype.numpy_dtype.itemsize * rows_of_a_chunk / self.shape[0]
-            )
+        bytes_of_layer = self.size * array.dtype.numpy_dtype.itemsize / max(1, *self.shape[:1])
+        self._cache_bytes = int(1.1 * bytes_of_layer * chunk[0]) if chunk and chunk[0] > 1 else 0
 
     @property
     def size(self) -> int:
@@ -147,15 +134,14 @@ def import_tensorstore() -> Any:
 def load_openpi_jax(
     folder: str | Path,
     *,
-    config: PiConfig | None = None,
+    config: PiConfig,
     dtype: torch.dtype = torch.float32,
     device: str | torch.device = "cpu",
 ) -> PiModel:
     """Load a checkpoint in openpi's JAX format.
 
-    Such a checkpoint does not state its configuration. Without `config` openpi's pi05_libero is taken, or pi0_libero if
-    there is a state projection. All shapes are checked against it; the action horizon is in none of them. LoRA arrays
-    are merged into the weights that they adapt.
+    Such a checkpoint does not state its configuration. All shapes are checked against the given one; the action horizon
+    is in none of them. LoRA arrays are merged into the weights that they adapt.
     """
     folder = Path(folder)
     detect_format(folder, "openpi_jax")
@@ -163,12 +149,14 @@ def load_openpi_jax(
     leaves = list_leaves(params)
     plans, pairs = plan_leaves(leaf.path for leaf in leaves)
     check_folder(params, UnreadableCheckpoint)  # the library opens the files by itself
-    if config is None:
-        config = find_config(implied_config_name(leaf.path for leaf in leaves))
     stored = {leaf.path: OpenLeaf(params, leaf) for leaf in leaves}
     shapes: Shapes = {}
     for path, plan in plans.items():
-        shapes |= _shapes_of(plan.shapes, stored[path])
+        try:
+            shapes |= plan.shapes(stored[path].shape)
+        except (ValueError, IndexError):
+            # An array with another number of axes than its conversion expects is reported by its JAX name.
+            shapes[path] = stored[path].shape
     check_shapes(shapes, expected_shapes(config))
     check_jax_heads({path: leaf.shape for path, leaf in stored.items()}, config)
 
@@ -184,29 +172,10 @@ def load_openpi_jax(
     # The largest first: reading one takes extra memory, and little of the model is in memory then.
     for path in sorted(plans, key=lambda path: stored[path].size, reverse=True):
         plan = plans[path]
-        if plan.layers is None:
-            keep(plan.whole(stored[path].read()))
-        elif path in pairs:
-            factors = zip(
-                stored[path].layers(), stored[pairs[path].a].layers(), stored[pairs[path].b].layers(), strict=True
-            )
-            for i, (w, a, b) in enumerate(factors):
-                keep(plan.layer(i, merge_lora(path, w, a, b)))
-        else:
-            for i, w in enumerate(stored[path].layers()):
-                keep(plan.layer(i, w))
+        if not plan.is_stacked:
+            keep(plan.layer(None, stored[path].read()))
+            continue
+        factors = (stored[factor].layers() for factor in pairs.get(path, ()))
+        for i, (w, *ab) in enumerate(zip(stored[path].layers(), *factors, strict=True)):
+            keep(plan.layer(i, merge_lora(path, w, *ab) if ab else w))
     return build_model(config, state, state.__getitem__, dtype=dtype, device=device)
-
-
-def implied_config_name(paths: Iterator[str]) -> str:
-    """Return openpi's LIBERO configuration for a tree of these leaves."""
-    return "pi0_libero" if any(path.startswith("state_proj/") for path in paths) else "pi05_libero"
-
-
-def _shapes_of(shapes: Any, leaf: OpenLeaf) -> Shapes:
-    try:
-        of_leaf: Shapes = shapes(leaf.shape)
-    except (ValueError, IndexError):
-        # An array with another number of axes than its conversion expects is reported by its JAX name.
-        of_leaf = {leaf.path: leaf.shape}
-    return of_leaf

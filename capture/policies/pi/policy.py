@@ -152,7 +152,7 @@ class PiPolicy:
     ) -> PolicyInput:
         """Return the model's input of the cameras' own pictures."""
         size = self.model.config.siglip.image_size
-        pictures = {camera: self.processing.model_picture(frame, size) for camera, frame in frames.items()}
+        pictures = {camera: self.processing.pictures_of_frame(frame, size) for camera, frame in frames.items()}
         kept = frames if self.needs_camera_frames else {}
         return self._input_of(pictures, kept, state, instruction, may_be_empty=False)
 
@@ -160,7 +160,7 @@ class PiPolicy:
         """Turn what a call was given into the model's input (batch 1)."""
         size = self.model.config.siglip.image_size
         pictures = {
-            camera.name: self.processing.model_picture(given.camera_frames[camera.name], size)
+            camera.name: self.processing.pictures_of_frame(given.camera_frames[camera.name], size)
             if camera.name in given.camera_frames
             else (given.frames[camera.name], image_tensor(given.frames[camera.name]))
             for camera in self.cameras
@@ -176,7 +176,7 @@ class PiPolicy:
         *,
         may_be_empty: bool,
     ) -> PolicyInput:
-        """Return the model's input; pictures: slot -> the stored picture and the model's, as in `model_picture`."""
+        """Return the model's input; pictures: slot -> the stored picture and the model's, as in `pictures_of_frame`."""
         config, device = self.model.config, self.model.device
         size = config.siglip.image_size
         normalised = self.processing.normalise_state(state)

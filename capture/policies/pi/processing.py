@@ -100,7 +100,7 @@ class Processing(Protocol):
     def whole_grey_levels(self) -> bool:
         """Whether the model's image is the stored one, without rounding."""
 
-    def model_picture(self, frame: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], Tensor]:
+    def pictures_of_frame(self, frame: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], Tensor]:
         """Return the model's image of a raw frame: (size, size, 3) uint8 for the store, (1, 3, size, size) in -1..1."""
 
     def normalise_state(self, state: NDArray[np.float64]) -> NDArray[np.floating]:
@@ -147,7 +147,7 @@ class OpenpiProcessing:
         self.cut_long_prompts = True
         self.whole_grey_levels = True
 
-    def model_picture(self, frame: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], Tensor]:
+    def pictures_of_frame(self, frame: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], Tensor]:
         """Rotate pictures of simulators by 180°, resize with PIL's bilinear filter; uint8 all the way."""
         image = model_image(frame, size) if self.robot.turned else resize_with_pad(frame, size)
         return image, image_tensor(image)

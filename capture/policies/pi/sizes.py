@@ -40,16 +40,10 @@ def is_pi05(shapes: Shapes) -> bool:
     )
 
 
-def infer_config(
-    shapes: Shapes,
-    config_json: dict[str, Any],
-    *,
-    action_horizon: str = "action_horizon",
-    action_dim: str = "action_dim",
-) -> PiConfig:
+def infer_config(shapes: Shapes, config_json: Mapping[str, Any]) -> PiConfig:
     """Infer a configuration from tensor shapes and the checkpoint's config.json.
 
-    `action_horizon` and `action_dim` are the names under which config.json states these. Tensors of projections do not
+    Tensors of projections do not
     tell heads from their width (256 rows are one key head of 256 or two of 128): the heads are those of the Gemma
     variant that config.json names, which both transformers share. The image encoder's heads are known for So400m's
     width only.
@@ -57,7 +51,7 @@ def infer_config(
     Raises `CheckpointMismatch` when no known variant is named, or when a named one has other sizes than the tensors.
     """
     pi05 = is_pi05(shapes)
-    for name in (action_dim, action_horizon):
+    for name in ("action_dim", "action_horizon"):
         if not isinstance(config_json.get(name), int):
             raise CheckpointMismatch(
                 f"The checkpoint's config.json should state '{name}' as a whole number, but has "
@@ -82,8 +76,8 @@ def infer_config(
         paligemma=vlm,
         action_expert=expert,
         siglip=siglip,
-        action_horizon=config_json[action_horizon],
-        action_dim=config_json[action_dim],
+        action_horizon=config_json["action_horizon"],
+        action_dim=config_json["action_dim"],
         max_token_len=MAX_TOKEN_LEN[pi05],
         vocab_size=_size(shapes, TABLE, 0),
         pi05=pi05,

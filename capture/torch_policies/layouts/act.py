@@ -9,7 +9,7 @@ from __future__ import annotations
 from vla_attention.capture.torch_policies.layouts.layout_building import (
     KeyOrder,
     camera_name,
-    find_policy,
+    find_module,
     inside,
     rule_path,
 )
@@ -28,7 +28,7 @@ def act(policy: object) -> PolicyLayout:
     Raises:
         NotThisPolicy: no ACTPolicy.
     """
-    path, module = find_policy(policy, ("ACTPolicy",), _NAME)
+    path, module = find_module(policy, ("ACTPolicy",), _NAME)
     config = module.config
     keys = KeyOrder()
     keys.add("latent", "state", 1, "learned")

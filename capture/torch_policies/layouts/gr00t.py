@@ -13,7 +13,7 @@ from typing import Any
 from vla_attention.capture.torch_policies.layouts.layout_building import (
     KeyOrder,
     NotThisPolicy,
-    find_policy,
+    find_module,
     inside,
     rule_path,
     square,
@@ -56,7 +56,7 @@ def gr00t(
         NotThisPolicy: no GR00TN15 or GR00TN17.
         BadArgument: the ids do not hold one picture for each camera.
     """
-    path, module = find_policy(policy, ("GR00TN15", "GR00TN17"), _NAME)
+    path, module = find_module(policy, ("GR00TN15", "GR00TN17"), _NAME)
     head = module.action_head
     placeholder = _placeholder(module) if image_token is None else image_token
     ids = [int(token) for token in input_ids]

@@ -18,7 +18,7 @@ class NotThisPolicy(BadArgument):
     """A layout asked for a policy of another class, or with settings that it does not cover."""
 
 
-def find_policy(policy: object, classes: Sequence[str], layout: str) -> tuple[str, Any]:
+def find_module(policy: object, classes: Sequence[str], layout: str) -> tuple[str, Any]:
     """Return the path of the first module of one of these classes, as the recorder names modules, and the module.
 
     The path is "" for the policy itself. Classes are compared by name, also those that a class is derived from.

@@ -14,7 +14,7 @@ from typing import Any
 
 from vla_attention.capture.torch_policies.layouts.layout_building import (
     KeyOrder,
-    find_policy,
+    find_module,
     inside,
     rule_path,
     square,
@@ -41,7 +41,7 @@ def openvla(
     Raises:
         NotThisPolicy: no OpenVLAForActionPrediction.
     """
-    path, module = find_policy(policy, _CLASSES, "openvla")
+    path, module = find_module(policy, _CLASSES, "openvla")
     keys = _prefix([camera], prompt_tokens, patches, _picture_size(module), 0, "openvla")
     keys.add_growing("action_tokens", action_dim - 1)
     return _layout(
@@ -85,7 +85,7 @@ def openvla_oft(
     Raises:
         NotThisPolicy: no OpenVLAForActionPrediction.
     """
-    path, module = find_policy(policy, _CLASSES, "openvla_oft")
+    path, module = find_module(policy, _CLASSES, "openvla_oft")
     placeholders = action_dim * chunk
     keys = _prefix(cameras, prompt_tokens, patches, _picture_size(module), int(proprio), "openvla_oft", diffusion_steps)
     keys.add("actions", "action", placeholders, "action")

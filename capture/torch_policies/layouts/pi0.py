@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from vla_attention.capture.torch_policies.layouts.layout_building import (
     KeyOrder,
     camera_name,
-    find_policy,
+    find_module,
     inside,
     rule_path,
 )
@@ -33,7 +33,7 @@ def pi0_pytorch(policy: object, *, cameras: Sequence[str] = (), num_steps: int =
     Raises:
         NotThisPolicy: no such class.
     """
-    path, module = find_policy(policy, ("PI0Pytorch", "PI05Pytorch"), "pi0_pytorch")
+    path, module = find_module(policy, ("PI0Pytorch", "PI05Pytorch"), "pi0_pytorch")
     config, networks = module.config, module.paligemma_with_expert
     vision, expert = networks.paligemma.config.vision_config, networks.gemma_expert.config
     chunk = getattr(config, "chunk_size", 0) or config.action_horizon
@@ -88,7 +88,7 @@ def pi0_fast(policy: object) -> PolicyLayout:
     Raises:
         NotThisPolicy: no PI0FastPolicy.
     """
-    path, module = find_policy(policy, ("PI0FastPolicy",), "pi0_fast")
+    path, module = find_module(policy, ("PI0FastPolicy",), "pi0_fast")
     config = module.config
     paligemma = module.model.paligemma_with_expert.paligemma
     vision, text = paligemma.config.vision_config, paligemma.config.text_config
@@ -135,7 +135,7 @@ def pi0_transformers(
     Raises:
         NotThisPolicy: no PI0ForConditionalGeneration.
     """
-    path, module = find_policy(policy, ("PI0ForConditionalGeneration",), "pi0_transformers")
+    path, module = find_module(policy, ("PI0ForConditionalGeneration",), "pi0_transformers")
     if not cameras or prompt_tokens < 1:
         raise BadArgument(f"pi0 needs at least one camera and one prompt token; got {list(cameras)}, {prompt_tokens}.")
     config = module.config

@@ -13,7 +13,7 @@ from vla_attention.capture.torch_policies.layouts.layout_building import (
     KeyOrder,
     NotThisPolicy,
     camera_name,
-    find_policy,
+    find_module,
     inside,
     rule_path,
     square,
@@ -38,7 +38,7 @@ def smolvla(policy: object) -> PolicyLayout:
     Raises:
         NotThisPolicy: no SmolVLAPolicy, or one whose calls cannot be told from the prefix's by their numbers.
     """
-    path, module = find_policy(policy, ("SmolVLAPolicy",), _NAME)
+    path, module = find_module(policy, ("SmolVLAPolicy",), _NAME)
     config, model = module.config, module.model.vlm_with_expert
     prompt = config.tokenizer_max_length
     if config.prefix_length > 0 and config.pad_language_to != "max_length":

@@ -13,7 +13,7 @@ from vla_attention.capture.torch_policies.layouts.layout_building import (
     KeyOrder,
     NotThisPolicy,
     camera_name,
-    find_policy,
+    find_module,
     inside,
     rule_path,
 )
@@ -31,7 +31,7 @@ def xvla(policy: object) -> PolicyLayout:
     Raises:
         NotThisPolicy: no XVLAPolicy, or one with other picture features than means and patches.
     """
-    path, module = find_policy(policy, ("XVLAPolicy",), _NAME)
+    path, module = find_module(policy, ("XVLAPolicy",), _NAME)
     config, vision = module.config, module.model.vlm.config.vision_config
     cameras = [(camera_name(feature), config.image_features[feature].shape) for feature in config.image_features]
     views = max(config.num_image_views or 0, len(cameras))

@@ -15,9 +15,9 @@ from tests.kit.lerobot_data_sets import (
     numbered_picture,
     write_data_set,
 )
-from vla_attention.capture.replay.data_set_files import UndecodableVideo, UnsupportedDataSet
-from vla_attention.capture.replay.data_tables import DamagedDataSet, DataSetNotFound
+from vla_attention.capture.replay.data_set_files import DamagedDataSet, DataSetNotFound, UnsupportedDataSet
 from vla_attention.capture.replay.lerobot_dataset import open_dataset
+from vla_attention.capture.replay.video import UndecodableVideo
 from vla_attention.schemas.errors import BadArgument, UnknownName
 
 CAMERAS = ("observation.images.front", "observation.images.wrist")
@@ -81,9 +81,7 @@ def test_episodes_are_in_the_order_of_their_numbers_and_the_last_of_several_coun
     (folder / "meta" / "episodes.jsonl").write_text("\n".join([wrong, lines[1], "", lines[0]]))
     data = open_dataset(folder)
     assert [(entry.index, entry.length) for entry in data.episodes] == [(0, 3), (1, 4)]
-    assert list(data.info.episodes) == [0, 1]
-    assert 1 in data.info.episodes
-    assert 2 not in data.info.episodes
+    assert data.episode_numbers == [0, 1]
 
 
 def test_whole_numbers_of_tables_may_be_stored_as_floats(tmp_path):
@@ -96,7 +94,7 @@ def test_whole_numbers_of_tables_may_be_stored_as_floats(tmp_path):
     data = open_dataset(folder)
     assert [number_of(frame.images[CAMERAS[0]]) for frame in data.episode(1).frames()] == [100, 101, 102, 103]
     rows.with_columns(pl.lit(0.5).alias("data/file_index")).write_parquet(path)
-    with pytest.raises(DamagedDataSet, match="'data/file_index' that are no whole ones"):
+    with pytest.raises(DamagedDataSet, match="a whole number in the column 'data/file_index'"):
         open_dataset(folder)
 
 
@@ -130,14 +128,11 @@ def test_another_version_is_refused_with_those_that_are_read(tmp_path, version):
         open_dataset(folder)
 
 
-@pytest.mark.parametrize(
-    "template",
-    ["../../{episode_index}.parquet", "{elsewhere}", "{episode_index:0999d}.parquet"],
-)
+@pytest.mark.parametrize("template", ["../../{episode_index}.parquet", "{elsewhere}"])
 def test_a_path_template_stays_inside_of_the_data_set(tmp_path, template):
     folder = write_data_set(tmp_path / "robot", "v2.1", made_up_episodes((3,)))
     edit_info(folder, data_path=template)
-    with pytest.raises((DamagedDataSet, BadArgument), match="path"):
+    with pytest.raises(DamagedDataSet, match="path"):
         open_dataset(folder)
 
 

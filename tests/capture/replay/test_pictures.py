@@ -11,15 +11,16 @@ import pytest
 from PIL import EpsImagePlugin, Image
 
 from tests.kit.lerobot_data_sets import encoded, numbered_picture
-from vla_attention.capture.replay.data_set_reader import PictureRefused, decode_picture
+from vla_attention.capture.replay.data_set_files import DamagedDataSet
+from vla_attention.capture.replay.data_set_reader import decode_picture
 
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 96 64\n%%EndComments\nshowpage\n"
 
 
 def test_png_and_jpeg_are_decoded():
     picture = numbered_picture(5)
-    np.testing.assert_array_equal(decode_picture(encoded("PNG", picture)), picture)
-    decoded = decode_picture(encoded("JPEG", picture, quality=95))
+    np.testing.assert_array_equal(decode_picture("it", encoded("PNG", picture)), picture)
+    decoded = decode_picture("it", encoded("JPEG", picture, quality=95))
     assert decoded.shape == picture.shape
     assert decoded.flags.writeable
     assert np.abs(decoded.astype(int) - picture).mean() < 3
@@ -27,8 +28,8 @@ def test_png_and_jpeg_are_decoded():
 
 @pytest.mark.parametrize("kind", ["GIF", "TIFF"])
 def test_other_formats_are_refused(kind):
-    with pytest.raises(PictureRefused, match="is no PNG and no JPEG"):
-        decode_picture(encoded(kind, numbered_picture(5)))
+    with pytest.raises(DamagedDataSet, match="is no PNG and no JPEG"):
+        decode_picture("it", encoded(kind, numbered_picture(5)))
 
 
 def test_no_program_is_started_for_an_eps(tmp_path, monkeypatch):
@@ -44,8 +45,8 @@ def test_no_program_is_started_for_an_eps(tmp_path, monkeypatch):
         image.convert("RGB")
     assert trace.exists()  # the attack is one
     trace.unlink()
-    with pytest.raises(PictureRefused, match="is no PNG and no JPEG"):
-        decode_picture(EPS)
+    with pytest.raises(DamagedDataSet, match="is no PNG and no JPEG"):
+        decode_picture("it", EPS)
     assert not trace.exists()
 
 
@@ -53,5 +54,5 @@ def test_a_picture_of_a_billion_pixels_is_refused_before_it_is_decoded():
     header = struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0)
     content = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + b"IHDR" + header
     content += struct.pack(">I", zlib.crc32(b"IHDR" + header))
-    with pytest.raises(PictureRefused, match=r"has 30,000 x 30,000 pixels; expected at most 10,000,000"):
-        decode_picture(content + struct.pack(">I", 0) + b"IDAT" + struct.pack(">I", zlib.crc32(b"IDAT")))
+    with pytest.raises(DamagedDataSet, match="900000000 pixels"):
+        decode_picture("it", content + struct.pack(">I", 0) + b"IDAT" + struct.pack(">I", zlib.crc32(b"IDAT")))

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from tests.kit.lerobot_data_sets import H264, Encoding, number_of, numbered_picture, write_video
-from vla_attention.capture.replay.data_set_files import UndecodableVideo
-from vla_attention.capture.replay.data_tables import DamagedDataSet
-from vla_attention.capture.replay.video import VideoFile
+from vla_attention.capture.replay.data_set_files import DamagedDataSet
+from vla_attention.capture.replay.video import UndecodableVideo, VideoFile
 
 FPS, FRAMES = 10, 90
 ENCODINGS = {
@@ -23,24 +22,23 @@ def test_the_picture_of_a_time_is_exact_to_the_frame_in_any_order(tmp_path, name
     write_video(path, [numbered_picture(i) for i in range(FRAMES)], FPS, ENCODINGS[name])
     generator = np.random.default_rng(0)
     orders = [range(FRAMES), range(0, FRAMES, 7), range(FRAMES - 1, -1, -11), generator.integers(0, FRAMES, 40)]
-    with VideoFile(path) as video:
-        assert video.codec == name.split()[0]
-        np.testing.assert_allclose(video.times, np.arange(FRAMES) / FPS, atol=1e-9)
-        for order in orders:
-            shown = [number_of(video.picture(float(i) / FPS, 0.025)) for i in order]
-            assert shown == [int(i) for i in order]
-    with VideoFile(path) as video:  # the last picture first: the decoder has to be emptied
-        assert number_of(video.picture((FRAMES - 1) / FPS, 0.025)) == FRAMES - 1
+    video = VideoFile(path)
+    np.testing.assert_allclose(video.times, np.arange(FRAMES) / FPS, atol=1e-9)
+    for order in orders:
+        shown = [number_of(video.picture(float(i) / FPS, 0.025)) for i in order]
+        assert shown == [int(i) for i in order]
+    # the last picture first: the decoder has to be emptied
+    assert number_of(VideoFile(path).picture((FRAMES - 1) / FPS, 0.025)) == FRAMES - 1
 
 
 def test_a_time_between_two_pictures_has_none(tmp_path):
     path = tmp_path / "video.mp4"
     write_video(path, [numbered_picture(i) for i in range(5)], FPS, H264)
-    with VideoFile(path) as video:
-        assert number_of(video.picture(0.22, 0.025)) == 2
-        for seconds in (0.15, 0.23, -0.1, 0.5):
-            with pytest.raises(DamagedDataSet, match="has no picture at"):
-                video.picture(seconds, 0.025)
+    video = VideoFile(path)
+    assert number_of(video.picture(0.22, 0.025)) == 2
+    for seconds in (0.15, 0.23, -0.1, 0.5):
+        with pytest.raises(DamagedDataSet, match="has no picture at"):
+            video.picture(seconds, 0.025)
 
 
 @pytest.mark.parametrize("text", ["ffconcat version 1.0\nfile 'other.mp4'\n", "#EXTM3U\n#EXTINF:1,\nother.mp4\n"])
@@ -73,9 +71,9 @@ def test_a_damaged_video_is_an_error_and_never_a_wrong_picture(tmp_path):
     path.write_bytes(content)
 
     def read_all():
-        with VideoFile(path) as video:
-            for i in range(12):
-                video.picture(i / FPS, 0.025)
+        video = VideoFile(path)
+        for i in range(12):
+            video.picture(i / FPS, 0.025)
 
     with pytest.raises(UndecodableVideo, match="damaged"):
         read_all()

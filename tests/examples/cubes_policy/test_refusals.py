@@ -28,8 +28,7 @@ def test_a_mistake_is_one_sentence(given, said, folder, tmp_path, monkeypatch, c
 
 def test_nothing_is_written_into_a_store(folder, tmp_path, capsys) -> None:
     inside = write_store(tmp_path / "a.zarr") / "output"
-    evaluate = ["evaluate", "expert", "--output"]
-    for given in (["demonstrate"], ["train", str(folder)], evaluate):
+    for given in (["demonstrate"], ["train", str(folder)]):
         assert main([*given, str(inside)]) == 2
         assert "is inside of the store" in capsys.readouterr().err
         assert not inside.exists()

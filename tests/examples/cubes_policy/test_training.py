@@ -17,13 +17,12 @@ from examples.cubes_policy.training import (
     learning_rate,
     train,
 )
-from examples.cubes_policy.training_pass import _RmsNorm, encode, velocities
+from examples.cubes_policy.training_pass import encode, velocities
 from tests.examples.cubes_policy.test_dataset import make_batches
 from tests.kit.made_up_demonstrations import INSTRUCTIONS
 from tests.thorough.hostile_checkpoints.hostile_files import TRACE, executing_pickle, pipe, torch_zip
 from vla_attention.capture.policies.pi.family import PiSettings
 from vla_attention.capture.policies.pi.flow_time import denoise_times
-from vla_attention.capture.policies.pi.gemma import RMSNorm
 from vla_attention.capture.policies.pi.loading import build_pi_policy
 from vla_attention.schemas.errors import BadArgument
 
@@ -74,15 +73,6 @@ def test_pairs_do_not_see_each_other(model, demonstrations, tokenizer):
     torch.testing.assert_close(together[:, 2:3], alone, atol=1e-5, rtol=1e-5)
 
 
-def test_the_short_gradient_of_the_norm_is_that_of_the_norm():
-    torch.manual_seed(0)
-    x, norm = torch.randn(2, 5, 16, dtype=torch.float64), RMSNorm(16)
-    torch.nn.init.normal_(norm.weight)
-    weight = norm.weight.detach().double()
-    assert torch.autograd.gradcheck(_RmsNorm.apply, (x.requires_grad_(), weight.requires_grad_()))
-    torch.testing.assert_close(_RmsNorm.apply(x.float(), norm.weight), norm(x.float(), None)[0])
-
-
 def test_every_part_of_the_model_gets_a_gradient(model, demonstrations, tokenizer):
     heads = Heads(128, 0)
     parts = losses(model, heads, make_batches(demonstrations, tokenizer, batch_size=4).draw(0))
@@ -105,7 +95,6 @@ def test_the_loss_falls(demonstrations, tmp_path):
     assert [int(row["step"]) for row in rows] == [10, 20, 30, 40]
     assert float(rows[-1]["train_flow"]) < 0.6 * float(rows[0]["train_flow"])
     assert float(rows[-1]["held_out_total"]) > 0
-    assert (tmp_path / "loss.png").stat().st_size > 10_000
 
 
 @pytest.mark.thorough
@@ -114,7 +103,7 @@ def test_a_training_that_was_stopped_goes_on_the_same(demonstrations, whole, tmp
     said: list[str] = []
     train(demonstrations, INSTRUCTIONS, tmp_path, SETTINGS, stop_at=3, say=said.append)
     assert said[0].startswith("trains ")  # at once, not with the first line of losses
-    assert f"samples to step {SETTINGS.steps}" in said[0]
+    assert f"to step {SETTINGS.steps}" in said[0]
     found = train(demonstrations, INSTRUCTIONS, tmp_path, SETTINGS, resume=True, say=quiet)
     for name, tensor in expected.average.state_dict().items():
         torch.testing.assert_close(found.average.state_dict()[name], tensor, rtol=0, atol=1e-6)
@@ -169,7 +158,7 @@ def test_an_exported_policy_runs_like_any_checkpoint(demonstrations, whole, tmp_
             tensor, training.average.state_dict()[name].to(torch.bfloat16).float(), rtol=0, atol=0
         )
     sample = demonstrations.samples.state[5].astype(np.float64)
-    facts = json.loads((folder / "settings.json").read_text())["training"]["state"]
+    facts = json.loads((folder / "settings.json").read_text())["state"]
     low, high = np.array(facts["q01"]), np.array(facts["q99"])
     np.testing.assert_allclose(
         policy.processing.normalise_state(sample), (sample - low) / (high - low) * 2 - 1, rtol=1e-4

@@ -168,13 +168,14 @@ PI: dict[str, Case] = {
         openpi(lambda path: sparse(path / "config.json", 50_000_000, b"{")), "has 50,?000,?000 bytes"
     ),
     "control characters in a type": Case(
-        config(lambda content: content.update(type="\x1b[2J\u202e\nx")), r"type '\\x1b\[2J\\u202e\\nx', not pi0"
+        config(lambda content: content.update(type="\x1b[2J\u202e\nx")), r"family: '\\x1b\[2J\\u202e\\nx', not pi0"
     ),
     "a billion blocks": Case(
-        case_file(lambda content: content["config"]["paligemma"].update(depth=10**9)), "'depth' .* is 1000000000"
+        case_file(lambda content: content["config"]["paligemma"].update(depth=10**9)),
+        r"paligemma\.depth: Expected .* <= 500",
     ),
     "a billion empty cameras": Case(
-        config(lambda content: content.update(empty_cameras=10**9)), "empty_cameras 1000000000"
+        config(lambda content: content.update(empty_cameras=10**9)), "empty_cameras: Expected .* <= 64"
     ),
     "a step of somebody's code": Case(
         steps(lambda found: found.insert(0, {"class": "os.system"})), "step that is not supported: 'os.system'"

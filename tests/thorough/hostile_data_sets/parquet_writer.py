@@ -10,9 +10,8 @@ from pathlib import Path
 #: Kinds of Thrift's compact protocol.
 I32, I64, BYTES, LIST, STRUCT = 5, 6, 8, 9, 12
 #: Physical types, codecs and encodings of Parquet.
-INT64, FLOAT, BYTE_ARRAY, FIXED = 2, 4, 6, 7
-PLAIN_CODEC, GZIP = 0, 2
-PLAIN, RLE, DELTA_BYTE_ARRAY, RLE_DICTIONARY = 0, 3, 7, 8
+INT64, FLOAT, BYTE_ARRAY = 2, 4, 6
+PLAIN, RLE, RLE_DICTIONARY = 0, 3, 8
 REQUIRED, REPEATED = 0, 2
 
 
@@ -55,18 +54,15 @@ def run(value: int, count: int) -> bytes:
     return varint(count << 1) + bytes([value])
 
 
-def page(
-    content: bytes, values: int, *, encoding: int = RLE_DICTIONARY, stored: bytes | None = None, **said: int
-) -> bytes:
-    """A page of values. stored: the content, packed. said: the bytes (`unpacked`, `packed`) that its header says."""
-    stored = content if stored is None else stored
+def page(content: bytes, values: int, *, encoding: int = RLE_DICTIONARY) -> bytes:
+    """A page of values."""
     header = struct_of(
         (1, I32, 0),
-        (2, I32, said.get("unpacked", len(content))),
-        (3, I32, said.get("packed", len(stored))),
+        (2, I32, len(content)),
+        (3, I32, len(content)),
         (5, STRUCT, struct_of((1, I32, values), (2, I32, encoding), (3, I32, RLE), (4, I32, RLE))),
     )
-    return header + stored
+    return header + content
 
 
 def dictionary(content: bytes, values: int) -> bytes:
@@ -80,7 +76,7 @@ class Stored:
     """A column of one group of rows: its pages, and what the footer says of them.
 
     kind: physical type. values: in all pages. has_dictionary: the first page is one, of so many `dictionary_bytes` with
-    its header. repeated: a list in each row. width: bytes of a value, for one of a fixed size.
+    its header. repeated: a list in each row.
     """
 
     name: str
@@ -89,8 +85,6 @@ class Stored:
     values: int
     has_dictionary: bool = True
     repeated: bool = False
-    codec: int = PLAIN_CODEC
-    width: int = 0
     dictionary_bytes: int = 0
 
 
@@ -131,15 +125,14 @@ def counting(name: str, count: int) -> Stored:
     return Stored(name, INT64, page(content, count, encoding=PLAIN), count, has_dictionary=False)
 
 
-def write_parquet(path: Path, columns: Sequence[Stored], rows: int, *, footer: bytes | None = None) -> None:
-    """Write a file of one group of rows; footer: another one."""
+def write_parquet(path: Path, columns: Sequence[Stored], rows: int) -> None:
+    """Write a file of one group of rows."""
     body, chunks = b"PAR1", []
     elements = [struct_of((4, BYTES, b"schema"), (5, I32, len(columns)))]
     for column in columns:
         start = len(body)
         body += column.pages
         element: list[tuple[int, int, object]] = [(1, I32, column.kind)]
-        element += [(2, I32, column.width)] if column.width else []
         element += [(3, I32, REPEATED if column.repeated else REQUIRED), (4, BYTES, column.name.encode())]
         element += [(6, I32, 0)] if column.kind == BYTE_ARRAY else []  # a text
         elements.append(struct_of(*element))
@@ -147,7 +140,7 @@ def write_parquet(path: Path, columns: Sequence[Stored], rows: int, *, footer: b
             (1, I32, column.kind),
             (2, LIST, (I32, [PLAIN, RLE, RLE_DICTIONARY])),
             (3, LIST, (BYTES, [column.name.encode()])),
-            (4, I32, column.codec),
+            (4, I32, 0),
             (5, I64, column.values),
             (6, I64, len(column.pages)),
             (7, I64, len(column.pages)),
@@ -157,7 +150,6 @@ def write_parquet(path: Path, columns: Sequence[Stored], rows: int, *, footer: b
             fields.append((11, I64, start))
         chunks.append(struct_of((2, I64, start), (3, STRUCT, struct_of(*fields))))
     group = struct_of((1, LIST, (STRUCT, chunks)), (2, I64, len(body)), (3, I64, rows))
-    if footer is None:
-        footer = struct_of((1, I32, 1), (2, LIST, (STRUCT, elements)), (3, I64, rows), (4, LIST, (STRUCT, [group])))
+    footer = struct_of((1, I32, 1), (2, LIST, (STRUCT, elements)), (3, I64, rows), (4, LIST, (STRUCT, [group])))
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(body + footer + struct.pack("<I", len(footer)) + b"PAR1")

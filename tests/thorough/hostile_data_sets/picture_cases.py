@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import polars as pl
-from PIL import Image
 
 from tests.thorough.hostile_checkpoints.hostile_files import pipe, sparse
 from tests.thorough.hostile_data_sets.made import CAMERA, TABLE, Case, hostile
@@ -57,15 +54,6 @@ def png(width: int, height: int, *, bits: int = 1, more: bytes = b"", filled: bo
     return b"\x89PNG\r\n\x1a\n" + parts
 
 
-def jpeg(width: int, height: int) -> bytes:
-    """A black JPEG."""
-    buffer = io.BytesIO()
-    Image.fromarray(np.zeros((16, 16, 3), np.uint8)).save(buffer, format="JPEG")
-    content = buffer.getvalue()
-    size = next(content.index(mark) for mark in (b"\xff\xc0", b"\xff\xc2") if mark in content) + 5
-    return content[:size] + struct.pack(">HH", height, width) + content[size + 4 :]
-
-
 def eps() -> bytes:
     return b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 96 64\n%%EndComments\nshowpage\n"
 
@@ -74,16 +62,12 @@ def text_bomb() -> bytes:
     return chunk(b"zTXt", b"a\0\0" + zlib.compress(bytes(200_000_000), 9))
 
 
-LARGE = r"has 1\d,000 x 1\d,000 pixels; expected at most"
-
 PICTURES: dict[str, Case] = {
-    "a PNG of 13,000 x 13,000": Case(picture(lambda: png(13_000, 13_000)), LARGE),
     "a PNG header of 100,000 x 100,000": Case(
-        picture(lambda: png(100_000, 100_000, filled=False)), "has 100,000 x 100,000 pixels; expected"
+        picture(lambda: png(100_000, 100_000, filled=False)), "cannot be decoded .*10000000000 pixels"
     ),
     "a PNG with few of its pixels": Case(picture(lambda: png(4000, 2000, filled=False)), "cannot be decoded"),
     "a PNG with a text of 200 MB": Case(picture(lambda: png(96, 64, more=text_bomb())), "cannot be decoded"),
-    "a JPEG of 16,000 x 16,000": Case(picture(lambda: jpeg(16_000, 16_000)), LARGE),
     "an EPS": Case(picture(eps), "no PNG and no JPEG"),
     "a file of a terabyte": Case(
         file(lambda path: sparse(path, 2**40, png(96, 64))),

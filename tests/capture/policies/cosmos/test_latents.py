@@ -16,9 +16,9 @@ from vla_attention.capture.policies.cosmos.config import CosmosConfig, SamplerCo
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG
 from vla_attention.capture.policies.cosmos.latents import (
     action_shares,
+    actions_of_frame,
     fill_frame,
     query_pools,
-    read_actions,
     read_value,
 )
 from vla_attention.capture.policies.cosmos.sampler import flow_time, noise_levels, sample, seeded_noise
@@ -34,7 +34,7 @@ def test_a_frame_repeats_its_numbers_and_cuts_the_last_copy():
 def test_actions_written_as_copies_are_read_back(chunk, dim, extra):
     actions = torch.arange(float(chunk * dim)).reshape(chunk, dim)
     frame = torch.cat([actions.reshape(-1).repeat(3), torch.full((min(extra, chunk * dim - 1),), 99.0)])
-    torch.testing.assert_close(read_actions(frame, chunk, dim), actions)
+    torch.testing.assert_close(actions_of_frame(frame, chunk, dim), actions)
 
 
 def test_the_value_is_cut_to_its_range():

@@ -26,7 +26,7 @@ from vla_attention.capture.policies.cosmos.locate import (
 from vla_attention.capture.policies.cosmos.policy import CosmosPolicy
 from vla_attention.capture.policies.identity import downloads_of
 from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.layout import Role
 
 
@@ -84,6 +84,12 @@ def test_missing_files_are_named(folder, missing, error, message):
     (folder / missing).unlink()
     with pytest.raises(error, match=message):
         load(str(folder))
+
+
+def test_a_sentence_without_an_embedding_is_refused_before_the_weights_are_read(folder):
+    (folder / WEIGHTS_NAME).write_bytes(b"no weights")
+    with pytest.raises(UnknownName, match=r"'fly to the moon'.*encode_prompts .*--prompt 'fly to the moon'"):
+        load_cosmos_policy(CosmosSettings(str(folder), image_size=64, instructions=(INSTRUCTION, "fly to the moon")))
 
 
 def test_embeddings_of_another_model_are_refused(folder, tmp_path):

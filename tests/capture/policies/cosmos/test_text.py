@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import pickle
+import shutil
+from pathlib import Path
 
 import pytest
 import torch
 
 from tests.kit.cosmos_helpers import INSTRUCTION
 from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint
+from vla_attention.capture.policies.cosmos import encode_prompts
 from vla_attention.capture.policies.cosmos.t5_pickle import TextEmbeddings, read_embeddings
 from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
 from vla_attention.capture.policies.cosmos.text import PieceTokenizer, PrecomputedText
@@ -137,10 +140,8 @@ def test_zeros_between_real_positions_are_refused():
 class StubEncoder:
     """A replacement of T5: every token's embedding is its id."""
 
-    folder = "t5"
-
-    def __init__(self):
-        self.calls = 0
+    def __init__(self, folder=Path("t5")):
+        self.calls, self.folder = 0, Path(folder)
 
     def encode(self, ids, positions, width):
         self.calls += 1
@@ -161,3 +162,17 @@ def test_what_the_file_lacks_is_encoded_once_and_what_it_has_is_not():
     assert encoded.embedding[0, :, 0].ne(0).sum() == len(encoded.prompt.pieces) + 1
     with pytest.raises(UnreadableCheckpoint, match="--t5-tokenizer"):
         PrecomputedText(text.embeddings, None, encoder)
+
+
+def test_sentences_are_added_to_a_file_of_embeddings(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(encode_prompts, "T5Encoder", StubEncoder)
+    shutil.copyfile(EMBEDDED_TOKENIZER, tmp_path / "spiece.model")
+    old, new = save(tmp_path / "old.pkl", {INSTRUCTION: made_up(3, 32)}), tmp_path / "new.pkl"
+    words = [str(old), str(new), "--t5-encoder", str(tmp_path), "--prompt", INSTRUCTION, "open the drawer"]
+    assert encode_prompts.main(words) == 0
+    assert "1 sentence added" in capsys.readouterr().out
+    found = read_embeddings(new)
+    assert torch.equal(found.find(INSTRUCTION), made_up(3, 32))
+    ids = PieceTokenizer(EMBEDDED_TOKENIZER).token_ids("open the drawer")
+    assert found.find("open the drawer")[0, : len(ids), 0].tolist() == ids
+    assert encode_prompts.main(words) == 2  # the file exists

@@ -25,10 +25,8 @@ def from_jax_flat(leaves: Mapping[str, np.ndarray], config: PiConfig) -> dict[st
     for path, plan in plans.items():
         leaf = np.asarray(leaves[path], dtype=np.float32)
         if path in pairs:
-            pair = pairs[path]
-            leaf = np.stack(
-                [merge_lora(path, w, *ab) for w, *ab in zip(leaf, leaves[pair.a], leaves[pair.b], strict=True)]
-            )
+            factors = (leaves[factor] for factor in pairs[path])
+            leaf = np.stack([merge_lora(path, w, *ab) for w, *ab in zip(leaf, *factors, strict=True)])
         state |= {name: torch.from_numpy(np.array(array, order="C")) for name, array in plan.whole(leaf).items()}
     check_shapes(shapes_of(state), expected_shapes(config))
     return state

@@ -44,8 +44,8 @@ def test_a_folder_in_two_formats_is_taken_as_the_user_says(tmp_path):
     ("config", "family"),
     [
         ({"type": "smolvla"}, "type 'smolvla'"),
-        ({"model_type": "openvla", "architectures": ["OpenVLAForActionPrediction"]}, "OpenVLA"),
-        ({"model_type": "llama"}, "a transformers model 'llama'"),
+        ({"model_type": "openvla", "architectures": ["OpenVLAForActionPrediction"]}, "openvla"),
+        ({"model_type": "llama"}, "llama"),
     ],
 )
 @pytest.mark.parametrize("weights", ["model.safetensors", "model-00001-of-00002.safetensors"])

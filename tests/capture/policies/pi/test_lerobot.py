@@ -223,7 +223,6 @@ def test_weights_without_prefix_and_without_embed_tokens(checkpoint, tokenizer_p
     [
         ({"use_relative_actions": True}, "use_relative_actions True"),
         ({"rtc_config": {"enabled": True}}, "rtc_config {'enabled': True}"),
-        ({"use_magic": True}, "does not know.*use_magic True"),
         ({"n_action_steps": 51}, "n_action_steps 51 of a chunk_size"),
         ({"dtype": "float16"}, "supported are float32 and bfloat16"),
         ({"output_features": {"action": {"type": "ACTION", "shape": [14]}}}, "actions of 14 numbers.*another robot"),

@@ -168,12 +168,12 @@ def test_full_size_lerobot_keys_load_strictly(name, kind, leave_out):
         assert len(manifest) == len(read_manifest(name)) - 1
     shapes = {key: manifest[raw] for key, raw in model_names(manifest).items()}
     stated = {
-        "chunk_size": 50,
-        "max_action_dim": 32,
+        "action_horizon": 50,
+        "action_dim": 32,
         "paligemma_variant": "gemma_2b",
         "action_expert_variant": "gemma_300m",
     }
-    config = infer_config(shapes, stated, action_horizon="chunk_size", action_dim="max_action_dim")
+    config = infer_config(shapes, stated)
     assert config == dataclasses.replace(find_config(kind), action_horizon=50)
     load_meta(shapes, config)
 

@@ -10,7 +10,6 @@ from safetensors.torch import save_file
 
 from tests.kit.pi_golden import GOLDEN
 from tests.kit.policy_inputs import assert_same_input
-from tests.kit.thorough import thorough_except
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.pi.config import find_config
@@ -51,7 +50,7 @@ def dummy_pi0():
     )
 
 
-@pytest.fixture(params=thorough_except(["dummy", "dummy_pi0"], ["dummy", "dummy_pi0", "embedded"]))
+@pytest.fixture(params=["dummy", "dummy_pi0"])
 def policy(request):
     return request.getfixturevalue(request.param)
 
