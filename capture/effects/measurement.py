@@ -236,6 +236,10 @@ class EpisodeEffectsMeasured:
             variant = self._variant(condition, policy_input, noise_seed, context, tokens, vocabularies)
             if variant is not None:
                 variants[number] = variant
+        cut = {knockout.selector for number in variants for knockout in self.conditions[number].keys}
+        for name, selector in planned.groups.items():
+            if selector not in cut:
+                self.run.say_once(f"The group '{name}' has no key at some replans: it is not measured there.")
         made = self.run.actions_of(variants)
         if planned.denoise_steps < policy.num_denoise_steps:
             # Fewer steps change the actions by themselves: the same call with as many steps is what effects are of.
@@ -243,7 +247,7 @@ class EpisodeEffectsMeasured:
             actions = made.pop(unchanged, actions)
         changes = {number: ((given - actions) / self.run.units).astype(np.float32) for number, given in made.items()}
         measured = self._refused_if_unlike(changes, context, self.run.allowed_difference(actions))
-        cut = {
+        weights = {
             site.name: np.stack([_cut(variants[number], site.name, site.num_keys) for number in measured])
             if measured
             else np.zeros((0, site.num_keys), np.float32)
@@ -256,7 +260,7 @@ class EpisodeEffectsMeasured:
         )
         self.run.seconds.append(time.perf_counter() - begun)
         return ReplanEffects(
-            self.conditions, tuple(float(unit) for unit in self.run.units), tuple(measured), change, cut
+            self.conditions, tuple(float(unit) for unit in self.run.units), tuple(measured), change, weights
         )
 
     def _mean_pictures(self, context: CallContext) -> Mapping[str, NDArray[np.uint8]]:
