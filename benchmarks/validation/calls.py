@@ -23,8 +23,8 @@ from vla_attention.analyze.core.action_changes import (
     root_mean_square_change,
     with_noise,
 )
-from vla_attention.capture.interventions.factors import QueryWithoutKeys
 from vla_attention.capture.interventions.changed_inputs import changed_inputs
+from vla_attention.capture.interventions.factors import QueryWithoutKeys
 from vla_attention.capture.interventions.resolution import TooFewKeys, interventions_for
 from vla_attention.capture.interventions.run_changes import RunChanges
 from vla_attention.capture.rerun.base_store import instructions_of

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from vla_attention.capture.commands.command_line import run_capture_command
 from vla_attention.capture.policies.families import policy_families
 from vla_attention.capture.policies.family import PolicyFamily
-from vla_attention.capture.run.command import run_analysis
+from vla_attention.capture.run.command import load_policy, run_analysis
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.layers import select_layers
 from vla_attention.schemas.options import read_options
@@ -126,23 +126,17 @@ def _plan_suites(arguments: argparse.Namespace, index: int | None) -> dict[Path,
 def _capture(
     arguments: argparse.Namespace, suites: Sequence[RunSettings], threads: Threads, termination: Termination
 ) -> None:
-    from vla_attention.capture.environments.drawing import check_simulator
     from vla_attention.schemas.stores.store_place import check_writable
 
     for settings in suites:
         check_writable(settings.store.parent, "--output")
-    check_simulator(suites[0].suite, suites[0].libero_assets)
+    policy, device = load_policy(arguments, suites, threads)
 
     from vla_attention.capture.engine.faults import EpisodesMissing
     from vla_attention.capture.engine.progress import say
-    from vla_attention.capture.machine import load_torch
     from vla_attention.capture.run.capture_run import run_capture
     from vla_attention.schemas.stores.verify import DamagedEpisodesLeft
 
-    say(threads.describe())
-    device = load_torch(arguments.device, threads.number)
-    arguments.instructions = [told for settings in suites for told in settings.instructions()]
-    policy = arguments.family.read(arguments).build(device)
     # A layer that does not exist is an error before the capture, not after it.
     select_layers(arguments.layers, policy.num_layers, policy.family)
     missing = []
