@@ -7,27 +7,24 @@ and `transforms.py` (normalisation); each is checked against arrays that openpi 
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from vla_attention.capture.foreign_files.checked_files import MAX_FILES, read_object
+from vla_attention.capture.foreign_files.checked_files import read_object
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
+from vla_attention.schemas.jsonable import MalformedDocument, from_json
 
 NormalisationMode = Literal["quantile", "z-score"]
 
 #: Prevents a division by zero for constant dimensions (openpi's value).
 NORMALISATION_EPS = 1e-6
-
-#: Folders in one another in which statistics are looked for; asset ids are names such as `lerobot/droid`.
-_MAX_ASSET_DEPTH = 8
 
 #: Action dimensions that a LIBERO or robosuite arm takes: translation, rotation, gripper.
 ENVIRONMENT_ACTION_DIM = 7
@@ -167,38 +164,41 @@ def environment_actions(
     return actions
 
 
+class _Numbers(msgspec.Struct, frozen=True):
+    mean: list[float]
+    std: list[float]
+    q01: list[float] | None = None
+    q99: list[float] | None = None
+
+    def statistics(self, name: str) -> Statistics:
+        """Return them as arrays; raise `UnreadableCheckpoint` for unequal lengths, NaN and infinity."""
+        arrays = {
+            key: np.array(numbers) for key, numbers in msgspec.structs.asdict(self).items() if numbers is not None
+        }
+        for key, array in arrays.items():
+            if not np.isfinite(array).all():
+                raise UnreadableCheckpoint(f"The statistics have NaN or infinity in '{key}' of '{name}'.")
+            if len(array) != len(self.mean):
+                raise UnreadableCheckpoint(f"The statistics '{key}' and 'mean' of '{name}' have unequal lengths.")
+        return Statistics(**arrays)
+
+
+class _Groups(msgspec.Struct, frozen=True):
+    state: _Numbers
+    actions: _Numbers
+
+
+class _File(msgspec.Struct, frozen=True):
+    norm_stats: _Groups
+
+
 def parse_norm_stats(content: object, where: str) -> NormStats:
     """Build the statistics from the content of openpi's norm_stats.json; `where` names it in errors."""
-    groups = content.get("norm_stats") if isinstance(content, Mapping) else None
-    if not isinstance(groups, Mapping):
-        raise UnreadableCheckpoint(f"{where} has no 'norm_stats' with statistics of 'state' and 'actions'.")
-    return NormStats(state=_statistics(groups, "state", where), actions=_statistics(groups, "actions", where))
-
-
-def _statistics(groups: Mapping[str, Any], name: str, where: str) -> Statistics:
-    numbers = groups.get(name)
-    if not isinstance(numbers, Mapping) or numbers.get("mean") is None or numbers.get("std") is None:
-        raise UnreadableCheckpoint(f"{where} has no mean and std for '{name}'.")
-    arrays: dict[str, NDArray[np.float64] | None] = {}
-    for key in ("mean", "std", "q01", "q99"):
-        given = numbers.get(key)
-        try:
-            arrays[key] = None if given is None else np.asarray(given, dtype=np.float64)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise UnreadableCheckpoint(f"{where} has other values than numbers as '{key}' of '{name}'.") from error
-        array = arrays[key]
-        if array is not None and not np.isfinite(array).all():
-            raise UnreadableCheckpoint(f"{where} has NaN or infinity in '{key}' of '{name}'.")
-    lengths = {array.shape for array in arrays.values() if array is not None}
-    if len(lengths) != 1 or len(next(iter(lengths))) != 1:
-        raise UnreadableCheckpoint(
-            f"{where} has statistics of unequal lengths for '{name}': {listing(sorted(lengths))}."
-        )
-    mean, std = arrays["mean"], arrays["std"]
-    # checked above; for mypy
-    assert mean is not None
-    assert std is not None
-    return Statistics(mean=mean, std=std, q01=arrays["q01"], q99=arrays["q99"])
+    try:
+        groups = from_json(_File, content, where).norm_stats
+        return NormStats(groups.state.statistics("state"), groups.actions.statistics("actions"))
+    except (MalformedDocument, UnreadableCheckpoint) as error:
+        raise UnreadableCheckpoint(f"{where} has no statistics that can be used: {error}") from None
 
 
 def read_norm_stats(checkpoint: str | Path, given: Path | None = None, asset_id: str | None = None) -> NormStats:
@@ -244,19 +244,4 @@ def _read_norm_stats(path: Path, inside: Path | None) -> NormStats:
 
 def find_norm_stats(checkpoint: Path) -> list[Path]:
     """Return the files norm_stats.json below the folder `assets` of a checkpoint, in the order of their paths."""
-    files, level = [], [checkpoint / "assets"]
-    for _ in range(_MAX_ASSET_DEPTH):
-        entries = [entry for folder in level for entry in _entries(folder)]
-        files += [Path(entry.path) for entry in entries if entry.name == "norm_stats.json" and not entry.is_dir()]
-        level = [Path(entry.path) for entry in entries if entry.is_dir(follow_symlinks=False)]
-        if len(entries) > MAX_FILES:
-            raise UnreadableCheckpoint(f"'{checkpoint / 'assets'}' holds more than {MAX_FILES} files.")
-    return sorted(files)
-
-
-def _entries(folder: Path) -> list[os.DirEntry[str]]:
-    try:
-        with os.scandir(folder) as entries:
-            return list(entries)
-    except OSError:
-        return []
+    return sorted(path for path in (checkpoint / "assets").glob("**/norm_stats.json") if not path.is_dir())
