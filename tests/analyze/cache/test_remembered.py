@@ -72,9 +72,8 @@ def measured(monkeypatch) -> list[str]:
 
 
 def tables(path: Path, **settings: object) -> list[pl.DataFrame]:
-    run = va.open(path)
-    found = [run.analyze(**settings)[level] for level in ("tasks", "episodes", "replans", "steps")]  # type: ignore
-    return [*found, run.analyze(**settings)["steps_groups"], run.analyze(**settings)["tasks_groups"]]  # type: ignore[arg-type]
+    answer = va.open(path).analyze(**settings)  # type: ignore[arg-type]
+    return [answer[name] for name in ("tasks", "episodes", "replans", "steps", "steps_groups", "tasks_groups")]
 
 
 def same(found: list[pl.DataFrame], expected: list[pl.DataFrame]) -> bool:

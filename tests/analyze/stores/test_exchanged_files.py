@@ -17,6 +17,7 @@ from tests.kit.stores import StoreSpec, reseal_root, write_store
 from tests.kit.thorough import thorough_except
 from vla_attention.analyze.__main__ import main
 from vla_attention.analyze.api import OpenStores
+from vla_attention.analyze.core.result import Result
 from vla_attention.analyze.store.copying import copy_store
 from vla_attention.capture.store import site_writer
 from vla_attention.schemas.stores.reader import open_store
@@ -32,19 +33,20 @@ ARRAYS = (
 )
 WORDS = {"groups": {"image": "role:image", "bowl": "word:bowl"}, "ratio": "image/bowl"}
 
+
+def tables(answer: Result, *names: str) -> list[pl.DataFrame]:
+    return [answer[name] for name in names]
+
+
 #: Every table of every command that answers a question, and every number that overlays and exports show.
 QUESTIONS: dict[str, Callable[[OpenStores, Path], pl.DataFrame | list[pl.DataFrame]]] = {
-    "ratios of spans": lambda run, other: [
-        run.analyze()["steps"],
-        run.analyze()["steps_groups"],
-        run.analyze()["contributions_steps"],
-    ],
+    "ratios of spans": lambda run, other: tables(run.analyze(), "steps", "steps_groups", "contributions_steps"),
     "ratios of words": lambda run, other: run.analyze(**WORDS)["steps"],
     "episodes": lambda run, other: run.episodes,
-    "heads": lambda run, other: [run.analyze(by=("layer", "head"))["by"], run.analyze(by=("denoise",))["by"]],
+    "heads": lambda run, other: [run.analyze(by=by)["by"] for by in (("layer", "head"), ("denoise",))],
     "sinks": lambda run, other: run.analyze(without_sinks="")["sinks"],
-    "words": lambda run, other: [run.words()["words"], run.words()["words_episodes"]],
-    "objects": lambda run, other: [run.objects()["objects_episodes"], run.objects()["iou_episodes"]],
+    "words": lambda run, other: tables(run.words(), "words", "words_episodes"),
+    "objects": lambda run, other: tables(run.objects(), "objects_episodes", "iou_episodes"),
     "time": lambda run, other: run.analyze(by=("time",))["by"],
     "compare": lambda run, other: run.compare(other, allow_mismatch=["seed"])["differences"],
     "export": lambda run, other: [
