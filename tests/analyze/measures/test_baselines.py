@@ -89,15 +89,17 @@ def test_uniform_attention_has_lift_1_everywhere(data):
         path = write_store(Path(folder) / "a.zarr", spec=spec)
         run = va.open(path)
         for per_head in (False, True):
+            answer = run.analyze(per_head=per_head)
             for level in ("steps", "replans", "episodes", "tasks"):
-                all_one(run.analyze(per_head=per_head)[f"{level}_groups"], "lift")
-                ratios = run.analyze(per_head=per_head)[level]
+                all_one(answer[f"{level}_groups"], "lift")
+                ratios = answer[level]
                 all_one(ratios, "ratio_lift")
                 assert ratios["ratio_lift"].is_finite().all()
         words = run.words()["words_episodes"]
         all_one(words, "lift")
-        all_one(run.analyze(by=("layer", "head"))["by_groups"], "lift")
-        np.testing.assert_allclose(run.analyze(by=("layer", "head"))["by"]["ratio_lift"].to_numpy(), 1.0, atol=1e-5)
+        cells = run.analyze(by=("layer", "head"))
+        all_one(cells["by_groups"], "lift")
+        np.testing.assert_allclose(cells["by"]["ratio_lift"].to_numpy(), 1.0, atol=1e-5)
         search = search_sinks(question_about(path), SinkRule(factor=1.0))
         assert search.sinks.is_empty()
         # Others take nothing at some replans, which their mean counts.
