@@ -117,7 +117,11 @@ KINDS: dict[str, dict[str, Any]] = {
     "all ten steps": {"denoise_steps": "all", "contributions": False},
     "last step, contributions": {"denoise_steps": ["last"], "contributions": True},
     "first and last step, contributions": {"contributions": True},
-    "last step, knockout": {"denoise_steps": ["last"], "contributions": False, "knockout": "camera:camera_0"},
+    "last step, knockout": {
+        "denoise_steps": ["last"],
+        "contributions": False,
+        "interventions": va.knockout("camera:camera_0"),
+    },
 }
 
 
@@ -139,7 +143,7 @@ def measure(
     def recorded(episode: Any, kind: str) -> None:
         with episode.replan(env_step=next(steps)):
             actions = act()
-        assert "knockout" in kinds[kind] or torch.equal(actions, expected), kind
+        assert "interventions" in kinds[kind] or torch.equal(actions, expected), kind
 
     def waited_for(call: Callable[[], object]) -> Callable[[], object]:
         def waiting() -> None:

@@ -7,7 +7,7 @@ has the formulas; the arithmetic is in `capture/interventions/`. Groups of keys 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Literal
 
 from msgspec import field
@@ -267,6 +267,38 @@ class Interventions(Document, frozen=True):
         parts += [change.describe() for change in self.images]
         parts += [self.noise.describe()] if self.noise else []
         return "; ".join(parts) if parts else "none"
+
+
+def knockout(
+    *selectors: str,
+    keep: bool = False,
+    layers: Iterable[int] | None = None,
+    heads: Iterable[int] | None = None,
+    denoise_steps: Iterable[int] | None = None,
+    weight: float = 1.0,
+    name: str = "",
+) -> Interventions:
+    """Groups of keys that the action queries do not read, or with `keep` the one that alone they read.
+
+    >>> knockout("word:bowl", layers=[1]).describe()
+    "the keys of 'word:bowl' knocked out for the action queries, layers 1"
+
+    selectors: in the grouping language. layers, heads, denoise_steps: where; None is everywhere. weight: the share of
+    the weights that is taken away, 0 to 1. name: of the condition, for tables.
+
+    Raises:
+        BadArgument: a number is below 0, or the weight is none.
+    """
+    layers, heads, denoise_steps = (
+        None if chosen is None else tuple(sorted(set(chosen))) for chosen in (layers, heads, denoise_steps)
+    )
+    return Interventions(
+        name,
+        tuple(
+            KeyKnockout(selector, keep=keep, weight=weight, layers=layers, heads=heads, denoise_steps=denoise_steps)
+            for selector in selectors
+        ),
+    )
 
 
 class RerunSource(Document, frozen=True):

@@ -9,9 +9,9 @@
         ...
 
 Public names: `open`, `example`, `workers` and `OpenStores` (stage two); `record`, `inspect`, `check_layout`, `layouts`,
-the parts of a `PolicyLayout` and `EffectSettings` (stage one, from your own code; they need torch); `UserError` (the
-base of every error that a user can cause) and `__version__`. `vla_attention.datasets` reads data sets of robots.
-This import loads neither torch nor zarr, polars or numpy.
+the parts of a `PolicyLayout`, `EffectSettings`, `Interventions` and `knockout` (stage one, from your own code; it needs
+torch); `UserError` (the base of every error that a user can cause) and `__version__`. `vla_attention.datasets` reads
+data sets of robots. This import loads neither torch nor zarr, polars or numpy.
 """
 
 from __future__ import annotations
@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     from vla_attention.capture.torch_policies.policy_layout import PromptText as PromptText
     from vla_attention.capture.torch_policies.policy_layout import RecordedSite as RecordedSite
     from vla_attention.capture.torch_policies.record import record as record
+    from vla_attention.schemas.interventions import Interventions as Interventions
+    from vla_attention.schemas.interventions import knockout as knockout
     from vla_attention.schemas.layout import PatchGrid as PatchGrid
     from vla_attention.schemas.layout import SiteLayout as SiteLayout
     from vla_attention.schemas.layout import Span as Span
@@ -55,6 +57,7 @@ _RECORDER = {
         "PromptText",
         "RecordedSite",
     ),
+    "schemas.interventions": ("Interventions", "knockout"),
     "schemas.layout": ("PatchGrid", "SiteLayout", "Span"),
 }
 

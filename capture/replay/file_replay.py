@@ -144,7 +144,7 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
         bits=settings.mantissa_bits,
         contributions=None if settings.contributions else False,
         frames=settings.frames,
-        knockout=None if of_attention.is_none else of_attention,
+        interventions=of_attention,
         allow_empty=arguments.allow_empty,
         provenance=plan.data.downloads | decoder_version(),
         resume=plan.mode == "resume",

@@ -79,7 +79,8 @@ def _refuse_own_loop(root: RootAttributes) -> None:
     if root.protocol.name == "recorded":
         raise BadArgument(
             f"Cannot rerun a store that va.record made: the policy '{root.policy.name}' is called by your own code. "
-            "Run that again with va.record(..., knockout=...) into another store; vla-attention compare pairs the two."
+            "Run that again with va.record(..., interventions=va.knockout(...)) into another store; vla-attention "
+            "compare pairs the two."
         )
 
 
@@ -91,8 +92,7 @@ def _family_of(root: RootAttributes) -> PolicyFamily:
         raise BadArgument(
             f"Cannot rerun a store of '{root.policy.family}', a policy of the caller's own code, which vla-capture "
             "cannot load; use vla-attention capture replay DATASET --policy FILE.py --knockout SELECTOR --rerun-of "
-            "STORE, or "
-            "va.record(..., knockout=SELECTOR) (docs/your-policy.md)."
+            "STORE, or va.record(..., interventions=va.knockout(SELECTOR)) (docs/your-policy.md)."
         ) from None
 
 

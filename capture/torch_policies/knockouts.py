@@ -24,61 +24,22 @@ from vla_attention.schemas.interventions import AttentionScale, Interventions, K
 from vla_attention.schemas.layout import SiteLayout
 
 
-def interventions_of(
-    knockout: str | Sequence[str] | Interventions | None,
-    keep: str | None,
-    layers: Sequence[int] | None,
-    heads: Sequence[int] | None,
-    denoise_steps: Sequence[int] | None,
-    weight: float,
-    layout: PolicyLayout,
-) -> Interventions:
-    """Return the interventions of a session; raise `BadArgument` for those that need more than an additive mask."""
-    places = {
-        "layers": _places_of_layout("layer", layers, layout.num_layers),
-        "heads": _places_of_layout("head", heads, layout.num_heads),
-        "denoise_steps": _places_of_layout("denoise step", denoise_steps, layout.num_denoise_steps),
-    }
-    if isinstance(knockout, Interventions):
-        if keep is not None or any(chosen is not None for chosen in places.values()):
-            raise BadArgument("Give knockouts as Interventions, or by selectors with layers and heads, not both.")
-        _check(knockout)
-        return knockout
-    selectors = [knockout] if isinstance(knockout, str) else list(knockout or ())
-    named = [(selector, False) for selector in selectors] + ([(keep, True)] if keep is not None else [])
-    keys = [
-        KeyKnockout(
-            selector,
-            keep=others,
-            weight=weight,
-            layers=places["layers"],
-            heads=places["heads"],
-            # One step without a denoising loop; the calls of an autoregressive policy are its tokens.
-            denoise_steps=places["denoise_steps"] if layout.num_denoise_steps > 1 else None,
-        )
-        for selector, others in named
-    ]
-    if not keys and any(chosen is not None for chosen in places.values()):
-        raise BadArgument("knockout_layers, knockout_heads and knockout_denoise_steps need a knockout or keep.")
-    return Interventions(keys=tuple(keys))
-
-
-def _places_of_layout(what: str, numbers: Sequence[int] | None, count: int) -> tuple[int, ...] | None:
-    if numbers is None:
-        return None
-    for number in numbers:
-        if not 0 <= number < count:
-            raise BadArgument(f"There is no {what} {number} for a knockout; expected 0 to {count - 1}.")
-    return tuple(sorted(set(numbers)))
-
-
-def _check(interventions: Interventions) -> None:
+def check_interventions(interventions: Interventions, layout: PolicyLayout) -> None:
+    """Raise `BadArgument` for interventions that need more than an additive mask, or places that the layout lacks."""
     if interventions.changes_input or interventions.noise is not None:
         raise BadArgument(
             f"Cannot record with {interventions.describe()}: prompt, pictures and noise are given to the policy by "
             "your own code; change them there, and give only knockouts and factors of attention."
         )
+    counts = {"layer": layout.num_layers, "head": layout.num_heads, "denoise step": layout.num_denoise_steps}
     for edit in (*interventions.keys, *interventions.attention):
+        for (what, count), chosen in zip(counts.items(), (edit.layers, edit.heads, edit.denoise_steps), strict=True):
+            # Without a denoising loop there is one step; the calls of an autoregressive policy are its tokens.
+            if chosen is not None and (chosen[-1] >= count or (what == "denoise step" and count == 1)):
+                raise BadArgument(
+                    f"There is no {what} {chosen[-1]} for {edit.describe()}; '{layout.name}' has {count}: leave "
+                    f"{what}s out, or give 0 to {count - 1}."
+                )
         if not isinstance(edit, (KeyKnockout, AttentionScale)):
             raise BadArgument(
                 f"Cannot record with {edit.describe()}: only what is added to the logits of a call can be changed, a "

@@ -16,7 +16,7 @@ from vla_attention.capture.engine.plan import recording_of, root_attributes
 from vla_attention.capture.engine.settings import RecordingSettings
 from vla_attention.capture.machine import describe_machine
 from vla_attention.capture.torch_policies.batch_rows import rows_apart
-from vla_attention.capture.torch_policies.knockouts import interventions_of
+from vla_attention.capture.torch_policies.knockouts import check_interventions
 from vla_attention.capture.torch_policies.own_setting import difference_to_own_setting
 from vla_attention.capture.torch_policies.policy_layout import (
     LayoutForAnotherVersion,
@@ -63,13 +63,7 @@ def record(
     contributions: bool | None = None,
     frames: bool = True,
     effects: str | EffectSettings | None = None,
-    knockout: str | Sequence[str] | Interventions | None = None,
-    keep: str | None = None,
-    knockout_layers: Sequence[int] | None = None,
-    knockout_heads: Sequence[int] | None = None,
-    knockout_denoise_steps: Sequence[int] | None = None,
-    knockout_weight: float = 1.0,
-    condition: str = "",
+    interventions: Interventions | None = None,
     allow_empty: bool = False,
     own_setting: Callable[[], Any] | None = None,
     resume: bool = False,
@@ -109,11 +103,8 @@ def record(
         effects: what is taken away from each call, one at a time, to see how the action changes: `text`, `cameras`,
             `objects`, `tokens`, with commas between, or `EffectSettings`. Each replan then needs `repeat`
             (docs/your-policy.md, "Effects").
-        knockout, keep: keys that the action queries do not read, or that alone they read, in the grouping language; or
-            `Interventions`.
-        knockout_layers, knockout_heads, knockout_denoise_steps, knockout_weight: where, and which share of the weights.
-        condition: a short name for a run with a knockout.
-        allow_empty: leave a replan unchanged where the knocked-out group has no key.
+        interventions: what is changed in the attention of the action queries, as `va.knockout("word:bowl")` says it.
+        allow_empty: leave a replan unchanged where a group of them has no key.
         own_setting: a policy call that can be repeated, `lambda: policy.select_action(batch)`: it is made once as you
             make it and once as it is recorded, and the difference goes into the store. Two further calls check that the
             rows of its batch are apart.
@@ -148,10 +139,8 @@ def record(
         contributions=contributions,
     )
     recording = plan_recording(settings, layout)
-    changes = interventions_of(
-        knockout, keep, knockout_layers, knockout_heads, knockout_denoise_steps, knockout_weight, layout
-    )
-    changes = replace(changes, name=condition) if condition else changes
+    changes = interventions or Interventions()
+    check_interventions(changes, layout)
     planned = effects_of_layout(effects, layout)
     if planned is not None:
         refuse_both(changes)

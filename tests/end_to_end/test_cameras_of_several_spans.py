@@ -261,7 +261,7 @@ def policy_layout():
 
 
 def test_a_knock_out_of_a_camera_hides_every_key(tmp_path):
-    store, _ = act_recorded(tmp_path, SmallPolicy(), layout=policy_layout(), knockout="camera:front")
+    store, _ = act_recorded(tmp_path, SmallPolicy(), layout=policy_layout(), interventions=va.knockout("camera:front"))
     rows = store.episodes[0].read("joint/rows")
     assert (rows[..., [0, 1, 2, 3, 10]] == 0).all()
     np.testing.assert_allclose(rows.sum(axis=-1), 1, atol=1e-3)

@@ -60,12 +60,12 @@ def record(case: PolicyCase, path: Path, replans: int = 2, **settings: Any) -> A
                 actions = case.call(case.observation)
                 replan.actions = actions[0]
             assert replan.recorded
-            if "knockout" not in settings:
+            if "interventions" not in settings:
                 torch.testing.assert_close(actions, expected, rtol=0, atol=0)
         episode.success = True
     store = open_store(path / "run.zarr")
     assert verify_store(store) == []
-    if "knockout" not in settings:
+    if "interventions" not in settings:
         assert run.largest_error < PRODUCT_TOLERANCE
     assert store.attributes.recording.contributions == settings.get("contributions", True)
     return store

@@ -90,7 +90,9 @@ def test_contributions_are_what_the_layers_add(case, tmp_path, site):
 
 
 def test_a_knockout_takes_the_keys_mass_away(case, tmp_path):
-    rows = rows_of(record(case, tmp_path, replans=1, tokenizer=None, knockout="camera:wrist"), "cross")
+    rows = rows_of(
+        record(case, tmp_path, replans=1, tokenizer=None, interventions=va.knockout("camera:wrist")), "cross"
+    )
     assert not rows[..., -ROWS * COLUMNS :].any()
     np.testing.assert_allclose(rows.sum(axis=-1), 1, atol=1e-5)
 

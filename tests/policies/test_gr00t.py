@@ -103,7 +103,7 @@ def test_the_state_reaches_its_key(case):
 
 
 def test_a_knockout_takes_the_keys_mass_away(case, tmp_path):
-    rows = rows_of(record(case, tmp_path, replans=1, knockout="camera:wrist"), "cross")
+    rows = rows_of(record(case, tmp_path, replans=1, interventions=va.knockout("camera:wrist")), "cross")
     assert not rows[..., 2 + PATCHES : 2 + 2 * PATCHES].any()
     np.testing.assert_allclose(rows.sum(axis=-1), 1, atol=1e-5)
 

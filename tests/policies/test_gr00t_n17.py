@@ -161,7 +161,7 @@ def test_a_word_reaches_its_key_and_no_others(case, site):
 
 def test_a_knockout_of_words_leaves_the_picture_only_blocks_alone(case, tmp_path):
     plain = record(case, tmp_path / "plain", replans=1)
-    changed = record(case, tmp_path / "changed", replans=1, knockout="word:bowl")
+    changed = record(case, tmp_path / "changed", replans=1, interventions=va.knockout("word:bowl"))
     bowl = 1 + PATCHES + INSTRUCTION.split().index("bowl")
     assert not rows_of(changed, "cross_text")[..., bowl].any()
     # At the first denoise step block 2 has other queries (block 0 changed them) but the same keys.

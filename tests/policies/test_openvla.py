@@ -137,7 +137,9 @@ def test_contributions_are_what_the_layers_add(request, tmp_path, kind):
 
 @pytest.mark.parametrize("name", ["one", "chunked"])
 def test_a_knockout_takes_the_keys_mass_away(name, request, tmp_path):
-    rows = rows_of(record(request.getfixturevalue(name), tmp_path, replans=1, knockout="camera:image"), "joint")
+    rows = rows_of(
+        record(request.getfixturevalue(name), tmp_path, replans=1, interventions=va.knockout("camera:image")), "joint"
+    )
     assert not rows[..., 1 : 1 + PATCHES].any()
     np.testing.assert_allclose(rows.sum(axis=-1), 1, atol=1e-5)
 

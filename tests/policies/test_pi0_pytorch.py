@@ -75,7 +75,7 @@ def test_contributions_are_what_the_expert_s_layers_add(case, tmp_path):
 
 
 def test_a_knockout_takes_the_keys_mass_away(case, tmp_path):
-    rows = rows_of(record(case, tmp_path, replans=1, knockout="word:bowl"), "joint")
+    rows = rows_of(record(case, tmp_path, replans=1, interventions=va.knockout("word:bowl")), "joint")
     assert not rows[..., 2 * PATCHES + INSTRUCTION.split().index("bowl")].any()
     np.testing.assert_allclose(rows.sum(axis=-1), 1, atol=1e-5)
 

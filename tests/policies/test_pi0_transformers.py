@@ -90,7 +90,7 @@ def test_contributions_are_what_the_layers_add(case, tmp_path):
 
 
 def test_a_knockout_takes_the_keys_mass_away_and_changes_actions(case, tmp_path):
-    store = record(case, tmp_path, replans=1, knockout="word:bowl")
+    store = record(case, tmp_path, replans=1, interventions=va.knockout("word:bowl"))
     rows, roles = rows_of(store, "joint"), roles_of(store, "joint")
     bowl = 2 * PATCHES + 1 + INSTRUCTION.split().index("bowl")
     assert roles[bowl] == "instruction"

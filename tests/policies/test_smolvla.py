@@ -151,7 +151,7 @@ def test_contributions_are_what_the_expert_s_layers_add(case, tmp_path, site):
 
 @pytest.mark.parametrize("what", ["word:bowl", "camera:wrist"])
 def test_a_knockout_takes_the_keys_mass_away(case, tmp_path, what):
-    store = record(case, tmp_path, replans=1, knockout=what)
+    store = record(case, tmp_path, replans=1, interventions=va.knockout(what))
     start = 2 * (PATCHES + 3)
     keys = [start + INSTRUCTION.split().index("bowl")] if what == "word:bowl" else range(start - 1 - PATCHES, start - 1)
     for site in ("self", "cross"):

@@ -78,7 +78,7 @@ def test_contributions_are_what_the_blocks_add(case, tmp_path):
 
 
 def test_a_knockout_takes_the_keys_mass_away(case, tmp_path):
-    rows = rows_of(record(case, tmp_path, replans=1, knockout="camera:wrist"), "joint")
+    rows = rows_of(record(case, tmp_path, replans=1, interventions=va.knockout("camera:wrist")), "joint")
     start = CHUNK + 1 + PATCHES + WORDS + PADDING + 1
     assert not rows[..., start : start + PATCHES].any()
     np.testing.assert_allclose(rows.sum(axis=-1), 1, atol=1e-5)

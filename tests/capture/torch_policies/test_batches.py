@@ -15,6 +15,7 @@ from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.recorded_episodes import NothingRecorded, RecordingStopped
 from vla_attention.capture.torch_policies.replan_text import KeysShifted
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.interventions import knockout
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
@@ -46,7 +47,7 @@ def stored(path):
     return {one.name: one for one in store.episodes}
 
 
-@pytest.mark.parametrize("changes", [{}, {"knockout": "word:pick"}])
+@pytest.mark.parametrize("changes", [{}, {"interventions": knockout("word:pick")}])
 def test_rows_of_a_batch_are_those_of_single_calls(tmp_path, changes):
     policy = SmallPolicy()
     with start(tmp_path / "batch", policy, **changes) as run, run.episodes(episodes()) as batch:

@@ -26,6 +26,7 @@ from tests.kit.small_torch_variants import (
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.interventions import knockout
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
@@ -214,10 +215,10 @@ def decoder_layout() -> va.PolicyLayout:
 
 
 @pytest.mark.parametrize("contributions", [True, False])
-@pytest.mark.parametrize("knockout", [None, "word:bowl"])
-def test_actions_that_read_each_other_before_a_prompt_of_changing_length(tmp_path, contributions, knockout):
+@pytest.mark.parametrize("changes", [None, knockout("word:bowl")])
+def test_actions_that_read_each_other_before_a_prompt_of_changing_length(tmp_path, contributions, changes):
     policy = DecoderPolicy()
-    settings = {"layout": decoder_layout(), "tokenizer": policy.tokenizer, "durable": False, "knockout": knockout}
+    settings = {"layout": decoder_layout(), "tokenizer": policy.tokenizer, "durable": False, "interventions": changes}
     with record(tmp_path / "a.zarr", policy, contributions=contributions, **settings) as run:
         for number, text in enumerate(TEXTS):
             with run.episode(task_id=number, episode_index=0, instruction=text) as episode, episode.replan(env_step=0):
@@ -227,6 +228,6 @@ def test_actions_that_read_each_other_before_a_prompt_of_changing_length(tmp_pat
         roles = [Role(code).label for code in episode.read("cross/key_role")[0]]
         assert roles == ["bos", *["instruction"] * len(words), "template"] + ["absent"] * (LONGEST - len(words) - 2)
         rows = episode.read("cross/rows")[0]
-        assert (rows[..., words.index("bowl") + 1] == 0).all() == (knockout is not None)
+        assert (rows[..., words.index("bowl") + 1] == 0).all() == (changes is not None)
         assert (rows[..., : len(words) + 2].sum(-1) > 0.999).all()
         assert episode.has("cross/contribution") == contributions

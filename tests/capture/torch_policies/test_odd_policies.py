@@ -18,6 +18,7 @@ from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.session import WeightsChanged
 from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
 from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
+from vla_attention.schemas.interventions import knockout
 from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
@@ -95,11 +96,18 @@ def layout(**changes: object) -> PolicyLayout:
     return PolicyLayout(**{**fields, **changes})  # type: ignore[arg-type]
 
 
-def rows_of(path, policy, act=None, knockout=None, shape=None):
+def rows_of(path, policy, act=None, cut=None, shape=None):
     """Record one call; return its rows (block, head, query, key) and what it gave."""
+    changes = None if cut is None else knockout(cut)
     with (
         record(
-            path / "a.zarr", policy, layout=shape or layout(), bits=23, queries="all", durable=False, knockout=knockout
+            path / "a.zarr",
+            policy,
+            layout=shape or layout(),
+            bits=23,
+            queries="all",
+            durable=False,
+            interventions=changes,
         ) as run,
         run.episode(task_id=0, episode_index=0, instruction="") as episode,
         episode.replan(env_step=0),
@@ -123,13 +131,13 @@ def float32_softmax(block, q, k, v):
     return torch.softmax(logits(q.float(), k.float()), dim=-1).to(v.dtype) @ v
 
 
-@pytest.mark.parametrize("knockout", [None, "role:state"])
-def test_a_float32_softmax_over_bfloat16_values(tmp_path, knockout):
+@pytest.mark.parametrize("cut", [None, "role:state"])
+def test_a_float32_softmax_over_bfloat16_values(tmp_path, cut):
     policy = OddPolicy(float32_softmax).to(torch.bfloat16)
     own = policy.act()
-    rows, result = rows_of(tmp_path, policy, knockout=knockout)
-    assert torch.equal(result, own) == (knockout is None)
-    np.testing.assert_allclose(rows, expected(policy, (4, 5) if knockout else ()), atol=2e-6)
+    rows, result = rows_of(tmp_path, policy, cut=cut)
+    assert torch.equal(result, own) == (cut is None)
+    np.testing.assert_allclose(rows, expected(policy, (4, 5) if cut else ()), atol=2e-6)
 
 
 class MultiheadBlock(nn.Module):
@@ -202,9 +210,9 @@ def test_a_knockout_does_not_change_a_gate_of_experts(tmp_path, experts):
     np.testing.assert_allclose(rows, expected(policy), atol=2e-6)
     if experts == KEYS:  # as many experts as keys: nothing tells the two apart before the product
         with pytest.raises(ChangeRefused, match="A softmax that is no attention was changed"):
-            rows_of(tmp_path / "knockout", policy, knockout="role:state")
+            rows_of(tmp_path / "knockout", policy, cut="role:state")
     else:
-        rows, _ = rows_of(tmp_path / "knockout", policy, knockout="role:state")
+        rows, _ = rows_of(tmp_path / "knockout", policy, cut="role:state")
         np.testing.assert_allclose(rows, expected(policy, (4, 5)), atol=2e-6)
 
 
@@ -217,13 +225,13 @@ SPELLINGS = {
 
 
 @pytest.mark.parametrize("multiply", SPELLINGS.values(), ids=SPELLINGS)
-@pytest.mark.parametrize("knockout", [None, "role:state"])
-def test_spellings_of_the_product(tmp_path, multiply, knockout):
+@pytest.mark.parametrize("cut", [None, "role:state"])
+def test_spellings_of_the_product(tmp_path, multiply, cut):
     policy = OddPolicy(lambda block, q, k, v: multiply(torch.softmax(logits(q, k), dim=-1), v))
     own = policy.act()
-    rows, result = rows_of(tmp_path, policy, knockout=knockout)
-    assert torch.equal(result, own) == (knockout is None)
-    np.testing.assert_allclose(rows, expected(policy, (4, 5) if knockout else ()), atol=2e-6)
+    rows, result = rows_of(tmp_path, policy, cut=cut)
+    assert torch.equal(result, own) == (cut is None)
+    np.testing.assert_allclose(rows, expected(policy, (4, 5) if cut else ()), atol=2e-6)
 
 
 @pytest.mark.parametrize("heads", [2, 3])
@@ -249,7 +257,7 @@ def test_a_knockout_where_the_softmax_is_written_over_its_logits(tmp_path):
         return scores @ v
 
     policy = OddPolicy(attend)
-    rows, _ = rows_of(tmp_path, policy, knockout="role:image")
+    rows, _ = rows_of(tmp_path, policy, cut="role:image")
     np.testing.assert_allclose(rows, expected(policy, range(4)), atol=2e-6)
     roles = open_store(tmp_path / "a.zarr").episodes[0].read("joint/key_role")[0]
     assert set(roles[:4]) == {1}  # image, and not masked
@@ -343,10 +351,10 @@ def swap_keys_in_a_view(block, q, k, v):
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 @pytest.mark.parametrize("attend", [reuse_logits, swap_keys, swap_keys_in_a_view])
-@pytest.mark.parametrize("knockout", [None, "role:image"])
+@pytest.mark.parametrize("cut", [None, "role:image"])
 @pytest.mark.parametrize("inference", [False, True])
-def test_what_is_written_after_the_softmax_is_seen(tmp_path, dtype, attend, knockout, inference):
-    if (attend, dtype, inference, knockout) == (reuse_logits, torch.bfloat16, True, None):
+def test_what_is_written_after_the_softmax_is_seen(tmp_path, dtype, attend, cut, inference):
+    if (attend, dtype, inference, cut) == (reuse_logits, torch.bfloat16, True, None):
         pytest.skip("tensors of inference mode do not count what is written: the check of P·V refuses the rows")
     policy = OddPolicy(attend).to(dtype)
 
@@ -355,9 +363,9 @@ def test_what_is_written_after_the_softmax_is_seen(tmp_path, dtype, attend, knoc
             return policy.act()
 
     own = act()
-    rows, result = rows_of(tmp_path, policy, act, knockout=knockout)
-    assert torch.equal(result, own) == (knockout is None)
-    wanted = expected(policy, range(4) if knockout else ())
+    rows, result = rows_of(tmp_path, policy, act, cut=cut)
+    assert torch.equal(result, own) == (cut is None)
+    wanted = expected(policy, range(4) if cut else ())
     if attend is not reuse_logits:
         wanted = wanted[..., [1, 0, *range(2, KEYS)]]
     np.testing.assert_allclose(rows, wanted, atol=2e-6 if dtype is torch.float32 else 4e-3)

@@ -24,6 +24,7 @@ from tests.kit.small_torch_policy import HORIZON, WIDTH, SmallPolicy, given, sma
 from tests.kit.small_torch_variants import token_layout
 from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.capture.torch_policies.record import record
+from vla_attention.schemas.interventions import knockout
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
 
@@ -148,13 +149,13 @@ def guided_layout():
     )
 
 
-@pytest.mark.parametrize("knockout", [None, "word:bowl"])
-def test_guidance_as_a_batch_of_two(tmp_path, knockout):
+@pytest.mark.parametrize("changes", [None, knockout("word:bowl")])
+def test_guidance_as_a_batch_of_two(tmp_path, changes):
     policy, inputs = GuidedPolicy(), given()
     own = policy.act(**inputs)
     table = str(va.inspect(policy, lambda: policy.act(**inputs)))
     assert table.splitlines()[-1].startswith("Calls with a batch are recorded with run.episodes([...])")
-    settings = {"tokenizer": policy.network.tokenizer, "durable": False, "bits": 23, "knockout": knockout}
+    settings = {"tokenizer": policy.network.tokenizer, "durable": False, "bits": 23, "interventions": changes}
     facts = {"task_id": 0, "episode_index": 0, "instruction": "pick the bowl"}
     with record(tmp_path / "a.zarr", policy, layout=guided_layout(), **settings) as run:
         with (
@@ -168,7 +169,7 @@ def test_guidance_as_a_batch_of_two(tmp_path, knockout):
             episodes.replan(env_step=0, state=inputs["states"], frames=[{"front": inputs["pictures"]}]) as replan,
         ):
             replan.actions = policy.act(**inputs)
-            assert torch.equal(replan.actions, own) == (knockout is None)
+            assert torch.equal(replan.actions, own) == (changes is None)
     with (
         record(tmp_path / "b.zarr", policy.network, layout=small_layout(), **settings) as run,
         run.episode(**facts) as episode,

@@ -33,6 +33,7 @@ from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
 from vla_attention.capture.torch_policies.watched_block import NotFollowed
 from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.groupings.vocabulary import SceneObject
+from vla_attention.schemas.interventions import knockout
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import RunMismatch, StoreExists
@@ -339,7 +340,7 @@ def encoded(embedding):
     return small_layout(text=PromptText(("prompt",), embedding))
 
 
-@pytest.mark.parametrize("changes", [{}, {"contributions": False}, {"knockout": "role:state"}])
+@pytest.mark.parametrize("changes", [{}, {"contributions": False}, {"interventions": knockout("role:state")}])
 def test_an_embedding_that_is_not_called_is_refused_by_name(tmp_path, changes):
     policy = with_encoder()
     with start(tmp_path, policy, layout=encoded("words.shared"), **changes) as run:

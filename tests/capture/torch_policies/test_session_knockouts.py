@@ -19,6 +19,7 @@ from vla_attention.schemas.interventions import (
     AttentionScale,
     Interventions,
     KeyKnockout,
+    knockout,
 )
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.store_format import RunMismatch
@@ -64,7 +65,7 @@ def act_changed(policy, monkeypatch, bias, layers=(0, 1, 2), steps=(0, 1, 2, 3))
 
 def test_a_word_that_is_not_read(tmp_path, monkeypatch):
     policy = SmallPolicy()
-    store, actions = act_recorded(tmp_path, policy, knockout="word:bowl", condition="without_bowl")
+    store, actions = act_recorded(tmp_path, policy, interventions=knockout("word:bowl", name="without_bowl"))
     bias = torch.zeros(2, HORIZON, 14)
     bias[..., BOWL] = -torch.inf
     torch.testing.assert_close(actions, act_changed(policy, monkeypatch, bias), rtol=0, atol=1e-6)
@@ -75,8 +76,8 @@ def test_a_word_that_is_not_read(tmp_path, monkeypatch):
 
 def test_layers_heads_steps_and_weight(tmp_path, monkeypatch):
     policy = SmallPolicy()
-    places = {"knockout_layers": [1], "knockout_heads": [0], "knockout_denoise_steps": [0, 2], "knockout_weight": 0.25}
-    store, actions = act_recorded(tmp_path, policy, knockout=["word:bowl", "role:state"], **places)
+    changed = knockout("word:bowl", "role:state", layers=[1], heads=[0], denoise_steps=[2, 0], weight=0.25)
+    store, actions = act_recorded(tmp_path, policy, interventions=changed)
     bias = torch.zeros(2, HORIZON, 14)
     bias[0, :, [BOWL, 10]] = float(np.log(0.75))
     expected = act_changed(policy, monkeypatch, bias, layers=(1,), steps=(0, 2))
@@ -86,13 +87,13 @@ def test_layers_heads_steps_and_weight(tmp_path, monkeypatch):
 
 def test_keeping_one_group_and_factors_of_attention(tmp_path, monkeypatch):
     policy = SmallPolicy()
-    _, actions = act_recorded(tmp_path / "keep", policy, keep="camera:front")
+    _, actions = act_recorded(tmp_path / "keep", policy, interventions=knockout("camera:front", keep=True))
     bias = torch.full((2, HORIZON, 14), -torch.inf)
     bias[..., :4] = 0
     bias[..., 11:] = 0
     torch.testing.assert_close(actions, act_changed(policy, monkeypatch, bias), rtol=0, atol=1e-6)
     scaled = Interventions(attention=(AttentionScale("camera:front", 3.0),))
-    _, actions = act_recorded(tmp_path / "scale", policy, knockout=scaled)
+    _, actions = act_recorded(tmp_path / "scale", policy, interventions=scaled)
     bias = torch.zeros(2, HORIZON, 14)
     bias[..., :4] = float(np.log(3))
     torch.testing.assert_close(actions, act_changed(policy, monkeypatch, bias), rtol=0, atol=1e-6)
@@ -100,7 +101,7 @@ def test_keeping_one_group_and_factors_of_attention(tmp_path, monkeypatch):
 
 def test_a_knockout_is_a_part_of_the_runs_configuration(tmp_path, capsys):
     policy = SmallPolicy()
-    act_recorded(tmp_path, policy, knockout="word:bowl")
+    act_recorded(tmp_path, policy, interventions=knockout("word:bowl"))
     with pytest.raises(RunMismatch, match="interventions"):
         act_recorded(tmp_path, policy, resume=True)
     assert vla_capture(["rerun", str(tmp_path / "a.zarr")]) == 2
@@ -110,15 +111,15 @@ def test_a_knockout_is_a_part_of_the_runs_configuration(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("changes", "error", "sentence"),
     [
-        ({"knockout": "word:cup"}, SelectorError, "cup"),
-        ({"knockout": "word:bowl", "knockout_layers": [3]}, BadArgument, "There is no layer 3 for a knockout"),
-        ({"knockout": "role:value"}, EmptyGroup, "has no key at replan 0"),
-        ({"knockout": "* - role:padding"}, QueryWithoutKeys, "leaves a query without any key"),
+        (knockout("word:cup"), SelectorError, "cup"),
+        (knockout("word:bowl", layers=[3]), BadArgument, "There is no layer 3 for the keys of 'word:bowl'"),
+        (knockout("role:value"), EmptyGroup, "has no key at replan 0"),
+        (knockout("* - role:padding"), QueryWithoutKeys, "leaves a query without any key"),
     ],
 )
 def test_what_cannot_be_done_is_a_sentence(tmp_path, changes, error, sentence):
     with pytest.raises(error) as caught:
-        act_recorded(tmp_path, SmallPolicy(), **changes)
+        act_recorded(tmp_path, SmallPolicy(), interventions=changes)
     assert sentence in str(caught.value)
 
 
@@ -130,7 +131,7 @@ def test_a_word_in_a_prompt_of_changing_length(tmp_path):
         policy,
         layout=token_layout(),
         tokenizer=policy.tokenizer,
-        knockout="word:bowl",
+        interventions=knockout("word:bowl"),
         durable=False,
     ) as run:
         for number, text in enumerate(("pick the bowl", "pick up the red bowl")):
@@ -148,7 +149,7 @@ def test_a_word_in_a_prompt_of_changing_length(tmp_path):
 def test_a_word_that_the_instruction_lacks_changes_nothing_where_that_is_allowed(tmp_path, group):
     policy = SmallPolicy()
     with pytest.raises(SelectorError):
-        act_recorded(tmp_path, policy, knockout=group)
+        act_recorded(tmp_path, policy, interventions=knockout(group))
     (tmp_path / "allowed").mkdir()
-    _, actions = act_recorded(tmp_path / "allowed", policy, knockout=group, allow_empty=True)
+    _, actions = act_recorded(tmp_path / "allowed", policy, interventions=knockout(group), allow_empty=True)
     assert torch.equal(actions, policy.act(**given()))
