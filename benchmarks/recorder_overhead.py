@@ -102,7 +102,7 @@ def layout(blocks: int) -> va.PolicyLayout:
     return va.PolicyLayout(
         name="overhead",
         family="overhead",
-        sites=(va.RecordedSite(keys, (0, HORIZON), roles, "blocks.{block}.attention.o_proj"),),
+        sites=(va.RecordedSite(keys, (0, HORIZON), roles),),
         rules=(va.CallRule(r"blocks\.(?P<block>\d+)\.attention", "joint"),),
         num_layers=blocks,
         num_heads=HEADS,
@@ -117,6 +117,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "all ten steps": {"denoise_steps": "all", "contributions": False},
     "last step, contributions": {"denoise_steps": ["last"], "contributions": True},
     "first and last step, contributions": {"contributions": True},
+    "all ten steps, contributions": {"denoise_steps": "all", "contributions": True},
     "last step, knockout": {
         "denoise_steps": ["last"],
         "contributions": False,
@@ -173,7 +174,7 @@ def milliseconds(seconds: list[float]) -> str:
 
 def times(seconds: list[float], plain: list[float]) -> str:
     """The median, lowest and highest of the ratios within the rounds."""
-    found = measurement.measured(measurement.analyze(seconds, plain)["tasks"])
+    found = measurement.measured(measurement.ratios(seconds, plain))
     return f"{found.median:.3f} ({found.lowest:.3f}, {found.highest:.3f})"
 
 

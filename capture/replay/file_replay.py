@@ -142,7 +142,7 @@ def replay_with_file(arguments: argparse.Namespace, plan: ReplayPlan, given: Rep
         heads=settings.heads,
         queries="mean" if settings.queries == "mean" else "all",
         bits=settings.mantissa_bits,
-        contributions=None if settings.contributions else False,
+        contributions=settings.contributions,
         frames=settings.frames,
         interventions=of_attention,
         allow_empty=arguments.allow_empty,

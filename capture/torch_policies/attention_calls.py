@@ -1,12 +1,12 @@
 """What is known about one attention call of a policy, and who is told about it.
 
-`watch_attention` (watch.py) builds these for every kind of call. The policy's own kernel computes the output; rows are
-computed beside it, for the wanted queries only.
+`watch_attention` (watch.py) makes one of every call. The policy's own kernel computes the output; rows are computed
+beside it, for the wanted queries only.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Literal, Protocol
@@ -14,7 +14,7 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
-from vla_attention.capture.torch_policies.added_updates import OutputWay
+from vla_attention.capture.torch_policies.output_ways import OutputWay
 from vla_attention.schemas.errors import BadArgument
 
 #: How a policy computes attention. `sdpa`: `scaled_dot_product_attention`. `softmax`: a softmax by hand whose result is
@@ -65,44 +65,29 @@ class CallShape:
         return f"{self.module or '(policy)'}: {self.kind}, {self.queries} x {self.keys}, {heads}, {self.dtype}"
 
 
-class CallTensors(Protocol):
-    """The tensors of one call, as far as they are asked for. Every kind of call has its own class."""
-
-    @property
-    def values(self) -> Tensor:
-        """The values (batch, kv_head, key, dim)."""
-        ...
-
-    @property
-    def outputs(self) -> Tensor:
-        """What the policy's kernel computed, (batch, head, query, dim), before any projection."""
-        ...
-
-    def rows(self, queries: Positions, batch: Positions) -> Tensor:
-        """Return float32 probabilities (batch, head, query, key)."""
-        ...
-
-    def allowed(self, queries: Positions) -> Tensor:
-        """Return (batch, head or 1, query, key) bool: keys that the policy's own mask lets the query see.
-
-        The axis of heads may have length 1 where all of them have the same mask.
-        """
-        ...
-
-
 @dataclass(frozen=True)
 class AttentionCall:
     """One attention call, right after its kernel ran. Its tensors may be overwritten in place later.
 
     Attributes:
         shape: module, kind and sizes.
-        tensors: where the tensors come from.
+        values: (batch, kv_head, key, dim).
+        output: what the policy's own kernel computed, (batch, head, query, dim), before any projection.
+        rows_of: queries, rows of the batch -> float32 probabilities (batch, head, query, key).
+        allowed_of: queries -> (batch, head or 1, query, key) bool, see `allowed`.
+        laid_out: numbers (batch, head, query, dim) -> the same in the axes that the policy got its output in.
+        multiplied: the dtype of the probabilities that met the values; None: the kernel's own.
         asked: the shape that the watcher was asked about before a softmax by hand, if its product has another one.
         refused: why rows and values of this call cannot be recorded, in words that follow "it"; "" where they can.
     """
 
     shape: CallShape
-    tensors: CallTensors
+    values: Tensor
+    output: Tensor
+    rows_of: Callable[[Positions, Positions], Tensor]
+    allowed_of: Callable[[Positions], Tensor]
+    laid_out: Callable[[Tensor], Tensor]
+    multiplied: torch.dtype | None = None
     asked: CallShape | None = None
     refused: str = ""
 
@@ -110,12 +95,7 @@ class AttentionCall:
     def value(self) -> Tensor:
         """The values (batch, kv_head, key, dim); errors as `rows`."""
         self._check_refused()
-        return self.tensors.values
-
-    @property
-    def output(self) -> Tensor:
-        """What the policy's own kernel computed, (batch, head, query, dim), before the output projection."""
-        return self.tensors.outputs
+        return self.values
 
     def rows(self, queries: Positions = slice(None), batch: Positions = slice(None)) -> Tensor:
         """Return the probabilities of these queries, (batch, head, query, key) float32, exact zeros where masked.
@@ -125,24 +105,25 @@ class AttentionCall:
         """
         self._check_refused()
         with exact():
-            return self.tensors.rows(queries, batch)
+            return self.rows_of(queries, batch)
 
     def _check_refused(self) -> None:
         if self.refused:
             raise RowsRefused(f"The attention call {self.shape} cannot be recorded: it {self.refused}.")
 
     def allowed(self, queries: Positions = slice(None)) -> Tensor:
-        """Return (batch, head or 1, query, key) bool: keys that the policy's own mask lets the query see."""
+        """Return (batch, head or 1, query, key) bool: keys that the policy's own mask lets the query see.
+
+        The axis of heads has length 1 where all of them have the same mask.
+        """
         with exact():
-            return self.tensors.allowed(queries)
+            return self.allowed_of(queries)
 
     @property
     def precision(self) -> str:
         """The least precise dtype of what is multiplied and of its result: a softmax may be of higher precision."""
         dtypes = [self.value.dtype, self.output.dtype, getattr(torch, self.shape.dtype)]
-        probabilities = getattr(self.tensors, "probabilities", None)
-        if probabilities is not None:
-            dtypes.append(probabilities.dtype)
+        dtypes += [] if self.multiplied is None else [self.multiplied]
         return str(max(dtypes, key=lambda dtype: torch.finfo(dtype).eps)).removeprefix("torch.")
 
     def product_error(self, rows: Tensor, queries: Positions = slice(None), batch: Positions = slice(None)) -> float:
@@ -193,11 +174,8 @@ class Watcher(Protocol):
     """Is told about every attention call of a watched block, in order.
 
     It may have an attribute `changes`, False where it changes nothing: it is not asked then. It may have a method
-    `passes(shape) -> bool` too, asked when the kernel has run: whether the call is not wanted.
-    It is not told of such a call again, and nothing is made of its tensors. It may have
-    `output_modules`, the projections to which it wants outputs to be followed, and a method
-    `inside(shape, modules, given)`, told before `saw` which modules run, the innermost last, and what each was given,
-    as (args, kwargs).
+    `passes(shape) -> bool` too, asked when the kernel has run: whether the call is not wanted. It is not told of such a
+    call again, and nothing is made of its tensors.
     """
 
     def change(self, shape: CallShape) -> Tensor | None:

@@ -9,8 +9,8 @@ another first row, and in the actions of a policy call that the user can repeat 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -39,6 +39,34 @@ class BatchRowsMixed(BadArgument):
 Given = tuple[tuple[Any, ...], dict[str, Any]]
 
 
+class RunningModules:
+    """The modules of a policy that run, and what they were given, the innermost last."""
+
+    def __init__(self, policy: FoundPolicy) -> None:
+        self._policy = policy
+        self.stack: list[tuple[nn.Module, Given]] = []
+
+    @contextmanager
+    def followed(self) -> Iterator[None]:
+        """Keep track of them within the block."""
+
+        def begins(module: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+            self.stack.append((module, (args, kwargs)))
+
+        def ends(module: nn.Module, *others: Any) -> None:
+            if self.stack and self.stack[-1][0] is module:
+                self.stack.pop()
+
+        with ExitStack() as stack:
+            for module in self._policy.modules.values():
+                for handle in (
+                    module.register_forward_pre_hook(begins, with_kwargs=True),
+                    module.register_forward_hook(ends, always_call=True),
+                ):
+                    stack.callback(handle.remove)
+            yield
+
+
 @dataclass(frozen=True)
 class ModuleCall:
     """The first recorded call of a batch: its shape, a module that makes it, and a copy of what that was given.
@@ -53,11 +81,11 @@ class ModuleCall:
     autocast: tuple[tuple[str, torch.dtype], ...]
 
     @classmethod
-    def of(cls, shape: CallShape, modules: Sequence[nn.Module], given: Sequence[Given]) -> ModuleCall | None:
+    def of(cls, shape: CallShape, running: RunningModules) -> ModuleCall | None:
         """Copy what the innermost running module was given that was given tokens, and nothing that has no copy."""
         devices = (device for device in ("cpu", "cuda") if torch.is_autocast_enabled(device))
         autocast = tuple((device, torch.get_autocast_dtype(device)) for device in devices)
-        for module, arguments in zip(reversed(modules), reversed(given), strict=True):
+        for module, arguments in reversed(running.stack):
             if any(_batch_axis(value, shape.batch) is not None for value in pytree.tree_leaves(arguments)):
                 # A lock, a file, a tensor with gradients have no copy: a module around it may not be given them.
                 with suppress(Exception):

@@ -1,9 +1,8 @@
-"""Tensors of attention calls that are queries, keys and masks: their rows, folded axes, and changes of logits."""
+"""Logits, masks and axes of attention calls, and changes of logits."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +13,6 @@ from vla_attention.capture.torch_policies.attention_calls import (
     CallShape,
     Positions,
     at_positions,
-    position_numbers,
 )
 from vla_attention.schemas.errors import BadArgument
 
@@ -69,60 +67,6 @@ def check_keys_left(before: Tensor, after: Tensor, shape: CallShape) -> None:
 
 #: Where modules keep their number of heads; asked where a kernel gets (batch · head, query, dim).
 _HEAD_NAMES = ("num_heads", "n_heads", "num_attention_heads", "heads", "n_head", "num_head", "nheads", "nhead")
-
-
-@dataclass(frozen=True)
-class LogitTensors:
-    """A call of queries, keys and values; rows are softmax(scale · query · keyᵀ + mask + change) in float32.
-
-    Attributes:
-        query: (batch, head, query, dim).
-        key, values: (batch, kv_head, key, dim).
-        outputs: of the policy's kernel, (batch, head, query, dim).
-        mask: the policy's mask, bool (True: keep) or additive, (batch or 1, head or 1, query or 1, key); None: none.
-        causal: whether query i sees keys 0..i only, beside the mask.
-        scale: factor of the logits.
-        change: logits that a watcher added, broadcastable to (batch, head, query, key).
-    """
-
-    query: Tensor
-    key: Tensor
-    values: Tensor
-    outputs: Tensor
-    mask: Tensor | None
-    causal: bool
-    scale: float
-    change: Tensor | None
-
-    def rows(self, queries: Positions, batch: Positions) -> Tensor:
-        """Return float32 probabilities (batch, head, query, key) of these queries."""
-        logits = query_key_logits(
-            at_positions(at_positions(self.query, 0, batch), 2, queries), at_positions(self.key, 0, batch), self.scale
-        )
-        if self.mask is not None:
-            mask = part(self.mask, queries, batch)
-            logits = logits.masked_fill_(~mask, float("-inf")) if mask.dtype is torch.bool else logits.add_(mask)
-        if self.causal:
-            seen = causal_mask(self._query_numbers(queries), self.key.shape[2])
-            logits.masked_fill_(~seen, float("-inf"))
-        if self.change is not None:
-            logits.add_(part(self.change, queries, batch))
-        return normalised(logits)
-
-    def allowed(self, queries: Positions) -> Tensor:
-        """Return (batch, head or 1, query, key) bool."""
-        batch, keys = self.key.shape[0], self.key.shape[2]
-        numbers = self._query_numbers(queries)
-        seen = torch.ones((batch, 1, len(numbers), keys), dtype=torch.bool, device=self.query.device)
-        if self.mask is not None:
-            mask = part(self.mask, queries, slice(None))
-            seen = seen & (mask if mask.dtype is torch.bool else mask > MASKED_BELOW)
-        if self.causal:
-            seen &= causal_mask(numbers, keys)
-        return seen
-
-    def _query_numbers(self, queries: Positions) -> Tensor:
-        return position_numbers(queries, self.query.shape[2], self.query.device)
 
 
 def query_key_logits(query: Tensor, key: Tensor, scale: float) -> Tensor:

@@ -7,8 +7,8 @@ Run eager, it applies the mask function to every key, whatever the blocks say.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -17,27 +17,32 @@ from torch._higher_order_ops.flex_attention import flex_attention as flex_operat
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from vla_attention.capture.torch_policies.attention_calls import (
+    MASKED_BELOW,
     AttentionCall,
     Positions,
     at_positions,
     position_numbers,
 )
 from vla_attention.capture.torch_policies.call_tensors import (
-    LogitTensors,
     batch_and_heads,
+    causal_mask,
     changed_mask,
     check_keys_left,
     fitted_change,
     normalised,
+    part,
     query_key_logits,
 )
-from vla_attention.capture.torch_policies.watched_block import WatchedBlock
+
+if TYPE_CHECKING:
+    from vla_attention.capture.torch_policies.watch import AttentionMode
 
 SDPA_FUNCTIONS: tuple[Callable[..., Any], ...] = (
     torch.nn.functional.scaled_dot_product_attention,
     torch.ops.aten.scaled_dot_product_attention,
     torch.ops.aten.scaled_dot_product_attention.default,
 )
+FLEX_FUNCTIONS: tuple[Callable[..., Any], ...] = (flex_operator,)
 
 #: Where a call is changed: flash attention, which a policy may have asked for, takes no mask.
 _ANY_KERNEL = [
@@ -58,29 +63,29 @@ class _SdpaArguments:
 
 
 def watch_sdpa(
-    block: WatchedBlock, function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]
+    mode: AttentionMode, function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]
 ) -> Any:
     """Run one call, changed if the watcher says so, and tell the watcher about it."""
     given = _SdpaArguments(*args, **kwargs)
     query, key = given.query, given.key
-    block.refuse_nested(query, key)
+    mode.refuse_nested(query, key)
     dtype = query.dtype
     if torch.is_autocast_enabled(query.device.type):
         dtype = torch.get_autocast_dtype(query.device.type)
-    where = block.where()
+    where = mode.where()
     lead, kernel_queries, dim = _lead(given), query.shape[-2], query.shape[-1]
     keys = key.shape[-2]
     batch, kernel_heads = batch_and_heads(lead, where.module)
     kv_heads = key.shape[-3] if given.enable_gqa and len(lead) >= 2 else kernel_heads
     group = _packed_heads(where.module, query, key)
     heads, queries = kernel_heads * group, kernel_queries // group
-    shape = block.new_shape(where, "sdpa", (batch, heads, kv_heads, queries, keys), dtype)
+    shape = mode.new_shape(where, "sdpa", (batch, heads, kv_heads, queries, keys), dtype)
     mask = None
     if given.attn_mask is not None:
         mask = _folded_mask(given.attn_mask.detach(), lead, batch, kernel_heads)
         if group > 1 and mask.shape[1:3] != (1, 1):
             mask = mask.expand(-1, kernel_heads, kernel_queries, -1).reshape(-1, heads, queries, mask.shape[-1])
-    change = block.change(shape)
+    change = mode.change(shape)
     if change is None:
         output = function(*args, **kwargs)
     else:
@@ -92,19 +97,35 @@ def watch_sdpa(
         options = {"scale": given.scale, "enable_gqa": given.enable_gqa}
         with sdpa_kernel(_ANY_KERNEL):
             output = function(query, key, given.value, logits, given.dropout_p, **options)
-    if block.passes(shape):
+    if mode.passes(shape):
         return output
-    tensors = LogitTensors(
-        query=query.detach().to(dtype).expand(*lead, -1, -1).reshape(batch, heads, queries, dim),
-        key=_folded(key.to(dtype), lead, batch, kv_heads),
-        values=_folded(given.value.to(dtype), lead, batch, kv_heads),
-        outputs=output.detach().reshape(batch, heads, queries, given.value.shape[-1]),
-        mask=mask,
-        causal=given.is_causal,
-        scale=dim**-0.5 if given.scale is None else given.scale,
-        change=change,
-    )
-    block.saw(AttentionCall(shape, tensors))
+    folded_query = query.detach().to(dtype).expand(*lead, -1, -1).reshape(batch, heads, queries, dim)
+    folded_key, values = (
+        _folded(tensor.to(dtype), lead, batch, kv_heads) for tensor in (key, given.value)
+    )  # fmt: skip
+    scale = dim**-0.5 if given.scale is None else given.scale
+
+    def rows_of(wanted: Positions, rows: Positions) -> Tensor:
+        chosen = at_positions(at_positions(folded_query, 0, rows), 2, wanted)
+        logits = query_key_logits(chosen, at_positions(folded_key, 0, rows), scale)
+        if mask is not None:
+            seen = part(mask, wanted, rows)
+            logits = logits.masked_fill_(~seen, float("-inf")) if seen.dtype is torch.bool else logits.add_(seen)
+        if given.is_causal:
+            numbers = position_numbers(wanted, queries, logits.device)
+            logits.masked_fill_(~causal_mask(numbers, keys), float("-inf"))
+        return normalised(logits if change is None else logits.add_(part(change, wanted, rows)))
+
+    def allowed_of(wanted: Positions) -> Tensor:
+        numbers = position_numbers(wanted, queries, query.device)
+        seen = torch.ones((batch, 1, len(numbers), keys), dtype=torch.bool, device=query.device)
+        if mask is not None:
+            chosen = part(mask, wanted, slice(None))
+            seen = seen & (chosen if chosen.dtype is torch.bool else chosen > MASKED_BELOW)
+        return seen & causal_mask(numbers, keys) if given.is_causal else seen
+
+    folded = output.detach().reshape(batch, heads, queries, given.value.shape[-1])
+    mode.saw(AttentionCall(shape, values, folded, rows_of, allowed_of, lambda mixed: mixed.reshape(output.shape)))
     return output
 
 
@@ -148,122 +169,73 @@ def _packed_heads(module: nn.Module | None, query: Tensor, key: Tensor) -> int:
     return group if query.shape[2] == group and query.shape[1] * group == heads else 1
 
 
-FLEX_FUNCTIONS: tuple[Callable[..., Any], ...] = (flex_operator,)
-
-
-@dataclass(frozen=True)
-class FlexTensors:
-    """The tensors of one call; see `LogitTensors`.
-
-    Attributes:
-        query: (batch, head, query, dim).
-        key, values: (batch or 1, kv_head, key, dim).
-        outputs: (batch, head, query, dim).
-        scale: factor of the logits.
-        score: score function (score, batch, head, query, key) -> score; further arguments: `score_buffers`.
-        mask: mask function (batch, head, query, key) -> bool; further arguments: `mask_buffers`.
-        change: logits that a watcher added.
-    """
-
-    query: Tensor
-    key: Tensor
-    values: Tensor
-    outputs: Tensor
-    scale: float
-    score: Callable[..., Tensor]
-    mask: Callable[..., Tensor]
-    score_buffers: tuple[Any, ...]
-    mask_buffers: tuple[Any, ...]
-    change: Tensor | None = None
-
-    def rows(self, queries: Positions, batch: Positions) -> Tensor:
-        """Return float32 probabilities (batch, head, query, key) of these queries."""
-        return normalised(self.logits(queries, batch))
-
-    def logits(self, queries: Positions, batch: Positions) -> Tensor:
-        """Return masked logits of these queries, -inf where masked."""
-        numbers = position_numbers(queries, self.query.shape[2], self.query.device)
-        batches = position_numbers(batch, self.query.shape[0], self.query.device)
-        query = at_positions(at_positions(self.query, 0, batch), 2, queries)
-        logits = query_key_logits(query, at_positions(self.key, 0, batch), self.scale)
-        places = self._places(batches, numbers)
-        logits = _over_places(self.score, True)(logits, *places, *self.score_buffers)
-        if self.change is not None:
-            change = at_positions(self.change, 0, batch) if self.change.shape[0] > 1 else self.change
-            logits = logits + (at_positions(change, 2, queries) if change.shape[2] > 1 else change)
-        return logits.masked_fill(~_over_places(self.mask, False)(*places, *self.mask_buffers), float("-inf"))
-
-    def allowed(self, queries: Positions) -> Tensor:
-        """Return (batch, head, query, key) bool."""
-        numbers = position_numbers(queries, self.query.shape[2], self.query.device)
-        batches = torch.arange(self.query.shape[0], device=self.query.device)
-        places = self._places(batches, numbers)
-        full = (len(batches), self.query.shape[1], len(numbers), self.key.shape[2])
-        return _over_places(self.mask, False)(*places, *self.mask_buffers).expand(full)
-
-    def _places(self, batches: Tensor, queries: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        device = self.query.device
-        heads, keys = torch.arange(self.query.shape[1], device=device), torch.arange(self.key.shape[2], device=device)
-        return batches, heads, queries, keys
-
-
 def watch_flex(
-    block: WatchedBlock, function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]
+    mode: AttentionMode, function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]
 ) -> Any:
     """Run one call, changed if the watcher says so, and tell the watcher about it."""
     names = ("query", "key", "value", "score_mod", "block_mask", "scale", "kernel_options")
-    given = {"score_mod_other_buffers": (), "mask_mod_other_buffers": ()} | dict(
-        zip((*names, "score_mod_other_buffers", "mask_mod_other_buffers"), args, strict=False)
-    )
-    given.update(kwargs)
+    buffers = ("score_mod_other_buffers", "mask_mod_other_buffers")
+    given: dict[str, Any] = {
+        **dict.fromkeys(buffers, ()),
+        **dict(zip((*names, *buffers), args, strict=False)),
+        **kwargs,
+    }
     query, key, value = (given[name] for name in names[:3])
-    block.refuse_nested(query, key)
+    mode.refuse_nested(query, key)
     batch, heads, queries, _ = query.shape
-    shape = block.new_shape(
-        block.where(), "flex", (batch, heads, key.shape[1], queries, key.shape[2]), query.dtype
-    )  # fmt: skip
+    keys = key.shape[2]
+    shape = mode.new_shape(mode.where(), "flex", (batch, heads, key.shape[1], queries, keys), query.dtype)
     score: Callable[..., Tensor] = given["score_mod"] or (lambda score, *_: score)
-    tensors = FlexTensors(
-        query=query.detach(),
-        key=key.detach().expand(batch, -1, -1, -1),
-        values=value.detach().expand(batch, -1, -1, -1),
-        outputs=query.new_empty(0),
-        scale=given["scale"],
-        score=score,
-        mask=given["block_mask"][-1],
-        score_buffers=tuple(given["score_mod_other_buffers"]),
-        mask_buffers=tuple(given["mask_mod_other_buffers"]),
-    )
-    change = block.change(shape)
-    if change is not None:
-        change = fitted_change(change, shape, query.device)
-        changed = replace(tensors, change=change)
-        check_keys_left(tensors.logits(slice(None), slice(None)), changed.logits(slice(None), slice(None)), shape)
-        tensors = changed
-        full = change.expand(batch, heads, queries, key.shape[2])
+    kept_query, kept_key, kept_value = (tensor.detach().expand(batch, -1, -1, -1) for tensor in (query, key, value))
 
-        def changed_score(scores: Tensor, b: Tensor, h: Tensor, q: Tensor, k: Tensor, *buffers: Any) -> Tensor:
-            return score(scores, b, h, q, k, *buffers) + full[b, h, q, k]
+    def allowed_of(wanted: Positions, rows: Positions = slice(None)) -> Tensor:
+        numbers = position_numbers(rows, batch, query.device), position_numbers(wanted, queries, query.device)
+        places = _places(*numbers, heads, keys)
+        seen = _over_places(given["block_mask"][-1], ())(*places, *given[buffers[1]])
+        return seen.expand([len(place) for place in places])
+
+    def logits_of(wanted: Positions, rows: Positions) -> Tensor:
+        chosen = at_positions(at_positions(kept_query, 0, rows), 2, wanted)
+        logits = query_key_logits(chosen, at_positions(kept_key, 0, rows), given["scale"])
+        numbers = position_numbers(rows, batch, query.device), position_numbers(wanted, queries, query.device)
+        logits = _over_places(score, (0,))(logits, *_places(*numbers, heads, keys), *given[buffers[0]])
+        return logits.masked_fill(~allowed_of(wanted, rows), float("-inf"))
+
+    change = mode.change(shape)
+    if change is None:
+        result = function(*args, **kwargs)
+    else:
+        change = fitted_change(change, shape, query.device)
+        before = logits_of(slice(None), slice(None))
+        check_keys_left(before, before + change, shape)
+        full = change.expand(batch, heads, queries, keys)
+
+        def changed_score(scores: Tensor, b: Tensor, h: Tensor, q: Tensor, k: Tensor, *others: Any) -> Tensor:
+            return score(scores, b, h, q, k, *others) + full[b, h, q, k]
 
         result = function(**{**given, "score_mod": changed_score})
-    else:
-        result = function(*args, **kwargs)
-    if not block.passes(shape):
-        block.saw(AttentionCall(shape, replace(tensors, outputs=result[0].detach())))
+    if not mode.passes(shape):
+
+        def rows_of(wanted: Positions, rows: Positions) -> Tensor:
+            logits = logits_of(wanted, rows)
+            return normalised(logits if change is None else logits + part(change, wanted, rows))
+
+        mode.saw(AttentionCall(shape, kept_value, result[0].detach(), rows_of, allowed_of, lambda mixed: mixed))
     return result
 
 
-def _over_places(function: Callable[..., Tensor], with_score: bool) -> Callable[..., Tensor]:
+def _places(batches: Tensor, queries: Tensor, heads: int, keys: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    device = queries.device
+    return batches, torch.arange(heads, device=device), queries, torch.arange(keys, device=device)
+
+
+def _over_places(function: Callable[..., Tensor], score_axes: tuple[int, ...]) -> Callable[..., Tensor]:
     """Apply a score or mask function of single places to all of (batch, head, query, key) at once."""
 
     def broadcast(*arguments: Any) -> Tensor:
-        first, rest = (arguments[:1], arguments[1:]) if with_score else ((), arguments)
-        places, buffers = rest[:4], rest[4:]
-        mapped = function
-        score_dims: tuple[int | None, ...] = (0,) if with_score else ()
+        mapped, others = function, (None,) * (len(arguments) - len(score_axes) - 4)
         for axis in (3, 2, 1, 0):
-            dims: tuple[int | None, ...] = tuple(0 if number == axis else None for number in range(4))
-            mapped = torch.vmap(mapped, in_dims=(*score_dims, *dims, *(None for _ in buffers)))
-        return mapped(*first, *places, *buffers)
+            mapped = torch.vmap(mapped, (*score_axes, *(0 if place == axis else None for place in range(4)), *others))
+        return mapped(*arguments)
 
     return broadcast

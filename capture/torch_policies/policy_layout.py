@@ -113,7 +113,7 @@ class CallRule(Document, frozen=True):
 
 
 class RecordedSite(Document, frozen=True):
-    r"""One family of softmaxes: its keys, its action queries, and where contributions go.
+    r"""One family of softmaxes: its keys and its action queries.
 
     Attributes:
         keys: the spans, with grids; also the blocks (`layers`) that have the site, when others do not.
@@ -122,8 +122,6 @@ class RecordedSite(Document, frozen=True):
         role_of_span: span -> role of its keys ("image", "instruction", "state", "action" ...), one that keys of its
             kind can have. Keys of the prompt get finer roles where token ids are known; keys that no action query may
             see become `masked_image` in image spans, `padding` in text, and `absent` in others.
-        projection: path of the output projection with ``{block}`` for the block's number, for contributions; None where
-            there is none. What the policy does before and behind it (gates, norms) is seen as it runs.
         variable_span: the span that may have fewer keys in a call than in `keys` (a prompt without padding). Its keys
             come first in the span, the rest is absent at this replan.
     """
@@ -131,7 +129,6 @@ class RecordedSite(Document, frozen=True):
     keys: SiteLayout
     action_queries: tuple[int, int | None]
     role_of_span: dict[str, str]
-    projection: str | None = None
     variable_span: str | None = None
 
     def __post_init__(self) -> None:

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import types
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
-from vla_attention.capture.torch_policies.attention_calls import CallShape
-from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
-from vla_attention.capture.torch_policies.tensor_functions import tensors_among
 from vla_attention.capture.torch_policies.unseen_attention import refuse_unseen_settings
-from vla_attention.schemas.errors import BadArgument, did_you_mean, unknown_name
+from vla_attention.schemas.errors import BadArgument, unknown_name
 
 #: How deep modules are looked for in objects that are no modules.
 DEPTH = 4
@@ -41,17 +38,10 @@ class FoundPolicy:
     Attributes:
         policy: what was given.
         modules: by path, see `modules_of`.
-        attending: those in whose own forward attention can run.
-        simple: the others that have a forward: torch's modules without children, such as `nn.Linear`.
-        softmaxes: filled by blocks that look at every function: what a softmax by hand turned out to be, if all that
-            looked alike were attention of one shape, and None if not; see `WatchedBlock.expected`.
     """
 
     policy: object
     modules: Mapping[str, nn.Module]
-    attending: tuple[nn.Module, ...]
-    simple: tuple[nn.Module, ...]
-    softmaxes: dict[CallShape, CallShape | None] = field(default_factory=dict)
 
 
 def find_policy(policy: object) -> FoundPolicy:
@@ -65,14 +55,7 @@ def find_policy(policy: object) -> FoundPolicy:
         return policy
     modules = modules_of(policy)
     refuse_unseen_settings(modules)
-    running = [module for module in modules.values() if type(module).forward is not nn.Module.forward]
-    attending = tuple(module for module in running if _may_attend(module))
-    return FoundPolicy(policy, modules, attending, tuple(module for module in running if not _may_attend(module)))
-
-
-def _may_attend(module: nn.Module) -> bool:
-    """Whether attention can run in a module's own forward: not in torch's modules without children."""
-    return bool(module._modules) or not type(module).__module__.startswith("torch.nn.")
+    return FoundPolicy(policy, modules)
 
 
 def modules_of(policy: object) -> dict[str, nn.Module]:
@@ -191,65 +174,3 @@ def root_modules(policy: object) -> dict[str, nn.Module]:
             roots[path] = module
             inside.update(id(part) for part in module.modules())
     return roots
-
-
-@dataclass(frozen=True)
-class OutputProjection:
-    """The output projection of a block, by its module and path."""
-
-    module: nn.Module
-    path: str
-
-    def __call__(self, mixed: Tensor) -> Tensor:
-        """Map mixed values (..., head · dim) float32 to (..., width), without a bias: no key gives it."""
-        if (linear := self._linear) is not None:
-            return nn.functional.linear(mixed, linear.weight.to(mixed.dtype))
-        flat = mixed.flatten(0, -2)
-        both = self._called(torch.cat([flat, torch.zeros_like(flat[:1])]))
-        return (both[:-1] - both[-1:]).view(*mixed.shape[:-1], -1)
-
-    def bias(self, mixed: Tensor) -> Tensor:
-        """Return what it gives for zeros, (width,) float32; mixed: values of the size that it takes."""
-        if (linear := self._linear) is not None:
-            zeros = linear.weight.new_zeros(len(linear.weight), dtype=torch.float32)
-            return zeros if linear.bias is None else linear.bias.float()
-        return self._called(torch.zeros_like(mixed.flatten(0, -2)[:1]))[0]
-
-    @property
-    def _linear(self) -> nn.Linear | None:
-        module = self.module
-        if isinstance(module, nn.Linear) and type(module).forward is nn.Linear.forward:
-            plain = type(module.weight) in (Tensor, nn.Parameter) and not module.weight.is_meta
-            return module if plain and module.weight.is_floating_point() else None
-        return None
-
-    def _called(self, mixed: Tensor) -> Tensor:
-        # Quantised or offloaded weights, adapters: the module itself.
-        weights = (weight.dtype for weight in self.module.parameters() if weight.is_floating_point())
-        result = self.module(mixed.to(next(weights, mixed.dtype)))
-        return next(tensors_among((result,))).float()
-
-
-def projections_of(
-    policy: object, layout: PolicyLayout, layers: tuple[int, ...]
-) -> dict[tuple[str, int], OutputProjection]:
-    """Return (site, block) -> the output projection of a block, for the recorded layers."""
-    modules = modules_of(policy)
-    projections = {}
-    for site in layout.sites:
-        if site.projection is None:
-            raise BadArgument(
-                f"Contributions need the output projection of site '{site.name}', and the layout '{layout.name}' names "
-                "none: record with contributions=False."
-            )
-        for block in site.keys.layers or range(layout.num_layers):
-            if block not in layers:
-                continue
-            path = site.projection.replace("{block}", str(block))
-            if path not in modules:
-                raise BadArgument(
-                    f"The output projection '{path}' of site '{site.name}' is no module of the policy."
-                    f"{did_you_mean(path, modules)} Change RecordedSite.projection, or record with contributions=False."
-                )
-            projections[site.name, block] = OutputProjection(modules[path], path)
-    return projections

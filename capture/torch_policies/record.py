@@ -24,7 +24,6 @@ from vla_attention.capture.torch_policies.policy_layout import (
     RecordedSite,
     check_versions,
 )
-from vla_attention.capture.torch_policies.policy_modules import projections_of
 from vla_attention.capture.torch_policies.policy_weights import device_and_dtype, policy_digest
 from vla_attention.capture.torch_policies.prompts import TokenText
 from vla_attention.capture.torch_policies.repeated_calls import effects_of_layout
@@ -60,7 +59,7 @@ def record(
     heads: Sequence[int] | None = None,
     queries: Literal["mean", "all"] = "mean",
     bits: int = 10,
-    contributions: bool | None = None,
+    contributions: bool = True,
     frames: bool = True,
     effects: str | EffectSettings | None = None,
     interventions: Interventions | None = None,
@@ -96,9 +95,8 @@ def record(
         layers, denoise_steps, heads: what is recorded; None is everything. `first`, `last` and `all` are denoise steps.
         queries: `mean` over the action queries, or `all` of them.
         bits: precision of the stored rows in mantissa bits; 23 is exact.
-        contributions: also what each part of the keys adds to the residual stream, gates and norms included; None:
-            where the layout names projections and the first policy call shows it (docs/your-policy.md,
-            "Contributions").
+        contributions: also what each part of the keys adds to the residual stream, gates and norms included
+            (docs/your-policy.md, "Contributions"). It is an error at a policy call that does not show it.
         frames: store the pictures that replans are given.
         effects: what is taken away from each call, one at a time, to see how the action changes: `text`, `cameras`,
             `objects`, `tokens`, with commas between, or `EffectSettings`. Each replan then needs `repeat`
@@ -118,7 +116,7 @@ def record(
         RunMismatch: `resume` with other settings than those of the store.
         LayoutForAnotherVersion: the layout was written for other libraries than those that are installed.
         BatchRowsMixed: a change of one row of the batch of `own_setting` changes the actions of another.
-        BadArgument: a number of a layer, head or denoise step does not exist; a projection is no module.
+        BadArgument: a number of a layer, head or denoise step does not exist.
     """
     if resume and overwrite:
         raise BadArgument("Give resume=True or overwrite=True, not both.")
@@ -126,9 +124,6 @@ def record(
     other = check_versions(layout, installed)
     if other is not None and not any_version:
         raise LayoutForAnotherVersion(other)
-    undecided = contributions is None
-    if contributions is None:
-        contributions = all(site.projection is not None for site in layout.sites)
     settings = RecordingSettings(
         layers=None if layers is None else tuple(layers),
         denoise_steps=(denoise_steps,) if isinstance(denoise_steps, (int, str)) else tuple(denoise_steps),
@@ -146,7 +141,6 @@ def record(
         refuse_both(changes)
         recording = replace(recording, effects=planned)
     device, dtype = device_and_dtype(policy)
-    projections = projections_of(policy, layout, recording.layers) if recording.contributions else {}
     facts = describe_machine(device)
     facts |= {library: version for library, version in installed.items() if version is not None}
     facts |= {"layout for another version": other} if other is not None else {}
@@ -180,8 +174,6 @@ def record(
         "resume" if resume else "overwrite" if overwrite else "new",
         allow_empty=allow_empty,
         tokenizer=None if tokenizer is None else TokenText(tokenizer),
-        projections=projections,
-        undecided=undecided and recording.contributions,
         durable=durable,
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -16,8 +16,8 @@ from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.recording.finite_numbers import all_finite, not_finite
 from vla_attention.capture.store.replan_records import RecordedRows, ReplanRecord
 from vla_attention.capture.torch_policies.attention_calls import CallShape
-from vla_attention.capture.torch_policies.batch_rows import BatchRowsMixed, rows_of_module_apart
-from vla_attention.capture.torch_policies.call_order import CallPlace, CallsDoNotFit
+from vla_attention.capture.torch_policies.batch_rows import BatchRowsMixed, RunningModules, rows_of_module_apart
+from vla_attention.capture.torch_policies.call_order import CallPlace
 from vla_attention.capture.torch_policies.call_state import CallState
 from vla_attention.capture.torch_policies.knockouts import CallBias
 from vla_attention.capture.torch_policies.policy_layout import RecordedSite
@@ -32,11 +32,6 @@ from vla_attention.schemas.layout import Prompt
 if TYPE_CHECKING:
     from vla_attention.capture.torch_policies.recorded_episodes import Episode
     from vla_attention.capture.torch_policies.session import RecordedRun
-
-_BY_NAMES = (
-    "This policy call was watched at the names of torch's attention functions only, since all attention of an earlier "
-    "one was called by them. If it is called otherwise here, record again with run.every_function = True."
-)
 
 #: Where it is not known.
 NO_STATE = np.zeros(0)
@@ -87,16 +82,15 @@ class WatchedCall:
             run.attributes.recording,
             batch,
             [one.row for one in rows],
-            run._projections,
             self._text.early_roles,
             self._bias if run.attributes.interventions.changes_attention else None,
             self._where,
         )
-        self.recorder.keeps_module = batch > 1 and not run._asked_of_batch
+        if batch > 1 and not run._asked_of_batch:
+            self.recorder.running = RunningModules(run._found)
         self._present = self._text.present = self.recorder.order.present
         self._biases: dict[int, CallBias | None] = {}
         self._before = self._state_before(rows[0])
-        self._every_function = run.every_function or run._names_unknown
 
     def _state_before(self, one: RowOfCall) -> CallState | None:
         """Return the state before a policy call whose effects are measured; None where they are not."""
@@ -114,11 +108,13 @@ class WatchedCall:
     @contextmanager
     def watched(self) -> Iterator[None]:
         """Watch the call that is made within the block."""
-        seen = watch_attention(self._run._found, self.recorder, every_function=self._every_function)
-        with self._ids.watched(), seen as functions:
+        running = self.recorder.running
+        with (
+            self._ids.watched(),
+            nullcontext() if running is None else running.followed(),
+            watch_attention(self._run._found, self.recorder),
+        ):
             yield
-        if self.recorder.saw_attention:
-            self._run._names_unknown = not functions.by_names
 
     def finish(self) -> list[dict[str, SiteRows]]:
         """Return what the sites gave for each row, once the call has ended; errors as `ReplanRecorder.finish`.
@@ -126,14 +122,8 @@ class WatchedCall:
         Raises:
             BatchRowsMixed: the rows of the batch are not those of the environments.
         """
-        try:
-            rows_of_sites = self.recorder.finish()
-        except CallsDoNotFit as error:
-            # Where there were fewer tokens, nothing was called otherwise.
-            if self._every_function or self.recorder.order.fewer_tokens:
-                raise
-            raise CallsDoNotFit(f"{error}\n{_BY_NAMES}") from None
-        if self.recorder.keeps_module:
+        rows_of_sites = self.recorder.finish()
+        if self.recorder.running is not None:
             self._check_batch()
         return rows_of_sites
 
@@ -142,7 +132,7 @@ class WatchedCall:
         run, batch, call = self._run, self.recorder.batch, self.recorder.module_call
         run._asked_of_batch, contributions = True, run.attributes.recording.contributions
         if contributions and self.recorder.contributions.unknown() is None:
-            return  # the output projections were given the rows in the order of the batch
+            return  # what each row adds is seen at its own tokens
         apart = None if call is None else rows_of_module_apart(run._found, call)
         if apart is None:
             run._of_batch = (
@@ -212,8 +202,7 @@ class WatchedCall:
         others = [site for site in run.layout.sites if site.name not in given.key_role]
         key_role = self._roles(one.row, others, given.prompt) | dict(given.key_role)
         given = replace(cast(CallInput, given), key_role=key_role, call=repeat.given)
-        every_function = run.every_function or run._names_unknown
-        run._repeats.take(CallToRepeat(repeat, given, before, actions, self._present, every_function, one.where))
+        run._repeats.take(CallToRepeat(repeat, given, before, actions, self._present, one.where))
         return replace(call, policy_input=given)
 
     def _bias(self, row: int, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:

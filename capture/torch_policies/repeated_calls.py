@@ -23,12 +23,12 @@ from vla_attention.capture.interventions.changed_inputs import GREY
 from vla_attention.capture.interventions.factors import SiteEdit, SiteEditor
 from vla_attention.capture.policies.noise import noise_seed
 from vla_attention.capture.policies.policy import CallVariant, GivenInputs, Policy, PolicyInput, VariantMemory
-from vla_attention.capture.torch_policies.added_updates import OutputWay
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
 from vla_attention.capture.torch_policies.call_order import CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.call_state import CallState
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.knockouts import CallBias
+from vla_attention.capture.torch_policies.output_ways import OutputWay
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
 from vla_attention.capture.torch_policies.policy_modules import FoundPolicy
 from vla_attention.capture.torch_policies.replan_inputs import Repeat, RepeatedCall, read_actions
@@ -99,7 +99,7 @@ class CallToRepeat:
     """What is known of a recorded call that is to be repeated.
 
     before: the state before it. actions: (horizon, action dim). present: site -> (key,) bool, the keys that its calls
-    had. every_function: see `watch_attention`. where: the replan, in words.
+    had. where: the replan, in words.
     """
 
     repeat: Repeat
@@ -107,7 +107,6 @@ class CallToRepeat:
     before: CallState
     actions: NDArray[np.float64]
     present: Mapping[str, NDArray[np.bool_]]
-    every_function: bool
     where: str
 
 
@@ -250,7 +249,7 @@ class RepeatedPolicy:
         edits = {site: cast(SiteEditor, editor).edits for site, editor in variant.editors.items()}
         bias = CallBias(self._known.layout, edits, call.present) if edits or self._masks else None
         watcher = RepeatWatcher(self._known, self._identity.name, self._recording, bias)
-        with watch_attention(self._found, watcher, every_function=call.every_function):
+        with watch_attention(self._found, watcher):
             result = call.repeat.call(given) if call.repeat.takes_call else call.repeat.call()
         if not watcher.saw_attention:
             raise NotRepeated(
@@ -295,7 +294,7 @@ class RepeatWatcher(ReplanRecorder):
     """
 
     def __init__(self, known: KnownCalls, policy: str, recording: Recording, bias: CallBias | None) -> None:
-        super().__init__(known, policy, recording, 1, [0], {}, _no_roles, bias)
+        super().__init__(known, policy, recording, 1, [0], _no_roles, bias)
         self.seen: dict[str, NDArray[np.bool_]] = {}
 
     def change(self, shape: CallShape) -> Tensor | None:

@@ -6,7 +6,7 @@ the output took, and the parts have to add up to what was added.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,31 +14,27 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vla_attention.capture.recording.contributions import gram_matrix, keys_of_parts, part_values
-from vla_attention.capture.torch_policies.added_updates import AddedUpdate, OutputWay, multiplied
+from vla_attention.capture.recording.contributions import keys_of_parts, part_values
 from vla_attention.capture.torch_policies.attention_calls import TOLERANCE, AttentionCall
 from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace
-from vla_attention.capture.torch_policies.followed_outputs import difference
+from vla_attention.capture.torch_policies.output_ways import NotReplayed, OutputWay, Replay
 from vla_attention.capture.torch_policies.policy_layout import RecordedSite
-from vla_attention.capture.torch_policies.policy_modules import OutputProjection
 from vla_attention.schemas.segments import segment_members, segments_of
 
 #: Row of the batch, site -> the role codes of its keys (key,), before masks are known.
 EarlyRoles = Callable[[int, RecordedSite, NDArray[np.bool_]], NDArray[np.uint8]]
 Cell = tuple[int, int]
+#: Largest distance from a whole number of what tells the rows of a batch apart.
+_MIXED = 0.05
 
 
 @dataclass
 class _SiteParts:
-    """Of one site. roles, parts: by row of the batch. grams: by (block, denoise step, row), (part, part).
-
-    between: what stands between the attention and the residual stream, beside the output projection.
-    """
+    """Of one site. roles, members: by row of the batch, (key,) and (key, part). ways: of the calls of each cell."""
 
     roles: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
-    parts: dict[int, list[slice | Tensor]] = field(default_factory=dict)
-    grams: dict[tuple[int, int, int], list[Tensor]] = field(default_factory=dict)
-    between: set[str] = field(default_factory=set)
+    members: dict[int, NDArray[np.bool_]] = field(default_factory=dict)
+    ways: dict[Cell, list[OutputWay]] = field(default_factory=dict)
 
 
 class ReplanContributions:
@@ -47,25 +43,13 @@ class ReplanContributions:
     Args:
         order: the calls of the replan.
         rows: the rows of the batch that are recorded.
-        projections: (site, block) -> the block's output projection.
         early_roles: the roles of keys before the masks are known.
     """
 
-    def __init__(
-        self,
-        order: CallOrder,
-        rows: Sequence[int],
-        projections: Mapping[tuple[str, int], OutputProjection],
-        early_roles: EarlyRoles,
-    ) -> None:
-        self._order = order
-        self._rows = rows
-        self._projections = projections
-        self._early_roles = early_roles
+    def __init__(self, order: CallOrder, rows: Sequence[int], early_roles: EarlyRoles) -> None:
+        self._order, self._rows, self._early_roles = order, rows, early_roles
         self._sites = {site.name: _SiteParts() for site in order.layout.sites}
-        #: Outputs that were not added to the residual stream yet, and of which call they are.
-        self._on_the_way: dict[OutputWay, CallPlace] = {}
-        self._unknown: list[str] = []
+        self._places: list[tuple[CallPlace, OutputWay]] = []
 
     def roles_of(self, site: str, row: int) -> NDArray[np.uint8] | None:
         """Return the roles (key,) for which contributions were made; None without any."""
@@ -73,98 +57,85 @@ class ReplanContributions:
 
     def grams(self, site: str, cells: Sequence[Cell], row: int) -> NDArray[np.float32]:
         """Return the Gram matrices (cell, part + 1, part + 1) of a row; of several calls of a cell their mean."""
-        grams_of_site = self._sites[site].grams
-        grams: NDArray[np.float32] = (
-            torch.stack([torch.stack(grams_of_site[*cell, row]).mean(dim=0) for cell in cells]).cpu().numpy()
-        )
+        ways, place = self._sites[site].ways, self._rows.index(row)
+        each = [torch.stack([way.result()[place] for way in ways[cell]]).mean(dim=0) for cell in cells]
+        grams: NDArray[np.float32] = torch.stack(each).cpu().numpy()
         return grams
 
     def way(
-        self,
-        call: AttentionCall,
-        rows: Tensor,
-        keys: Tensor | None,
-        place: CallPlace,
-        site: RecordedSite,
-        cell: tuple[int, int],
-    ) -> OutputWay:
-        """Keep the mixed values of each part of the keys until the call's output is added to the residual stream."""
-        site_parts, project = self._sites[site.name], self._projections[site.name, place.block]
-        values = call.value if keys is None else spread(call.value, keys, site.keys.num_keys, axis=2)
-        mixed = {}
+        self, call: AttentionCall, rows: Tensor, keys: NDArray[np.int64] | None, place: CallPlace, site: RecordedSite,
+        cell: Cell,
+    ) -> OutputWay:  # fmt: skip
+        """Follow the output of a call. rows: (batch, head, query, key) of its keys, which are the site's `keys`."""
+        of_site = self._sites[site.name]
+        mixed = []
         for row in self._rows:
-            if row not in site_parts.roles:
-                site_parts.roles[row] = roles = self._early_roles(row, site, self._order.present[site.name])
-                members = segment_members(site.keys, roles[None], segments_of(site.keys, roles))[0]
-                site_parts.parts[row] = keys_of_parts(members, rows.device)
-            mixed[row] = part_values(rows[row], values[row], site_parts.parts[row])
-
-        def take(update: AddedUpdate | None) -> None:
-            if update is None:
-                self._unknown.append(f"{_where(place)} {way.describe_loss()}")
-                return
-            del self._on_the_way[way]
-            self._take(update, mixed, project, place, cell)
-
-        itself = call.shape.kind == "multihead"
-        way = OutputWay(project.module, project.path, call.output, place.queries, itself, take)
-        self._on_the_way[way] = place
+            if row not in of_site.roles:
+                of_site.roles[row] = roles = self._early_roles(row, site, self._order.present[site.name])
+                of_site.members[row] = segment_members(site.keys, roles[None], segments_of(site.keys, roles))[0]
+            members = of_site.members[row] if keys is None else of_site.members[row][keys]
+            parts = keys_of_parts(members, rows.device)
+            values = part_values(rows[row], call.value[row], parts)
+            values = values.view(*values.shape[:2], rows.shape[1], -1)
+            mixed.append(values.permute(1, 2, 0, 3))  # (part, head, query, dim)
+        precision = TOLERANCE.get(call.precision, TOLERANCE["float32"]), call.precision
+        way = OutputWay(lambda replay, added: self._added(call, mixed, place.queries, replay, added, precision))
+        of_site.ways.setdefault(cell, []).append(way)
+        self._places.append((place, way))
         return way
 
-    def _take(
-        self,
-        update: AddedUpdate,
-        mixed: Mapping[int, Tensor],
-        project: OutputProjection,
-        place: CallPlace,
-        cell: tuple[int, int],
-    ) -> None:
-        """Make the Gram matrices of what was added; mixed: row -> (query, part, head · dim)."""
-        site_parts, mismatches = self._sites[place.site or ""], [update.mismatch]
-        for row, mixed_parts in mixed.items():
-            # The last one is the whole output.
-            every = torch.cat([mixed_parts, update.mixed[row][:, None]], dim=1)
-            projected = project(multiplied(every, update.before, row))
-            mismatches.append(difference(projected[:, -1] + project.bias(every), update.projected[row]))
-            vectors = multiplied(projected, update.behind, row)
-            mismatches.append(difference(vectors[:, :-1].sum(dim=1), vectors[:, -1]))
-            gram = gram_matrix(vectors[:, :-1], vectors[:, -1])
-            site_parts.grams.setdefault((*cell, row), []).append(gram)
-        for factors, where in ((update.before, "before"), (update.behind, "behind")):
-            if factors is not None:
-                site_parts.between.add(f"factors {where} the projection")
-        mismatch, most = float(torch.stack(mismatches).max()), TOLERANCE.get(update.precision, TOLERANCE["float32"])
-        if not mismatch <= most:
-            self._unknown.append(
-                f"{_where(place)} the parts of the keys add up to something that differs from what was added by "
-                f"{mismatch:.2g} of its largest number (allowed is {most:g} for {update.precision}): the output "
-                f"projection '{project.path}' is not linear, or something changes numbers that is no function of torch"
+    def _added(
+        self, call: AttentionCall, mixed: Sequence[Tensor], queries: slice, replay: Replay, added: Tensor,
+        precision: tuple[float, str],
+    ) -> tuple[list[Tensor], bool]:  # fmt: skip
+        """Return the Gram matrix of each recorded row, and whether the action queries are in what was added.
+
+        mixed: of each row, (part, head, query, dim). added: what the policy added.
+        """
+        shape, most = call.shape, max(len(parts) for parts in mixed)
+        # The last one is nothing: what is added whatever the attention gives. The last but one tells rows apart.
+        given = mixed[0].new_zeros(most + 2, shape.batch, shape.heads, shape.queries, mixed[0].shape[-1])
+        for number, (row, parts) in enumerate(zip(self._rows, mixed, strict=True), start=1):
+            given[: len(parts), row, :, queries] = parts
+            given[most, row, :, queries] = number * parts.sum(dim=0)
+        if len(mixed) == 1:
+            given = torch.cat([given[:most], given[-1:]])
+        given = torch.vmap(lambda output: replay(call.laid_out(output)))(given).flatten(1, -2)
+        each = given[:most] - given[-1]
+        total = each.sum(dim=0)
+        places = total.abs().amax(dim=-1) > 0
+        each, total = each[:, places], total[places]
+        theirs = added.float().flatten(0, -2)[places]
+        scale = theirs.abs().amax() if theirs.numel() else theirs.new_ones(())
+        mismatch = float((total + given[-1, places] - theirs).abs().amax() / scale) if theirs.numel() else 0.0
+        if not mismatch <= precision[0]:
+            raise NotReplayed(
+                f"the parts of the keys add up to something that differs from what was added by {mismatch:.2g} of its "
+                f"largest number (allowed is {precision[0]:g} for {precision[1]}): what is done with the attention's "
+                "output is not linear, or something changes numbers that is no function of torch"
             )
+        owners = torch.ones(len(total), device=total.device)
+        if len(mixed) > 1:
+            owners = ((given[most, places] - given[-1, places]) * total).sum(-1) / total.square().sum(-1)
+            if float((owners - owners.round()).abs().amax()) > _MIXED:
+                raise NotReplayed("what is added to one row of the batch comes from several of them")
+        count, grams = len(range(*queries.indices(shape.queries))), []
+        for number, parts in enumerate(mixed, start=1):
+            of_row = owners.round() == number
+            vectors = torch.cat([each[: len(parts), of_row], total[None, of_row]]).flatten(1)
+            grams.append(vectors @ vectors.T / count)
+        return grams, bool(places.any()) or not any(bool(parts.any()) for parts in mixed)
 
     def unknown(self) -> str | None:
         """Say why it is not known what the parts of the keys add to the residual stream; None if it is known."""
-        if self._unknown:
-            return self._unknown[0]
-        return next((f"{_where(place)} {way.describe_loss()}" for way, place in self._on_the_way.items()), None)
-
-    def describe(self) -> str:
-        """Say what stands between the attention and the residual stream, beside the output projections."""
-        between_of_sites = [
-            f"{name}: {', '.join(sorted(site_parts.between)) or 'nothing but the projection'}"
-            for name, site_parts in self._sites.items()
-            if site_parts.grams
-        ]
-        return "; ".join(between_of_sites)
+        for place, way in self._places:
+            if way.result() is None:
+                return f"in block {place.block} of site '{place.site}' (step {place.step}), {way.lost}"
+        return None
 
 
-def _where(place: CallPlace) -> str:
-    return f"in block {place.block} of site '{place.site}' (step {place.step}),"
-
-
-def spread(values: Tensor, keys: Tensor, count: int, axis: int = -1) -> Tensor:
-    """Values with their key axis at the places `keys` of an axis of `count`; 0 elsewhere."""
-    shape = list(values.shape)
-    shape[axis] = count
-    result = values.new_zeros(shape)
-    result.index_copy_(axis % values.ndim, keys, values)
+def spread(values: Tensor, keys: Tensor, count: int) -> Tensor:
+    """Values (..., key) with their keys at the places `keys` of an axis of `count`; 0 elsewhere."""
+    result = values.new_zeros((*values.shape[:-1], count))
+    result.index_copy_(-1, keys, values)
     return result

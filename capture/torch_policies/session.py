@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
@@ -10,16 +9,14 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from msgspec import structs
 
 from vla_attention.capture.store.episode_writer import EpisodeWriter
 from vla_attention.capture.store.replan_records import EpisodeStart
-from vla_attention.capture.store.store_root import read_existing_root
-from vla_attention.capture.store.store_writer import RunStore, WriteMode, make_way, open_run
+from vla_attention.capture.store.store_writer import RunStore, WriteMode, open_run
 from vla_attention.capture.torch_policies.call_order import KnownCalls
 from vla_attention.capture.torch_policies.knockouts import changes_of_episode
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
-from vla_attention.capture.torch_policies.policy_modules import OutputProjection, find_policy
+from vla_attention.capture.torch_policies.policy_modules import find_policy
 from vla_attention.capture.torch_policies.policy_weights import policy_digest, weights_state
 from vla_attention.capture.torch_policies.prompts import TokenText
 from vla_attention.capture.torch_policies.recorded_call import RowOfCall, WatchedCall
@@ -35,7 +32,7 @@ from vla_attention.capture.torch_policies.repeated_calls import RepeatedPolicy
 from vla_attention.capture.torch_policies.replan_inputs import EpisodeFacts
 from vla_attention.capture.torch_policies.replan_text import embeddings_of
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder
-from vla_attention.schemas.errors import BadArgument, Note, UserError
+from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stores.store_format import RootAttributes, StoreExists, episode_name
 
 
@@ -57,12 +54,6 @@ class RecordedRun:
         num_dropped: replan blocks in which no attention ran.
         largest_error: largest difference of P·V from a kernel's output, relative to the largest output, of the stored
             episodes.
-        every_function: look at every function of torch at every policy call, which is slower. False: at an episode's
-            first, and at all where attention functions are called otherwise than by their names in torch.
-
-    Args:
-        undecided: contributions are recorded if the first policy call shows what each part of the keys adds to the
-            residual stream. The store, which says whether it has any, is made after that call.
     """
 
     def __init__(
@@ -75,8 +66,6 @@ class RecordedRun:
         *,
         allow_empty: bool,
         tokenizer: TokenText | None,
-        projections: Mapping[tuple[str, int], OutputProjection],
-        undecided: bool = False,
         durable: bool = True,
     ) -> None:
         self.path = path
@@ -92,15 +81,10 @@ class RecordedRun:
         self._allow_empty = allow_empty
         self._mode = mode
         self._tokenizer = tokenizer
-        self._projections = projections
-        self._undecided = undecided
         self._durable = durable
-        #: Where it is or will be; None outside of the block.
+        #: None outside of the block.
         self._store: RunStore | None = None
         self._in_block = False
-        self.every_function = False
-        #: Whether it is not known yet that names are enough.
-        self._names_unknown = True
         #: Whether it was asked if the rows of a batch are apart, and what stands in sentences where that is not known.
         self._asked_of_batch, self._of_batch = False, ""
         self._sites = tuple(layout.site(site.name) for site in attributes.sites)
@@ -109,15 +93,8 @@ class RecordedRun:
             self._repeats = RepeatedPolicy(self._found, self._known, attributes.policy, attributes.recording)
 
     def __enter__(self) -> RecordedRun:
-        if self._undecided and self._mode == "resume" and self.path.exists():
-            # The policy calls that are stored there have shown it.
-            self._decide(contributions=read_existing_root(self.path).recording.contributions)
-        elif self._undecided:
-            self.path = make_way(self.path, self._mode)
-            self._store = RunStore(self.path, self.attributes)
-            self._mode = "new" if self._mode == "new" else "resume"
-        else:
-            self._open()
+        self._store = open_run(self.path, self.attributes, self._mode, durable=self._durable)
+        self.path = self._store.path
         return self
 
     def __exit__(
@@ -125,26 +102,9 @@ class RecordedRun:
     ) -> None:
         self._store = None
 
-    def _open(self) -> None:
-        planned = self._store
-        self._store = open_run(self.path, self.attributes, self._mode, durable=self._durable)
-        if planned is not None:
-            self._store.locks = planned.locks
-        self.path = self._store.path
-
-    def _decide(self, *, contributions: bool, because: str = "") -> None:
-        """Make the store, which says whether it has contributions; because: for the store."""
-        self._undecided = False
-        self.attributes = structs.replace(
-            self.attributes,
-            recording=structs.replace(self.attributes.recording, contributions=contributions),
-            provenance={**self.attributes.provenance, **({"contributions": because} if because else {})},
-        )
-        self._open()
-
     @property
     def store(self) -> RunStore:
-        """The store that is written to; the first policy call makes it where contributions are not decided before."""
+        """The store that is written to."""
         if self._store is None:
             raise RecordingStopped("This run is not open; use it as: with va.record(...) as run.")
         return self._store
@@ -241,7 +201,6 @@ class RecordedRun:
             )
         interventions, sites = self.attributes.interventions, self.attributes.sites
         changes = changes_of_episode(interventions, sites, facts, allow_empty=self._allow_empty)
-        self._names_unknown = True
         episode = Episode(self, facts, changes, _stack=stack)
         if self._repeats is not None:
             self._repeats.siblings[facts.task_id] = facts.siblings
@@ -300,28 +259,14 @@ class RecordedRun:
             one.episode._append(call.record(one, of_sites, replan.actions))
 
     def _check_contributions(self, recorder: ReplanRecorder) -> None:
-        """Raise `ContributionsUnknown` if a call's contributions are not known; at the first one, decide about them."""
+        """Raise `ContributionsUnknown` if contributions are recorded, and those of a call are not known."""
         unknown, of_batch = recorder.contributions.unknown(), f"; {self._of_batch}" if self._of_batch else ""
-        if not self._undecided:
-            if unknown is not None:
-                raise ContributionsUnknown(
-                    "Contributions cannot be recorded, because it is not known what each part of the keys adds to the "
-                    f"residual stream: {unknown}{of_batch}. Name another projection in the layout, or record with "
-                    "contributions=False. Nothing of this episode was kept."
-                )
-            return
-        if unknown is None:
-            between = recorder.contributions.describe()
-            self._decide(contributions=True, because=f"what is added to the residual stream ({between})")
-            return
-        self._decide(contributions=False, because=f"none: {unknown}")
-        warnings.warn(
-            "The store has no contributions, because it is not known what each part of the keys adds to the residual "
-            f"stream: {unknown}. The rows are recorded{of_batch}. Name another projection in the layout if this is not "
-            'the output projection (docs/your-policy.md, "Contributions"), or record with contributions=False.',
-            Note,
-            stacklevel=2,
-        )
+        if unknown is not None:
+            raise ContributionsUnknown(
+                "Contributions cannot be recorded, because it is not known what each part of the keys adds to the "
+                f"residual stream: {unknown}{of_batch}. Record with contributions=False (docs/your-policy.md, "
+                '"Contributions"). Nothing of this episode was kept.'
+            )
 
 
 @contextmanager

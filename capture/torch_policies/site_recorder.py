@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from vla_attention.capture.recording.finite_numbers import not_finite
 from vla_attention.capture.store.replan_records import RecordedRows
-from vla_attention.capture.torch_policies.added_updates import OutputWay
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
-from vla_attention.capture.torch_policies.batch_rows import Given, ModuleCall
+from vla_attention.capture.torch_policies.batch_rows import ModuleCall, RunningModules
 from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.key_caches import LOAD_WITH_DYNAMIC_CACHE, first_values, slid
+from vla_attention.capture.torch_policies.output_ways import OutputWay
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
-from vla_attention.capture.torch_policies.policy_modules import OutputProjection
 from vla_attention.capture.torch_policies.replan_contributions import EarlyRoles, ReplanContributions, spread
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.segments import Segment, segment_members, segments_of
@@ -77,7 +76,6 @@ class ReplanRecorder:
         recording: what of them is recorded.
         batch: batch size that every call of the sites must have.
         rows: the rows of the batch that are recorded.
-        projections: (site, block) -> the block's output projection, for contributions.
         early_roles: the roles of keys before the masks are known, for contributions.
         bias: what knockouts add to the logits.
         where: the replan in words.
@@ -90,7 +88,6 @@ class ReplanRecorder:
         recording: Recording,
         batch: int,
         rows: Sequence[int],
-        projections: Mapping[tuple[str, int], OutputProjection],
         early_roles: EarlyRoles,
         bias: LogitBias | None = None,
         where: str = "",
@@ -100,14 +97,13 @@ class ReplanRecorder:
         self.batch = batch
         self.rows = tuple(rows)
         self.order = CallOrder(known, policy)
-        self.contributions = ReplanContributions(self.order, self.rows, projections, early_roles)
-        self.output_modules = tuple(projection.module for projection in projections.values())
+        self.contributions = ReplanContributions(self.order, self.rows, early_roles)
         self.bias = bias
         self._where = where
         self.largest_error = 0.0
-        #: The first recorded call of a batch, if `keeps_module`.
+        #: The modules that run, where the first recorded call of a batch is kept, and that call.
+        self.running: RunningModules | None = None
         self.module_call: ModuleCall | None = None
-        self.keeps_module = False
         self._changes: dict[tuple[int, ...], Tensor] = {}
         self._collected = {site.name: _Collected() for site in layout.sites}
 
@@ -153,24 +149,17 @@ class ReplanRecorder:
     def passes(self, shape: CallShape) -> bool:
         """Return whether a call that has run is not recorded; it is counted then, and `saw` not called."""
         place = self.order.place(shape)
-        if self._is_recorded(place):
+        if place is not None and place.site is not None and self._wanted(place):
+            if self.running is not None and self.module_call is None and shape.batch == self.batch:
+                self.module_call = ModuleCall.of(shape, self.running)
             return False
         self.order.ran(shape, place)
         return True
-
-    def _is_recorded(self, place: CallPlace | None) -> bool:
-        return place is not None and place.site is not None and self._wanted(place)
 
     def _wanted(self, place: CallPlace) -> bool:
         recording = self.recordings.get(place.site or "")
         step = 0 if self.layout.autoregressive else place.step
         return recording is not None and place.block in recording.layers and step in recording.denoise_steps
-
-    def inside(self, shape: CallShape, modules: Sequence[nn.Module], given: Sequence[Given]) -> None:
-        """Keep what the module of the first recorded call was given, if that is wanted."""
-        wanted = self.keeps_module and self.module_call is None and shape.batch == self.batch
-        if wanted and self._is_recorded(self.order.place(shape)):
-            self.module_call = ModuleCall.of(shape, modules, given)
 
     def saw(self, call: AttentionCall) -> OutputWay | None:
         """Keep the rows of a call, if it is recorded; its output is followed for the contributions."""
@@ -228,10 +217,10 @@ class ReplanRecorder:
             self._check_cache(call, place)
         seen = call.allowed(queries)
         uniform = seen / seen.sum(dim=-1, keepdim=True).clamp(min=1)
+        way = self.contributions.way(call, rows, place.keys, place, site, cell) if recording.contributions else None
         keys = None if place.keys is None else torch.from_numpy(place.keys).to(rows.device)
         if keys is not None:
             rows, uniform = spread(rows, keys, site.keys.num_keys), spread(uniform, keys, site.keys.num_keys)
-        way = self.contributions.way(call, rows, keys, place, site, cell) if recording.contributions else None
         chosen = self._chosen(rows, recording)
         collected.rows.setdefault(cell, []).append(chosen.cpu() if chosen.numel() > _LARGE_COPY else chosen)
         collected.uniform.setdefault(cell, []).append(_kind_of(self._chosen(uniform, recording), collected.kinds))

@@ -1,16 +1,18 @@
 """Attention calls by hand: a softmax over the last axis, and a product of its result with the values.
 
-The result of the softmax is followed through casts, dropout, transposes and folds to a `matmul`, `bmm` or `einsum`. A
-softmax that meets no values (a classifier, the gate of a mixture of experts) is no attention call.
+What comes of the softmax is followed to a `matmul`, `bmm` or `einsum`, and decided by values there: numbers that are
+those of the softmax have its logits, which are exact; others (dropout, gates) are the rows themselves, as they are
+multiplied; the softmax's numbers in another order are refused. A softmax that meets no values (a classifier, the gate
+of a mixture of experts) is no attention call.
 """
 
 from __future__ import annotations
 
-import weakref
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -19,8 +21,8 @@ from vla_attention.capture.torch_policies.attention_calls import (
     MASKED_BELOW,
     AttentionCall,
     CallShape,
-    Positions,
     at_positions,
+    exact,
 )
 from vla_attention.capture.torch_policies.call_tensors import (
     ChangeRefused,
@@ -28,326 +30,281 @@ from vla_attention.capture.torch_policies.call_tensors import (
     check_keys_left,
     fitted_change,
     normalised,
-    part,
 )
-from vla_attention.capture.torch_policies.softmax_axes import Axes, Product, find_product
-from vla_attention.capture.torch_policies.tensor_functions import (
-    CHANGES,
-    SAME_NUMBERS,
-    TensorTable,
-    axes_after,
-    no_dropout,
-)
-from vla_attention.capture.torch_policies.watched_block import WatchedBlock, Where
+from vla_attention.capture.torch_policies.tensor_table import TensorTable, tensors_among
 
-#: `torch.nn.functional.softmax` calls the tensor's.
+if TYPE_CHECKING:
+    from vla_attention.capture.torch_policies.watch import AttentionMode
+
+#: In the order of what a mode is given, for torch's own functions in Python call the tensor's.
 SOFTMAXES: tuple[Callable[..., Any], ...] = (
-    torch.softmax, Tensor.softmax, torch.special.softmax, torch._safe_softmax,
+    torch.nn.functional.softmax, torch.softmax, Tensor.softmax, torch.special.softmax, torch._safe_softmax,
     torch.ops.aten.softmax, torch.ops.aten.softmax.int, torch.ops.aten._softmax, torch.ops.aten._softmax.default,
 )  # fmt: skip
-_MATMULS = {
+_PRODUCTS = {
     torch.matmul, torch.bmm, Tensor.matmul, Tensor.bmm, Tensor.__matmul__, Tensor.__rmatmul__, torch.linalg.matmul,
-    torch.ops.aten.matmul, torch.ops.aten.matmul.default, torch.ops.aten.bmm, torch.ops.aten.bmm.default,
+    torch.ops.aten.matmul, torch.ops.aten.matmul.default, torch.ops.aten.bmm, torch.ops.aten.bmm.default, torch.einsum,
 }  # fmt: skip
-
-
+#: Largest difference of a sum of probabilities from 1 that rounding to bfloat16 leaves, with room.
+_ROUNDING = 1e-2
 _ORDER_UNKNOWN = (
-    "picks its probabilities by an index (as rows[..., order]) before it multiplies them with the values, so that "
-    "nothing tells which key, head and row of the batch is where. Slices are followed, and an order that is made after "
-    "the product; else give the call a rule without a site"
+    "brings the probabilities of its softmax into another order (as rows[..., order]) before it multiplies them with "
+    "the values, so that nothing tells which key, head and row of the batch is where. Slices are followed, and an "
+    "order that is made after the product; else give the call a rule without a site"
 )
-#: Functions whose result has some of the numbers, in an order of its own.
-_PICKS = {
-    torch.index_select, Tensor.index_select, torch.gather, Tensor.gather, torch.take_along_dim, Tensor.take_along_dim,
-    torch.flip, Tensor.flip, torch.roll, Tensor.roll,
-}  # fmt: skip
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Softmax:
     """A softmax whose result has not met values yet.
 
-    Attributes:
-        where: the module that ran it.
-        shape: of the call, if it is one.
-        logits: what it took, before any change; None if the result was written over them.
-        result: what it returned. Weak, so that what meets no values is not kept.
-        change: logits that the watcher added, (batch or 1, head or 1, query or 1, key or 1).
-        written: how often torch had written to logits and result when the softmax returned.
-        altered: whether something wrote to the result, or to a tensor that comes from it, afterwards.
+    logits: what it took; before: the same without the watcher's change. changed: whether there is one.
     """
 
-    where: Where
     shape: CallShape
-    logits: Tensor | None
-    result: weakref.ref[Tensor]
-    change: Tensor | None
-    written: tuple[int, int]
-    altered: bool = False
-
-
-@dataclass(frozen=True)
-class _Followed:
-    """A tensor that comes from a softmax.
-
-    altered: its numbers are others than the softmax's. picked: they were picked by an index, so that which key, head
-    and row of the batch is where is not known.
-    """
-
-    softmax: _Softmax
-    axes: Axes
-    altered: bool
-    picked: bool = False
-
-
-@dataclass(frozen=True)
-class SoftmaxTensors:
-    """The tensors of a call by hand.
-
-    Attributes:
-        softmax: what the call began with.
-        product: which axes are what.
-        probabilities: as they were multiplied.
-        altered: whether they differ from the softmax's result by more than rounding and the order of axes.
-        operand, result: the other operand of the product, and its result.
-    """
-
-    softmax: _Softmax
-    product: Product
-    probabilities: Tensor
-    altered: bool
-    operand: Tensor
-    result: Tensor
-
-    @property
-    def values(self) -> Tensor:
-        """The values (batch, kv_head, key, dim)."""
-        return self.product.values_of(self.operand.detach())
-
-    @property
-    def outputs(self) -> Tensor:
-        """What the product computed, (batch, head, query, dim)."""
-        return self.product.output_of(self.result.detach())
-
-    def rows(self, queries: Positions, batch: Positions) -> Tensor:
-        """Return float32 probabilities (batch, head, query, key) of these queries."""
-        softmax, result = self.softmax, self.softmax.result()
-        if not self.altered and result is not None and torch.finfo(result.dtype).bits >= 32:
-            return self._part(self._in_order(result.detach()), queries, batch).float()
-        if self.altered or softmax.logits is None:
-            rows = self._part(self.product.rows_of(self.probabilities.detach()), queries, batch).float()
-            if torch.finfo(self.probabilities.dtype).bits >= 32:
-                return rows
-            sums = rows.sum(dim=-1, keepdim=True)
-            return rows / torch.where((sums - 1).abs() < _ROUNDING, sums, 1.0)
-        # Rounded to the compute precision, probabilities would not sum to 1.
-        logits = self._part(self._in_order(softmax.logits.detach()), queries, batch)
-        logits = logits.to(torch.promote_types(logits.dtype, torch.float32))
-        return normalised(logits if softmax.change is None else logits + part(softmax.change, queries, batch))
-
-    def allowed(self, queries: Positions) -> Tensor:
-        """Return (batch, head or 1, query, key) bool: where the logits are those of no mask.
-
-        Where the logits are gone, a key that has any mass in any head is seen.
-        """
-        if self.softmax.logits is None or self.softmax.logits.shape[-1] != self.product.axes.sizes[-1]:
-            return (self.rows(queries, slice(None)) > 0).any(1, keepdim=True)
-        logits = self._part(self._in_order(self.softmax.logits.detach()), queries, slice(None)).float()
-        highest = logits.amax(-1, keepdim=True)
-        return (logits > highest + MASKED_BELOW) & (highest > MASKED_BELOW)
-
-    def _in_order(self, tensor: Tensor) -> Tensor:
-        product, keys = self.product, self.product.axes.key
-        return tensor.reshape(*product.axes.sizes[:-1], tensor.shape[-1]).permute(
-            *product.batch, *product.heads, product.query, keys
-        )
-
-    def _part(self, tensor: Tensor, queries: Positions, batch: Positions) -> Tensor:
-        """Take queries and batch rows of (*batch, *heads, query, key)."""
-        tensor = at_positions(tensor, tensor.ndim - 2, queries)
-        sizes = (self.product.size(self.product.batch), self.product.size(self.product.heads))
-        return at_positions(tensor.reshape(*sizes, *tensor.shape[-2:]), 0, batch)
+    logits: Tensor
+    before: Tensor
+    changed: bool
 
 
 class Softmaxes:
     """Follows the results of softmaxes in one thread to their products with values."""
 
-    def __init__(self, block: WatchedBlock) -> None:
-        self._block = block
-        self.followed: TensorTable[_Followed] = TensorTable()
+    def __init__(self, mode: AttentionMode) -> None:
+        self._mode = mode
+        self._followed: TensorTable[_Softmax] = TensorTable()
+        #: Empty where nothing is followed: every function of the policy comes by here.
+        self.entries = self._followed.entries
+        #: Softmaxes that were changed and met no values yet.
+        self.changed: list[CallShape] = []
 
     def softmax(self, function: Callable[..., Any], args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
         """Run a softmax, changed if the watcher says so, and follow its result."""
-        if not self._may_attend(function, args, kwargs):
+        logits = args[0] if args else kwargs.get("input", kwargs.get("self"))
+        axis = args[1] if len(args) > 1 else kwargs.get("dim", kwargs.get("axis"))
+        if not isinstance(logits, Tensor) or torch._C._functorch.is_functorch_wrapped_tensor(logits):
             return function(*args, **kwargs)
-        name = "self" if "self" in kwargs else "input"
-        logits: Tensor = args[0] if args else kwargs[name]
+        if not 3 <= logits.ndim <= 5 or axis not in (-1, logits.ndim - 1):
+            return function(*args, **kwargs)
         *lead, queries, keys = logits.shape
-        where = self._block.where()
+        where = self._mode.where()
         # Of (batch, kv_head, group, query, key), the heads are both; of one axis, the module tells the heads.
         batch, heads = (lead[0], lead[1] * lead[2]) if len(lead) == 3 else batch_and_heads(lead, where.module)
-        shape = self._block.new_shape(where, "softmax", (batch, heads, heads, queries, keys), logits.dtype)
-        asked = replace(shape, number=0)
-        expected = self._block.expected(asked)
-        if expected is not None and self._block.passes(replace(expected, number=shape.number)):
-            return function(*args, **kwargs)  # attention that is not wanted need not be followed
-        self._block.began_softmax(asked)
-        change = self._block.change(shape)
+        shape = self._mode.new_shape(where, "softmax", (batch, heads, heads, queries, keys), logits.dtype)
+        batch, heads = shape.batch, shape.heads
+        change, given = self._mode.change(shape), logits
         if change is None:
             result = function(*args, **kwargs)
         else:
             change = fitted_change(change, shape, logits.device)
-            # The policy may write over them, and they tell which keys are masked.
-            logits = logits.clone()
-            changed = logits + change.expand(batch, heads, queries, keys).reshape(logits.shape).to(logits.dtype)
-            check_keys_left(
-                logits.reshape(batch, heads, queries, keys), changed.reshape(batch, heads, queries, keys), shape
-            )
-            result = function(changed, *args[1:], **kwargs) if args else function(**{**kwargs, name: changed})
-            self._block.changed.append(shape)
-        sizes = (batch, heads, queries, keys) if len(lead) == 1 else tuple(logits.shape)
-        first = ((0, 1), (2,), (3,)) if len(lead) == 1 else tuple((axis,) for axis in range(len(sizes)))
-        overwritten = result.data_ptr() == logits.data_ptr()
-        softmax = _Softmax(
-            where,
-            shape,
-            None if overwritten else logits,
-            weakref.ref(result),
-            change,
-            (_times_written(logits), _times_written(result)),
-        )
-        self.followed.put(result, _Followed(softmax, Axes(sizes, first), altered=False))
+            logits = logits.clone()  # the policy may write over them
+            given = logits + change.expand(batch, heads, queries, keys).reshape(logits.shape).to(logits.dtype)
+            size = batch, heads, queries, keys
+            check_keys_left(logits.reshape(size), given.reshape(size), shape)
+            name = "self" if "self" in kwargs else "input"
+            result = function(given, *args[1:], **kwargs) if args else function(**{**kwargs, name: given})
+            self.changed.append(shape)
+        self._followed.put(result, _Softmax(shape, given.detach(), logits.detach(), change is not None))
         return result
 
     def follow(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
         """Run any other function, and follow what comes of a softmax's result."""
-        operands = (*args[:1], *args[1]) if function is torch.einsum and isinstance(args[1], list | tuple) else args
-        known = ((tensor, self.followed.get(tensor)) for tensor in (*operands, *kwargs.values()))
-        source = next(((tensor, followed) for tensor, followed in known if followed is not None), None)
         result = function(*args, **kwargs)
-        if source is None:
-            return result
-        before, given = source
-        if args and args[0] is not None and getattr(function, "__name__", "") in _WRITES:
-            written = self.followed.get(args[0])
-            if written is not None:
-                written.softmax.altered = True
-        if function in _MATMULS or function is torch.einsum:
-            self._product(function, args, kwargs, result)
-        elif isinstance(result, Tensor) and result.ndim:
-            axes = _axes_after(function, args, kwargs, before, given.axes, result)
-            if axes is not None:
-                altered = given.altered or (function not in SAME_NUMBERS and not no_dropout(function, args, kwargs))
-                picked = given.picked or _picks(function, args)
-                self.followed.put(result, _Followed(given.softmax, axes, altered, picked))
+        for given in tensors_among((*args, *kwargs.values())):
+            softmax = self._followed.get(given)
+            if softmax is None:
+                continue
+            if function in _PRODUCTS:
+                self._product(function, args, kwargs, given, softmax, result)
+            elif isinstance(result, Tensor) and result is not given and result.is_floating_point() and result.ndim:
+                # Some keys may be cut off, as those of attention sinks are.
+                fewer = result.ndim == given.ndim and sum(a != b for a, b in zip(result.shape, given.shape)) == 1  # noqa: B905
+                if result.numel() == given.numel() or (fewer and result.numel() < given.numel()):
+                    self._followed.put(result, softmax)
+            break
         return result
 
-    def _may_attend(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> bool:
-        logits = args[0] if args else kwargs.get("input", kwargs.get("self"))
-        axis = args[1] if len(args) > 1 else kwargs.get("dim", kwargs.get("axis"))
-        if not isinstance(logits, Tensor) or torch._C._functorch.is_functorch_wrapped_tensor(logits):
-            return False
-        return 3 <= logits.ndim <= 5 and axis in (-1, logits.ndim - 1)
-
-    def _product(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], result: Any) -> None:
-        if function is torch.einsum:
-            equation, *operands = args
-            if len(operands) == 1 and isinstance(operands[0], list | tuple):
-                operands = list(operands[0])
-        else:
-            equation, operands = None, [*args, *kwargs.values()][:2]
-            if function is Tensor.__rmatmul__:
-                operands.reverse()
-        if len(operands) != 2 or not all(isinstance(operand, Tensor) for operand in operands):
+    def _product(
+        self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], given: Tensor, softmax: _Softmax,
+        result: Tensor,
+    ) -> None:  # fmt: skip
+        operands = list(tensors_among((*args, *kwargs.values())))
+        if function is Tensor.__rmatmul__:
+            operands.reverse()
+        if len(operands) != 2:
             return
-        letters = _letters(equation, operands[0].ndim, operands[1].ndim)
+        letters = _letters(args[0] if function is torch.einsum else None, operands[0].ndim, operands[1].ndim)
         if letters is None:
             return
-        first, second, out = letters
-        for given, values, probability_letters, value_letters in ((0, 1, first, second), (1, 0, second, first)):
-            followed = self.followed.get(operands[given])
-            if followed is None:
-                continue
-            product = find_product(
-                followed.axes, probability_letters, value_letters, out, tuple(operands[values].shape)
-            )
-            if product is not None:
-                self._saw(followed, product, operands[given], operands[values], result)
-                return
-
-    def _saw(
-        self, followed: _Followed, product: Product, probabilities: Tensor, values: Tensor, result: Tensor
-    ) -> None:
-        softmax = followed.softmax
-        batch, heads, kv_heads, queries, keys = product.sizes
-        before = softmax.shape
-        if softmax.change is not None and (batch, heads, queries) != (before.batch, before.heads, before.queries):
-            refused = ChangeRefused(
-                f"The attention call {before} cannot be changed: its product with the values shows other axes "
-                f"(batch {batch}, {heads} heads, {queries} queries) than the softmax. Leave this call out."
-            )
-            raise self._block.failed(refused)
-        shape = before
-        if product.sizes != (before.batch, before.heads, before.kv_heads, before.queries, before.keys):
-            shape = replace(before, batch=batch, heads=heads, kv_heads=kv_heads, queries=queries, keys=keys)
-        if softmax.change is not None:
-            self._block.changed.remove(before)
-        # Other tensors that come from this softmax need not be followed any more.
-        self.followed.keep(lambda other: other.softmax is not softmax)
-        # What was written to the result after the softmax is in the rows that meet the values, not in those of the
-        # softmax; and logits that were written over do not give its rows again.
-        before_logits, before_result = softmax.written
-        softmax_result = softmax.result()
-        altered = (
-            followed.altered
-            or softmax.altered
-            or (softmax_result is not None and _times_written(softmax_result) != before_result)
-        )
-        if softmax.logits is not None and _times_written(softmax.logits) != before_logits:
-            softmax.logits = None
-        self._block.softmax_met_values(before, shape)
-        if not self._block.changes and self._block.passes(shape):
+        place = 0 if operands[0] is given else 1
+        value = operands[1 - place]
+        product = find_product(
+            letters[place], letters[1 - place], letters[2], tuple(given.shape), tuple(value.shape)
+        )  # fmt: skip
+        if product is None:
             return
-        tensors = SoftmaxTensors(softmax, product, probabilities, altered, values, result)
-        asked = None if shape == replace(before, kv_heads=kv_heads) else before
-        self._block.saw(AttentionCall(shape, tensors, asked, _ORDER_UNKNOWN if followed.picked else ""))
+        # Other tensors that come from this softmax need not be followed any more.
+        self._followed.keep(lambda other: other is not softmax)
+        if softmax.changed:
+            self.changed.remove(softmax.shape)
+        multiplied = given.detach().permute(product.rows)
+        sizes, keys, dim = _sizes(softmax, product, given), multiplied.shape[-1], value.shape[product.values[-1]]
+        kv_heads = math.prod(multiplied.shape[: product.num_lead_of_values]) // sizes[0]
+        before = softmax.shape
+        shape = replace(
+            before, batch=sizes[0], heads=sizes[1], kv_heads=kv_heads, queries=sizes[2], keys=keys
+        )  # fmt: skip
+        if softmax.changed and sizes != (before.batch, before.heads, before.queries):
+            raise self._mode.failed(
+                ChangeRefused(
+                    f"The attention call {before} cannot be changed: its product with the values shows other axes "
+                    f"(batch {sizes[0]}, {sizes[1]} heads, {sizes[2]} queries) than the softmax. Leave this call out."
+                )
+            )
+        if self._mode.passes(shape):
+            return
+        with exact():
+            rows, allowed, refused = _decided(multiplied, softmax, given, product)
+            rows, allowed = rows.reshape(*sizes, keys), allowed.reshape(sizes[0], -1, sizes[2], keys)
+            values = product.values_of(value.detach(), multiplied).reshape(sizes[0], kv_heads, keys, dim)
+        back = sorted(range(len(product.output)), key=lambda axis: product.output[axis])
+        self._mode.saw(
+            AttentionCall(
+                shape,
+                values,
+                result.detach().permute(back).reshape(*sizes, dim),
+                lambda queries, batch: at_positions(at_positions(rows, 0, batch), 2, queries),
+                lambda queries: at_positions(allowed, 2, queries),
+                lambda mixed: mixed.reshape(*multiplied.shape[:-1], dim).permute(product.output),
+                given.dtype,
+                None if shape == replace(before, kv_heads=kv_heads) else before,
+                refused,
+            )
+        )
 
 
-#: Methods that write to their tensor otherwise than those of `CHANGES`.
-_WRITES = {"__setitem__", "copy_", "index_fill_", "index_copy_", "scatter_", "masked_scatter_", "zero_", "fill_"}
-#: Largest difference of a sum of probabilities from 1 that rounding to bfloat16 leaves, with room.
-_ROUNDING = 1e-2
+def _decided(rows: Tensor, softmax: _Softmax, given: Tensor, product: Product) -> tuple[Tensor, Tensor, str]:
+    """Return the rows of a product (*lead, query, key) float32, the keys that the mask allows, and why it is refused.
+
+    rows: the probabilities as they are multiplied.
+    """
+    expected = normalised(softmax.logits.to(torch.promote_types(softmax.logits.dtype, torch.float32)))
+    rounding = max(torch.finfo(dtype).eps for dtype in (rows.dtype, softmax.logits.dtype))
+    narrow = torch.finfo(rows.dtype).bits < 32
+    for arrange in _arrangements(expected, given):
+        arranged = arrange(expected).permute(product.rows)
+        # Rounded to the compute precision, probabilities would not sum to 1.
+        if torch.allclose(rows.float(), arranged, rtol=max(2 * rounding, 1e-4), atol=max(rounding / 100, 1e-6)):
+            logits = arrange(softmax.before).permute(product.rows).float()
+            highest = logits.amax(-1, keepdim=True)
+            allowed = (logits > highest + MASKED_BELOW) & (highest > MASKED_BELOW)
+            return arranged if narrow else rows.float(), allowed, ""
+    # Something else is multiplied than what the softmax gave, or its logits were written over: then a key that has any
+    # mass is seen.
+    rows, refused = rows.float(), ""
+    if rows.numel() == expected.numel():
+        ours, theirs = (tensor.flatten().sort().values for tensor in (expected, rows))
+        same_numbers = torch.allclose(theirs, ours, rtol=max(2 * rounding, 1e-4), atol=rounding / 100)
+        refused = _ORDER_UNKNOWN if same_numbers else ""
+    if narrow:
+        sums = rows.sum(dim=-1, keepdim=True)
+        rows = rows / torch.where((sums - 1).abs() < _ROUNDING, sums, 1.0)
+    return rows, (rows > 0).expand(rows.shape), refused
 
 
-def _axes_after(
-    function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], before: Tensor, axes: Axes, result: Tensor
-) -> Axes | None:
-    """Return the axes of what a function made of a followed tensor, None if it cannot be followed."""
-    if function in CHANGES:
-        return axes if result.shape == before.shape else None
-    if function in SAME_NUMBERS:
-        return axes_after(function, args, kwargs, axes, result)
-    if result is before:  # changed in place
-        return axes
-    if (function is Tensor.__getitem__ or function in _PICKS) and result.ndim == before.ndim:
-        # Keys may be cut off, as those of attention sinks are.
-        key = axes.key_position()
-        same = all(result.shape[axis] == before.shape[axis] for axis in range(before.ndim) if axis != key)
-        return axes.with_keys(result.shape[key]) if key is not None and same else None
-    return None
+def _arrangements(expected: Tensor, given: Tensor) -> list[Callable[[Tensor], Tensor]]:
+    """Return how a softmax's (..., query, key) may have become the probabilities of a product, the likely way first."""
+    shape, count = given.shape, given.shape[-1]
+    if expected.numel() == given.numel():
+        ways: list[Callable[[Tensor], Tensor]] = [lambda t: t.reshape(shape), lambda t: t.mT.reshape(shape)]
+        return [*ways, lambda t: t.transpose(1, 2).reshape(shape)] if expected.ndim > 3 else ways
+    if expected.shape[:-1] == shape[:-1] and count < expected.shape[-1]:  # keys are cut off
+        return [lambda t: t[..., :count], lambda t: t[..., -count:]]
+    return []
 
 
-def _picks(function: Any, args: tuple[Any, ...]) -> bool:
-    """Whether a function's result may have the numbers in another order: slices keep it, other indices may not."""
-    if function is not Tensor.__getitem__:
-        return function in _PICKS
-    index = args[1] if isinstance(args[1], tuple) else (args[1],)
-    return not all(part is Ellipsis or isinstance(part, slice) for part in index)
+def _sizes(softmax: _Softmax, product: Product, given: Tensor) -> tuple[int, int, int]:
+    """Return batch, heads and queries: of the axes of the product, or of the softmax where a reshape stands between."""
+    *lead, queries, _ = (given.shape[axis] for axis in product.rows)
+    of_product = math.prod(lead[: product.num_batch]), math.prod(lead[product.num_batch :]), queries
+    before, shape = softmax.shape, softmax.logits.shape
+    of_softmax = before.batch, before.heads, before.queries
+    turned = not given.is_contiguous() and given.shape in (
+        softmax.logits.mT.shape,
+        softmax.logits.transpose(1, 2).shape,
+    )
+    as_is = given.shape[:-1] == shape[:-1] or turned or len(shape) == 3
+    return of_product if math.prod(of_softmax) != math.prod(of_product) or (len(lead) > 1 and as_is) else of_softmax
 
 
-def _times_written(tensor: Tensor) -> int:
-    """Return how often torch wrote to a tensor; tensors of inference mode do not count it."""
-    return 0 if tensor.is_inference() else tensor._version
+@dataclass(frozen=True)
+class Product:
+    """Which axes of a product are what.
+
+    Attributes:
+        rows: the axes of the probabilities in the order *batch, *heads, query, key.
+        num_batch: how many of them are the batch.
+        values: the axes of the values in the order *batch, *heads, key, dim; -1 for those that they lack.
+        num_lead_of_values: how many of batch and heads, from the first, the values have; other heads share them.
+        output: the order in which the output has *batch, *heads, query, dim.
+    """
+
+    rows: tuple[int, ...]
+    num_batch: int
+    values: tuple[int, ...]
+    num_lead_of_values: int
+    output: tuple[int, ...]
+
+    def values_of(self, values: Tensor, rows: Tensor) -> Tensor:
+        """Return the values, (*batch, *heads that they have, key, dim)."""
+        ordered = values.permute([axis for axis in self.values if axis >= 0])
+        for position, axis in enumerate(self.values):
+            ordered = ordered if axis >= 0 else ordered.unsqueeze(position)
+        count = self.num_lead_of_values
+        return ordered.expand(*rows.shape[:count], *ordered.shape[count:])
+
+
+# A policy makes the same few products hundreds of times in a call.
+@lru_cache(maxsize=1024)
+def find_product(
+    letters: str, value_letters: str, output_letters: str, shape: tuple[int, ...], value_shape: tuple[int, ...]
+) -> Product | None:
+    """Read a product in the notation of einsum: the probabilities' letters, the values' and the output's.
+
+    Returns None for a product that is no attention: it does not sum over one axis, sums over something else, or its
+    values are the same for every batch row, head and query, as class embeddings are.
+    """
+    keys = [letter for letter in letters if letter in value_letters and letter not in output_letters]
+    dims = [letter for letter in value_letters if letter not in letters]
+    if len(keys) != 1 or len(dims) != 1 or len(set(letters)) != len(letters):
+        return None
+    if set(output_letters) != (set(letters) | set(dims)) - set(keys) or (len(value_shape) == 2 and len(shape) > 2):
+        return None
+    size, value_size = dict(zip(letters, shape, strict=True)), dict(zip(value_letters, value_shape, strict=True))
+    # Letters of size 1 in the values are broadcast: these axes share the values.
+    held = {letter for letter in value_letters if letter in size and value_size[letter] == size[letter]}
+    free = [letter for letter in letters if letter not in held]
+    if not free or any(value_size[letter] not in (1, size[letter]) for letter in value_letters if letter in size):
+        return None
+    query = free[-1]
+    lead = [letter for letter in letters if letter not in (query, keys[0])]
+    if lead and lead[0] in free and any(letters.index(letter) > letters.index(query) for letter in held - set(keys)):
+        # The same for every batch row and another one for each query: a table of relative positions, not values.
+        return None
+    shared = [letter in held for letter in lead]
+    # The first axis is the batch; a third one that values lack is grouped heads. Heads share values if those that the
+    # values lack are the last axes; else every head is given its values.
+    num_batch = min(1, len(lead)) if len(lead) < 3 or not shared[-1] else len(lead) - 1
+    first_free = shared.index(False) if False in shared else len(lead)
+    if any(shared[first_free:]) or first_free < num_batch:
+        first_free = len(lead)
+    return Product(
+        rows=tuple(letters.index(letter) for letter in (*lead, query, keys[0])),
+        num_batch=num_batch,
+        values=tuple(value_letters.find(letter) for letter in (*lead, keys[0], dims[0])),
+        num_lead_of_values=first_free,
+        output=tuple([*lead, query, dims[0]].index(letter) for letter in output_letters),
+    )
 
 
 @lru_cache(maxsize=1024)
@@ -358,10 +315,7 @@ def _letters(equation: str | None, first: int, second: int) -> tuple[str, str, s
         if min(first, second) < 2:
             return None
         batch = "".join(spare[: max(first, second) - 2])
-        first_batch, second_batch = batch[len(batch) - (first - 2) :], batch[len(batch) - (second - 2) :]
-        return f"{first_batch}mk", f"{second_batch}kn", f"{batch}mn"
-    if not isinstance(equation, str):
-        return None
+        return f"{batch[len(batch) - first + 2 :]}mk", f"{batch[len(batch) - second + 2 :]}kn", f"{batch}mn"
     inputs, arrow, out = equation.replace(" ", "").partition("->")
     operands = inputs.split(",")
     if len(operands) != 2:

@@ -1,38 +1,270 @@
-"""Seeing every attention call of a torch policy while its own code runs.
+"""Seeing every attention call of a torch policy while its own code runs, by one `TorchFunctionMode`.
 
-`seen_functions` sees the functions that compute attention. Compiled parts run eager meanwhile, and the fast path of
-`nn.MultiheadAttention`, which nothing sees, is off. The policy's own kernels compute what it returns: with nothing
-changed, actions are bit-equal with those of the same policy run eager with the fast path off.
+Compiled parts run eager meanwhile, and the fast path of `nn.MultiheadAttention`, which nothing sees, is off. The
+policy's own kernels compute what it returns: with nothing changed, actions are bit-equal with those of the same policy
+run eager with the fast path off.
 """
 
 from __future__ import annotations
 
 import random
+import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+import types
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
-from vla_attention.capture.torch_policies.attention_calls import Watcher
-from vla_attention.capture.torch_policies.policy_modules import find_policy
-from vla_attention.capture.torch_policies.seen_functions import SeenFunctions
-from vla_attention.capture.torch_policies.watched_block import WatchedBlock
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape, Kind, Watcher, exact
+from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
+from vla_attention.capture.torch_policies.fused_calls import FLEX_FUNCTIONS, SDPA_FUNCTIONS, watch_flex, watch_sdpa
+from vla_attention.capture.torch_policies.output_ways import OutputWay, OutputWays
+from vla_attention.capture.torch_policies.policy_modules import FoundPolicy, find_policy
+from vla_attention.capture.torch_policies.softmax_calls import SOFTMAXES, Softmaxes
+from vla_attention.capture.torch_policies.unseen_attention import ATTENTION_OPERATOR, LOAD_WITH_SDPA, UnseenAttention
+from vla_attention.schemas.errors import BadArgument, UserError
 
 _ACTIVE = threading.Lock()
+_OPERATORS = frozenset((torch._ops.OpOverload, torch._ops.OpOverloadPacket))
+_MULTIHEAD = torch.nn.functional.multi_head_attention_forward
+#: The same function for a mode that sees what it calls inside: it does not ask first whether there is a mode.
+_OPEN_MULTIHEAD = types.FunctionType(
+    _MULTIHEAD.__code__,
+    {**vars(torch.nn.functional), "has_torch_function": lambda tensors: False},
+    argdefs=_MULTIHEAD.__defaults__,
+)
+_OPEN_MULTIHEAD.__kwdefaults__ = _MULTIHEAD.__kwdefaults__
 
 
 class AlreadyWatched(BadArgument):
     """A block inside another one, or two at the same time."""
 
 
-@contextmanager
-def watch_attention(policy: object, watcher: Watcher, *, every_function: bool = True) -> Iterator[SeenFunctions]:
-    """Tell `watcher` about every attention call of `policy` inside the block, in the thread of the block.
+class OtherPolicy(BadArgument):
+    """Attention of modules that the watched policy does not hold."""
 
-    The block gives `SeenFunctions`, whose `by_names` says whether `every_function` was needed.
+
+class NotFollowed(BadArgument):
+    """A policy that ran in another thread than the block that records it."""
+
+
+@dataclass(frozen=True)
+class Where:
+    """The innermost module that is running: its path in the policy, and itself (None outside every module)."""
+
+    path: str
+    module: nn.Module | None
+
+
+class AttentionMode(TorchFunctionMode):
+    """Sees every function of torch that the thread of one block calls, and tells the watcher of attention.
+
+    Attributes:
+        outputs: the outputs of attention calls that are followed to the residual stream.
+    """
+
+    def __init__(self, known: FoundPolicy, watcher: Watcher) -> None:
+        super().__init__()
+        self._policy, self._watcher = known.policy, watcher
+        self._paths = {id(module): path for path, module in known.modules.items()}
+        self._softmaxes = Softmaxes(self)
+        self.outputs = OutputWays(lambda: f"module '{self.where().path}'", self.computing)
+        self._handlers: dict[Any, Callable[[Any, tuple[Any, ...], Mapping[str, Any]], Any]] = {
+            **dict.fromkeys(SDPA_FUNCTIONS, lambda *call: watch_sdpa(self, *call)),
+            **dict.fromkeys(FLEX_FUNCTIONS, lambda *call: watch_flex(self, *call)),
+            **dict.fromkeys(SOFTMAXES, self._softmaxes.softmax),
+        }
+        #: The first error of watching, which the block raises at its end if the policy's code went on without it.
+        self._error: BaseException | None = None
+        self._number = 0
+        #: Heads of `nn.MultiheadAttention` while it runs, 0 otherwise.
+        self._multihead_heads = 0
+        self._way: OutputWay | None = None
+        self._thread = threading.get_ident()
+        self._ran_elsewhere = False
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        handler = self._handlers.get(func)
+        if handler is None:
+            if func is _MULTIHEAD:
+                return self._multihead(args, kwargs or {})
+            if type(func) in _OPERATORS:
+                self._refuse_unseen(func)
+            if not self._softmaxes.entries and not self.outputs.entries:
+                return func(*args, **kwargs) if kwargs else func(*args)
+            handler = self._softmaxes.follow
+        given = kwargs or {}
+        try:
+            if not self.outputs.entries:
+                result = handler(func, args, given)
+            else:
+                result = self.outputs.follow(func, args, given, lambda: handler(func, args, given))
+        except UserError as error:  # the policy's code may catch it
+            raise self.failed(error) from None
+        if self._way is not None:
+            way, self._way = self._way, None
+            self.outputs.begin(way, result[0] if isinstance(result, tuple) else result)
+        return result
+
+    def _multihead(self, args: tuple[Any, ...], kwargs: Mapping[str, Any]) -> Any:
+        """Run the function of `nn.MultiheadAttention`, and see what it calls inside: projections and attention."""
+        before, self._multihead_heads = self._multihead_heads, kwargs["num_heads"] if len(args) < 5 else args[4]
+        try:
+            with self:
+                return _OPEN_MULTIHEAD(*args, **kwargs)
+        finally:
+            self._multihead_heads = before
+
+    def _refuse_unseen(self, operator: Any) -> None:
+        name = str(getattr(operator, "_qualified_op_name", None) or operator.name())
+        if ATTENTION_OPERATOR.match(name):
+            raise self.failed(
+                UnseenAttention(f"The operator {name} computes attention in a way that gives no rows. {LOAD_WITH_SDPA}")
+            )
+
+    def where(self) -> Where:
+        """Return the innermost module of the policy that is running: in its forward, or in another of its methods.
+
+        Raises:
+            OtherPolicy: a module that the policy does not hold is running, and none of the policy's is.
+        """
+        foreign = None
+        for owner in _frame_owners():
+            if id(owner) in self._paths:
+                return Where(self._paths[id(owner)], owner if isinstance(owner, nn.Module) else None)
+            if owner is self._policy:
+                return Where("", None)
+            if foreign is None and isinstance(owner, nn.Module):
+                foreign = owner
+        if foreign is None:
+            return Where("", None)
+        raise self.failed(
+            OtherPolicy(
+                f"Attention ran in a module of class {type(foreign).__name__}, which the watched policy "
+                f"({type(self._policy).__name__}) does not hold: one block records one policy. Call the other model "
+                "outside the block, or give the object that holds both."
+            )
+        )
+
+    def new_shape(
+        self, where: Where, kind: Kind, sizes: tuple[int, int, int, int, int], dtype: torch.dtype
+    ) -> CallShape:
+        """Return the shape of the call that comes next; sizes: batch, heads, kv_heads, queries, keys."""
+        batch, heads, kv_heads, queries, keys = sizes
+        if self._multihead_heads:
+            kind, batch, heads = "multihead", batch * heads // self._multihead_heads, self._multihead_heads
+            kv_heads = heads
+        return CallShape(
+            module=where.path, kind=kind, number=self._number, batch=batch, heads=heads, kv_heads=kv_heads,
+            queries=queries, keys=keys, dtype=str(dtype).removeprefix("torch."),
+        )  # fmt: skip
+
+    def change(self, shape: CallShape) -> Tensor | None:
+        """Ask the watcher for a change of the call that comes next."""
+        if not getattr(self._watcher, "changes", True):
+            return None
+        with torch.no_grad(), self._failing():
+            return self._watcher.change(shape)
+
+    def passes(self, shape: CallShape) -> bool:
+        """Return whether a call that has run is none of the watcher's, and count it then."""
+        ask = getattr(self._watcher, "passes", None)
+        if ask is None:
+            return False
+        with self._failing():
+            if not ask(replace(shape, number=self._number)):
+                return False
+        self._number += 1
+        return True
+
+    def saw(self, call: AttentionCall) -> None:
+        """Tell the watcher about a call, and count it."""
+        if call.shape.number != self._number:  # another call came between a softmax and its product
+            call = replace(call, shape=replace(call.shape, number=self._number))
+        with self.computing():
+            self._number += 1
+            self._way = self._watcher.saw(call)
+
+    @contextmanager
+    def computing(self) -> Iterator[None]:
+        """Compute for the watcher beside the policy: without gradients, autocast and function modes."""
+        with exact(), self._failing(), _without_modes():
+            yield
+
+    def refuse_nested(self, *tensors: Tensor) -> None:
+        """Raise `UnseenAttention` for nested tensors, whose sequences have lengths of their own, and inside of vmap."""
+        reason = ""
+        if any(torch._C._functorch.is_functorch_wrapped_tensor(tensor) for tensor in tensors):
+            reason = (
+                "inside of torch.vmap or another transform of torch.func, whose tensors have no numbers that can be "
+                "recorded. Call it with a batch instead."
+            )
+        elif any(tensor.is_nested for tensor in tensors):
+            reason = "of nested tensors, whose rows cannot be recorded. Call the policy with padded tensors and a mask."
+        if reason:
+            raise self.failed(UnseenAttention(f"{self.where().path or 'The policy'} computes attention {reason}"))
+
+    def failed(self, error: BaseException) -> BaseException:
+        """Remember an error of watching, and return it."""
+        self._error = self._error or error
+        return error
+
+    @contextmanager
+    def _failing(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException as error:
+            self.failed(error)
+            raise
+
+    @contextmanager
+    def noticing_threads(self) -> Iterator[None]:
+        """Notice a module of the policy that runs in another thread, whose functions this mode does not see.
+
+        torch's global hooks would make every module slower, and torch.compile warn.
+        """
+        call = nn.Module.__call__
+
+        def noticed(module: nn.Module, *args: Any, **kwargs: Any) -> Any:
+            if threading.get_ident() != self._thread and id(module) in self._paths:
+                self._ran_elsewhere = True
+            return call(module, *args, **kwargs)
+
+        nn.Module.__call__ = noticed  # type: ignore[method-assign]
+        try:
+            yield
+        finally:
+            nn.Module.__call__ = call  # type: ignore[method-assign]
+
+    def close(self) -> None:
+        """End a block whose code raised nothing; errors: see `watch_attention`, also those that the policy caught."""
+        if self._error is not None:
+            raise self._error
+        if self._softmaxes.changed:
+            raise ChangeRefused(
+                f"A softmax that is no attention was changed as if it were the call {self._softmaxes.changed[0]}: it "
+                "was multiplied with no values, as the gate of a mixture of experts. Give the layout's rule a kind or "
+                "a number of keys that this softmax does not have, or leave its block out."
+            )
+        if self._ran_elsewhere:
+            raise NotFollowed(
+                f"The policy ({type(self._policy).__name__}) ran in another thread than the block that records "
+                "it. Open the block in the thread that calls the policy, around that one call, and let no other thread "
+                "call it meanwhile."
+            )
+
+
+@contextmanager
+def watch_attention(policy: object, watcher: Watcher) -> Iterator[None]:
+    """Tell `watcher` about every attention call of `policy` inside the block, in the thread of the block.
 
     policy: an `nn.Module`, an object that holds modules, or what `find_policy` made of one, which spares the search for
     modules at every block.
@@ -53,16 +285,10 @@ def watch_attention(policy: object, watcher: Watcher, *, every_function: bool = 
             "one block records one policy. Close the other block first."
         )
     try:
-        block = WatchedBlock(known_policy, watcher, every_function=every_function)
-        functions = SeenFunctions(block, every_function=every_function)
-        with (
-            seen_by_python(),
-            functions.names_replaced(),
-            block.following_modules(functions.at_module, functions.around_projection),
-            functions.seeing(),
-        ):
-            yield functions
-        block.close()
+        mode = AttentionMode(known_policy, watcher)
+        with seen_by_python(), mode.noticing_threads(), mode:
+            yield
+        mode.close()
     finally:
         _ACTIVE.release()
 
@@ -77,6 +303,21 @@ def seen_by_python() -> Iterator[None]:
             yield
     finally:
         torch.backends.mha.set_fastpath_enabled(fast_path)
+
+
+def _without_modes() -> AbstractContextManager[object]:
+    """Compute past function modes, those of the policy's code too: what a watcher computes is none of theirs."""
+    return torch._C.DisableTorchFunction() if torch._C._len_torch_function_stack() else nullcontext()
+
+
+def _frame_owners() -> Iterator[object]:
+    """Yield the `self` of the functions that are running, the innermost first."""
+    frame = sys._getframe(2)
+    while frame is not None:
+        code = frame.f_code
+        if code.co_argcount and code.co_varnames[0] == "self":
+            yield frame.f_locals.get("self")
+        frame = frame.f_back  # type: ignore[assignment]
 
 
 class RandomNumbers:

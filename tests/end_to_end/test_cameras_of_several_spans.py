@@ -256,7 +256,7 @@ def policy_layout():
         "actions": "action",
         **dict.fromkeys(("tile_top", "tile_bottom", "pooled"), "image"),
     }
-    site = RecordedSite(SiteLayout("joint", spans), (0, HORIZON), roles, "blocks.{block}.attention.out")
+    site = RecordedSite(SiteLayout("joint", spans), (0, HORIZON), roles)
     return small_layout(sites=(site,))
 
 

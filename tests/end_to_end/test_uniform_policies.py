@@ -43,7 +43,7 @@ def test_sites_in_different_blocks(tmp_path):
     width = policy.expert.projections[0].in_features
     prefix, noise = torch.zeros(1, 5, width), torch.zeros(1, 3, width)
     with (
-        va.record(tmp_path / "a.zarr", policy, layout=one_module_layout(), durable=False) as run,
+        va.record(tmp_path / "a.zarr", policy, layout=one_module_layout(), durable=False, contributions=False) as run,
         run.episode(task_id=0, episode_index=0, instruction="go") as episode,
         episode.replan(env_step=0),
     ):

@@ -129,7 +129,7 @@ def small_layout(**changes: Any) -> PolicyLayout:
     fields: dict[str, Any] = {
         "name": "small",
         "family": "small",
-        "sites": (RecordedSite(keys, (0, HORIZON), roles, "blocks.{block}.attention.out"),),
+        "sites": (RecordedSite(keys, (0, HORIZON), roles),),
         "rules": (
             CallRule(r"blocks\.(?P<block>\d+)\.attention", "joint", queries=HORIZON),
             CallRule(r"blocks\.\d+\.attention", None, queries=5 + PROMPT),

@@ -82,7 +82,7 @@ def token_layout(*, stops_early: bool = False) -> PolicyLayout:
     return PolicyLayout(
         name="tokens",
         family="tokens",
-        sites=(RecordedSite(keys, (-1, None), roles, "layers.{block}.o_proj", "prompt"),),
+        sites=(RecordedSite(keys, (-1, None), roles, "prompt"),),
         rules=(CallRule(r"layers\.(?P<block>\d+)", "joint"),),
         num_layers=BLOCKS,
         num_heads=HEADS,
@@ -133,8 +133,8 @@ def one_module_layout() -> PolicyLayout:
         name="one module",
         family="one",
         sites=(
-            RecordedSite(own, (0, 3), {"prefix": "text", "actions": "action"}, "expert.projections.{block}"),
-            RecordedSite(cross, (0, 3), {"prefix": "text"}, "expert.projections.{block}"),
+            RecordedSite(own, (0, 3), {"prefix": "text", "actions": "action"}),
+            RecordedSite(cross, (0, 3), {"prefix": "text"}),
         ),
         rules=(CallRule("expert", None, sequence=(("self", 0), ("cross", 1), ("self", 2), ("cross", 3))),),
         num_layers=4,
@@ -190,8 +190,7 @@ def turns_layout() -> PolicyLayout:
         name="turns",
         family="turns",
         sites=tuple(
-            RecordedSite(SiteLayout(name, spans, layers=(block,)), (0, 3), roles, "blocks.{block}.out")
-            for block, name in enumerate(names)
+            RecordedSite(SiteLayout(name, spans, layers=(block,)), (0, 3), roles) for block, name in enumerate(names)
         ),
         rules=tuple(CallRule(rf"blocks\.(?P<block>{block})", name) for block, name in enumerate(names)),
         num_layers=2,

@@ -124,12 +124,12 @@ def check_contributions(
     store: Any,
     site: str,
     stream: Callable[[int], tuple[Stream, Stream]],
-    between: str = "nothing but the projection",
+    projection: str = "",
 ) -> None:
     """Compare what is stored of each block of a site with what it adds to the residual stream in the policy's own call.
 
-    stream: block -> where the residual stream is seen before the attention and behind it. The bias of the output
-    projection, which no key gives, is taken away. between: what the store says stands between.
+    stream: block -> where the residual stream is seen before the attention and behind it. projection: path of the
+    output projection, with {block}, where it has a bias: no key gives that, and it is taken away.
     """
     recorded, modules = case.layout.site(site), modules_of(case.policy)
     blocks = recorded.keys.layers or tuple(range(case.layout.num_layers))
@@ -145,15 +145,15 @@ def check_contributions(
     seen = [[call[number[which]] for call in calls] for calls, (_, which) in zip(kept, places, strict=True)]
     expected = []
     for block, before, after in zip(blocks, seen[::2], seen[1::2], strict=True):
-        projection = modules[str(recorded.projection).replace("{block}", str(block))]
+        bias = modules[projection.replace("{block}", str(block))].bias if projection else None
         norms = []
         for first, second in zip(before, after, strict=True):
             added = (second - first)[:, 0] if case.layout.name == "act" else (second - first)[0]
             added = added[slice(*recorded.queries(len(added)))]
-            added = added if projection.bias is None else added - projection.bias.detach()
+            added = added if bias is None else added - bias.detach()
             norms.append(float(added.square().sum(dim=-1).mean()))
         expected.append([np.mean(norms)] if case.layout.autoregressive else norms)
-    assert f"{site}: {between}" in store.attributes.provenance["contributions"]
+    assert store.attributes.recording.contributions
     grams = np.asarray(store.episodes[0].read(f"{site}/contribution"))
     least = 1e-6 * np.max(expected)
     assert least > 0

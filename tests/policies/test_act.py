@@ -86,7 +86,9 @@ def test_contributions_are_what_the_layers_add(case, tmp_path, site):
         before = (layer, "given") if site == "self" else (layer.norm1, "returned")
         return before, (layer.norm1 if site == "self" else layer.norm2, "given")
 
-    check_contributions(case, record(case, tmp_path, tokenizer=None), site, stream)
+    part = "self_attn" if site == "self" else "multihead_attn"
+    projection = f"model.decoder.layers.{{block}}.{part}.out_proj"
+    check_contributions(case, record(case, tmp_path, tokenizer=None), site, stream, projection)
 
 
 def test_a_knockout_takes_the_keys_mass_away(case, tmp_path):

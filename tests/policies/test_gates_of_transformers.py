@@ -32,20 +32,18 @@ QWEN: dict[str, Any] = {
     "moe_intermediate_size": 16, "shared_expert_intermediate_size": 16, "linear_num_value_heads": 2,
     "linear_num_key_heads": 2, "linear_key_head_dim": 8, "linear_value_head_dim": 8,
 }  # fmt: skip
-#: Class, configuration, the norm that reads the residual stream behind the attention, what stands between.
+#: Class, configuration, the norm that reads the residual stream behind the attention.
 CLASSES = {
-    "Gemma 2": (Gemma2Model, Gemma2Config(**SIZES), "pre_feedforward_layernorm", "factors behind the projection"),
+    "Gemma 2": (Gemma2Model, Gemma2Config(**SIZES), "pre_feedforward_layernorm"),
     "Gemma 3": (
         Gemma3TextModel,
         Gemma3TextConfig(**SIZES),
         "pre_feedforward_layernorm",
-        "factors behind the projection",
     ),
     "Qwen3-Next": (
         Qwen3NextModel,
         Qwen3NextConfig(**QWEN),
         "post_attention_layernorm",
-        "factors before the projection",
     ),
 }
 
@@ -57,7 +55,7 @@ def layout() -> PolicyLayout:
     return PolicyLayout(
         name="model",
         family="model",
-        sites=(RecordedSite(SiteLayout("joint", spans), (-ACTIONS, None), roles, "layers.{block}.self_attn.o_proj"),),
+        sites=(RecordedSite(SiteLayout("joint", spans), (-ACTIONS, None), roles),),
         rules=(CallRule(r"layers\.(?P<block>\d+)\.self_attn", "joint"),),
         num_layers=BLOCKS,
         num_heads=HEADS,
@@ -73,7 +71,7 @@ def layout() -> PolicyLayout:
     ],
 )
 def test_contributions_are_what_the_layers_add(name, attention, tmp_path):
-    kind, config, norm, between = CLASSES[name]
+    kind, config, norm = CLASSES[name]
     torch.manual_seed(0)
     config._attn_implementation = attention
     policy = kind(config).eval().requires_grad_(False)
@@ -88,4 +86,4 @@ def test_contributions_are_what_the_layers_add(name, attention, tmp_path):
         return (layer.input_layernorm, "given"), (getattr(layer, norm), "given")
 
     store = record(case, tmp_path, tokenizer=None)
-    check_contributions(case, store, "joint", stream, between)
+    check_contributions(case, store, "joint", stream)

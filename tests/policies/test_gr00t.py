@@ -94,7 +94,8 @@ def test_contributions_are_what_the_blocks_add(case, tmp_path, site):
     def stream(block):
         return (blocks[block].norm1, "given"), (blocks[block].norm3, "given")
 
-    check_contributions(case, record(case, tmp_path), site, stream)
+    projection = "_groot_model.action_head.model.transformer_blocks.{block}.attn1.to_out.0"
+    check_contributions(case, record(case, tmp_path), site, stream, projection)
 
 
 def test_the_state_reaches_its_key(case):

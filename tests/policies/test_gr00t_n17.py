@@ -149,7 +149,11 @@ def test_rows_are_those_of_the_blocks_own_queries_and_keys(case, tmp_path):
 def test_contributions_are_what_the_blocks_add(case, tmp_path, site):
     blocks = case.policy.action_head.model.transformer_blocks
     check_contributions(
-        case, record(case, tmp_path), site, lambda block: ((blocks[block], "given"), (blocks[block], "returned"))
+        case,
+        record(case, tmp_path),
+        site,
+        lambda block: ((blocks[block], "given"), (blocks[block], "returned")),
+        "action_head.model.transformer_blocks.{block}.attn1.to_out.0",
     )
 
 

@@ -74,7 +74,7 @@ def test_contributions_are_what_the_blocks_add(case, tmp_path):
     def stream(block):
         return (blocks[block].norm1, "given"), (blocks[block].norm2, "given")
 
-    check_contributions(case, record(case, tmp_path), "joint", stream)
+    check_contributions(case, record(case, tmp_path), "joint", stream, "model.transformer.blocks.{block}.attn.proj")
 
 
 def test_a_knockout_takes_the_keys_mass_away(case, tmp_path):

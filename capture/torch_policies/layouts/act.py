@@ -10,7 +10,6 @@ from vla_attention.capture.torch_policies.layouts.layout_building import (
     KeyOrder,
     camera_name,
     find_module,
-    inside,
     rule_path,
 )
 from vla_attention.capture.torch_policies.policy_layout import CallRule, CameraPicture, PolicyLayout
@@ -40,14 +39,13 @@ def act(policy: object) -> PolicyLayout:
         keys.add_picture(camera, -(-height // stride), -(-width // stride), height, width)
     chunk = KeyOrder()
     chunk.add("actions", "action", config.chunk_size, "action")
-    decoder = inside(path, "model.decoder.layers.{block}")
     queries = (0, config.chunk_size)
     return PolicyLayout(
         name=_NAME,
         family="act",
         sites=(
-            keys.site("cross", queries, projection=f"{decoder}.multihead_attn.out_proj"),
-            chunk.site("self", queries, projection=f"{decoder}.self_attn.out_proj"),
+            keys.site("cross", queries),
+            chunk.site("self", queries),
         ),
         rules=(
             CallRule(rule_path(path, r"model\.decoder\.layers\.(?P<block>\d+)\.multihead_attn"), "cross"),

@@ -68,20 +68,17 @@ def gr00t(
     horizon = int(head.action_horizon)
     learned = head.future_tokens.num_embeddings if hasattr(head, "future_tokens") else 0
     queries = (-horizon, None)
-    output = inside(path, "action_head.model.transformer_blocks.{block}.attn1.to_out.0")
     every = getattr(head.model, "attend_text_every_n_blocks", None)
     groups = {"cross": cross} if every is None else _by_turns(cross, every)
     sites: list[RecordedSite] = [
-        keys.site(name, queries, layers=layers, projection=output, variable=texts[-1])
-        for name, layers in groups.items()
-        if layers
+        keys.site(name, queries, layers=layers, variable=texts[-1]) for name, layers in groups.items() if layers
     ]
     if self_blocks:
         tokens = KeyOrder()
         tokens.add("state", "state", state_tokens, "state")
         tokens.add("learned", "state", learned, "learned")
         tokens.add("actions", "action", horizon, "action")
-        sites.append(tokens.site("self", queries, layers=self_blocks, projection=output))
+        sites.append(tokens.site("self", queries, layers=self_blocks))
     steps = int(head.num_inference_timesteps)
     return PolicyLayout(
         name="gr00t_n1.7" if every is not None else "gr00t_n1.5",

@@ -110,9 +110,8 @@ class KeyOrder:
         *,
         layers: tuple[int, ...] = (),
         heads: int = 0,
-        projection: str | None = None,
         variable: str | None = None,
     ) -> RecordedSite:
         """Return the site with these spans; arguments as in `RecordedSite` and `SiteLayout`."""
         keys = SiteLayout(name, tuple(self.spans), layers=layers, heads=heads)
-        return RecordedSite(keys, queries, dict(self.roles), projection, variable)
+        return RecordedSite(keys, queries, dict(self.roles), variable)

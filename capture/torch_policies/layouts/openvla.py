@@ -134,7 +134,7 @@ def _layout(
     **fields: Any,
 ) -> PolicyLayout:
     llama = inside(path, "language_model.model")
-    site = keys.site("joint", queries, projection=f"{llama}.layers.{{block}}.self_attn.o_proj", variable="prompt")
+    site = keys.site("joint", queries, variable="prompt")
     text = module.config.text_config
     # OFT embeds its placeholders and the stop token with the prompt.
     after = [span.name for span in keys.spans if span.name in ("actions", "stop")]

@@ -53,7 +53,6 @@ def pi0_pytorch(policy: object, *, cameras: Sequence[str] = (), num_steps: int =
     site = keys.site(
         "joint",
         (-chunk, None),
-        projection=inside(path, f"{decoder}.{{block}}.self_attn.o_proj"),
         variable="prompt",
     )
     embedding = inside(path, "paligemma_with_expert.paligemma.model.language_model.embed_tokens")
@@ -100,7 +99,7 @@ def pi0_fast(policy: object) -> PolicyLayout:
     keys.add("prompt", "text", config.tokenizer_max_length + 1, "instruction")
     keys.add_growing("action_tokens", config.max_decoding_steps - 1)
     decoder = inside(path, "model.paligemma_with_expert.paligemma.model.language_model")
-    site = keys.site("joint", (-1, None), projection=f"{decoder}.layers.{{block}}.self_attn.o_proj", variable="prompt")
+    site = keys.site("joint", (-1, None), variable="prompt")
     return PolicyLayout(
         name="pi0_fast",
         family="pi0_fast",
@@ -152,7 +151,6 @@ def pi0_transformers(
     site = keys.site(
         "joint",
         (-config.chunk_size, None),
-        projection=inside(path, "model.dit.layers.{block}.self_attn.o_proj"),
         variable="prompt",
     )
     return PolicyLayout(

@@ -130,6 +130,5 @@ def _site(
         kind,
         (0, config.chunk_size),
         layers=blocks,
-        projection=f"{expert}.lm_expert.layers.{{block}}.self_attn.o_proj",
         variable="prompt",
     )

@@ -50,7 +50,6 @@ def xvla(policy: object) -> PolicyLayout:
     site = keys.site(
         "joint",
         (0, config.chunk_size),
-        projection=inside(path, "model.transformer.blocks.{block}.attn.proj"),
         variable="prompt",
     )
     return PolicyLayout(

@@ -7,7 +7,7 @@ values adds with the factors of that call.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -37,6 +37,7 @@ class Call:
     value: Tensor
     condition: Tensor
     branch: Tensor
+    older: Tensor
 
     def share(self, keys: slice) -> Tensor:
         """The mixed values (batch, query, head · dim) of some keys."""
@@ -96,7 +97,7 @@ class Block(nn.Module):
 
     def forward(self, tokens: Tensor, prefix: Tensor, condition: Tensor) -> Tensor:
         normed = self.norm(tokens)
-        branch = self.mlp(normed)
+        branch, older = self.mlp(normed), self.gate_proj(normed)
         both = torch.cat([prefix, normed], dim=1)
         q, k, v = (
             linear(given).view(len(given), -1, HEADS, DIM).transpose(1, 2)
@@ -108,8 +109,8 @@ class Block(nn.Module):
         if self.kept is not None:
             rows = ((q.float() @ k.float().transpose(2, 3)) / DIM**0.5).softmax(-1)
             # Some ways write over what they are given.
-            self.kept.append(Call(tokens.clone(), normed, folded.clone(), rows, v, condition, branch))
-        tokens = self.add(self, Call(tokens, normed, folded, q, v, condition, branch))
+            self.kept.append(Call(tokens.clone(), normed, folded.clone(), rows, v, condition, branch, older))
+        tokens = self.add(self, Call(tokens, normed, folded, q, v, condition, branch, older))
         return tokens + self.mlp(tokens)
 
 
@@ -156,7 +157,7 @@ def residual_layout(**changes: Any) -> PolicyLayout:
         Span("actions", "action", PREFIX, KEYS),
     )
     roles = {"image_front": "image", "prompt": "instruction", "actions": "action"}
-    site = RecordedSite(SiteLayout("joint", spans), (0, ACTIONS), roles, "blocks.{block}.out")
+    site = RecordedSite(SiteLayout("joint", spans), (0, ACTIONS), roles)
     fields: dict[str, Any] = {
         "name": "residual",
         "family": "residual",
@@ -180,8 +181,6 @@ class Way:
 
     add: Add
     part: Part
-    #: What stands in the store's provenance: gates and norms before and behind the projection.
-    between: str = field(default="")
 
 
 def chunk(block: Block, call: Call, number: int) -> Tensor:
@@ -298,6 +297,47 @@ def added_behind_the_feed_forward(block: Block, call: Call) -> Tensor:
     return tokens + block.beside(call.mixed)
 
 
+def linear_part(add: Add) -> Part:
+    """Of a way that is linear: what it adds with a share of the mixed values, less what it adds with none."""
+
+    def part(block: Block, call: Call, share: Tensor) -> Tensor:
+        with_share, without = (
+            add(block, replace(call, mixed=mixed.clone(), stream=call.stream.clone()))
+            for mixed in (share, torch.zeros_like(share))
+        )
+        return with_share - without
+
+    return part
+
+
+#: Further ways, all linear: other layers on the way, sums that are not the residual stream, and several ways.
+_LINEAR: dict[str, Add] = {
+    "adaLN in one function": lambda b, c: torch.addcmul(c.stream, b.out(c.mixed), chunk(b, c, 2)),
+    "second linear layer": lambda b, c: c.stream + b.second(b.out(c.mixed)),
+    "other tokens": lambda b, c: c.stream + b.out(c.mixed).flip(1),
+    "mixed heads": lambda b, c: c.stream + b.out(c.mixed.unflatten(-1, (HEADS, DIM)).mT.flatten(-2)),
+    "value residual": lambda b, c: c.stream + b.out(c.mixed + b.gate_proj(c.normed)),
+    "older value residual": lambda b, c: c.stream + b.out(c.older + c.mixed),
+    "adapter beside the projection": lambda b, c: c.stream + (b.out(c.mixed) + b.beside(c.mixed)),
+    "scaled adapter of a copy": (lambda b, c: c.stream + (b.out(c.mixed) + 0.5 * b.beside(c.mixed.double().float()))),
+    "adapter behind the projection": (
+        lambda b, c: c.stream + (lambda update: update + b.second(update))(b.out(c.mixed))
+    ),
+    "adapter in a gated branch": lambda b, c: c.stream + chunk(b, c, 2) * (b.out(c.mixed) + b.beside(c.mixed)),
+    "adapter of some heads": lambda b, c: c.stream + (b.out(c.mixed) + b.second(c.mixed[..., :WIDTH])),
+    "another way before": lambda b, c: (c.stream + b.beside(c.mixed)) + b.out(c.mixed),
+    "another way behind": lambda b, c: (c.stream + b.out(c.mixed)) + b.beside(c.mixed),
+    "another way behind, fused": (lambda b, c: torch.addcmul(c.stream + b.out(c.mixed), b.beside(c.mixed), b.alpha)),
+    "another way in place": added_in_place,
+    "added twice": lambda b, c: (lambda update: c.stream + update + 0.5 * update)(b.out(c.mixed)),
+    "added constant": lambda b, c: c.stream + chunk(b, c, 2) * (b.out(c.mixed) + b.second.bias),
+    "LayerNorm by hand without its scale": (
+        lambda b, c: c.stream + (lambda update: update - update.mean(-1, keepdim=True))(b.out(c.mixed))
+    ),
+    "gate of zero": lambda b, c: c.stream + 0 * b.out(c.mixed),
+}
+WAYS |= {name: Way(add, linear_part(add)) for name, add in _LINEAR.items()}
+
 #: Ways of which it cannot be said what each part adds, and a word of the sentence that says why.
 UNKNOWN: dict[str, tuple[Add, str]] = {
     "tanh": (lambda b, c: c.stream + torch.tanh(b.out(c.mixed)), "tanh"),
@@ -306,61 +346,32 @@ UNKNOWN: dict[str, tuple[Add, str]] = {
         lambda b, c: c.stream + b.out(functional.layer_norm(c.mixed, c.mixed.shape[-1:])),
         "layer_norm",
     ),
-    "adaLN in one function": (lambda b, c: torch.addcmul(c.stream, b.out(c.mixed), chunk(b, c, 2)), "addcmul"),
-    "clamped": (lambda b, c: c.stream + b.out(c.mixed).clamp(-100, 100), "clamp"),
-    "projected inside of vmap": (lambda b, c: c.stream + torch.vmap(b.out)(c.mixed), "vmap"),
-    "second linear layer": (lambda b, c: c.stream + b.second(b.out(c.mixed)), "linear"),
-    "gate of a sum": (lambda b, c: c.stream + chunk(b, c, 2) * (b.out(c.mixed) + b.mlp(c.normed)), "mul"),
+    "LayerNorm of a value residual": (
+        lambda b, c: c.stream + b.out(functional.layer_norm(c.older + c.mixed, c.mixed.shape[-1:])),
+        "of a sum with",
+    ),
+    "gate of a sum": (
+        lambda b, c: c.stream + chunk(b, c, 2) * (b.out(c.mixed) + b.mlp(c.normed)),
+        "adds a multiple of a sum with",
+    ),
     "gate of a sum with an older branch": (
         lambda b, c: c.stream + chunk(b, c, 2) * (c.branch + b.out(c.mixed)),
         "adds a multiple of a sum with",
     ),
-    "other tokens": (lambda b, c: c.stream + b.out(c.mixed).flip(1), "flip"),
+    "clamped": (lambda b, c: c.stream + b.out(c.mixed).clamp(-100, 100), "clamp"),
+    "projected inside of vmap": (lambda b, c: c.stream + torch.vmap(b.out)(c.mixed), "added to no tensor"),
     "squared": (lambda b, c: c.stream + b.out(c.mixed) ** 2, "pow"),
-    "no residual stream": (lambda b, c: b.out(c.mixed), "adds something else"),
-    "mixed heads": (lambda b, c: c.stream + b.out(c.mixed.unflatten(-1, (HEADS, DIM)).mT.flatten(-2)), "out"),
-    "value residual": (lambda b, c: c.stream + b.out(c.mixed + b.gate_proj(c.normed)), "add"),
-    "adapter beside the projection": (
-        lambda b, c: c.stream + (b.out(c.mixed) + b.beside(c.mixed)),
-        "adds something else",
-    ),
-    "scaled adapter of a copy": (
-        lambda b, c: c.stream + (b.out(c.mixed) + 0.5 * b.beside(c.mixed.double().float())),
-        "adds something else",
-    ),
-    "adapter behind the projection": (
-        lambda b, c: c.stream + (lambda update: update + b.second(update))(b.out(c.mixed)),
-        "adds something else",
-    ),
-    "adapter in a gated branch": (
-        lambda b, c: c.stream + chunk(b, c, 2) * (b.out(c.mixed) + b.beside(c.mixed)),
-        "adds something else",
-    ),
-    "adapter of some heads": (
-        lambda b, c: c.stream + (b.out(c.mixed) + b.second(c.mixed[..., :WIDTH])),
-        "adds something else",
-    ),
+    "no residual stream": (lambda b, c: b.out(c.mixed), "gelu"),
+    "gate of itself": (lambda b, c: c.stream + (lambda u: u * torch.sigmoid(u))(b.out(c.mixed)), "sigmoid"),
     "feed-forward of the output": (
         lambda b, c: c.stream + (b.out(c.mixed) + b.mlp(c.normed + b.beside(c.mixed))),
-        "adds something else",
+        "gelu",
     ),
-    "projected twice": (lambda b, c: c.stream + (b.out(c.mixed) + b.out(c.mixed.square())), "adds something else"),
-    "another way before": (lambda b, c: (c.stream + b.beside(c.mixed)) + b.out(c.mixed), "adds something else"),
-    "another way behind": (lambda b, c: (c.stream + b.out(c.mixed)) + b.beside(c.mixed), "adds something else"),
-    "another way behind, fused": (
-        lambda b, c: torch.addcmul(c.stream + b.out(c.mixed), b.beside(c.mixed), b.alpha),
-        "adds something else",
-    ),
-    "another way in place": (added_in_place, "adds something else"),
-    "another way in place of some numbers": (added_to_some_numbers, "adds something else"),
-    "added twice": (
-        lambda b, c: (lambda update: c.stream + update + 0.5 * update)(b.out(c.mixed)),
-        "adds something else",
-    ),
+    "projected twice": (lambda b, c: c.stream + (b.out(c.mixed) + b.out(c.mixed.square())), "square"),
+    "another way in place of some numbers": (added_to_some_numbers, "writes over a part"),
     "feed-forward of what was added": (
         lambda b, c: (lambda update: c.stream + update + b.mlp(update))(b.out(c.mixed)),
-        "adds something else",
+        "gelu",
     ),
     "another way behind the feed-forward": (added_behind_the_feed_forward, "adds something else"),
-    "added constant": (lambda b, c: c.stream + chunk(b, c, 2) * (b.out(c.mixed) + b.second.bias), "add"),
 }

@@ -118,7 +118,7 @@ def masked_layout() -> PolicyLayout:
     return PolicyLayout(
         name="masked",
         family="masked",
-        sites=(RecordedSite(SiteLayout("joint", spans), (0, ACTIONS), roles, "blocks.{block}.out"),),
+        sites=(RecordedSite(SiteLayout("joint", spans), (0, ACTIONS), roles),),
         rules=(CallRule(r"blocks\.(?P<block>\d+)", "joint"),),
         num_layers=LAYERS,
         num_heads=HEADS,

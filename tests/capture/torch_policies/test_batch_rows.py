@@ -15,6 +15,7 @@ import vla_attention as va
 from tests.capture.torch_policies.test_odd_policies import ACTIONS, HEADS, PREFIX, WIDTH, OddPolicy, layout, logits
 from vla_attention.capture.torch_policies.batch_rows import BatchRowsMixed
 from vla_attention.capture.torch_policies.record import record
+from vla_attention.capture.torch_policies.session import ContributionsUnknown
 from vla_attention.schemas.errors import Note
 from vla_attention.schemas.stores.reader import open_store
 
@@ -240,23 +241,19 @@ def test_what_a_module_counts_beside_its_attributes_is_as_if_it_had_not_been_cal
 def test_where_nothing_tells_a_sentence_says_that_rows_may_be_mixed(tmp_path):
     policy = folded_policy(False, FOLDED["sdpa"], "cannot be called again")
     with pytest.warns(Note, match="rows of a batch of 2 may be mixed"):
-        recorded(tmp_path / "a.zarr", policy)
+        recorded(tmp_path / "a.zarr", policy, contributions=False)
 
 
 @pytest.mark.parametrize("outside", [True, False])
 def test_contributions_tell_it_where_the_module_cannot_be_called_again(tmp_path, outside):
     policy = folded_policy(outside, FOLDED["sdpa"], "cannot be called again")
-    (site,) = layout().sites
-    with_projection = layout(
-        sites=(va.RecordedSite(site.keys, site.action_queries, site.role_of_span, "blocks.{block}.out"),)
-    )
     if outside:
-        with pytest.warns(Note, match="no contributions.*rows of a batch of 2 may be mixed"):
-            recorded(tmp_path / "a.zarr", policy, layout=with_projection)
+        with pytest.raises(ContributionsUnknown, match=r"several of them.*rows of a batch of 2 may be mixed"):
+            recorded(tmp_path / "a.zarr", policy)
     else:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            assert recorded(tmp_path / "a.zarr", policy, layout=with_projection)[0] < 2e-6
+            assert recorded(tmp_path / "a.zarr", policy)[0] < 2e-6
 
 
 @pytest.mark.parametrize("outside", [True, False])

@@ -185,7 +185,11 @@ def padded_layout(text) -> va.PolicyLayout:
 )
 def test_padding_on_the_left_moves_the_keys_and_is_refused(tmp_path, texts, text, tokenizer):
     policy = PaddedPolicy("left")
-    settings = {"layout": padded_layout(text), "tokenizer": policy.tokenizer if tokenizer else None}
+    settings = {
+        "layout": padded_layout(text),
+        "tokenizer": policy.tokenizer if tokenizer else None,
+        "contributions": False,
+    }
 
     def act(side):
         policy.side = side
@@ -219,7 +223,7 @@ class MaskedPolicy(PaddedPolicy):
 def test_patches_that_are_hidden_for_other_reasons_are_not_padding(tmp_path, text, hidden):
     policy = MaskedPolicy("right")
     ids = [IMAGE] * 4 + policy.tokenizer.encode("pick up the red bowl")
-    with va.record(tmp_path / "a.zarr", policy, layout=padded_layout(text), durable=False) as run:
+    with va.record(tmp_path / "a.zarr", policy, layout=padded_layout(text), durable=False, contributions=False) as run:
         facts = [{"task_id": row, "episode_index": 0, "instruction": ""} for row in range(2)]
         with run.episodes(facts) as found, found.replan(env_step=0):
             policy.act(ids, ["1" * 11, hidden + "1" * 7])
@@ -236,7 +240,7 @@ def test_padding_on_the_left_of_a_text_before_the_patches(tmp_path):
     roles = {"head": "template", "image_front": "image", "prompt": "instruction"}
     site = va.RecordedSite(va.SiteLayout("joint", spans), (0, 1), roles)
     policy, layout = MaskedPolicy("left"), replace(padded_layout(None), sites=(site,))
-    with va.record(tmp_path / "a.zarr", policy, layout=layout, durable=False) as run:
+    with va.record(tmp_path / "a.zarr", policy, layout=layout, durable=False, contributions=False) as run:
         facts = [{"task_id": row, "episode_index": 0, "instruction": ""} for row in range(2)]
         with (
             pytest.raises(KeysShifted, match="row 1 of the batch"),

@@ -7,7 +7,6 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from msgspec.structs import replace
 from torch import Tensor, nn
 
 import vla_attention as va
@@ -27,7 +26,6 @@ from tests.capture.torch_policies.residual_policies import (
 )
 from vla_attention.capture.torch_policies.policy_layout import CallRule, RecordedSite
 from vla_attention.capture.torch_policies.session import ContributionsUnknown
-from vla_attention.schemas.errors import Note
 from vla_attention.schemas.layout import SiteLayout, Span
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.verify import verify_store
@@ -38,11 +36,6 @@ def fill(run, policy, number=0, replans=2):
         for step in range(replans):
             with episode.replan(env_step=step) as replan:
                 replan.actions = policy.act()[0]
-
-
-def fill_two(run, policy):
-    for number in range(2):
-        fill(run, policy, number=number)
 
 
 def recorded(path, policy, replans=2, **settings):
@@ -120,21 +113,12 @@ def test_rows_of_a_batch_have_gates_of_their_own(tmp_path, name):
 
 
 @pytest.mark.parametrize(("add", "word"), UNKNOWN.values(), ids=UNKNOWN)
-def test_where_it_cannot_be_said_there_are_none_and_a_sentence_says_why(tmp_path, add, word):
+def test_where_it_cannot_be_said_a_sentence_says_why(tmp_path, add, word):
     policy = ResidualPolicy(add)
-    run = va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), durable=False)
-    with run, pytest.warns(Note, match="The store has no contributions") as notes:
-        fill_two(run, policy)
-    assert len(notes) == 1
-    sentence = str(notes[0].message)
-    assert "block 0 of site 'joint'" in sentence
-    assert "blocks.0.out" in sentence
-    assert word in sentence
-    store = stored(tmp_path)
-    assert not store.attributes.recording.contributions
-    assert store.attributes.provenance["contributions"].removeprefix("none: ") in sentence
-    assert [episode.has("joint/contribution") for episode in store.episodes] == [False, False]
-    assert va.open(tmp_path / "a.zarr").analyze()["steps_groups"].height > 0
+    with pytest.raises(ContributionsUnknown, match=r"block 0 of site 'joint'.*contributions=False") as caught:
+        recorded(tmp_path / "with", policy)
+    assert word in str(caught.value)
+    assert not recorded(tmp_path / "without", policy, contributions=False).episodes[0].has("joint/contribution")
 
 
 class Adapter(nn.Module):
@@ -150,19 +134,13 @@ class Adapter(nn.Module):
         return self.base_layer(mixed) + self.lora_B(self.lora_A(mixed)) * 2
 
 
-def test_an_adapter_is_the_projection_and_the_layer_inside_of_it_is_not(tmp_path):
+def test_an_adapter_that_is_not_merged(tmp_path):
     policy = ResidualPolicy(WAYS["plain"].add)
     for block in policy.blocks:
         block.out = Adapter(block.out)
     way = Way(WAYS["plain"].add, lambda block, call, share: block.out(share) - block.out(torch.zeros_like(share)))
     for gram in recorded(tmp_path, policy).episodes[0].read("joint/contribution"):
         close(gram, expected(policy, way))
-
-    site = replace(residual_layout().sites[0], projection="blocks.{block}.out.base_layer")
-    run = va.record(tmp_path / "inside.zarr", policy, layout=residual_layout(sites=(site,)), durable=False)
-    with run, pytest.warns(Note, match=r"module 'blocks.0.out' adds something else"):
-        fill(run, policy)
-    assert not run.attributes.recording.contributions
 
 
 def test_a_policy_that_begins_to_do_otherwise_is_an_error(tmp_path):
@@ -174,33 +152,6 @@ def test_a_policy_that_begins_to_do_otherwise_is_an_error(tmp_path):
         with pytest.raises(ContributionsUnknown, match=r"computes tanh .* Nothing of this episode was kept"):
             fill(run, policy, number=1)
     assert [episode.name for episode in stored(tmp_path).episodes] == ["task000_episode000"]
-
-
-@pytest.mark.parametrize("name", ["plain", "tanh"])
-def test_a_store_that_is_continued_keeps_what_it_has(tmp_path, name):
-    policy = ResidualPolicy(WAYS[name].add if name in WAYS else UNKNOWN[name][0])
-    notes = 0
-    for number in range(2):
-        with (
-            warnings.catch_warnings(record=True) as caught,
-            va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), resume=True, durable=False) as run,
-        ):
-            warnings.simplefilter("always")
-            assert run.has(0, 0) == bool(number)
-            fill(run, policy, number=number)
-        notes += len(caught)
-    assert notes == (name == "tanh")
-    store = stored(tmp_path)
-    assert [episode.has("joint/contribution") for episode in store.episodes] == [name == "plain"] * 2
-    # Another policy, whose gates are not known, may not be mixed in.
-    if name == "plain":
-        for block in policy.blocks:
-            block.add = UNKNOWN["tanh"][0]
-        with (
-            va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), resume=True, durable=False) as run,
-            pytest.raises(ContributionsUnknown),
-        ):
-            fill(run, policy, number=2)
 
 
 class Multihead(nn.Module):
@@ -232,7 +183,7 @@ def test_attention_that_projects_its_output_itself(tmp_path, batch_first):
 
     site = residual_layout().sites[0]
     layout = residual_layout(
-        sites=(type(site)(site.keys, site.action_queries, site.role_of_span, "block.attention.out_proj"),),
+        sites=(type(site)(site.keys, site.action_queries, site.role_of_span),),
         rules=(CallRule(r"block\.attention", None, sequence=(("joint", 0),)),),
         num_layers=1,
         num_denoise_steps=1,
@@ -297,7 +248,7 @@ AGAIN = {
 def test_a_second_attention_that_adds_the_output_of_the_first_again(tmp_path, again, crosses):
     (joint,) = residual_layout().sites
     memory = SiteLayout("cross", (Span("prompt", "text", 0, MEMORY),))
-    cross = RecordedSite(memory, (0, ACTIONS), {"prompt": "instruction"}, "blocks.{block}.cross_out")
+    cross = RecordedSite(memory, (0, ACTIONS), {"prompt": "instruction"})
     rules = (
         CallRule(r"blocks\.(?P<block>\d+)", "joint", keys=joint.keys.num_keys),
         CallRule(r"blocks\.(?P<block>\d+)", "cross" if crosses else None, keys=MEMORY),
@@ -310,10 +261,8 @@ def test_a_second_attention_that_adds_the_output_of_the_first_again(tmp_path, ag
             recorded(tmp_path, policy, layout=layout).episodes[0].read("joint/contribution")[0], expected(policy, way)
         )
         return
-    run = va.record(tmp_path / "a.zarr", policy, layout=layout, durable=False)
-    with run, pytest.warns(Note, match="adds something else that is computed of what the attention gave"):
-        fill(run, policy)
-    assert not stored(tmp_path).attributes.recording.contributions
+    with pytest.raises(ContributionsUnknown, match=r"in block 0 of site 'joint'.* what the attention gave"):
+        recorded(tmp_path, policy, layout=layout)
 
 
 class Experts(nn.Module):
@@ -344,7 +293,7 @@ def test_experts_that_share_an_attention(tmp_path, gated):
     context, tokens = torch.randn(1, 6, WIDTH), torch.randn(1, ACTIONS, WIDTH)
     site = residual_layout().sites[0]
     layout = residual_layout(
-        sites=(type(site)(site.keys, (-ACTIONS, None), site.role_of_span, "block.second"),),
+        sites=(type(site)(site.keys, (-ACTIONS, None), site.role_of_span),),
         rules=(CallRule("block", None, sequence=(("joint", 0),)),),
         num_layers=1,
         num_denoise_steps=1,
@@ -401,12 +350,8 @@ def test_a_projection_that_is_not_linear_has_no_parts(tmp_path):
     policy = ResidualPolicy(WAYS["plain"].add)
     for block in policy.blocks:
         block.out = Rectified(HEADS * DIM, WIDTH)
-    with (
-        pytest.warns(Note, match=r"add up to something that differs .* 'blocks\.0\.out'"),
-        va.record(tmp_path / "a.zarr", policy, layout=residual_layout(), durable=False) as run,
-    ):
-        fill(run, policy)
-    assert not stored(tmp_path).attributes.recording.contributions
+    with pytest.raises(ContributionsUnknown, match=r"module 'blocks\.0\.out' computes relu"):
+        recorded(tmp_path, policy)
 
 
 def test_what_is_done_to_the_output_by_code_that_is_not_seen_is_noticed(tmp_path):
@@ -423,6 +368,5 @@ def test_what_is_done_to_the_output_by_code_that_is_not_seen_is_noticed(tmp_path
 
     for number, add in enumerate((through_numpy, before)):
         policy = ResidualPolicy(add)
-        run = va.record(tmp_path / f"{number}.zarr", policy, layout=residual_layout(), durable=False)
-        with run, pytest.warns(Note, match="The store has no contributions"):
-            fill(run, policy)
+        with pytest.raises(ContributionsUnknown, match="add up to something that differs"):
+            recorded(tmp_path / str(number), policy)

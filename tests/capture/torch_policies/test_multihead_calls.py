@@ -54,7 +54,7 @@ def test_rows_and_results(data):
     with seen_by_python():
         expected = policy(hidden, memory, **masks)
     seen = Seen()
-    with watch_attention(policy, seen, every_function=data.draw(st.booleans())):
+    with watch_attention(policy, seen):
         result = policy(hidden, memory, **masks)
     assert torch.equal(result, expected)
     shape, call, rows = seen.shapes[0], seen.calls[0], seen.rows[0]
@@ -114,8 +114,7 @@ def test_a_change_takes_keys_away(mask):
     assert torch.equal(first.allowed[0], second.allowed[0])
 
 
-@pytest.mark.parametrize("every_function", [True, False])
-def test_the_fast_path_is_off_inside_and_as_before_afterwards(every_function):
+def test_the_fast_path_is_off_inside_and_as_before_afterwards():
     """An encoder layer in eval mode calls nothing that can be seen on the fast path, which torch takes in no mode."""
     torch.manual_seed(0)
     policy = nn.TransformerEncoder(nn.TransformerEncoderLayer(16, 4, batch_first=True), 2).eval()
@@ -124,7 +123,7 @@ def test_the_fast_path_is_off_inside_and_as_before_afterwards(every_function):
         torch.backends.mha.set_fastpath_enabled(before)
         try:
             seen = Seen()
-            with torch.no_grad(), watch_attention(policy, seen, every_function=every_function):
+            with torch.no_grad(), watch_attention(policy, seen):
                 policy(hidden)
             assert [shape.module for shape in seen.shapes] == ["layers.0.self_attn", "layers.1.self_attn"]
             assert torch.backends.mha.get_fastpath_enabled() is before

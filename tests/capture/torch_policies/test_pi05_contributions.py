@@ -68,4 +68,3 @@ def test_gates_are_in_both(tmp_path):
         for block in model.paligemma_with_expert.gemma_expert.model.layers
     ]
     assert all((gate - 1).abs().max() > 0.3 for _, gate in gates)
-    assert stored.attributes.provenance["contributions"].endswith("(joint: factors behind the projection)")

@@ -27,7 +27,7 @@ KEYS = SiteLayout(
     ),
 )
 ROLES = {"image_front": "image", "prompt": "instruction", "actions": "action"}
-SITE = RecordedSite(KEYS, (-3, None), ROLES, "blocks.{block}.out", "prompt")
+SITE = RecordedSite(KEYS, (-3, None), ROLES, "prompt")
 LAYOUT = PolicyLayout(
     name="small",
     family="small",

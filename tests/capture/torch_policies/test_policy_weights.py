@@ -146,7 +146,8 @@ def test_whatever_has_bytes_is_in_the_digest(tmp_path, make):
     assert unread == ()
     assert one == digest(0)[0] != other
     torch.manual_seed(0)
-    assert record(tmp_path / "a.zarr", make(0)).policy.digest == one
+    # What torch.ao quantises is projected by an operator of its own.
+    assert record(tmp_path / "a.zarr", make(0), contributions=False).policy.digest == one
 
 
 @pytest.mark.parametrize(("make", "name"), UNREAD.values(), ids=UNREAD)

@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from msgspec.structs import replace
 from torch import nn
 
 import vla_attention as va
@@ -30,7 +29,7 @@ from vla_attention.capture.torch_policies.prompts import PromptDoesNotFit
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.recorded_episodes import NothingRecorded
 from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
-from vla_attention.capture.torch_policies.watched_block import NotFollowed
+from vla_attention.capture.torch_policies.watch import NotFollowed
 from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import knockout
@@ -283,16 +282,6 @@ def test_resuming_goes_on_and_refuses_another_run(tmp_path, policy):
         ({"heads": [2]}, BadArgument, "There is no head 2; expected 0 to 1"),
         ({"resume": True, "overwrite": True}, BadArgument, "not both"),
         ({"layout": small_layout(versions={"torch": ("1.0",)})}, LayoutForAnotherVersion, "written for torch 1.0"),
-        (
-            {
-                "layout": small_layout(
-                    sites=(replace(small_layout().sites[0], projection="blocks.{block}.attention.o"),)
-                )
-            },
-            BadArgument,
-            "The output projection 'blocks.0.attention.o' of site 'joint' is no module of the policy. Did you mean "
-            "'blocks.0.attention.out'?",
-        ),
     ],
 )
 def test_wrong_arguments_are_sentences(tmp_path, policy, changes, error, sentence):

@@ -143,7 +143,7 @@ def test_rows_and_results(attend, data):
     expected = policy(hidden, memory, mask)
     taken.clear()
     seen = Seen()
-    with watch_attention(policy, seen, every_function=data.draw(st.booleans())):
+    with watch_attention(policy, seen):
         result = policy(hidden, memory, mask)
     assert torch.equal(result, expected)
     assert [shape.module for shape in seen.shapes] == ["layers.0", "layers.1"]
@@ -173,8 +173,6 @@ def test_some_queries_and_batch_rows(attend):
     for call, rows in zip(seen.calls, seen.rows, strict=True):
         for queries, batch in ((slice(1, 3), slice(None)), ([4, 0], [2, 1]), (slice(-1, None), slice(0, 1))):
             places = range(5)[queries] if isinstance(queries, slice) else queries
-            if call.tensors.softmax.logits is None:
-                continue
             some = call.rows(queries, batch)
             torch.testing.assert_close(some, rows[batch][:, :, list(places)])
             assert call.product_error(some, queries, batch) < 5e-6

@@ -15,8 +15,7 @@ from torch.nn.functional import scaled_dot_product_attention as sdpa
 from tests.kit.attention_modules import Attention, Policy, Seen
 from vla_attention.capture.torch_policies.policy_modules import CannotRunEager, modules_of
 from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
-from vla_attention.capture.torch_policies.watch import AlreadyWatched, watch_attention
-from vla_attention.capture.torch_policies.watched_block import NotFollowed, OtherPolicy
+from vla_attention.capture.torch_policies.watch import AlreadyWatched, NotFollowed, OtherPolicy, watch_attention
 
 
 def attend(query, key, value, mask):
@@ -115,8 +114,7 @@ class InMethods(nn.Module):
 
 
 @pytest.mark.parametrize("way", ["call", "forward", "method"])
-@pytest.mark.parametrize("every_function", [True, False])
-def test_a_policy_that_runs_in_another_thread_is_refused(way, every_function):
+def test_a_policy_that_runs_in_another_thread_is_refused(way):
     policy, methods, seen = small_policy(), InMethods(), Seen()
     call = {
         "call": lambda: policy(HIDDEN, MEMORY),
@@ -128,7 +126,7 @@ def test_a_policy_that_runs_in_another_thread_is_refused(way, every_function):
         # The first call of a thread may use another number of OpenMP threads than all later ones: other last bits.
         expected = [pool.submit(call).result() for _ in range(2)][-1]
         with pytest.raises(NotFollowed, match=r"\(Wrapper\) ran in another thread.*around that one call"):  # noqa: SIM117
-            with watch_attention(policies, seen, every_function=every_function):
+            with watch_attention(policies, seen):
                 result = pool.submit(call).result()
         assert torch.equal(result, expected)
         assert not seen.shapes

@@ -1,0 +1,385 @@
+"""The outputs of attention calls on their way to the residual stream, kept as functions that can be run again.
+
+What a policy computes of an output is kept as a replay: a function of the output, for as long as it is linear in it
+(copies, folds, products with other tensors, linear layers, sums). With another output, such as one part of the keys'
+share, the replay gives what that part becomes. Factors that are made of the output itself, as by a norm, stay those of
+the call.
+
+The sum of such a tensor with another one as large may be the residual stream. Whether it is shows later: the stream is
+added to something that is computed of it (a feed-forward layer's output, the next attention's). Where the sum itself is
+scaled or projected and then added once more, it was none (a value residual, a gated branch), and the later sum is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils import _pytree as pytree
+
+from vla_attention.capture.torch_policies.tensor_table import TensorTable, tensors_among
+
+#: Numbers in the axes of a call's result -> what the policy made of them, float32.
+Replay = Callable[[Tensor], Tensor]
+
+#: Functions by their names without underscores: those of the same numbers, whatever their precision and device.
+_COPIES = {
+    "to", "type", "type_as", "float", "half", "bfloat16", "double", "contiguous", "clone", "detach", "cpu", "cuda",
+    "requires_grad",
+}  # fmt: skip
+_FOLDS = {
+    "view", "reshape", "flatten", "unflatten", "ravel", "squeeze", "unsqueeze", "transpose", "swapaxes", "swapdims",
+    "permute", "movedim", "t", "get", "view_as", "reshape_as", "expand", "expand_as", "repeat", "repeat_interleave",
+    "chunk", "split", "unbind", "narrow", "select", "index_select", "getitem", "flip", "roll", "gather",
+    "take_along_dim",
+}  # fmt: skip
+_SUMS = {"add", "radd", "iadd", "sub", "rsub", "isub", "addcmul"}
+_MATRIX_PRODUCTS = {"linear", "matmul", "bmm", "mm", "einsum", "rmatmul", "conv1d"}
+_PRODUCTS = {"mul", "rmul", "imul"} | _MATRIX_PRODUCTS
+_QUOTIENTS = {"div", "truediv", "itruediv", "true_divide"}
+_JOINS = {"cat", "concat", "stack", "sum", "mean", "neg"}
+#: Functions that multiply every number with a factor of its own: a norm, or a dropout.
+_SCALES = {"rms_norm", "dropout"}
+
+
+#: Functions whose result has numbers of their first argument only, or none of what they are given.
+_OF_THE_FIRST = _COPIES | {"view_as", "reshape_as", "expand_as"}
+_OF_NONE = {
+    "zeros_like", "ones_like", "empty_like", "full_like", "randn_like",
+    "new_zeros", "new_ones", "new_empty", "new_full",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """What was kept of a sum.
+
+    projected: whether a matrix product stands between it and the attention, or the sum before. sums: those before that
+    are in it. doubtful: a sum before may be the stream as well: it was scaled or projected, and is as large.
+    """
+
+    kept: Any
+    shape: torch.Size
+    projected: bool
+    sums: tuple[int, ...]
+    doubtful: bool
+
+
+@dataclass(eq=False)
+class OutputWay:
+    """The output of one attention call, to be followed to the residual stream.
+
+    Attributes:
+        take: until the stream is found, makes of a replay, and of what the policy added, what is kept of it, and
+            whether the recorded queries are in it. It raises `NotReplayed` where the two differ.
+        taken: what was kept, of each sum that may be the residual stream.
+        nothing: what was kept where the recorded queries are not in a sum: other tokens', or behind a gate of 0.
+        lost: why it is not known what is added; "" where nothing stands against it.
+        found: whether the residual stream is known; it is the last of `taken` then.
+        changed: what was done to it first that is not linear, as "module 'x' computes tanh of".
+    """
+
+    take: Callable[[Replay, Tensor], tuple[Any, bool]] | None
+    taken: list[_Taken] = field(default_factory=list, init=False)
+    nothing: Any = field(default=None, init=False)
+    lost: str = field(default="", init=False)
+    found: bool = field(default=False, init=False)
+    changed: str = field(default="", init=False)
+
+    def result(self) -> Any:
+        """Return what was kept of the sum that is the residual stream; None, and `lost` says why, where none is."""
+        if not self.lost and not self.taken and self.nothing is not None:
+            return self.nothing
+        if not self.lost and not self.taken:
+            computed = f"; {self.changed} it" if self.changed else ""
+            self.lost = f"what the attention gave is added to no tensor of the same shape{computed}"
+        if self.lost:
+            return None
+        last = self.taken[-1]
+        if not self.found and (last.doubtful or len(last.sums) < len(self.taken) - 1):
+            self.lost = "what the attention gave is added to several tensors, none of which shows to be the stream"
+        return None if self.lost else last.kept
+
+
+class NotReplayed(Exception):
+    """A replay that gives something else than what the policy computed; the message says what."""
+
+
+@dataclass(frozen=True)
+class _Step:
+    """What a tensor is to an output.
+
+    Attributes:
+        replay: None where it is not linear in it.
+        sums: the numbers of the sums that it comes from, in order, from 1.
+        is_sum: whether it is the last of them, and not something computed of it.
+        projected: whether a matrix product stands on its way, from the last sum on.
+        factor: whether it is made of numbers such as those by which a norm divides.
+    """
+
+    replay: Replay | None
+    sums: tuple[int, ...] = ()
+    is_sum: bool = False
+    projected: bool = False
+    factor: bool = False
+
+
+_Steps = Sequence[tuple[Tensor, _Step]]
+
+
+class OutputWays:
+    """Follows the outputs of attention calls in one thread.
+
+    running: the module that is running, in words. computing: for computing beside the policy.
+    entries: of the tensors that are followed; empty where none is.
+    """
+
+    def __init__(self, running: Callable[[], str], computing: Callable[[], AbstractContextManager[None]]) -> None:
+        self._table: TensorTable[dict[OutputWay, _Step]] = TensorTable()
+        self.entries = self._table.entries
+        self._running, self._computing = running, computing
+
+    def begin(self, way: OutputWay, result: Tensor) -> None:
+        """Follow the output of a call that has just run; result: what the policy got of it."""
+        self._put([result], way, _Step(lambda given: given))
+
+    def follow(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], run: Callable[[], Any]) -> Any:
+        """Run a function, and note what its result is to the outputs that are followed."""
+        name = getattr(function, "__name__", "").strip("_")
+        given = () if name in _OF_NONE else args[:1] if name in _OF_THE_FIRST and args else (*args, *kwargs.values())
+        known = [(tensor, steps) for tensor in tensors_among(given) if (steps := self._table.get(tensor)) is not None]
+        if not known:
+            return run()
+        call = _Call(name, function, args, kwargs)
+        if call.in_place:
+            with self._computing():
+                call.first = args[0].clone()
+        call.result = run()
+        results = list(tensors_among((args[0] if name == "setitem" else call.result,)))
+        for way in {way for _, steps in known for way in steps} if results else ():
+            self._step(way, call, [(tensor, steps[way]) for tensor, steps in known if way in steps], results)
+        return call.result
+
+    def _step(self, way: OutputWay, call: _Call, steps: _Steps, results: Sequence[Tensor]) -> None:
+        """Note what a function made of what is followed of one output."""
+        from_start = any(not step.sums and not step.factor for _, step in steps)
+        if way.found:
+            if from_start and (call.name in _SUMS or call.name == "setitem"):
+                self._lose(way, "adds something else that is computed of")
+            else:
+                self._put(results, way, _Step(None))
+        elif call.in_place and self._shares_stream(way, call.args[0]):
+            self._lose(way, "writes over a part of a sum with")
+        elif call.name in _SUMS:
+            self._add(way, call, steps, results[0])
+        else:
+            sums = _sums(steps)
+            projected = call.name in _MATRIX_PRODUCTS or any(step.projected for _, step in steps)
+            replay = self._replay(call, steps)
+            if replay is not None:
+                is_sum = call.name in _COPIES | _FOLDS and any(step.is_sum for _, step in steps)
+                for position, result in enumerate(results):
+                    picked = replay if isinstance(call.result, Tensor) else _picked(replay, position)
+                    self._put([result], way, _Step(picked, sums, is_sum, projected))
+                return
+            factor = all(step.factor for _, step in steps) or _is_norm(call.name, steps, results)
+            if not way.changed and any(step.replay is not None for _, step in steps) and not factor:
+                way.changed = f"{self._running()} computes {call.name} of"
+            self._put(results, way, _Step(None, sums, projected=projected, factor=factor))
+
+    def _add(self, way: OutputWay, call: _Call, steps: _Steps, result: Tensor) -> None:
+        """Note a sum, which may be the residual stream."""
+        sums, projected = _sums(steps), any(step.projected for _, step in steps)
+        others = [
+            tensor
+            for tensor in tensors_among((*call.args, *call.kwargs.values()))
+            if tensor.shape == result.shape and all(tensor is not known for known, _ in steps)
+        ]
+        streams = [step for _, step in steps if step.is_sum]
+        rest = [step for _, step in steps if not step.is_sum]
+        nonlinear = [step for step in rest if step.replay is None]
+        if any(step.factor for step in rest):
+            factor = all(step.factor for step in rest) and not streams
+            self._put([result], way, _Step(None, sums, projected=projected, factor=factor))
+        elif streams and any(streams[0].sums[-1] in step.sums for step in rest):
+            self._find(way, streams[0].sums[-1])
+        elif nonlinear and (streams or others) and not all(step.sums for step in nonlinear):
+            self._lose(way)
+        elif len(nonlinear) > 1 and sums:
+            self._find(way, sums[-1])
+        elif nonlinear and others and projected:
+            self._lose(way, "adds something else that is computed of a sum with")
+        elif nonlinear:
+            of_all = () if any(not step.sums for _, step in steps) else sums
+            self._put([result], way, _Step(None, of_all, projected=projected))
+        elif (others and not streams) or (streams and rest):
+            self._sum(way, call, steps, result)
+        else:
+            self._put([result], way, _Step(self._replay(call, steps), sums, bool(streams), projected))
+
+    def _sum(self, way: OutputWay, call: _Call, steps: _Steps, result: Tensor) -> None:
+        """Take a sum with another tensor as large for the residual stream, until another one shows to be it."""
+        sums, projected = _sums(steps), any(step.projected for _, step in steps)
+        before = way.taken[sums[-1] - 1] if sums else None
+        if before is not None and before.projected and before.shape != result.shape:
+            return  # the stream has left the network: what became of it is added to noisy actions
+        replay = self._replay(call, steps)
+        if replay is None:
+            way.changed = way.changed or f"{self._running()} computes {call.name} of"
+            self._lose(way)
+            return
+        of_added, added = replay, result
+        if len(steps) == 1 and call.name != "addcmul":
+            # What is added is compared, for the stream may be many times as large.
+            tensor, step = steps[0]
+            factor = 1 if call.args[:1] and call.args[0] is tensor else call.kwargs.get("alpha", 1)
+            added = call.first if call.first is not None and call.args[0] is tensor else tensor
+            of_tensor = step.replay
+            assert of_tensor is not None
+            of_added = of_tensor if factor == 1 else _scaled(of_tensor, factor)
+            added = added if factor == 1 else factor * added
+        assert way.take is not None
+        taken, there = None, False
+        with self._computing():
+            try:
+                taken, there = way.take(of_added, added.detach())
+            except NotReplayed as error:
+                way.lost = str(error)
+            except (RuntimeError, TypeError, ValueError, IndexError) as error:
+                way.lost = f"what the policy does with it cannot be computed again ({error})"
+        if way.lost:
+            self._lose(way)
+        elif not there:
+            way.nothing = taken
+        else:
+            doubtful = before is not None and before.projected and not any(step.is_sum for _, step in steps)
+            way.taken.append(_Taken(taken, result.shape, projected, sums, doubtful))
+            self._put([result], way, _Step(replay, (*sums, len(way.taken)), is_sum=True))
+
+    def _replay(self, call: _Call, steps: _Steps) -> Replay | None:
+        with self._computing():
+            return call.replay(steps)
+
+    def _shares_stream(self, way: OutputWay, written: Tensor) -> bool:
+        """Whether a tensor is a part of another one that may be the residual stream."""
+        return written._is_view() and any(
+            way in steps
+            and steps[way].is_sum
+            and (tensor := reference()) is not None
+            and tensor is not written
+            and tensor.untyped_storage().data_ptr() == written.untyped_storage().data_ptr()
+            for reference, steps in list(self.entries.values())
+        )
+
+    def _find(self, way: OutputWay, number: int) -> None:
+        """Say which sum is the residual stream. What came before it is followed on: it may be added once more."""
+        if way.taken[number - 1].doubtful:
+            self._lose(way, "adds a multiple of a sum with")
+            return
+        way.found, way.take = True, None
+        del way.taken[number:]
+        self._change(way, lambda step: None if step.sums or step.factor else _Step(None))
+
+    def _lose(self, way: OutputWay, what: str = "") -> None:
+        """Note why it is not known what is added: what the running module does, or what it did before."""
+        way.take = None
+        way.lost = way.lost or f"{f'{self._running()} {what}' if what else way.changed} what the attention gave"
+        self._change(way, lambda step: None)
+
+    def _change(self, way: OutputWay, change: Callable[[_Step], _Step | None]) -> None:
+        for _, steps in list(self.entries.values()):
+            step = change(steps.pop(way)) if way in steps else None
+            if step is not None:
+                steps[way] = step
+        self._table.keep(bool)
+
+    def _put(self, tensors: Sequence[Tensor], way: OutputWay, step: _Step) -> None:
+        for tensor in tensors:
+            self._table.put(tensor, {**(self._table.get(tensor) or {}), way: step})
+
+
+@dataclass
+class _Call:
+    """A function of torch that was given tensors that are followed.
+
+    name: without underscores. first: of a function that writes over its first argument, a copy of that.
+    """
+
+    name: str
+    function: Any
+    args: tuple[Any, ...]
+    kwargs: Mapping[str, Any]
+    first: Tensor | None = None
+    result: Any = None
+
+    @property
+    def in_place(self) -> bool:
+        """Whether it writes over its first argument."""
+        name = getattr(self.function, "__name__", "")
+        return (name.endswith("_") and not name.endswith("__")) or name.startswith("__i") or name == "__setitem__"
+
+    def replay(self, steps: _Steps) -> Replay | None:
+        """Return the result as a function of an output, None where it is not linear in it."""
+        linear = {id(tensor): step.replay for tensor, step in steps if step.replay is not None}
+        if not linear or any(step.replay is None and not step.factor for _, step in steps) or "out" in self.kwargs:
+            return None
+        (tensor, step), single = steps[0], len(linear) == 1
+        factors = len(linear) < len({id(tensor) for tensor, _ in steps})
+        divided = self.name in _QUOTIENTS and id(self.args[0]) in linear and not self.kwargs.get("rounding_mode")
+        if self.name in _SCALES and single and step.replay is not None:
+            return _scaled(step.replay, (self.result.float() / tensor.float()).nan_to_num())
+        product = single and (self.name in _PRODUCTS or divided)
+        if not product and (factors or self.name not in _COPIES | _FOLDS | _SUMS | _JOINS):
+            return None
+        if self.name in _COPIES:
+            return step.replay
+        first = (self.first, *self.args[1:]) if self.in_place and id(self.args[0]) not in linear else self.args
+        given, form = pytree.tree_flatten((first, dict(self.kwargs)))
+        given = [_Followed(linear[id(value)]) if id(value) in linear else value for value in given]
+        function, in_place = self.function, self.in_place
+
+        def replay(output: Tensor) -> Tensor:
+            values = [_filled(value, output) for value in given]
+            if in_place:
+                values[0] = values[0].clone()
+            args, kwargs = pytree.tree_unflatten(values, form)
+            result: Tensor = function(*args, **kwargs)
+            return result
+
+        return replay
+
+
+def _sums(steps: _Steps) -> tuple[int, ...]:
+    return tuple(sorted({number for _, step in steps for number in step.sums}))
+
+
+def _is_norm(name: str, steps: _Steps, results: Sequence[Tensor]) -> bool:
+    """Whether of the numbers on the last axis of a tensor one is made: by this a norm divides."""
+    shape = steps[0][0].shape
+    norms = (*shape[:-1], 1), tuple(shape[:-1])
+    return name not in _MATRIX_PRODUCTS and all(tuple(result.shape) in norms for result in results)
+
+
+@dataclass(frozen=True)
+class _Followed:
+    """An argument of a function that is computed again."""
+
+    replay: Replay
+
+
+def _filled(value: Any, output: Tensor) -> Any:
+    if isinstance(value, Tensor):
+        return value.float() if value.is_floating_point() else value
+    return value.replay(output) if isinstance(value, _Followed) else value
+
+
+def _scaled(replay: Replay, factor: Any) -> Replay:
+    return lambda given: replay(given) * factor
+
+
+def _picked(replay: Callable[[Tensor], Any], position: int) -> Replay:
+    return lambda given: replay(given)[position]
