@@ -133,7 +133,7 @@ def record(
         frames=frames,
         contributions=contributions,
     )
-    recording = plan_recording(settings, layout)
+    recording = recording_of_layout(settings, layout)
     changes = interventions or Interventions()
     check_interventions(changes, layout)
     planned = effects_of_layout(effects, layout)
@@ -178,7 +178,7 @@ def record(
     )
 
 
-def plan_recording(settings: RecordingSettings, layout: PolicyLayout) -> Recording:
+def recording_of_layout(settings: RecordingSettings, layout: PolicyLayout) -> Recording:
     """Return what is recorded; raise `BadArgument` for what the layout does not have."""
     queries, bits = settings.queries, settings.mantissa_bits
     if queries not in ("mean", "all"):
