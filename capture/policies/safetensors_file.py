@@ -1,7 +1,4 @@
-"""safetensors files, one or several with an index.
-
-The length of a header is checked before it is read, and every error names the file.
-"""
+"""safetensors files, one or several with an index. Every error names the file."""
 
 from __future__ import annotations
 
@@ -14,21 +11,9 @@ from typing import Any
 from safetensors import safe_open
 from torch import Tensor
 
-from vla_attention.capture.policies.checkpoints import (
-    CheckpointMismatch,
-    UnreadableCheckpoint,
-    check_checkpoint_file,
-    read_json_object,
-)
+from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint, check_checkpoint_file, read_json_object
+from vla_attention.capture.policies.weights import check_floats
 from vla_attention.schemas.errors import listing
-
-#: Bytes of the header: names, shapes and places. A model of a thousand tensors has 0.15 MB; the format allows 100 MB,
-#: of which a reader makes some gigabytes.
-MAX_HEADER_BYTES = 8_000_000
-#: Types of weights. Whole numbers and 8 bits need scales, without which they would be other weights.
-_FLOATS = ("F64", "F32", "F16", "BF16")
-#: Files of one checkpoint; all are open at the same time.
-_MAX_FILES = 200
 
 
 @dataclass(frozen=True)
@@ -55,31 +40,14 @@ class SafetensorsFile:
         return tensor
 
     def check_floats(self, names: Iterable[str]) -> None:
-        """Raise `CheckpointMismatch` for weights that are no floating point numbers of at least 16 bits."""
-        kinds = {name: str(self.stored.get_slice(name).get_dtype()) for name in names}
-        wrong = [f"{name} ({kind})" for name, kind in kinds.items() if kind not in _FLOATS]
-        if wrong:
-            raise CheckpointMismatch(
-                f"'{self.path}' has weights that are no floating point numbers of 16 bits or more: {listing(wrong)}; "
-                "use the checkpoint before it was quantized."
-            )
+        """Raise `CheckpointMismatch` for tensors that are no weights; see `weights.check_floats`."""
+        check_floats({name: str(self.stored.get_slice(name).get_dtype()) for name in names}, self.path)
 
 
 @contextmanager
 def open_safetensors(path: Path) -> Iterator[SafetensorsFile]:
     """Open a file; `UnreadableCheckpoint` for a damaged one, also later while it is read."""
-    size = check_checkpoint_file(path)
-    with path.open("rb") as file:
-        header = int.from_bytes(file.read(8), "little")
-    if size < 8 or header > size - 8:
-        raise UnreadableCheckpoint(
-            f"'{path}' has {size} bytes, of which its header would take {header}: the file is damaged or its copy "
-            "incomplete."
-        )
-    if header > MAX_HEADER_BYTES:
-        raise UnreadableCheckpoint(
-            f"'{path}' has a header of {header} bytes; a header of {MAX_HEADER_BYTES} at most is read."
-        )
+    check_checkpoint_file(path)
     try:
         opened = safe_open(path, framework="pt")
     except Exception as error:  # the library's own, and PyTorch's for a file that does not fit into memory
@@ -117,8 +85,6 @@ def open_indexed_safetensors(index: Path) -> Iterator[SafetensorsFile]:
     ):
         raise UnreadableCheckpoint(f"'{index}' has no weight_map from tensors to files beside it.")
     files = sorted(set(stated.values()))
-    if len(files) > _MAX_FILES:
-        raise UnreadableCheckpoint(f"'{index}' names {len(files)} files; {_MAX_FILES} at most are read.")
     with ExitStack() as stack:
         opened = {file: stack.enter_context(open_safetensors(index.parent / file)) for file in files}
         held = {name: file for file in files for name in opened[file].names()}

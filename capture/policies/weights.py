@@ -25,6 +25,24 @@ def dtype_name(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
 
 
+#: Names of the types of weights, as PyTorch, numpy and safetensors call them. Whole numbers and 8 bits need scales,
+#: without which they would be other weights.
+_FLOATS = {"float64", "float32", "float16", "bfloat16", "F64", "F32", "F16", "BF16"}
+
+
+def check_floats(kinds: Mapping[str, str], where: object) -> None:
+    """Raise `CheckpointMismatch` for weights that are no floating point numbers of at least 16 bits.
+
+    kinds: name -> its type. where: the file or folder, for the error.
+    """
+    wrong = [f"{name} ({kind})" for name, kind in kinds.items() if kind.removeprefix("torch.") not in _FLOATS]
+    if wrong:
+        raise CheckpointMismatch(
+            f"'{where}' has weights that are no floating point numbers of 16 bits or more: {listing(wrong)}; use the "
+            "checkpoint before it was quantized."
+        )
+
+
 class WeightsNotFinite(UserError, ValueError):
     """Weights of a model hold NaN or infinity."""
 

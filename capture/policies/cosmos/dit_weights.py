@@ -17,7 +17,7 @@ from vla_attention.capture.policies.checkpoints import (
 )
 from vla_attention.capture.policies.cosmos.config import DitConfig
 from vla_attention.capture.policies.cosmos.dit import Dit
-from vla_attention.capture.policies.weights import Shapes, check_shapes, fill, make_empty, shapes_of
+from vla_attention.capture.policies.weights import Shapes, check_floats, check_shapes, fill, make_empty, shapes_of
 from vla_attention.schemas.errors import listing
 
 PREFIX = "net."
@@ -45,12 +45,8 @@ def dit_tensors(stored: Mapping[str, Any]) -> dict[str, Tensor]:
             continue
         if not isinstance(value, Tensor):
             raise UnreadableCheckpoint(f"'{name}' of the checkpoint is no tensor, but {type(value).__name__}.")
-        if not value.is_floating_point() or value.element_size() < 2:
-            raise CheckpointMismatch(
-                f"'{name}' of the checkpoint has numbers of type {value.dtype}; expected floating point numbers of 16 "
-                "bits or more: use the checkpoint before it was quantized."
-            )
         weights[plain] = value
+    check_floats({name: str(tensor.dtype) for name, tensor in weights.items()}, "the checkpoint")
     return weights
 
 

@@ -18,18 +18,15 @@ import torch
 from torch import Tensor
 
 from vla_attention.capture.foreign_files.checked_files import check_folder
-from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint, read_json_object
+from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint, read_json_object
 from vla_attention.capture.policies.hub import first_line
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.formats import detect_format
 from vla_attention.capture.policies.pi.jax_weights import merge_lora, plan_leaves
 from vla_attention.capture.policies.pi.model import PiModel, build_model, expected_shapes, expected_tensors
 from vla_attention.capture.policies.pi.sizes import check_jax_heads
-from vla_attention.capture.policies.weights import Shapes, check_shapes
-from vla_attention.schemas.errors import MissingDependency, listing
-
-#: Types of weights. Whole numbers and 8 bits need scales, without which they would be other weights.
-_FLOATS = ("float64", "float32", "float16", "bfloat16")
+from vla_attention.capture.policies.weights import Shapes, check_floats, check_shapes
+from vla_attention.schemas.errors import MissingDependency
 
 
 @dataclass(frozen=True)
@@ -79,11 +76,7 @@ class OpenLeaf:
         # A chunk is decoded as a whole, however little of it is in the array.
         if any(extent > max(1, size) for extent, size in zip(chunk, self.shape, strict=True)):
             raise UnreadableCheckpoint(f"{self._what} (its chunks of {chunk} are larger than itself, {self.shape}).")
-        if str(array.dtype.name) not in _FLOATS:
-            raise CheckpointMismatch(
-                f"The array '{leaf.path}' of '{params}' has numbers of type {array.dtype.name}; expected one of "
-                f"{listing(_FLOATS)}: use the checkpoint before it was quantized."
-            )
+        check_floats({leaf.path: str(array.dtype.name)}, params)
         #: One chunk often holds all layers; it is kept while its layers are read one by one.
         bytes_of_layer = self.size * array.dtype.numpy_dtype.itemsize / max(1, *self.shape[:1])
         self._cache_bytes = int(1.1 * bytes_of_layer * chunk[0]) if chunk and chunk[0] > 1 else 0

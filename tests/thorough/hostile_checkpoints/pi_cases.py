@@ -149,7 +149,9 @@ def manifest(change: Callable[[Path], object]) -> Make:
 
 
 PI: dict[str, Case] = {
-    "a header of 2^63 bytes": Case(weights(lambda path: safetensors(path, {}, length=2**63)), "its header would take"),
+    "a header of 2^63 bytes": Case(
+        weights(lambda path: safetensors(path, {}, length=2**63)), "damaged or its copy incomplete"
+    ),
     "overlapping tensors": Case(
         weights(lambda path: safetensors(path, {"a": tensor([2], 8), "b": tensor([2], 12, 4)}, bytes(12))), "damaged"
     ),
