@@ -175,15 +175,13 @@ class DataSetEpisode:
         self._what = f"episode {entry.index} of '{dataset.name}'"
         self._table = dataset.folder / entry.data
         self._rows, self._columns = dataset.process.call(self._table, open_episode, self._table, entry.index)
-        if len(self._rows) != self.length or not np.array_equal(
-            self._index_column("frame_index"), np.arange(self.length)
-        ):
+        if len(self._rows) != self.length or (self.column("frame_index")[:, 0] != np.arange(self.length)).any():
             raise DamagedDataSet(
                 f"Episode {self.index} of '{dataset.name}' has {len(self._rows)} rows in '{self._table}'; the meta "
                 f"files say frames 0 to {self.length - 1}, one after the other."
             )
-        self.seconds = self._index_column("timestamp")
-        self.task_indices = self._index_column("task_index").astype(np.int64)
+        self.seconds = self.column("timestamp")[:, 0]
+        self.task_indices = self.column("task_index")[:, 0].astype(np.int64)
         unknown = set(self.task_indices.tolist()) - set(dataset.tasks)
         if unknown:
             raise DamagedDataSet(f"In {self._what} is the task {min(unknown)}, which the meta files do not name.")
@@ -194,12 +192,6 @@ class DataSetEpisode:
                 f"The frames of {self._what} are {apart:.4g} s apart{rate}, and {INFO} says fps {dataset.fps:g}. "
                 "Correct the one that is wrong: it says when the policy is called."
             )
-
-    def _index_column(self, name: str) -> NDArray[np.float64]:
-        values = self._finite(name)
-        if values.shape != (self.length, 1):
-            raise DamagedDataSet(f"'{self._table}' has lists in its column '{name}'; expected a number in each row.")
-        return values[:, 0]
 
     @property
     def instructions(self) -> tuple[str, ...]:
@@ -217,20 +209,13 @@ class DataSetEpisode:
         feature = self.dataset.feature(name)
         if feature.is_picture:
             raise BadArgument(f"The column '{name}' of '{self.dataset.name}' holds {feature.dtype}, not numbers.")
-        values = self._finite(name)
-        stated = math.prod(feature.shape)
+        values, stated = self._numbers([name])[name], math.prod(feature.shape)
+        if isinstance(values, str):
+            raise BadArgument(f"The column '{name}' of {self._what} holds {values}, not as many numbers in each frame.")
         if values.shape[1] != stated:
             raise DamagedDataSet(
                 f"The column '{name}' of {self._what} has {values.shape[1]} numbers in each frame, and {INFO} says "
                 f"{stated}."
-            )
-        return values
-
-    def _finite(self, name: str) -> NDArray[np.float64]:
-        values = self._numbers([name])[name]
-        if isinstance(values, str):
-            raise BadArgument(
-                f"The column '{name}' of '{self.dataset.name}' holds {values}, not as many numbers in each frame."
             )
         if not np.isfinite(values).all():
             raise DamagedDataSet(
