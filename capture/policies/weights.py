@@ -105,10 +105,10 @@ def shapes_of(tensors: Mapping[str, Tensor]) -> Shapes:
     return {name: tuple(tensor.shape) for name, tensor in tensors.items()}
 
 
-def check_shapes(found: Shapes, expected: Shapes, what: str = "the model") -> None:
+def check_shapes(found: Shapes, expected: Shapes, what: str = "the model", hint: str = "") -> None:
     """Raise `CheckpointMismatch` that lists missing, extra and misshapen tensors, if there are any.
 
-    what: the model or the part of it that needs the expected tensors.
+    what: the model or the part of it that needs the expected tensors. hint: ends the error.
     """
     misshapen = [
         f"{name} is {found[name]} instead of {expected[name]}"
@@ -122,7 +122,7 @@ def check_shapes(found: Shapes, expected: Shapes, what: str = "the model") -> No
     )
     parts = [f"{len(names)} {fault}: {listing(names, _LISTED)}" for fault, names in faults if names]
     if parts:
-        raise CheckpointMismatch(f"The checkpoint's tensors are not those of {what}; {'; '.join(parts)}.")
+        raise CheckpointMismatch(f"The checkpoint's tensors are not those of {what}; {'; '.join(parts)}.{hint}")
 
 
 def fill(model: Model, tensors: Mapping[str, Tensor]) -> Model:

@@ -28,7 +28,7 @@ from vla_attention.capture.policies.pi.lerobot_pipeline import LerobotPipeline, 
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.openpi_torch import TensorFile, open_tensors
 from vla_attention.capture.policies.pi.processing import simulated_arm, simulator_cameras
-from vla_attention.capture.policies.pi.sizes import infer_config, is_pi05
+from vla_attention.capture.policies.pi.sizes import is_pi05, stated_config
 from vla_attention.capture.policies.pi.tokenizer import PromptFormat
 from vla_attention.capture.policies.robot import Robot
 from vla_attention.capture.policies.weights import DTYPES
@@ -171,26 +171,23 @@ def model_config(
     robot: Robot | None = None,
     chosen_cameras: Mapping[str, str] = MappingProxyType({}),
 ) -> PiConfig:
-    """Return the model's configuration: sizes from the tensors, everything else from config.json."""
-    shapes = tensors.shapes
-    if is_pi05(shapes) != stated.pi05:
+    """Return the model's configuration, as config.json states it; sizes: those of transformers and image encoder."""
+    if is_pi05(tensors.shapes) != stated.pi05:
         names = {True: "pi05", False: "pi0"}
         raise CheckpointMismatch(
             f"The checkpoint's config.json says type '{names[stated.pi05]}', but its tensors are those of "
             f"{names[not stated.pi05]}."
         )
-    base = sizes or infer_config(
-        shapes,
-        {
-            "action_horizon": stated.chunk_size,
-            "action_dim": stated.max_action_dim,
-            "paligemma_variant": stated.paligemma_variant,
-            "action_expert_variant": stated.action_expert_variant,
-        },
-    )
+    named = {
+        "action_horizon": stated.chunk_size,
+        "action_dim": stated.max_action_dim,
+        "paligemma_variant": stated.paligemma_variant,
+        "action_expert_variant": stated.action_expert_variant,
+    }
+    base = sizes or stated_config(named, pi05=stated.pi05, image_size=stated.image_resolution[0])
     if base.siglip.image_size != stated.image_resolution[0]:
         raise CheckpointMismatch(
-            f"The checkpoint's config.json says image_resolution {stated.image_resolution}, but its tensors take "
+            f"The checkpoint's config.json says image_resolution {stated.image_resolution}, but its sizes are for "
             f"images of {base.siglip.image_size} pixels."
         )
     return dataclasses.replace(

@@ -230,7 +230,7 @@ def choose_config(
             f"heads and the actions of a call. Give --config-name NAME (openpi's {listing(NAMED_CONFIGS)}), or "
             f"--model-config FILE, a file like {CASE_FILE} (docs/checkpoints.md)."
         )
-    return ChosenConfig(None, "config.json and the tensors")
+    return ChosenConfig(None, "config.json")
 
 
 def _is_pi05(folder: Path, found: CheckpointFormat) -> bool:

@@ -14,7 +14,7 @@ from vla_attention.capture.policies.checkpoints import UnsupportedCheckpoint, re
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.formats import WEIGHTS, WEIGHTS_INDEX, detect_format
 from vla_attention.capture.policies.pi.model import PiModel, build_model, expected_shapes
-from vla_attention.capture.policies.pi.sizes import PALIGEMMA, TABLE, infer_config
+from vla_attention.capture.policies.pi.sizes import OTHER_SIZES, PALIGEMMA, TABLE, is_pi05, stated_config
 from vla_attention.capture.policies.safetensors_file import (
     SafetensorsFile,
     open_indexed_safetensors,
@@ -59,7 +59,7 @@ class TensorFile:
 
     def build(self, config: PiConfig, *, dtype: torch.dtype, device: str | torch.device) -> PiModel:
         """Build the model strictly; `CheckpointMismatch` lists missing, extra and misshapen tensors."""
-        check_shapes(self.shapes, expected_shapes(config))
+        check_shapes(self.shapes, expected_shapes(config), hint=f" {OTHER_SIZES}.")
         self.stored.check_floats(self.names.values())
         return build_model(config, self.names, self.read, dtype=dtype, device=device)
 
@@ -93,8 +93,8 @@ def load_openpi_torch(
 ) -> PiModel:
     """Load a checkpoint in openpi's PyTorch format.
 
-    Sizes, and whether it is pi0 or pi0.5, come from the tensors; `config` overrides them. Some facts are in no
-    checkpoint: the number of text slots, the number of denoise steps, and whether the prompt contains the state.
+    Its config.json names the sizes; `config` overrides them. Some facts are in no checkpoint: the number of text slots,
+    the number of denoise steps, and whether the prompt contains the state.
 
     Raises `CheckpointNotFound`, `UnsupportedCheckpoint`, `UnreadableCheckpoint` or `CheckpointMismatch`.
     """
@@ -102,5 +102,5 @@ def load_openpi_torch(
     detect_format(folder, "openpi_torch")
     with open_tensors(folder) as tensors:
         if config is None:
-            config = infer_config(tensors.shapes, read_json_object(folder / "config.json"))
+            config = stated_config(read_json_object(folder / "config.json"), pi05=is_pi05(tensors.shapes))
         return tensors.build(config, dtype=dtype, device=device)

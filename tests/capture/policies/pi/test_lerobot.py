@@ -285,7 +285,7 @@ def test_the_type_must_be_that_of_the_tensors(checkpoint, tokenizer_path):
 
 def test_sizes_that_only_a_case_file_states(checkpoint, tokenizer_path, tmp_path):
     (tmp_path / "case.json").rename(tmp_path / "sizes.json")
-    with pytest.raises(CheckpointMismatch, match=r"32 wide.*case\.json beside its folder, or --model-config"):
+    with pytest.raises(CheckpointMismatch, match=r"instead of .*--model-config PATH .*case\.json beside"):
         load_pi_policy(checkpoint, tokenizer_path)
     options = PiSettings(model_config=tmp_path / "sizes.json")
     assert load_pi_policy(checkpoint, tokenizer_path, options).identity().config["configuration"].endswith("sizes.json")

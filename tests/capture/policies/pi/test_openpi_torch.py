@@ -16,7 +16,7 @@ from vla_attention.capture.policies.pi.config import NAMED_CONFIGS, SiglipConfig
 from vla_attention.capture.policies.pi.jax_weights import plan_leaves
 from vla_attention.capture.policies.pi.model import PiModel, expected_shapes
 from vla_attention.capture.policies.pi.openpi_torch import load_openpi_torch, model_names
-from vla_attention.capture.policies.pi.sizes import infer_config
+from vla_attention.capture.policies.pi.sizes import stated_config
 from vla_attention.capture.policies.weights import check_shapes
 from vla_attention.schemas.errors import BadArgument, UserError
 
@@ -61,22 +61,9 @@ def test_embed_tokens_wins_over_the_tied_name(checkpoint, pi05_case):
     assert (load_openpi_torch(checkpoint, config=pi05_case.config).state_dict()[TABLE] == 7).all()
 
 
-@pytest.mark.parametrize("name", NAMED_CONFIGS)
-def test_sizes_are_read_from_the_tensors(name):
-    config = find_config(name)
-    config_json = {
-        "action_dim": 32,
-        "action_horizon": config.action_horizon,
-        "paligemma_variant": "gemma_2b",
-        "action_expert_variant": "gemma_300m",
-    }
-    # Whether the prompt has the state is in no tensor.
-    found = infer_config(expected_shapes(config), config_json)
-    assert found == dataclasses.replace(config, discrete_state_input=False)
-
-
 #: The rows of gemma_2b's projections (8 query heads and one key head of 256) as other heads.
 OTHER_HEADS = {"num_heads": 16, "num_kv_heads": 2, "head_dim": 128}
+NAMED = {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"}
 
 
 def full_size(**heads):
@@ -85,29 +72,31 @@ def full_size(**heads):
     return dataclasses.replace(plain, **parts)
 
 
+@pytest.mark.parametrize("name", NAMED_CONFIGS)
+def test_sizes_are_those_that_config_json_names(name):
+    config = find_config(name)
+    stated = {"action_dim": 32, "action_horizon": config.action_horizon, **NAMED}
+    # Whether the prompt has the state is not stated.
+    assert stated_config(stated, pi05=config.pi05) == dataclasses.replace(config, discrete_state_input=False)
+
+
 def test_heads_that_nobody_states_are_asked_for():
     """The tensors have the same shapes whether there are 8 heads of 256 or 16 of 128."""
-    shapes = expected_shapes(full_size(**OTHER_HEADS))
-    assert shapes == expected_shapes(find_config("pi05_libero"))
-    for variant in ({}, {"paligemma_variant": "gemma_3b", "action_expert_variant": None}):
-        with pytest.raises(CheckpointMismatch, match=r"2048 and 256 rows.*fit several.*--model-config PATH"):
-            infer_config(shapes, {"action_dim": 32, "action_horizon": 10, **variant})
-    # One named variant is enough, and a LoRA variant has the heads of the plain one.
-    for variant in ({"action_expert_variant": "gemma_300m"}, {"paligemma_variant": "gemma_2b_lora"}):
-        assert infer_config(shapes, {"action_dim": 32, "action_horizon": 10, **variant}) == find_config("pi05_libero")
+    assert expected_shapes(full_size(**OTHER_HEADS)) == expected_shapes(find_config("pi05_libero"))
+    for variant in ({}, {"paligemma_variant": "gemma_3b"}, {"action_expert_variant": None}):
+        stated = {"action_dim": 32, "action_horizon": 10, **(NAMED | variant if variant else {})}
+        with pytest.raises(CheckpointMismatch, match=r"fit several numbers of heads.*--model-config PATH"):
+            stated_config(stated, pi05=True)
+    lora = {name: f"{variant}_lora" for name, variant in NAMED.items()}
+    stated = {"action_dim": 32, "action_horizon": 10, **lora}
+    assert stated_config(stated, pi05=True) == find_config("pi05_libero")
 
 
-@pytest.mark.parametrize(
-    ("heads", "said"),
-    [
-        ({"num_kv_heads": 2}, r"paligemma_variant 'gemma_2b'.*num_kv_heads=2"),
-        ({"num_kv_heads": 1, "head_dim": 192}, r"1536 rows, which are no whole number|192 rows, which are no whole"),
-    ],
-)
-def test_more_key_heads_than_the_named_variant_has_are_noticed(heads, said):
-    named = {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"}
-    with pytest.raises(CheckpointMismatch, match=said):
-        infer_config(expected_shapes(full_size(**heads)), {"action_dim": 32, "action_horizon": 10, **named})
+@pytest.mark.parametrize("heads", [{"num_kv_heads": 2}, {"num_kv_heads": 1, "head_dim": 192}])
+def test_more_key_heads_than_the_named_variant_has_are_noticed(heads):
+    named = stated_config({"action_dim": 32, "action_horizon": 10, **NAMED}, pi05=True)
+    with pytest.raises(CheckpointMismatch, match=r"of the wrong shape: .*k_proj\.weight"):
+        check_shapes(expected_shapes(full_size(**heads)), expected_shapes(named))
 
 
 def test_every_difference_is_listed_in_one_error(checkpoint, pi05_case):
@@ -151,7 +140,7 @@ def test_full_size_openpi_torch_keys_load_strictly(name):
     manifest = read_manifest(f"openpi_torch_{name}")
     shapes = {key: manifest[raw] for key, raw in model_names(manifest).items()}
     horizon = find_config(name).action_horizon
-    config = infer_config(shapes, {"action_dim": 32, "action_horizon": horizon, "paligemma_variant": "gemma_2b"})
+    config = stated_config({"action_dim": 32, "action_horizon": horizon, **NAMED}, pi05=name == "pi05_libero")
     assert config == find_config(name)
     load_meta(shapes, config)
 
@@ -167,13 +156,7 @@ def test_full_size_lerobot_keys_load_strictly(name, kind, leave_out):
         manifest = {key: shape for key, shape in manifest.items() if not key.endswith(leave_out)}
         assert len(manifest) == len(read_manifest(name)) - 1
     shapes = {key: manifest[raw] for key, raw in model_names(manifest).items()}
-    stated = {
-        "action_horizon": 50,
-        "action_dim": 32,
-        "paligemma_variant": "gemma_2b",
-        "action_expert_variant": "gemma_300m",
-    }
-    config = infer_config(shapes, stated)
+    config = stated_config({"action_horizon": 50, "action_dim": 32, **NAMED}, pi05=kind == "pi05_libero")
     assert config == dataclasses.replace(find_config(kind), action_horizon=50)
     load_meta(shapes, config)
 
