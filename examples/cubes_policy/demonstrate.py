@@ -301,9 +301,15 @@ def run(arguments: argparse.Namespace) -> int:
         tqdm(total=arguments.parts, initial=arguments.parts - len(missing), unit="part", disable=None) as bar,
         ProcessPoolExecutor(arguments.workers, context) as pool,
     ):
-        for done in as_completed([pool.submit(make_part, folder, settings, number) for number in missing]):
-            samples += done.result()
-            bar.update()
+        try:
+            for done in as_completed([pool.submit(make_part, folder, settings, number) for number in missing]):
+                samples += done.result()
+                bar.update()
+        except BaseException:  # Ctrl-C too
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():  # the parts that they make are made again
+                process.terminate()
+            raise
     size = sum(file.stat().st_size for file in folder.glob("part_*.npz"))
     print(f"{samples} samples added; {folder} has {format_bytes(size)}.")
     print(f"Next: python -m examples.cubes_policy train {folder} OUTPUT")
