@@ -47,6 +47,13 @@ META_FILES = ("meta/*.json", "meta/*.jsonl", "meta/*.parquet", "meta/episodes/**
 #: The columns of tasks and of episodes, with their types.
 _TASKS = {"task_index": pl.Int64(), "task": pl.String()}
 _EPISODES = {"episode_index": pl.Int64(), "length": pl.Int64(), "tasks": pl.List(pl.String())}
+#: What a value of a type is, for sentences.
+_IN_WORDS: Mapping[type[pl.DataType], str] = {
+    pl.Int64: "a whole number",
+    pl.Float64: "a finite number",
+    pl.String: "a text",
+    pl.List: "a list of texts",
+}
 
 
 @dataclass(frozen=True)
@@ -267,14 +274,6 @@ def _typed(path: Path, table: pl.DataFrame, types: Mapping[str, pl.DataType]) ->
             )
         columns.append(column.cast(kind).alias(name))
     return pl.DataFrame(columns)
-
-
-_IN_WORDS: Mapping[type[pl.DataType], str] = {
-    pl.Int64: "a whole number",
-    pl.Float64: "a finite number",
-    pl.String: "a text",
-    pl.List: "a list of texts",
-}
 
 
 @lru_cache(maxsize=2)
