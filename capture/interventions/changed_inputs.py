@@ -140,15 +140,15 @@ def object_patches(change: ImageChange, context: CallContext, *, known: bool = F
 
 Picture = NDArray[np.uint8]
 
-#: Grey levels of a blank picture: the middle of the model's range, and what a camera without light gives.
-GREY, BLACK = 128, 0
+#: Grey level of a blank picture: the middle of the model's range.
+GREY = 128
 #: Rounds of averaging neighbours that smooth a filled region.
 _SMOOTHING_ROUNDS = 60
 
 
-def blank(picture: Picture, level: int = GREY) -> Picture:
-    """Return an even picture of one grey level, 0 to 255."""
-    return np.full_like(picture, level)
+def blank(picture: Picture) -> Picture:
+    """Return an even grey picture."""
+    return np.full_like(picture, GREY)
 
 
 def noise(picture: Picture, generator: np.random.Generator) -> Picture:
