@@ -64,17 +64,23 @@ class ReplanContributions:
 
     def way(
         self, call: AttentionCall, rows: Tensor, keys: NDArray[np.int64] | None, place: CallPlace, site: RecordedSite,
-        cell: Cell,
+        cell: Cell, *, by_part: bool,
     ) -> OutputWay:  # fmt: skip
-        """Follow the output of a call. rows: (batch, head, query, key) of its keys, which are the site's `keys`."""
+        """Follow the output of a call.
+
+        rows: (batch, head, query, key) of its keys, which are the site's `keys`. by_part: for the contributions of each
+        part; else all keys are one part, which is enough to tell whether the rows of a batch are apart.
+        """
         of_site = self._sites[site.name]
         mixed = []
         for row in self._rows:
-            if row not in of_site.roles:
+            if by_part and row not in of_site.roles:
                 of_site.roles[row] = roles = self._early_roles(row, site, self._order.present[site.name])
                 of_site.members[row] = segment_members(site.keys, roles[None], segments_of(site.keys, roles))[0]
-            members = of_site.members[row] if keys is None else of_site.members[row][keys]
-            parts = keys_of_parts(members, rows.device)
+            parts: list[slice | Tensor] = [slice(None)]
+            if by_part:
+                members = of_site.members[row] if keys is None else of_site.members[row][keys]
+                parts = keys_of_parts(members, rows.device)
             values = part_values(rows[row], call.value[row], parts)
             values = values.view(*values.shape[:2], rows.shape[1], -1)
             mixed.append(values.permute(1, 2, 0, 3))  # (part, head, query, dim)
@@ -118,13 +124,20 @@ class ReplanContributions:
         if len(mixed) > 1:
             owners = ((given[most, places] - given[-1, places]) * total).sum(-1) / total.square().sum(-1)
             if float((owners - owners.round()).abs().amax()) > _MIXED:
-                raise NotReplayed("what is added to one row of the batch comes from several of them")
+                raise NotReplayed("what is added to one row of the batch comes from several of them", mixes_rows=True)
         count, grams = len(range(*queries.indices(shape.queries))), []
         for number, parts in enumerate(mixed, start=1):
             of_row = owners.round() == number
             vectors = torch.cat([each[: len(parts), of_row], total[None, of_row]]).flatten(1)
             grams.append(vectors @ vectors.T / count)
         return grams, bool(places.any()) or not any(bool(parts.any()) for parts in mixed)
+
+    def rows_apart(self) -> bool | None:
+        """Whether each row of the batch adds to its own tokens alone; None where that is not known."""
+        ways = [way for _, way in self._places]
+        if any(way.mixes_rows for way in ways):
+            return False
+        return True if any(way.result() is not None for way in ways) else None
 
     def unknown(self) -> str | None:
         """Say why it is not known what the parts of the keys add to the residual stream; None if it is known."""
