@@ -82,6 +82,7 @@ class OutputWay:
         mixes_rows: whether what one row of the batch gave is added to others.
         found: whether the residual stream is known; it is the last of `taken` then.
         changed: what was done to it first that is not linear, as "module 'x' computes tanh of".
+        dtypes: of all that is followed.
     """
 
     take: Callable[[Replay, Tensor], tuple[Any, bool]] | None
@@ -91,6 +92,7 @@ class OutputWay:
     mixes_rows: bool = field(default=False, init=False)
     found: bool = field(default=False, init=False)
     changed: str = field(default="", init=False)
+    dtypes: set[torch.dtype] = field(default_factory=set, init=False)
 
     def result(self) -> Any:
         """Return what was kept of the sum that is the residual stream; None, and `lost` says why, where none is."""
@@ -308,6 +310,7 @@ class OutputWays:
 
     def _put(self, tensors: Sequence[Tensor], way: OutputWay, step: _Step) -> None:
         for tensor in tensors:
+            way.dtypes.add(tensor.dtype)
             self._table.put(tensor, {**(self._table.get(tensor) or {}), way: step})
 
 

@@ -6,7 +6,7 @@ the output took, and the parts have to add up to what was added.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -84,15 +84,14 @@ class ReplanContributions:
             values = part_values(rows[row], call.value[row], parts)
             values = values.view(*values.shape[:2], rows.shape[1], -1)
             mixed.append(values.permute(1, 2, 0, 3))  # (part, head, query, dim)
-        precision = TOLERANCE.get(call.precision, TOLERANCE["float32"]), call.precision
-        way = OutputWay(lambda replay, added: self._added(call, mixed, place.queries, replay, added, precision))
+        way = OutputWay(lambda replay, added: self._added(call, mixed, place.queries, replay, added, way.dtypes))
         of_site.ways.setdefault(cell, []).append(way)
         self._places.append((place, way))
         return way
 
     def _added(
         self, call: AttentionCall, mixed: Sequence[Tensor], queries: slice, replay: Replay, added: Tensor,
-        precision: tuple[float, str],
+        dtypes: Iterable[torch.dtype],
     ) -> tuple[list[Tensor], bool]:  # fmt: skip
         """Return the Gram matrix of each recorded row, and whether the action queries are in what was added.
 
@@ -114,10 +113,12 @@ class ReplanContributions:
         theirs = added.float().flatten(0, -2)[places]
         scale = theirs.abs().amax() if theirs.numel() else theirs.new_ones(())
         mismatch = float((total + given[-1, places] - theirs).abs().amax() / scale) if theirs.numel() else 0.0
-        if not mismatch <= precision[0]:
+        names = [call.precision, *(str(dtype).removeprefix("torch.") for dtype in dtypes)]
+        allowed = max(TOLERANCE.get(name, 0.0) for name in names)
+        if not mismatch <= allowed:
             raise NotReplayed(
                 f"the parts of the keys add up to something that differs from what was added by {mismatch:.2g} of its "
-                f"largest number (allowed is {precision[0]:g} for {precision[1]}): what is done with the attention's "
+                f"largest number (allowed is {allowed:g}): what is done with the attention's "
                 "output is not linear, or something changes numbers that is no function of torch"
             )
         owners = torch.ones(len(total), device=total.device)
