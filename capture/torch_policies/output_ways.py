@@ -79,16 +79,20 @@ class OutputWay:
         taken: what was kept, of each sum that may be the residual stream.
         nothing: what was kept where the recorded queries are not in a sum: other tokens', or behind a gate of 0.
         lost: why it is not known what is added; "" where nothing stands against it.
+        mixes_rows: whether what one row of the batch gave is added to others.
         found: whether the residual stream is known; it is the last of `taken` then.
         changed: what was done to it first that is not linear, as "module 'x' computes tanh of".
+        dtypes: of all that is followed.
     """
 
     take: Callable[[Replay, Tensor], tuple[Any, bool]] | None
     taken: list[_Taken] = field(default_factory=list, init=False)
     nothing: Any = field(default=None, init=False)
     lost: str = field(default="", init=False)
+    mixes_rows: bool = field(default=False, init=False)
     found: bool = field(default=False, init=False)
     changed: str = field(default="", init=False)
+    dtypes: set[torch.dtype] = field(default_factory=set, init=False)
 
     def result(self) -> Any:
         """Return what was kept of the sum that is the residual stream; None, and `lost` says why, where none is."""
@@ -106,7 +110,14 @@ class OutputWay:
 
 
 class NotReplayed(Exception):
-    """A replay that gives something else than what the policy computed; the message says what."""
+    """A replay that gives something else than what the policy computed; the message says what.
+
+    mixes_rows: rows of the batch add to one another's.
+    """
+
+    def __init__(self, message: str, *, mixes_rows: bool = False) -> None:
+        super().__init__(message)
+        self.mixes_rows = mixes_rows
 
 
 @dataclass(frozen=True)
@@ -248,7 +259,7 @@ class OutputWays:
             try:
                 taken, there = way.take(of_added, added.detach())
             except NotReplayed as error:
-                way.lost = str(error)
+                way.lost, way.mixes_rows = str(error), error.mixes_rows
             except (RuntimeError, TypeError, ValueError, IndexError) as error:
                 way.lost = f"what the policy does with it cannot be computed again ({error})"
         if way.lost:
@@ -299,6 +310,7 @@ class OutputWays:
 
     def _put(self, tensors: Sequence[Tensor], way: OutputWay, step: _Step) -> None:
         for tensor in tensors:
+            way.dtypes.add(tensor.dtype)
             self._table.put(tensor, {**(self._table.get(tensor) or {}), way: step})
 
 

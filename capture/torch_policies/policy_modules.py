@@ -13,9 +13,9 @@ from vla_attention.capture.torch_policies.unseen_attention import refuse_unseen_
 from vla_attention.schemas.errors import BadArgument, unknown_name
 
 #: How deep modules are looked for in objects that are no modules.
-DEPTH = 4
+_DEPTH = 4
 #: Lists and dictionaries with more entries are not looked into.
-MANY = 1000
+_MANY = 1000
 #: Classes whose instances run a compiled program, by the beginning of their full names.
 _COMPILED = (
     "torch.jit.", "torch._inductor.package.", "torch_tensorrt.", "tensorrt.", "onnxruntime.",
@@ -111,8 +111,8 @@ def _parts(part: object, path: str, depth: int, seen: set[int]) -> Iterator[tupl
         for name, child in part._modules.items():
             if child is not None:
                 yield from _parts(child, _joined(path, name), depth, seen)
-        attributes = {name: held for name, held in part.__dict__.items() if name not in MODULE_ATTRIBUTES}
-        if depth < DEPTH:
+        attributes = {name: held for name, held in part.__dict__.items() if name not in _MODULE_ATTRIBUTES}
+        if depth < _DEPTH:
             for name, held in attributes.items():
                 yield from _held(held, _joined(path, name), depth + 1, seen)
     else:
@@ -120,7 +120,7 @@ def _parts(part: object, path: str, depth: int, seen: set[int]) -> Iterator[tupl
 
 
 #: What every nn.Module has.
-MODULE_ATTRIBUTES = frozenset(nn.Module().__dict__)
+_MODULE_ATTRIBUTES = frozenset(nn.Module().__dict__)
 
 
 def _held(part: object, path: str, depth: int, seen: set[int]) -> Iterator[tuple[str, object]]:
@@ -137,9 +137,9 @@ def _held(part: object, path: str, depth: int, seen: set[int]) -> Iterator[tuple
     if f"{type(part).__module__}.{type(part).__qualname__}".startswith(_COMPILED):
         yield path, part
         return
-    if depth >= DEPTH:
+    if depth >= _DEPTH:
         return
-    if isinstance(part, dict | list | tuple | set | frozenset) and len(part) > MANY:
+    if isinstance(part, dict | list | tuple | set | frozenset) and len(part) > _MANY:
         return  # vocabularies and data, no modules
     if isinstance(part, dict):
         items = [(str(name), held) for name, held in part.items()]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -16,16 +16,15 @@ from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.recording.finite_numbers import all_finite, not_finite
 from vla_attention.capture.store.replan_records import RecordedRows, ReplanRecord
 from vla_attention.capture.torch_policies.attention_calls import CallShape
-from vla_attention.capture.torch_policies.batch_rows import BatchRowsMixed, RunningModules, rows_of_module_apart
+from vla_attention.capture.torch_policies.batch_rows import BatchRowsMixed
 from vla_attention.capture.torch_policies.call_order import CallPlace
-from vla_attention.capture.torch_policies.call_state import CallState
 from vla_attention.capture.torch_policies.knockouts import CallBias
 from vla_attention.capture.torch_policies.policy_layout import RecordedSite
 from vla_attention.capture.torch_policies.repeated_calls import OWN_NOISE, CallInput, CallToRepeat
 from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs, read_actions
 from vla_attention.capture.torch_policies.replan_text import PromptIds, ReplanText
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder, SiteRows, final_contribution
-from vla_attention.capture.torch_policies.watch import watch_attention
+from vla_attention.capture.torch_policies.watch import RandomNumbers, watch_attention
 from vla_attention.schemas.errors import BadArgument, Note
 from vla_attention.schemas.layout import Prompt
 
@@ -86,14 +85,13 @@ class WatchedCall:
             self._bias if run.attributes.interventions.changes_attention else None,
             self._where,
         )
-        if batch > 1 and not run._asked_of_batch:
-            self.recorder.running = RunningModules(run._found)
+        self._asks_of_batch = self.recorder.asks_of_batch = batch > 1 and not run._asked_of_batch
         self._present = self._text.present = self.recorder.order.present
         self._biases: dict[int, CallBias | None] = {}
         self._before = self._state_before(rows[0])
 
-    def _state_before(self, one: RowOfCall) -> CallState | None:
-        """Return the state before a policy call whose effects are measured; None where they are not."""
+    def _state_before(self, one: RowOfCall) -> RandomNumbers | None:
+        """Return the random numbers before a policy call whose effects are measured; None where they are not."""
         planned = self._run.attributes.recording.effects
         if planned is None or one.episode.num_replans % planned.every:
             return None
@@ -103,17 +101,12 @@ class WatchedCall:
                 "cannot be made again. Give episode.replan(repeat=lambda call: ...), which makes it with "
                 "call.instruction and call.frames, or record without effects."
             )
-        return CallState(self._run.policy, one.inputs.repeat.call)
+        return RandomNumbers()
 
     @contextmanager
     def watched(self) -> Iterator[None]:
         """Watch the call that is made within the block."""
-        running = self.recorder.running
-        with (
-            self._ids.watched(),
-            nullcontext() if running is None else running.followed(),
-            watch_attention(self._run._found, self.recorder),
-        ):
+        with self._ids.watched(), watch_attention(self._run._found, self.recorder):
             yield
 
     def finish(self) -> list[dict[str, SiteRows]]:
@@ -123,30 +116,26 @@ class WatchedCall:
             BatchRowsMixed: the rows of the batch are not those of the environments.
         """
         rows_of_sites = self.recorder.finish()
-        if self.recorder.running is not None:
+        if self._asks_of_batch:
             self._check_batch()
         return rows_of_sites
 
     def _check_batch(self) -> None:
         """Raise `BatchRowsMixed` if the rows of a batch are not those of the environments; say where nothing tells."""
-        run, batch, call = self._run, self.recorder.batch, self.recorder.module_call
-        run._asked_of_batch, contributions = True, run.attributes.recording.contributions
-        if contributions and self.recorder.contributions.unknown() is None:
-            return  # what each row adds is seen at its own tokens
-        apart = None if call is None else rows_of_module_apart(run._found, call)
+        run, batch = self._run, self.recorder.batch
+        run._asked_of_batch, apart = True, self.recorder.contributions.rows_apart()
         if apart is None:
             run._of_batch = (
                 f"the rows of a batch of {batch} may be mixed, if heads are folded outside of the batch: compare them "
                 "with a call of one row (va.inspect, first_row=...), or record one environment at a time"
             )
-            if not contributions:
+            if not run.attributes.recording.contributions:
                 warnings.warn(f"It is not known whether rows are those of their episodes: {run._of_batch}.", Note)
         elif not apart:
-            assert call is not None
             raise BatchRowsMixed(
-                f"The rows of a batch of {batch} are not apart in module '{call.shape.module}': called again with "
-                "another first row, it changes the attention of other rows. It folds heads and batch into one axis "
-                "with the heads outside. Record one environment at a time, with run.episode."
+                f"The rows of a batch of {batch} are not apart: what the attention gave for one is added to others. "
+                "The policy folds heads and batch into one axis with the heads outside. Record one environment at a "
+                "time, with run.episode."
             )
 
     def record(self, one: RowOfCall, rows_of_sites: Mapping[str, SiteRows], given_actions: Any) -> ReplanRecord:
@@ -189,7 +178,7 @@ class WatchedCall:
         return record_of(call, stored, actions, run.attributes.recording, effects, inputs.noise_seed)
 
     def _to_be_repeated(
-        self, call: PolicyCall, one: RowOfCall, actions: NDArray[np.float64] | None, before: CallState
+        self, call: PolicyCall, one: RowOfCall, actions: NDArray[np.float64] | None, before: RandomNumbers
     ) -> PolicyCall:
         """Return the call as it is repeated, after telling the policy that is repeated."""
         run, repeat = self._run, one.inputs.repeat

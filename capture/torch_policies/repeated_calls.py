@@ -25,7 +25,6 @@ from vla_attention.capture.policies.noise import noise_seed
 from vla_attention.capture.policies.policy import CallVariant, GivenInputs, Policy, PolicyInput, VariantMemory
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
 from vla_attention.capture.torch_policies.call_order import CallPlace, KnownCalls
-from vla_attention.capture.torch_policies.call_state import CallState
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.knockouts import CallBias
 from vla_attention.capture.torch_policies.output_ways import OutputWay
@@ -33,7 +32,7 @@ from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
 from vla_attention.capture.torch_policies.policy_modules import FoundPolicy
 from vla_attention.capture.torch_policies.replan_inputs import Repeat, RepeatedCall, read_actions
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder
-from vla_attention.capture.torch_policies.watch import watch_attention
+from vla_attention.capture.torch_policies.watch import RandomNumbers, watch_attention
 from vla_attention.schemas.effects import EffectsRecorded
 from vla_attention.schemas.errors import BadArgument, Note, UserError
 from vla_attention.schemas.stores.store_format import PolicyIdentity, Recording
@@ -50,8 +49,9 @@ _TAKES_NO_CALL = (
 )
 _OTHER_ACTIONS = (
     "The callable given as repeat gives other actions than the recorded call when nothing is changed: it must return "
-    "what replan.actions is set to, and what it draws at random or keeps must be torch's, numpy's, Python's, the "
-    "policy's, or named in it. The effects of such replans are refused."
+    "what replan.actions is set to, and draw from torch's, numpy's or Python's global random numbers only. What the "
+    "policy keeps from call to call (a queue, a generator of its own) must be set back in it. The effects of such "
+    "replans are refused."
 )
 
 
@@ -98,13 +98,13 @@ class CallInput(PolicyInput):
 class CallToRepeat:
     """What is known of a recorded call that is to be repeated.
 
-    before: the state before it. actions: (horizon, action dim). present: site -> (key,) bool, the keys that its calls
-    had. where: the replan, in words.
+    before: the random numbers before it. actions: (horizon, action dim). present: site -> (key,) bool, the keys that
+    its calls had. where: the replan, in words.
     """
 
     repeat: Repeat
     given: CallInput
-    before: CallState
+    before: RandomNumbers
     actions: NDArray[np.float64]
     present: Mapping[str, NDArray[np.bool_]]
     where: str
@@ -182,8 +182,8 @@ class RepeatedPolicy:
         self, variants: Sequence[CallVariant], num_steps: int, batch: int
     ) -> list[NDArray[np.float64] | None]:
         """Repeat the call for each variant, the first of which is the unchanged one; None for what cannot be made."""
-        call, nothing = self._now, [None] * (len(variants) - 1)
-        after = CallState(self._found.policy, call.repeat.call)
+        nothing = [None] * (len(variants) - 1)
+        after = RandomNumbers()
         try:
             unchanged = self._made(variants[0])
             if unchanged is None or self._is_another(unchanged):
@@ -222,7 +222,7 @@ class RepeatedPolicy:
             say("A call with an exchanged word is not measured where its prompt has another number of tokens.")
             return None
         if variant.noise_seed != OWN_NOISE and np.array_equal(made.actions, unchanged.actions):
-            say("The repeated call draws no noise from a generator that is known: another noise is not measured.")
+            say("The repeated call draws no global random numbers: another noise is not measured.")
             return None
         return made.actions
 

@@ -6,7 +6,7 @@ the output took, and the parts have to add up to what was added.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -64,29 +64,34 @@ class ReplanContributions:
 
     def way(
         self, call: AttentionCall, rows: Tensor, keys: NDArray[np.int64] | None, place: CallPlace, site: RecordedSite,
-        cell: Cell,
+        cell: Cell, *, by_part: bool,
     ) -> OutputWay:  # fmt: skip
-        """Follow the output of a call. rows: (batch, head, query, key) of its keys, which are the site's `keys`."""
+        """Follow the output of a call.
+
+        rows: (batch, head, query, key) of its keys, which are the site's `keys`. by_part: for the contributions of each
+        part; else all keys are one part, which is enough to tell whether the rows of a batch are apart.
+        """
         of_site = self._sites[site.name]
         mixed = []
         for row in self._rows:
-            if row not in of_site.roles:
+            if by_part and row not in of_site.roles:
                 of_site.roles[row] = roles = self._early_roles(row, site, self._order.present[site.name])
                 of_site.members[row] = segment_members(site.keys, roles[None], segments_of(site.keys, roles))[0]
-            members = of_site.members[row] if keys is None else of_site.members[row][keys]
-            parts = keys_of_parts(members, rows.device)
+            parts: list[slice | Tensor] = [slice(None)]
+            if by_part:
+                members = of_site.members[row] if keys is None else of_site.members[row][keys]
+                parts = keys_of_parts(members, rows.device)
             values = part_values(rows[row], call.value[row], parts)
             values = values.view(*values.shape[:2], rows.shape[1], -1)
             mixed.append(values.permute(1, 2, 0, 3))  # (part, head, query, dim)
-        precision = TOLERANCE.get(call.precision, TOLERANCE["float32"]), call.precision
-        way = OutputWay(lambda replay, added: self._added(call, mixed, place.queries, replay, added, precision))
+        way = OutputWay(lambda replay, added: self._added(call, mixed, place.queries, replay, added, way.dtypes))
         of_site.ways.setdefault(cell, []).append(way)
         self._places.append((place, way))
         return way
 
     def _added(
         self, call: AttentionCall, mixed: Sequence[Tensor], queries: slice, replay: Replay, added: Tensor,
-        precision: tuple[float, str],
+        dtypes: Iterable[torch.dtype],
     ) -> tuple[list[Tensor], bool]:  # fmt: skip
         """Return the Gram matrix of each recorded row, and whether the action queries are in what was added.
 
@@ -108,23 +113,32 @@ class ReplanContributions:
         theirs = added.float().flatten(0, -2)[places]
         scale = theirs.abs().amax() if theirs.numel() else theirs.new_ones(())
         mismatch = float((total + given[-1, places] - theirs).abs().amax() / scale) if theirs.numel() else 0.0
-        if not mismatch <= precision[0]:
+        names = [call.precision, *(str(dtype).removeprefix("torch.") for dtype in dtypes)]
+        allowed = max(TOLERANCE.get(name, 0.0) for name in names)
+        if not mismatch <= allowed:
             raise NotReplayed(
                 f"the parts of the keys add up to something that differs from what was added by {mismatch:.2g} of its "
-                f"largest number (allowed is {precision[0]:g} for {precision[1]}): what is done with the attention's "
+                f"largest number (allowed is {allowed:g}): what is done with the attention's "
                 "output is not linear, or something changes numbers that is no function of torch"
             )
         owners = torch.ones(len(total), device=total.device)
         if len(mixed) > 1:
             owners = ((given[most, places] - given[-1, places]) * total).sum(-1) / total.square().sum(-1)
             if float((owners - owners.round()).abs().amax()) > _MIXED:
-                raise NotReplayed("what is added to one row of the batch comes from several of them")
+                raise NotReplayed("what is added to one row of the batch comes from several of them", mixes_rows=True)
         count, grams = len(range(*queries.indices(shape.queries))), []
         for number, parts in enumerate(mixed, start=1):
             of_row = owners.round() == number
             vectors = torch.cat([each[: len(parts), of_row], total[None, of_row]]).flatten(1)
             grams.append(vectors @ vectors.T / count)
         return grams, bool(places.any()) or not any(bool(parts.any()) for parts in mixed)
+
+    def rows_apart(self) -> bool | None:
+        """Whether each row of the batch adds to its own tokens alone; None where that is not known."""
+        ways = [way for _, way in self._places]
+        if any(way.mixes_rows for way in ways):
+            return False
+        return True if any(way.result() is not None for way in ways) else None
 
     def unknown(self) -> str | None:
         """Say why it is not known what the parts of the keys add to the residual stream; None if it is known."""

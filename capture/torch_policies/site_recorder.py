@@ -14,7 +14,6 @@ from torch import Tensor
 from vla_attention.capture.recording.finite_numbers import not_finite
 from vla_attention.capture.store.replan_records import RecordedRows
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
-from vla_attention.capture.torch_policies.batch_rows import ModuleCall, RunningModules
 from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.key_caches import LOAD_WITH_DYNAMIC_CACHE, first_values, slid
@@ -101,9 +100,8 @@ class ReplanRecorder:
         self.bias = bias
         self._where = where
         self.largest_error = 0.0
-        #: The modules that run, where the first recorded call of a batch is kept, and that call.
-        self.running: RunningModules | None = None
-        self.module_call: ModuleCall | None = None
+        #: Whether the output of the first recorded call is followed to see whether the rows of the batch are apart.
+        self.asks_of_batch = False
         self._changes: dict[tuple[int, ...], Tensor] = {}
         self._collected = {site.name: _Collected() for site in layout.sites}
 
@@ -150,8 +148,6 @@ class ReplanRecorder:
         """Return whether a call that has run is not recorded; it is counted then, and `saw` not called."""
         place = self.order.place(shape)
         if place is not None and place.site is not None and self._wanted(place):
-            if self.running is not None and self.module_call is None and shape.batch == self.batch:
-                self.module_call = ModuleCall.of(shape, self.running)
             return False
         self.order.ran(shape, place)
         return True
@@ -217,7 +213,10 @@ class ReplanRecorder:
             self._check_cache(call, place)
         seen = call.allowed(queries)
         uniform = seen / seen.sum(dim=-1, keepdim=True).clamp(min=1)
-        way = self.contributions.way(call, rows, place.keys, place, site, cell) if recording.contributions else None
+        way, by_part = None, recording.contributions
+        if by_part or self.asks_of_batch:
+            self.asks_of_batch = False
+            way = self.contributions.way(call, rows, place.keys, place, site, cell, by_part=by_part)
         keys = None if place.keys is None else torch.from_numpy(place.keys).to(rows.device)
         if keys is not None:
             rows, uniform = spread(rows, keys, site.keys.num_keys), spread(uniform, keys, site.keys.num_keys)

@@ -337,3 +337,10 @@ class RandomNumbers:
         random.setstate(self._python)
         for device, state in enumerate(self._gpus):
             torch.cuda.set_rng_state(state, device)
+
+    @staticmethod
+    def reseed(seed: int) -> None:
+        """Let all of them begin at a seed."""
+        torch.manual_seed(seed)
+        np.random.seed(seed % 2**32)  # noqa: NPY002
+        random.seed(seed)

@@ -255,6 +255,10 @@ WAYS: dict[str, Way] = {
         lambda b, c: (c.stream.float() + b.out(c.mixed) * chunk(b, c, 1)).type_as(c.stream),
         lambda b, c, s: projected(b, s) * chunk(b, c, 1),
     ),
+    "projected in bfloat16": Way(
+        lambda b, c: c.stream + nn.functional.linear(c.mixed.bfloat16(), b.out.weight.bfloat16()).float(),
+        lambda b, c, s: projected(b, s),
+    ),
     "scaled stream": Way(lambda b, c: 1.5 * c.stream + b.out(c.mixed), lambda b, c, s: projected(b, s)),
     "parallel feed-forward": Way(
         lambda b, c: b.out(c.mixed) + b.mlp(c.normed) + c.stream, lambda b, c, s: projected(b, s)

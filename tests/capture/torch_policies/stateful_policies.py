@@ -1,8 +1,7 @@
-"""Small policies with a state: noise from generators of every kind, a queue of actions, numbers that calls write to."""
+"""Small policies with a state: noise from random numbers, a queue of actions, an array that calls write to."""
 
 from __future__ import annotations
 
-import random
 from collections import deque
 from typing import Any
 
@@ -33,18 +32,14 @@ class SamplingPolicy(SmallPolicy):
 
 
 class GeneratorPolicy(SamplingPolicy):
-    """Draws from generators of its own, of three libraries, and from numpy's and Python's global numbers."""
+    """Draws from a generator of its own."""
 
     def __init__(self) -> None:
         super().__init__()
         self.generator = torch.Generator().manual_seed(4)
-        self.others: dict[str, Any] = {"numpy": [np.random.default_rng(4)], "old": np.random.RandomState(4)}
-        self.python = random.Random(4)
 
     def noise(self) -> Tensor:
-        drawn = self.others["numpy"][0].normal() + self.others["old"].normal() + self.python.gauss(0, 1)
-        drawn += np.random.normal() + random.gauss(0, 1)  # noqa: NPY002
-        return torch.randn(1, HORIZON, 2, generator=self.generator) + drawn
+        return torch.randn(1, HORIZON, 2, generator=self.generator)
 
 
 class BufferPolicy(SamplingPolicy):
@@ -60,25 +55,13 @@ class BufferPolicy(SamplingPolicy):
 
 
 class QueuePolicy(SamplingPolicy):
-    """Answers from a queue, as LeRobot's policies do; counts its calls in a buffer, in a list and in an attribute."""
+    """Answers from a queue, as LeRobot's policies do."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.queues = {"action": deque(maxlen=HORIZON)}
-        self.register_buffer("count", torch.zeros(()))
-        self.calls: list[int] = []
-        self.last: Tensor | None = None
+        self.queue: deque[Tensor] = deque(maxlen=HORIZON)
 
     def sample(self, pictures: Tensor, texts: list[str], states: Tensor) -> Tensor:
-        queue = self.queues["action"]
-        if not queue:
-            # Earlier calls decide about later ones, in a tensor that is written in place.
-            actions = super().sample(pictures, texts, states) * (1 + self.count)
-            queue.extend(actions.transpose(0, 1))
-            self.count += 1
-            self.calls.append(len(self.calls))
-            self.last = actions
-        return queue.popleft()
-
-    def reset(self) -> None:
-        self.queues["action"].clear()
+        if not self.queue:
+            self.queue.extend(super().sample(pictures, texts, states).transpose(0, 1))
+        return self.queue.popleft()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import threading
 import warnings
 
 import numpy as np
@@ -52,22 +51,9 @@ class Core(nn.Module):
         return self.multiply(*(tensor.flatten(0, 1) for tensor in parts)).unflatten(0, (-1, HEADS))
 
 
-def folded_policy(outside, multiply, kind=""):
+def folded_policy(outside, multiply):
     core = Core(multiply, outside)
-
-    def attend(block, *parts):
-        if kind == "counts its calls":
-            block.count = getattr(block, "count", 0) + 1
-        if kind == "cannot be called again":
-            if hasattr(block, "was_called"):
-                raise RuntimeError("called again")
-            block.was_called = True
-        return block.core(*parts) if kind == "in a module of its own" else core.forward(*parts)
-
-    policy = OddPolicy(attend)
-    for block in policy.blocks:
-        block.core = Core(multiply, outside)
-    return policy
+    return OddPolicy(lambda block, *parts: core.forward(*parts))
 
 
 def recorded(path, policy, batch=2, **settings):
@@ -81,40 +67,17 @@ def recorded(path, policy, batch=2, **settings):
     return float(np.abs(rows - expected).max()), actions
 
 
-@pytest.mark.parametrize(
-    ("batch", "kind"),  # as many rows as heads, as tokens, and neither
-    [(2, ""), (3, ""), (5, ""), (2, "in a module of its own"), (2, "counts its calls")],
-)
+@pytest.mark.parametrize("batch", [2, 3, 5])  # as many rows as heads, as tokens, and neither
+@pytest.mark.parametrize("contributions", [True, False])
 @pytest.mark.parametrize("multiply", FOLDED.values(), ids=FOLDED)
-def test_heads_outside_of_the_batch_are_refused_and_inside_they_are_right(tmp_path, multiply, batch, kind):
-    outside = folded_policy(True, multiply, kind)
+def test_heads_outside_of_the_batch_are_refused_and_inside_they_are_right(tmp_path, multiply, batch, contributions):
     with pytest.raises(BatchRowsMixed, match="one environment at a time"):
-        recorded(tmp_path / "a.zarr", outside, batch)
-    inside = folded_policy(False, multiply, kind)
+        recorded(tmp_path / "a.zarr", folded_policy(True, multiply), batch, contributions=contributions)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        off, actions = recorded(tmp_path / "b.zarr", inside, batch)
+        off, actions = recorded(tmp_path / "b.zarr", folded_policy(False, multiply), batch, contributions=contributions)
     assert off < 2e-6
-    assert torch.equal(actions, folded_policy(False, multiply, kind).act(batch))
-    assert getattr(inside.blocks[0], "count", 1) == 1  # as if the module had not been called again
-
-
-class Surroundings(nn.Module):
-    """Calls a block in ways that a second call has to repeat."""
-
-    def __init__(self, block, kind):
-        super().__init__()
-        self.block, self.out, self.kind = block, block.out, kind
-
-    @property
-    def kept(self):
-        return self.block.kept.float()
-
-    def forward(self, tokens, prefix):
-        if self.kind == "autocast":
-            with torch.autocast("cpu", torch.bfloat16):
-                return self.block(self.out(tokens), prefix)
-        return self.block(tokens, prefix, threading.Lock())
+    assert torch.equal(actions, folded_policy(False, multiply).act(batch))
 
 
 class TokensFirst(nn.Module):
@@ -195,65 +158,14 @@ def test_tokens_before_the_batch_as_many_as_rows_or_not(tmp_path, batch):
         recorded(tmp_path / "b.zarr", TokensFirstPolicy(True), batch)
 
 
-def surrounded(outside, kind):
-    policy = folded_policy(outside, FOLDED["sdpa"])
-    policy.blocks = nn.ModuleList(Surroundings(block, kind) for block in policy.blocks)
-    for outer in policy.blocks:
-        forward = outer.block.forward
-        outer.block.forward = lambda tokens, prefix, lock=None, forward=forward: forward(tokens, prefix)
-    return policy
-
-
-@pytest.mark.parametrize(("kind", "most"), [("autocast", 1e-2), ("given a lock", 2e-6)])
-def test_a_module_is_called_again_under_its_autocast_or_the_one_around_it_where_arguments_have_no_copy(
-    tmp_path, kind, most
-):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert recorded(tmp_path / "a.zarr", surrounded(False, kind))[0] < most
-    with pytest.raises(BatchRowsMixed):
-        recorded(tmp_path / "b.zarr", surrounded(True, kind))
-
-
-def test_what_a_module_counts_beside_its_attributes_is_as_if_it_had_not_been_called_again(tmp_path):
-    def counting():
-        policy, noted = folded_policy(False, FOLDED["sdpa"]), []
-        for block in policy.blocks:
-            block.register_buffer("calls", torch.zeros(()))
-            block.statistics = nn.BatchNorm1d(WIDTH)
-
-            def count(block, given, result):
-                block.statistics(given[0].flatten(0, 1))
-                block.calls.data.add_(1)  # which torch counts no version of
-                noted.append(len(noted))
-
-            block.register_forward_hook(count)
-        return policy, noted
-
-    (own, own_noted), (policy, noted) = counting(), counting()
-    own.act(2)
-    recorded(tmp_path / "a.zarr", policy)
-    assert noted == own_noted
-    for (name, numbers), wanted in zip(policy.state_dict().items(), own.state_dict().values(), strict=True):
-        assert torch.equal(numbers, wanted), name
-
-
 def test_where_nothing_tells_a_sentence_says_that_rows_may_be_mixed(tmp_path):
-    policy = folded_policy(False, FOLDED["sdpa"], "cannot be called again")
+    policy = folded_policy(False, FOLDED["sdpa"])
+    for block in policy.blocks:
+        block.out.register_forward_hook(lambda module, given, result: torch.tanh(result))
     with pytest.warns(Note, match="rows of a batch of 2 may be mixed"):
         recorded(tmp_path / "a.zarr", policy, contributions=False)
-
-
-@pytest.mark.parametrize("outside", [True, False])
-def test_contributions_tell_it_where_the_module_cannot_be_called_again(tmp_path, outside):
-    policy = folded_policy(outside, FOLDED["sdpa"], "cannot be called again")
-    if outside:
-        with pytest.raises(ContributionsUnknown, match=r"several of them.*rows of a batch of 2 may be mixed"):
-            recorded(tmp_path / "a.zarr", policy)
-    else:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            assert recorded(tmp_path / "a.zarr", policy)[0] < 2e-6
+    with pytest.raises(ContributionsUnknown, match=r"computes tanh .*rows of a batch of 2 may be mixed"):
+        recorded(tmp_path / "b.zarr", policy)
 
 
 @pytest.mark.parametrize("outside", [True, False])

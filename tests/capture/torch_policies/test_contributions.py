@@ -72,7 +72,7 @@ def expected(policy, way, row=0, batch=1) -> np.ndarray:
 
 def close(given: np.ndarray, wanted: np.ndarray, most: float = 1e-5) -> None:
     """Compare Gram matrices relative to the largest number of each."""
-    scale = np.abs(wanted).max(axis=(-1, -2), keepdims=True)
+    scale = np.abs(wanted).max(axis=(-1, -2), keepdims=True).clip(1e-9)
     np.testing.assert_allclose(given / scale, wanted / scale, atol=most, rtol=0)
 
 
@@ -84,7 +84,7 @@ def test_parts_are_what_the_policy_adds_of_them(tmp_path, way):
     episode, wanted = store.episodes[0], expected(policy, way)
     # Every function is looked at in the first policy call, and in the second only what follows the attention.
     for gram in episode.read("joint/contribution"):
-        close(gram, wanted)
+        close(gram, wanted, most=3e-2 if way is WAYS["projected in bfloat16"] else 1e-5)
     np.testing.assert_array_equal(episode.read("actions")[1], actions[0].double().numpy())
 
 
