@@ -165,7 +165,9 @@ class Softmaxes:
             return
         with exact():
             rows, allowed, refused = _decided(multiplied, softmax, given, product)
-            rows, allowed = rows.reshape(*sizes, keys), allowed.reshape(sizes[0], -1, sizes[2], keys)
+            rows = rows.reshape(*sizes, keys)
+            seen = rows.new_ones((), dtype=torch.bool).expand(sizes[0], 1, sizes[2], keys)
+            seen = seen if allowed is None else allowed.reshape(*sizes, keys)
             values = product.values_of(value.detach(), multiplied).reshape(sizes[0], kv_heads, keys, dim)
         back = sorted(range(len(product.output)), key=lambda axis: product.output[axis])
         self._mode.saw(
@@ -174,7 +176,7 @@ class Softmaxes:
                 values,
                 result.detach().permute(back).reshape(*sizes, dim),
                 lambda queries, batch: at_positions(at_positions(rows, 0, batch), 2, queries),
-                lambda queries: at_positions(allowed, 2, queries),
+                lambda queries: at_positions(seen, 2, queries),
                 lambda mixed: mixed.reshape(*multiplied.shape[:-1], dim).permute(product.output),
                 given.dtype,
                 None if shape == replace(before, kv_heads=kv_heads) else before,
@@ -183,10 +185,10 @@ class Softmaxes:
         )
 
 
-def _decided(rows: Tensor, softmax: _Softmax, given: Tensor, product: Product) -> tuple[Tensor, Tensor, str]:
+def _decided(rows: Tensor, softmax: _Softmax, given: Tensor, product: Product) -> tuple[Tensor, Tensor | None, str]:
     """Return the rows of a product (*lead, query, key) float32, the keys that the mask allows, and why it is refused.
 
-    rows: the probabilities as they are multiplied.
+    rows: the probabilities as they are multiplied. No mask is None.
     """
     expected = normalised(softmax.logits.to(torch.promote_types(softmax.logits.dtype, torch.float32)))
     rounding = max(torch.finfo(dtype).eps for dtype in (rows.dtype, softmax.logits.dtype))
@@ -194,10 +196,13 @@ def _decided(rows: Tensor, softmax: _Softmax, given: Tensor, product: Product) -
     for arrange in _arrangements(expected, given):
         arranged = arrange(expected).permute(product.rows)
         # Rounded to the compute precision, probabilities would not sum to 1.
-        if torch.allclose(rows.float(), arranged, rtol=max(2 * rounding, 1e-4), atol=max(rounding / 100, 1e-6)):
+        beyond = (rows.float() - arranged).abs_().sub_(arranged, alpha=max(2 * rounding, 1e-4))
+        if bool(beyond.amax() <= max(rounding / 100, 1e-6)):
             logits = arrange(softmax.before).permute(product.rows).float()
             highest = logits.amax(-1, keepdim=True)
-            allowed = (logits > highest + MASKED_BELOW) & (highest > MASKED_BELOW)
+            allowed = None
+            if not bool(logits.amin() > highest.amax() + MASKED_BELOW):
+                allowed = (logits > highest + MASKED_BELOW) & (highest > MASKED_BELOW)
             return arranged if narrow else rows.float(), allowed, ""
     # Something else is multiplied than what the softmax gave, or its logits were written over: then a key that has any
     # mass is seen.
