@@ -264,8 +264,8 @@ class RecordedRun:
         if unknown is not None and self.attributes.recording.contributions:
             raise ContributionsUnknown(
                 "Contributions cannot be recorded, because it is not known what each part of the keys adds to the "
-                f"residual stream: {unknown}{of_batch}. Record with contributions=False (docs/your-policy.md, "
-                '"Contributions"). Nothing of this episode was kept.'
+                f"residual stream: {unknown}{of_batch}. Record with contributions=False, or --no-contributions "
+                '(docs/your-policy.md, "Contributions"). Nothing of this episode was kept.'
             )
 
 
