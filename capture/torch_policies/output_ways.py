@@ -221,7 +221,7 @@ class OutputWays:
             self._lose(way)
         elif len(nonlinear) > 1 and sums:
             self._find(way, sums[-1])
-        elif nonlinear and others and projected:
+        elif nonlinear and others and projected and not self._left(way, sums, result):
             self._lose(way, "adds something else that is computed of a sum with")
         elif nonlinear:
             of_all = () if any(not step.sums for _, step in steps) else sums
@@ -235,8 +235,8 @@ class OutputWays:
         """Take a sum with another tensor as large for the residual stream, until another one shows to be it."""
         sums, projected = _sums(steps), any(step.projected for _, step in steps)
         before = way.taken[sums[-1] - 1] if sums else None
-        if before is not None and before.projected and before.shape != result.shape:
-            return  # the stream has left the network: what became of it is added to noisy actions
+        if before is not None and self._left(way, sums, result):
+            return
         replay = self._replay(call, steps)
         if replay is None:
             way.changed = way.changed or f"{self._running()} computes {call.name} of"
@@ -270,6 +270,11 @@ class OutputWays:
             doubtful = computed and (not projected or (before is not None and before.projected))
             way.taken.append(_Taken(taken, result.shape, projected, sums, computed, doubtful))
             self._put([result], way, _Step(replay, (*sums, len(way.taken)), is_sum=True))
+
+    def _left(self, way: OutputWay, sums: tuple[int, ...], result: Tensor) -> bool:
+        """Whether the stream has left the network in a sum: what became of it is added to noisy actions."""
+        before = way.taken[sums[-1] - 1]
+        return before.projected and before.shape != result.shape
 
     def _replay(self, call: _Call, steps: _Steps) -> Replay | None:
         with self._computing():
