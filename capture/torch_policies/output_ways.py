@@ -59,13 +59,15 @@ class _Taken:
     """What was kept of a sum.
 
     projected: whether a matrix product stands between it and the attention, or the sum before. sums: those before that
-    are in it. doubtful: a sum before may be the stream as well: it was scaled or projected, and is as large.
+    are in it. computed: it is a sum with something that is computed of a sum before. doubtful: that one may be the
+    stream as well.
     """
 
     kept: Any
     shape: torch.Size
     projected: bool
     sums: tuple[int, ...]
+    computed: bool
     doubtful: bool
 
 
@@ -104,7 +106,7 @@ class OutputWay:
         if self.lost:
             return None
         last = self.taken[-1]
-        if not self.found and (last.doubtful or len(last.sums) < len(self.taken) - 1):
+        if not self.found and (last.computed or len(last.sums) < len(self.taken) - 1):
             self.lost = "what the attention gave is added to several tensors, none of which shows to be the stream"
         return None if self.lost else last.kept
 
@@ -157,6 +159,10 @@ class OutputWays:
     def begin(self, way: OutputWay, result: Tensor) -> None:
         """Follow the output of a call that has just run; result: what the policy got of it."""
         self._put([result], way, _Step(lambda given: given))
+
+    def note_other_use(self, way: OutputWay, probabilities: Sequence[Tensor]) -> None:
+        """Follow the probabilities of a call too: keys give more through them than through the call's output."""
+        self._put(probabilities, way, _Step(None))
 
     def follow(self, function: Any, args: tuple[Any, ...], kwargs: Mapping[str, Any], run: Callable[[], Any]) -> Any:
         """Run a function, and note what its result is to the outputs that are followed."""
@@ -213,16 +219,20 @@ class OutputWays:
         streams = [step for _, step in steps if step.is_sum]
         rest = [step for _, step in steps if not step.is_sum]
         nonlinear = [step for step in rest if step.replay is None]
+        beside = [step for step in rest if not step.sums]
         if any(step.factor for step in rest):
             factor = all(step.factor for step in rest) and not streams
             self._put([result], way, _Step(None, sums, projected=projected, factor=factor))
         elif streams and any(streams[0].sums[-1] in step.sums for step in rest):
             self._find(way, streams[0].sums[-1])
-        elif nonlinear and (streams or others) and not all(step.sums for step in nonlinear):
+        elif nonlinear and (
+            ((streams or others) and any(step.replay is None for step in beside))
+            or (sums and any(step.replay is not None for step in beside))
+        ):
             self._lose(way)
         elif len(nonlinear) > 1 and sums:
             self._find(way, sums[-1])
-        elif nonlinear and others and projected:
+        elif nonlinear and others and projected and not self._left(way, sums, result):
             self._lose(way, "adds something else that is computed of a sum with")
         elif nonlinear:
             of_all = () if any(not step.sums for _, step in steps) else sums
@@ -236,8 +246,8 @@ class OutputWays:
         """Take a sum with another tensor as large for the residual stream, until another one shows to be it."""
         sums, projected = _sums(steps), any(step.projected for _, step in steps)
         before = way.taken[sums[-1] - 1] if sums else None
-        if before is not None and before.projected and before.shape != result.shape:
-            return  # the stream has left the network: what became of it is added to noisy actions
+        if before is not None and self._left(way, sums, result):
+            return
         replay = self._replay(call, steps)
         if replay is None:
             way.changed = way.changed or f"{self._running()} computes {call.name} of"
@@ -267,9 +277,15 @@ class OutputWays:
         elif not there:
             way.nothing = taken
         else:
-            doubtful = before is not None and before.projected and not any(step.is_sum for _, step in steps)
-            way.taken.append(_Taken(taken, result.shape, projected, sums, doubtful))
+            computed = before is not None and not any(step.is_sum for _, step in steps)
+            doubtful = computed and (not projected or (before is not None and before.projected))
+            way.taken.append(_Taken(taken, result.shape, projected, sums, computed, doubtful))
             self._put([result], way, _Step(replay, (*sums, len(way.taken)), is_sum=True))
+
+    def _left(self, way: OutputWay, sums: tuple[int, ...], result: Tensor) -> bool:
+        """Whether the stream has left the network in a sum: what became of it is added to noisy actions."""
+        before = way.taken[sums[-1] - 1]
+        return before.projected and before.shape != result.shape
 
     def _replay(self, call: _Call, steps: _Steps) -> Replay | None:
         with self._computing():
@@ -298,7 +314,9 @@ class OutputWays:
     def _lose(self, way: OutputWay, what: str = "") -> None:
         """Note why it is not known what is added: what the running module does, or what it did before."""
         way.take = None
-        way.lost = way.lost or f"{f'{self._running()} {what}' if what else way.changed} what the attention gave"
+        computed = f"{self._running()} {what}" if what else way.changed
+        computed = computed or f"{self._running()} uses its probabilities again, beside"
+        way.lost = way.lost or f"{computed} what the attention gave"
         self._change(way, lambda step: None)
 
     def _change(self, way: OutputWay, change: Callable[[_Step], _Step | None]) -> None:

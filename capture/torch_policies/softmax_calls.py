@@ -52,19 +52,27 @@ _ORDER_UNKNOWN = (
     "the values, so that nothing tells which key, head and row of the batch is where. Slices are followed, and an "
     "order that is made after the product; else give the call a rule without a site"
 )
+_VALUES_BY_QUERY = (
+    "gives every query keys and values of its own (as gathered ones), so that no key has a place that a layout can "
+    "name. Give the call a rule without a site"
+)
+#: Functions that change the order on an axis, as indices by tensors do too.
+_REORDERS = {"index_select", "gather", "take_along_dim", "flip", "fliplr", "flipud", "rot90", "roll"}
 
 
 @dataclass(frozen=True)
 class _Softmax:
     """A softmax whose result has not met values yet.
 
-    logits: what it took; before: the same without the watcher's change. changed: whether there is one.
+    logits: what it took; before: the same without the watcher's change. changed: whether there is one. reordered:
+    whether what is followed went through a function that changes the order of keys, heads or rows.
     """
 
     shape: CallShape
     logits: Tensor
     before: Tensor
     changed: bool
+    reordered: bool = False
 
 
 class Softmaxes:
@@ -75,6 +83,8 @@ class Softmaxes:
         self._followed: TensorTable[_Softmax] = TensorTable()
         #: Empty where nothing is followed: every function of the policy comes by here.
         self.entries = self._followed.entries
+        #: What else the policy computed of a softmax's result, such as its product with relative positions.
+        self._beside: TensorTable[_Softmax] = TensorTable()
         #: Softmaxes that were changed and met no values yet.
         self.changed: list[CallShape] = []
 
@@ -115,12 +125,16 @@ class Softmaxes:
             if softmax is None:
                 continue
             if function in _PRODUCTS:
+                self._beside.put(result, softmax)
                 self._product(function, args, kwargs, given, softmax, result)
             elif isinstance(result, Tensor) and result is not given and result.is_floating_point() and result.ndim:
                 # Some keys may be cut off, as those of attention sinks are.
                 fewer = result.ndim == given.ndim and sum(a != b for a, b in zip(result.shape, given.shape)) == 1  # noqa: B905
                 if result.numel() == given.numel() or (fewer and result.numel() < given.numel()):
-                    self._followed.put(result, softmax)
+                    reordered = softmax.reordered or _reorders(function, args)
+                    self._followed.put(result, replace(softmax, reordered=reordered))
+                else:
+                    self._beside.put(result, softmax)
             break
         return result
 
@@ -143,9 +157,7 @@ class Softmaxes:
         )  # fmt: skip
         if product is None:
             return
-        # Other tensors that come from this softmax need not be followed any more.
-        self._followed.keep(lambda other: other is not softmax)
-        if softmax.changed:
+        if softmax.shape in self.changed:
             self.changed.remove(softmax.shape)
         multiplied = given.detach().permute(product.rows)
         sizes, keys, dim = _sizes(softmax, product, given), multiplied.shape[-1], value.shape[product.values[-1]]
@@ -165,6 +177,7 @@ class Softmaxes:
             return
         with exact():
             rows, allowed, refused = _decided(multiplied, softmax, given, product)
+            refused = _VALUES_BY_QUERY if kv_heads > sizes[1] else refused
             rows = rows.reshape(*sizes, keys)
             seen = rows.new_ones((), dtype=torch.bool).expand(sizes[0], 1, sizes[2], keys)
             seen = seen if allowed is None else allowed.reshape(*sizes, keys)
@@ -181,8 +194,21 @@ class Softmaxes:
                 given.dtype,
                 None if shape == replace(before, kv_heads=kv_heads) else before,
                 refused,
-            )
+            ),
+            [
+                tensor
+                for table in (self._followed, self._beside)
+                for tensor in table.tensors(lambda other: other.logits is softmax.logits)
+            ],
         )
+
+
+def _reorders(function: Any, args: tuple[Any, ...]) -> bool:
+    name = getattr(function, "__name__", "").strip("_")
+    indices = args[1] if name == "getitem" else ()
+    indices = indices if isinstance(indices, tuple) else (indices,)
+    plain = (int, slice, type(None), type(Ellipsis))
+    return name in _REORDERS or not all(isinstance(index, plain) for index in indices)
 
 
 def _decided(rows: Tensor, softmax: _Softmax, given: Tensor, product: Product) -> tuple[Tensor, Tensor | None, str]:
@@ -211,6 +237,7 @@ def _decided(rows: Tensor, softmax: _Softmax, given: Tensor, product: Product) -
         ours, theirs = (tensor.flatten().sort().values for tensor in (expected, rows))
         same_numbers = torch.allclose(theirs, ours, rtol=max(2 * rounding, 1e-4), atol=rounding / 100)
         refused = _ORDER_UNKNOWN if same_numbers else ""
+    refused = _ORDER_UNKNOWN if softmax.reordered else refused
     if narrow:
         sums = rows.sum(dim=-1, keepdim=True)
         rows = rows / torch.where((sums - 1).abs() < _ROUNDING, sums, 1.0)

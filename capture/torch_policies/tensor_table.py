@@ -45,6 +45,11 @@ class TensorTable(Generic[_Known]):
 
         entries[number] = weakref.ref(tensor, forget), known
 
+    def tensors(self, wanted: Callable[[_Known], bool]) -> list[Tensor]:
+        """Return the living tensors of which something wanted is known."""
+        chosen = (reference() for reference, known in list(self.entries.values()) if wanted(known))
+        return [tensor for tensor in chosen if tensor is not None]
+
     def keep(self, wanted: Callable[[_Known], bool]) -> None:
         """Forget the tensors of which something else is known."""
         for number, (_, known) in list(self.entries.items()):

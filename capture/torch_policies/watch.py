@@ -11,7 +11,7 @@ import random
 import sys
 import threading
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any
@@ -185,13 +185,15 @@ class AttentionMode(TorchFunctionMode):
         self._number += 1
         return True
 
-    def saw(self, call: AttentionCall) -> None:
-        """Tell the watcher about a call, and count it."""
+    def saw(self, call: AttentionCall, probabilities: Sequence[Tensor] = ()) -> None:
+        """Tell the watcher about a call, and count it; probabilities: tensors that the policy may use once more."""
         if call.shape.number != self._number:  # another call came between a softmax and its product
             call = replace(call, shape=replace(call.shape, number=self._number))
         with self.computing():
             self._number += 1
             self._way = self._watcher.saw(call)
+        if self._way is not None:
+            self.outputs.note_other_use(self._way, probabilities)
 
     @contextmanager
     def computing(self) -> Iterator[None]:

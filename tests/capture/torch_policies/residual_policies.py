@@ -301,6 +301,13 @@ def added_behind_the_feed_forward(block: Block, call: Call) -> Tensor:
     return tokens + block.beside(call.mixed)
 
 
+def added_to_some_queries_and_to_others(block: Block, call: Call) -> Tensor:
+    tokens, update = call.stream.clone(), block.out(call.mixed)
+    tokens[:, :1] += update[:, :1]
+    tokens[:, 1:] += update[:, 1:]
+    return tokens
+
+
 def linear_part(add: Add) -> Part:
     """Of a way that is linear: what it adds with a share of the mixed values, less what it adds with none."""
 
@@ -376,6 +383,11 @@ UNKNOWN: dict[str, tuple[Add, str]] = {
     "feed-forward of what was added": (
         lambda b, c: (lambda update: c.stream + update + b.mlp(update))(b.out(c.mixed)),
         "gelu",
+    ),
+    "some queries after others": (added_to_some_queries_and_to_others, "setitem"),
+    "multiple of the stream without a projection": (
+        lambda b, c: 0.8 * (c.stream + c.mixed[..., :WIDTH]) + 0.2 * c.normed,
+        "adds a multiple of a sum with",
     ),
     "another way behind the feed-forward": (added_behind_the_feed_forward, "adds something else"),
 }

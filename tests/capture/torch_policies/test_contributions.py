@@ -16,12 +16,14 @@ from tests.capture.torch_policies.residual_policies import (
     DIM,
     HEADS,
     PARTS,
+    PREFIX,
     STEPS,
     UNKNOWN,
     WAYS,
     WIDTH,
     ResidualPolicy,
     Way,
+    projected,
     residual_layout,
 )
 from vla_attention.capture.torch_policies.policy_layout import CallRule, RecordedSite
@@ -119,6 +121,33 @@ def test_where_it_cannot_be_said_a_sentence_says_why(tmp_path, add, word):
         recorded(tmp_path / "with", policy)
     assert word in str(caught.value)
     assert not recorded(tmp_path / "without", policy, contributions=False).episodes[0].has("joint/contribution")
+
+
+class NarrowPolicy(ResidualPolicy):
+    """Its actions have fewer numbers than its stream."""
+
+    def __init__(self, add) -> None:
+        super().__init__(add)
+        self.into, self.norm, self.out = nn.Linear(3, WIDTH), nn.LayerNorm(WIDTH), nn.Linear(WIDTH, 3)
+
+    @torch.no_grad()
+    def act(self, batch: int = 1) -> Tensor:
+        numbers = torch.Generator().manual_seed(1)
+        prefix = torch.randn(batch, PREFIX, WIDTH, generator=numbers)
+        actions = torch.randn(batch, ACTIONS, 3, generator=numbers)
+        for step in range(STEPS):
+            hidden = self.into(actions)
+            for block in self.blocks:
+                hidden = block(hidden, prefix, torch.full((batch, WIDTH), float(step)))
+            actions = actions - self.out(self.norm(hidden)) / STEPS
+        return actions
+
+
+def test_a_scaled_stream_that_leaves_the_network(tmp_path):
+    way = Way(lambda b, c: 0.7 * (c.stream + b.out(c.mixed)), lambda b, c, s: projected(b, s))
+    policy = NarrowPolicy(way.add)
+    gram = recorded(tmp_path, policy).episodes[0].read("joint/contribution")[0]
+    close(gram, expected(policy, way))
 
 
 class Adapter(nn.Module):

@@ -12,10 +12,11 @@ from msgspec.structs import replace
 from torch import Tensor, nn
 
 from vla_attention.capture.torch_policies.attention_calls import RowsRefused
+from vla_attention.capture.torch_policies.call_order import CallsDoNotFit
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.policy_layout import CallRule, PolicyLayout, RecordedSite
 from vla_attention.capture.torch_policies.record import record
-from vla_attention.capture.torch_policies.session import WeightsChanged
+from vla_attention.capture.torch_policies.session import ContributionsUnknown, WeightsChanged
 from vla_attention.capture.torch_policies.site_recorder import RowsDoNotMatch
 from vla_attention.capture.torch_policies.unseen_attention import UnseenAttention
 from vla_attention.schemas.interventions import knockout
@@ -96,7 +97,7 @@ def layout(**changes: object) -> PolicyLayout:
     return PolicyLayout(**{**fields, **changes})  # type: ignore[arg-type]
 
 
-def rows_of(path, policy, act=None, cut=None, shape=None):
+def rows_of(path, policy, act=None, cut=None, shape=None, contributions=True):
     """Record one call; return its rows (block, head, query, key) and what it gave."""
     changes = None if cut is None else knockout(cut)
     with (
@@ -108,6 +109,7 @@ def rows_of(path, policy, act=None, cut=None, shape=None):
             queries="all",
             durable=False,
             interventions=changes,
+            contributions=contributions,
         ) as run,
         run.episode(task_id=0, episode_index=0, instruction="") as episode,
         episode.replan(env_step=0),
@@ -246,7 +248,10 @@ def test_relative_positions_added_to_the_values_are_not_the_values(tmp_path, hea
         return rows @ v + torch.einsum("bhqk,qkd->bhqd", rows, table)
 
     policy = OddPolicy(attend, heads=heads)
-    rows, _ = rows_of(tmp_path, policy, shape=layout(num_heads=heads))
+    shape = layout(num_heads=heads)
+    with pytest.raises(ContributionsUnknown, match="probabilities again"):  # keys give more than their values
+        rows_of(tmp_path / "with", policy, shape=shape)
+    rows, _ = rows_of(tmp_path, policy, shape=shape, contributions=False)
     np.testing.assert_allclose(rows, expected(policy), atol=2e-6)
 
 
@@ -279,6 +284,8 @@ PICKS = {
     "heads": lambda p, v: (p[:, HEAD_ORDER] @ v[:, HEAD_ORDER])[:, HEAD_ORDER],
     "flip": lambda p, v: p.flip(-1) @ v.flip(2),
     "gather": lambda p, v: p.gather(-1, KEY_ORDER.expand(p.shape)) @ v[:, :, KEY_ORDER],
+    "keys of changed rows": lambda p, v: (0.9 * p + 0.1 / KEYS)[..., KEY_ORDER] @ v[:, :, KEY_ORDER],
+    "roll of changed rows": lambda p, v: (p.square() / p.square().sum(-1, keepdim=True)).roll(1, -1) @ v.roll(1, 2),
 }
 
 
@@ -296,6 +303,31 @@ def test_an_index_that_may_permute_is_refused(tmp_path, multiply):
     rows, result = rows_of(tmp_path, policy, shape=layout(rules=rules, sites=sites))
     assert torch.equal(result, policy.act())
     np.testing.assert_allclose(rows, expected(policy)[1:], atol=2e-6)
+
+
+def test_keys_gathered_for_each_query_are_refused(tmp_path):
+    def attend(block, q, k, v):
+        scores, order = logits(q, k).sort(dim=-1)
+        each = v[:, :, None].expand(-1, -1, ACTIONS, -1, -1).gather(3, order[..., None].expand(*order.shape, DIM))
+        return (torch.softmax(scores, dim=-1).unsqueeze(-2) @ each).squeeze(-2)
+
+    with pytest.raises(RowsRefused, match="values of its own"):
+        rows_of(tmp_path, OddPolicy(attend))
+
+
+def test_products_of_some_queries_each_are_calls_of_their_own(tmp_path):
+    def attend(block, q, k, v):
+        rows = torch.softmax(logits(q, k), dim=-1)
+        return torch.cat([rows[:, :, :2] @ v, rows[:, :, 2:] @ v], dim=2)
+
+    sites = tuple(replace(site, action_queries=(-1, None)) for site in layout().sites)
+    with pytest.raises(CallsDoNotFit, match="block 0: 2, block 1: 2"):
+        rows_of(tmp_path, OddPolicy(attend), shape=layout(sites=sites))
+
+
+def test_a_sum_before_the_projection_may_be_the_stream_where_nothing_follows(tmp_path):
+    with pytest.raises(ContributionsUnknown, match=r"block 1 .* none of which shows"):
+        rows_of(tmp_path, OddPolicy(lambda block, q, k, v: by_hand(block, q, k, v) + q))
 
 
 def test_keys_that_a_slice_cuts_off_in_front(tmp_path):
