@@ -22,7 +22,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vla_attention.capture.recording.attention import MASKED_LOGIT, CallKeys, FactorEditor, LogitChange
+from vla_attention.capture.recording.attention import MASKED_LOGIT, CallKeys, FactorEditor, LogitChange, log_factors
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import Queries
 
@@ -59,6 +59,12 @@ class SiteEdit:
     def changes_nothing(self) -> bool:
         """Whether no key has another factor than 1, or a weight in the group."""
         return bool((self.values == (1.0 if self.kind == "factor" else 0.0)).all())
+
+    def is_at(self, layer: int, denoise_step: int | None) -> bool:
+        """Whether something changes in a layer and denoise step; in every step for None."""
+        if self.changes_nothing or (self.layers is not None and layer not in self.layers):
+            return False
+        return denoise_step is None or self.denoise_steps is None or denoise_step in self.denoise_steps
 
     def reaches(self, call: CallKeys) -> bool:
         """Whether some query of a call is one whose attention changes."""
@@ -117,12 +123,7 @@ class SiteEditor(FactorEditor):
     def change(self, layer: int, denoise_step: int | None, call: CallKeys) -> LogitChange | None:
         """See `AttentionEditor`."""
         numbers = [
-            number
-            for number, edit in enumerate(self.edits)
-            if not edit.changes_nothing
-            and edit.reaches(call)
-            and (edit.layers is None or layer in edit.layers)
-            and (denoise_step is None or edit.denoise_steps is None or denoise_step in edit.denoise_steps)
+            number for number, edit in enumerate(self.edits) if edit.is_at(layer, denoise_step) and edit.reaches(call)
         ]
         if not numbers:
             return None
@@ -201,17 +202,13 @@ def _applied(operands: _Operands, logits: Tensor) -> Tensor:
     return logits
 
 
-def log_factors(factors: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return what is added to logits for these factors of the weights before normalising; 0 for factors 0 and 1."""
-    return np.log(np.where(factors > 0, factors, 1.0)).astype(np.float32)
-
-
-def logit_bias(edits: Sequence[SiteEdit], heads: int, queries: int, call: CallKeys) -> NDArray[np.float32]:
+def logit_bias(edits: Sequence[SiteEdit], sizes: tuple[int, int, int], call: CallKeys) -> NDArray[np.float32]:
     """Return what edits that have factors add to the logits of a call, (head or 1, query, key); -inf for a factor 0.
 
-    heads, queries: of the call. One head stands for all where no edit has heads of its own.
+    sizes: heads, queries and keys of the call. One head stands for all where no edit has heads of its own.
     """
-    bias = np.zeros((heads if any(edit.heads is not None for edit in edits) else 1, queries, 1), np.float32)
+    heads, queries, keys = sizes
+    bias = np.zeros((heads if any(edit.heads is not None for edit in edits) else 1, queries, keys), np.float32)
     for edit in edits:
         factors = edit.factors(queries, call)
         added = np.where(factors == 0, -np.inf, log_factors(factors)).astype(np.float32)

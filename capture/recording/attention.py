@@ -188,6 +188,11 @@ class FactorEditor(AttentionEditor, Protocol):
         """Return the factors (query, key) in a call with `numbers` and so many queries; None where nothing changes."""
 
 
+def log_factors(factors: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return what is added to logits for these factors of the weights before normalising; 0 for factors 0 and 1."""
+    return np.log(np.where(factors > 0, factors, 1.0)).astype(np.float32)
+
+
 @dataclass(frozen=True)
 class BatchCollector(RowCollector):
     """Gives every member of a batch the rows and updates of its own call, as a batch of 1.

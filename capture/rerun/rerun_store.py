@@ -120,7 +120,7 @@ def _reading_the_base() -> Iterator[None]:
 class Rerun:
     """A loaded policy and the store whose calls it makes again.
 
-    recording: what is recorded of the calls. machine: provenance of this process. faults: of all stores that it wrote.
+    recording: what is recorded of the calls. machine: provenance of this process. faults: of the store that it wrote.
     pictures: what cameras' own are exchanged for in effects.
     """
 

@@ -79,14 +79,7 @@ def changes_of_episode(
 
 def edits_at(edits: Sequence[SiteEdit], place: CallPlace) -> list[SiteEdit]:
     """Return the edits that change one call of a site."""
-    return [
-        edit
-        for edit in edits
-        if edit.queries != "prefix"
-        and (edit.layers is None or place.block in edit.layers)
-        and (edit.denoise_steps is None or place.step in edit.denoise_steps)
-        and not (edit.values == 1).all()
-    ]
+    return [edit for edit in edits if edit.queries != "prefix" and edit.is_at(place.block, place.step)]
 
 
 @dataclass
@@ -119,7 +112,7 @@ class CallBias:
                 if place.site is None
                 else CallKeys(place.queries, self._own_keys(place.site, shape), place.keys)
             )
-            self._known[call] = logit_bias(edits, shape.heads, shape.queries, keys)
+            self._known[call] = logit_bias(edits, (shape.heads, shape.queries, shape.keys), keys)
         return self._known[call]
 
     def _tokens(self, site: str, shape: CallShape) -> NDArray[np.int64]:

@@ -14,12 +14,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from vla_attention.capture.interventions.factors import log_factors
 from vla_attention.capture.policies.pi.config import PiConfig
 from vla_attention.capture.policies.pi.flow_time import denoise_times, embed_times
 from vla_attention.capture.policies.pi.gemma import KeysValues, Rotation
 from vla_attention.capture.policies.pi.model import Denoising, PiModel
-from vla_attention.capture.recording.attention import CallKeys, FactorEditor, LogitChange
+from vla_attention.capture.recording.attention import CallKeys, FactorEditor, LogitChange, log_factors
 
 #: Bytes of the logits of one block that a batch may have: beyond it, larger batches gain nothing.
 _MOST_LOGITS = 1 << 28
