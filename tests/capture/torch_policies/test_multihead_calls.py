@@ -91,17 +91,18 @@ def test_rows_and_results(data):
         torch.testing.assert_close(call.rows(wanted), rows[:, :, wanted], rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.parametrize("options", [{}, {"add_zero_attn": True}, {"add_bias_kv": True}], ids=str)
 @pytest.mark.parametrize("mask", ["none", "bool", "padding", "causal"])
-def test_a_change_takes_keys_away(mask):
+def test_a_change_takes_keys_away(mask, options):
     torch.manual_seed(0)
-    policy = Block(batch_first=True).eval()
+    policy = Block(batch_first=True, **options).eval()
     hidden, memory = torch.randn(2, 5, 16), torch.randn(2, 5, 16)
     masks = {
         "none": {}, "bool": {"attn_mask": torch.ones(5, 5).triu(3).bool()},
         "padding": {"key_padding_mask": torch.tensor([[False] * 4 + [True]] * 2)},
         "causal": {"attn_mask": torch.ones(5, 5).triu(1).bool(), "is_causal": True, "need_weights": False},
     }[mask]  # fmt: skip
-    knocked = torch.zeros(4, 1, 5)
+    knocked = torch.zeros(4, 1, 5 + bool(options))
     knocked[2, :, 1] = float("-inf")
     first, second = Seen(), Seen(changes=lambda shape: knocked)
     for seen in (first, second):
