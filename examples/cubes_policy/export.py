@@ -100,5 +100,6 @@ def run(arguments: argparse.Namespace) -> int:
     print(
         f"{arguments.folder}: {card['parameters']:,} parameters after {card['steps']} steps, control {card['control']}"
     )
-    print(f"Next: python -m examples.cubes_policy evaluate {arguments.folder}")
+    print(f"Next: vla-attention capture pi --checkpoint {arguments.folder} --task-suite cubes --output cubes.zarr")
+    print("Then: python -m examples.cubes_policy rates cubes.zarr")
     return 0
