@@ -118,6 +118,29 @@ def row_of(
     }
 
 
+def verdict(store: Store, attributes: EpisodeAttributes) -> str:
+    """What an episode came to, in a line: ``Failed: told 'touch the red cube', touched blue cube first (step 17).``"""
+    if store.attributes.rerun_of is not None:
+        return "Outcome not run: the policy calls of another run were made again, and nothing was executed."
+    told, steps = told_instruction(store, attributes), attributes.steps
+    begin = {True: "Solved", False: "Failed", None: "Outcome not known"}[attributes.success]
+    begin += f": told '{visible(told)}'"
+    if steps is None:
+        return f"{begin}, {attributes.num_steps} steps." if attributes.num_steps else f"{begin}."
+    row = row_of(store.suite, attributes, told, steps, _same(store))
+    if attributes.success:
+        return f"{begin}, done after {attributes.num_steps} steps."
+    did, touched = f"'{row['did']}' (step {row['did_at']})", f"{row['touched']} first (step {row['touched_at']})"
+    came_to = {
+        TOLD_SO: f"did so (step {row['did_at']}), which is not the task '{visible(attributes.instruction)}'",
+        OTHER_GOAL: f"did {did}",
+        OTHER_TOUCH: f"touched {touched}",
+        UNFINISHED: f"touched {touched}, did not finish",
+        NO_TOUCH: NO_TOUCH,
+    }
+    return f"{begin}, {came_to[str(row['how'])]}."
+
+
 def key_of(goal: TaskGoal) -> str:
     """What goals with the same conditions share."""
     return _AND.join(sorted(set(goal.conditions)))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import hmac
 import re
-from collections.abc import Collection
-from dataclasses import dataclass
-from urllib.parse import unquote_to_bytes
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from urllib.parse import parse_qs, unquote_to_bytes
 
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.safe_text import check_inner_path
@@ -45,6 +45,7 @@ class Wanted:
         summary: the number of the store whose summary is asked for.
         store: the number of the store whose file is asked for.
         file: the path of that file in its store.
+        answer: the parts of an answer's address, see `answers`; query: what is asked there.
     """
 
     page: str = ""
@@ -52,6 +53,8 @@ class Wanted:
     summary: int | None = None
     store: int | None = None
     file: str = ""
+    answer: tuple[str, ...] = ()
+    query: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
 def name_of_host(host: str) -> str | None:
@@ -79,7 +82,7 @@ def wanted(target: str, token: str, num_stores: int) -> Wanted:
         WrongToken: it does not have the token.
         NothingThere: nothing of that name is served.
     """
-    path = target.partition("?")[0]
+    path, _, asked = target.partition("?")
     first, *parts = path.split("/")
     if first:
         raise WrongToken
@@ -96,6 +99,8 @@ def wanted(target: str, token: str, num_stores: int) -> Wanted:
         return Wanted(page=names[0])
     if names == [STORES_DOCUMENT]:
         return Wanted(document=True)
+    if names[0] in ("runs", "runs.json"):
+        return Wanted(answer=tuple(names), query=parse_qs(asked, keep_blank_values=True))
     if names[0] != "stores" or len(names) < 2:
         raise NothingThere
     summary = _SUMMARY.fullmatch(names[1])

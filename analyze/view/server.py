@@ -15,6 +15,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from typing import Any
 
+from vla_attention.analyze.view.answers import Answers, NoAnswer
 from vla_attention.analyze.view.kept_token import kept_token, new_token
 from vla_attention.analyze.view.paths import (
     PAGE_FILES,
@@ -28,7 +29,7 @@ from vla_attention.analyze.view.paths import (
     wanted,
 )
 from vla_attention.analyze.view.served_stores import ServedStore, stores_document
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stores.remote_source import RemoteFailure
 
 LOOPBACK = "127.0.0.1"
@@ -101,6 +102,7 @@ class ViewerServer(ThreadingHTTPServer):
         folder = files("vla_attention.analyze.view") / "bundle"
         self.page = {name: (folder / name).read_bytes() for name in PAGE_FILES}
         self.sent: dict[str, int] = {}
+        self._answers = Answers()
         try:
             super().__init__((LOOPBACK, port), _Handler)
         except OSError as error:
@@ -135,16 +137,24 @@ class ViewerServer(ThreadingHTTPServer):
             return _nothing()
         if asked.page:
             return Answer.of(self.page[asked.page], PAGE_FILES[asked.page])
-        if asked.document:
+        if asked.document or asked.answer == ("runs.json",):
             for store in self.stores:
                 store.refresh()
+        if asked.document:
             return _json(stores_document(self.stores, with_paths=True))
         if asked.summary is not None:
             return _json(self.stores[asked.summary].summary.document())
         try:
+            if asked.answer:
+                content, kind = self._answers.answer(self.stores, asked.answer, asked.query)
+                return Answer.of(content, kind)
             return self._file(asked, wanted_range)
+        except NoAnswer:
+            return _nothing()
         except RemoteFailure as error:
             return Answer.refused(502, str(error))
+        except UserError as error:
+            return Answer.of(json.dumps({"error": str(error)}).encode(), _JSON, HTTPStatus.UNPROCESSABLE_ENTITY)
         except OSError:
             return _nothing()
 

@@ -35,7 +35,9 @@ class Summary:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._rows: dict[str, dict[str, Any]] = {}
-        self._about: dict[str, Any] = dict.fromkeys(("site", "grouping", "ratio", "effect_units", "failed"))
+        self._about: dict[str, Any] = dict.fromkeys(
+            ("site", "grouping", "ratio", "effect_units", "findings", "leaves", "failed")
+        )
         self._complete = False
         self._process: subprocess.Popen[str] | None = None
         self._reader: threading.Thread | None = None

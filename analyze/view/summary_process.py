@@ -17,6 +17,7 @@ from typing import Any
 
 import polars as pl
 
+from vla_attention.analyze.ask import answer_to
 from vla_attention.analyze.core.about import sides
 from vla_attention.analyze.core.action_changes import units_of_recorded
 from vla_attention.analyze.core.levels import levels_of
@@ -26,7 +27,10 @@ from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.view.summaries import empty_row
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
+from vla_attention.schemas.stores.store_format import episode_name
 
+#: Whose answers are the findings of the run, in this order.
+_QUESTIONS = ("language", "failures", "objects")
 #: Episodes that are measured together; their numbers appear together.
 _AT_ONCE = 8
 
@@ -69,6 +73,28 @@ def summary_parts(store: Store) -> Iterator[dict[str, Any]]:
             except UserError as error:
                 failed = failed or str(error)
                 yield {"failed": failed}
+    yield _findings(store)
+
+
+def _findings(store: Store) -> dict[str, Any]:
+    """What the commands say of the run, each sentence once; and the steps at which failed episodes leave solved ones.
+
+    A question that the store cannot answer says nothing.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    leaves: dict[str, int] = {}
+    for name in _QUESTIONS:
+        try:
+            result = answer_to(name, [store], AnalysisSettings(skip_corrupt=True))
+        except UserError:
+            continue
+        for one in result.findings:
+            found.setdefault(one.sentence, {"asks": one.asks, "sentence": one.sentence, "limit": one.limit})
+        for table in result.tables:
+            if table.name == "failures":
+                rows = table.shown.drop_nulls("step").select("task_id", "episode_index", "step")
+                leaves |= {episode_name(task, episode): step for task, episode, step in rows.iter_rows()}
+    return {"findings": list(found.values()), "leaves": leaves}
 
 
 def _effect_units(store: Store) -> dict[str, Any]:

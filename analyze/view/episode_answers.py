@@ -1,0 +1,354 @@
+"""What the page is told of one episode, by the functions that the commands use: the page itself computes sums alone.
+
+Arrays are sent as `.npy` files, which state their shape: little-endian float32, axes in the order of stores.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from vla_attention.analyze.core.action_changes import GRIPPER, ActionSpread
+from vla_attention.analyze.core.camera_maps import PictureMap, map_note, seen_cameras, stored_picture, upright, view_of
+from vla_attention.analyze.core.levels import levels_of
+from vla_attention.analyze.core.measure import means
+from vla_attention.analyze.core.recorded_effects import NAMES, recorded_effects
+from vla_attention.analyze.measures.frames import LAYERS_AVG
+from vla_attention.analyze.measures.masses import uniform_keys
+from vla_attention.analyze.measures.question import Question, ask
+from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.measures.selected import SelectedEpisode, check_replan, resolve_episode
+from vla_attention.analyze.stores.rows import layer_rows
+from vla_attention.analyze.stores.selection import Selection, select
+from vla_attention.analyze.view.run_answers import episode_line
+from vla_attention.schemas.cached_property import cached_property
+from vla_attention.schemas.effects import CHANGE
+from vla_attention.schemas.episode_steps import EXECUTED, HAND, POSES
+from vla_attention.schemas.episode_steps import GRIPPER as FINGERS
+from vla_attention.schemas.errors import BadArgument, unknown_name
+from vla_attention.schemas.groupings.resolve import check_names
+from vla_attention.schemas.layout import Role
+from vla_attention.schemas.safe_text import visible
+from vla_attention.schemas.stores.reader import Store, StoredEpisode
+
+Array = NDArray[Any]
+#: An object is where it covers at least this part of a patch.
+_COVERED = 0.25
+#: A gripper that closes for fewer steps did not mean to.
+_FEWEST_CLOSED = 3
+#: The layer that stands for the mean of all.
+MEAN = "mean"
+
+
+@dataclass(frozen=True)
+class ShownEpisode:
+    """An episode of a store, opened for the page."""
+
+    store: Store
+    episode: StoredEpisode
+
+    @cached_property
+    def questions(self) -> dict[AnalysisSettings, Question]:
+        """The questions about the episode that were asked last."""
+        return {}
+
+    def question(self, site: str, **settings: Any) -> Question:
+        """A question about this episode alone, as the commands ask it."""
+        asked = AnalysisSettings(site=site, **settings)
+        if asked not in self.questions:
+            if len(self.questions) > 50:
+                self.questions.clear()
+            self.questions[asked] = ask([replace(self.store, episodes=(self.episode,))], asked)
+        return self.questions[asked]
+
+    def item(self, site: str) -> SelectedEpisode:
+        """The episode with the tokens of a site."""
+        return self.question(site).selected[0]
+
+    def about(self) -> dict[str, Any]:
+        """`about.json`: what happened, and what every key is."""
+        item = self.item(self.store.attributes.sites[0].name)
+        attributes = self.episode.attributes
+        env_step = self.episode.read("env_step").astype(np.int64)
+        starts, end = item.timing(env_step)
+        return episode_line(self.store, self.episode) | {
+            "env_step": env_step.tolist(),
+            "starts": starts.tolist(),
+            "end": end,
+            "prompt_index": self.episode.read("prompt_index").tolist(),
+            "objects": [
+                {"name": thing.name, "shown": visible(thing.name.replace("_", " ")), "named": thing.of_interest}
+                for thing in attributes.objects
+                if thing.kind == "object"
+            ],
+            "events": self._events(starts),
+            "courses": self._courses(),
+            "actions": _numbers(self.episode.read("actions")) if self.episode.has("actions") else None,
+            "effects": attributes.effects is not None,
+            "sites": {site.name: self._site(site.name) for site in self.store.attributes.sites},
+        }
+
+    def _events(self, starts: NDArray[np.int64]) -> list[dict[str, Any]]:
+        """Touches, reached goals and closings of the gripper, in the order of their steps; then the end."""
+        attributes = self.episode.attributes
+        found: list[tuple[int, str, str]] = []
+        if (steps := attributes.steps) is not None:
+            for body, at in zip(steps.bodies, steps.first_touch, strict=True):
+                if at is not None:
+                    found.append((at, "touch", f"touches {body.replace('_', ' ')}"))
+            found += [(goal.first_held, "goal", goal.instruction) for goal in steps.goals if goal.first_held]
+            closes = _closings(self.episode.read(EXECUTED)[:, GRIPPER])
+            found += [(at, "gripper", "gripper closes") for at in closes]
+        outcome = attributes.success if self.store.attributes.rerun_of is None else None
+        ends = {True: "solved", False: "not solved", None: "end"}[outcome]
+        found = [*sorted(found), (attributes.num_steps, "end", ends)]
+        replans = np.searchsorted(starts, [max(at - 1, 0) for at, *_ in found], side="right") - 1
+        return [
+            {"step": at, "replan": int(replan), "kind": kind, "text": visible(text)}
+            for (at, kind, text), replan in zip(found, replans, strict=True)
+        ]
+
+    def _courses(self) -> dict[str, Any] | None:
+        """By step: where the hand and the objects are in metres, the way between the fingers, the executed actions."""
+        steps = self.episode.attributes.steps
+        if steps is None:
+            return None
+        poses = self.episode.read(POSES)[..., :3]
+        fingers = self.episode.read(FINGERS)
+        return {
+            "places": {visible(name): _numbers(poses[:, i]) for i, name in enumerate(steps.bodies)},
+            "hand": HAND,
+            "gap": _numbers(np.abs(fingers).sum(axis=1)),
+            "executed": _numbers(self.episode.read(EXECUTED)),
+        }
+
+    def _site(self, site: str) -> dict[str, Any]:
+        item = self.item(site)
+        tokens, prompts = item.tokens, item.tokens.prompts
+        return {
+            "spans": [
+                {"name": span.name, "kind": span.kind, "start": span.start, "stop": span.stop}
+                for span in tokens.layout.spans
+            ],
+            "roles": [[Role(code).label for code in line] for line in tokens.static_roles.tolist()],
+            "valid": item.valid.astype(int).tolist(),
+            "cameras": {camera: _camera(item, camera) for camera in seen_cameras(item)},
+            "prompts": [
+                {
+                    "text": visible(prompt.text),
+                    "words": [{"text": visible(word.text), "keys": list(word.keys)} for word in words],
+                }
+                for prompt, words in zip(prompts, tokens.words, strict=True)
+            ],
+        }
+
+    def picture(self, camera: str, replan: int) -> bytes:
+        """A stored picture as a person sees the scene, as PNG."""
+        from PIL import Image
+
+        item = next((item for item in map(self.item, self._site_names) if camera in item.tokens.layout.pictured), None)
+        if item is None:
+            raise unknown_name("camera", camera, [view.name for view in self.store.attributes.policy.cameras])
+        picture = stored_picture(item, camera, check_replan(item, replan))
+        if picture is None:
+            raise BadArgument(f"No pictures of {camera} were stored.")
+        file = io.BytesIO()
+        Image.fromarray(np.ascontiguousarray(picture)).save(file, "PNG", compress_level=1)
+        return file.getvalue()
+
+    @property
+    def _site_names(self) -> list[str]:
+        return [site.name for site in self.store.attributes.sites]
+
+    def covered(self, site: str) -> dict[str, Any]:
+        """`objects.json`: camera -> object -> at each replan the cells of the map that it covers."""
+        item = self.item(site)
+        found = {}
+        for camera, coverage in (item.tokens.coverage or {}).items():
+            picture, view = PictureMap.of(item.tokens.layout, camera), view_of(item, camera)
+            cells = picture.highest(np.moveaxis(coverage, -1, 1))  # (replan, object, row, column)
+            shown = {
+                thing.name: [np.flatnonzero(upright(cell, view) >= _COVERED).tolist() for cell in cells[:, i]]
+                for i, thing in enumerate(item.tokens.objects)
+                if thing.kind == "object"
+            }
+            found[camera] = {name: of_replans for name, of_replans in shown.items() if any(of_replans)}
+        return found
+
+    def rows(self, site: str, layer: str, heads: bool = False) -> Array:
+        """Rows of a layer, or of the mean of all: (replan, denoise, key), mean over heads and queries.
+
+        heads: each head's, (replan, denoise, head, key).
+        """
+        selection = replace(self._selection(site, layer), per_head=heads)
+        parts: list[Array] = [np.zeros(())] * len(selection.denoise)
+        for part in layer_rows(self.store.attributes, self.episode, selection, site):
+            if part.layer in selection.once:
+                parts[part.denoise] = parts[part.denoise] + part.rows.astype(np.float64)
+        rows = np.stack(parts, axis=1) / len(selection.once)
+        return rows if heads else rows[:, :, 0]
+
+    def uniform(self, site: str, layer: str) -> Array:
+        """What uniform attention gives in the place of `rows`, (replan or 1, denoise or 1, key)."""
+        selection = self._selection(site, layer)
+        uniform = uniform_keys(self.item(site), selection)[:, :, :, 0]
+        found: Array = (uniform[:, list(selection.once)] if uniform.shape[1] > 1 else uniform).mean(axis=1)
+        return found
+
+    def _selection(self, site: str, layer: str) -> Selection:
+        root = self.store.attributes
+        if layer == MEAN:
+            return select(root, site=site)
+        if not layer.isdecimal():
+            raise BadArgument(f"There is no layer '{layer}'; expected its number, or {MEAN}.")
+        return select(root, [int(layer)], site=site)
+
+    def groups(self, site: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """`groups.json`: the numbers of `vla-attention analyze` for one episode, by replan and layer, then their mean.
+
+        settings: as of `AnalysisSettings`.
+        """
+        question = self.question(site, **settings)
+        levels = levels_of(question)
+        replans = levels.replans().collect()
+        groups = levels.groups("replan", "layer").collect()
+        layers = [*map(str, question.selection.layer_labels), MEAN]
+        columns = ("ratio", "uniform_ratio", "ratio_lift", "numerator_mass", "denominator_mass")
+        ratio = question.grouping.ratio
+        return {
+            "grouping": question.grouping.name,
+            "layers": layers,
+            "sides": None if ratio is None else [list(ratio.numerator), list(ratio.denominator)],
+            **{name: _by_layer(replans, name, layers) for name in columns if ratio is not None},
+            "groups": {
+                name: {
+                    column: _by_layer(groups.filter(group=name), column, layers)
+                    for column in ("keys", "mass", "fraction", "lift")
+                }
+                for name in question.grouping.names
+            },
+        }
+
+    def heads(self, site: str, selector: str) -> dict[str, Any]:
+        """`heads.json`: mass and lift of a selector's keys in every head, (replan, layer, head)."""
+        question = self.question(site, groups=(f"group={selector}",))
+        levels = levels_of(question, heads=True)
+        frame = pl.concat(means(one, ("replan", "layer", "head")) for one in levels.measured)
+        frame = frame.filter(pl.col("group") == "group", pl.col("layer") != LAYERS_AVG)
+        shape = (self.episode.attributes.num_replans, len(question.selection.layers), len(question.selection.heads))
+        return {
+            "layers": list(question.selection.layer_labels),
+            "heads": list(question.selection.head_numbers),
+            **{name: _numbers(frame[name].to_numpy().reshape(shape), exact=True) for name in ("mass", "lift")},
+        }
+
+    def keys(self, site: str, selector: str) -> dict[str, Any]:
+        """`keys.json`: the keys that a selector takes with their weights, once where they never change, by replan."""
+        question = self.question(site, groups=(f"group={selector}",))
+        check_names(question.grouping, question.vocabulary)
+        weights = resolve_episode(question.grouping, question.selected[0]).weights[..., 0]
+        if (weights == weights[:1]).all():
+            weights = weights[:1]
+        return {"keys": [[[int(key), float(line[key])] for key in np.flatnonzero(line)] for line in weights]}
+
+    def effects(self, units: ActionSpread) -> dict[str, Any] | None:
+        """`effects.json`: the numbers of `vla-attention effects` for one episode, item by item; None without any.
+
+        units: of the whole store. effect: at each replan, null where it was not measured; mean: over these.
+        """
+        found = recorded_effects(self.question(self._site_names[0]), spread=units)
+        if found is None:
+            return None
+        rows = found.rows().collect()
+        of_episode = {row["condition"]: row for row in found.episodes().iter_rows(named=True)}
+        stored = self.episode.attributes.effects
+        assert stored is not None
+        numbers = {visible(condition.name): i for i, condition in enumerate(stored.conditions)}
+        items = []
+        for names, part in rows.group_by(*NAMES, maintain_order=True):
+            named = dict(zip(NAMES, names, strict=True))
+            by_replan: list[float | None] = [None] * self.episode.attributes.num_replans
+            for replan, effect in part.select("replan", "effect").iter_rows():
+                by_replan[replan] = effect
+            mean = of_episode[named["condition"]]
+            items.append(
+                named
+                | {"number": numbers[named["condition"]], "effect": by_replan, "mean": mean["effect"]}
+                | {name: mean[name] for name in ("noise", "lift", "keys")}
+            )
+        return {"items": items, "notes": list(found.notes), "used": units.used.tolist()}
+
+    def changed_actions(self, number: int) -> Array:
+        """The actions of a condition's calls, (replan, step, dimension); NaN where it was not tried."""
+        effects, actions = self.episode.attributes.effects, self.episode.read("actions").astype(np.float64)
+        changed = np.full_like(actions, np.nan)
+        if effects is None or not 0 <= number < len(effects.conditions) or not self.episode.has(CHANGE):
+            raise BadArgument(f"There is no effect {number} in episode {self.episode.name}.")
+        entries = [i for i, condition in enumerate(effects.condition) if condition == number]
+        replans = [effects.replan[i] for i in entries]
+        change = self.episode.read(CHANGE)[entries].astype(np.float64) * np.array(effects.units)
+        changed[replans] = actions[replans] + change
+        return changed
+
+
+def _camera(item: SelectedEpisode, camera: str) -> dict[str, Any]:
+    """How a camera's keys lie on its picture, as a person sees it.
+
+    keys, cells, shares: a part of the mass of a key, and the cell of the map that it is added to; cells are counted row
+    by row from the top left corner.
+    """
+    picture, view = PictureMap.of(item.tokens.layout, camera), view_of(item, camera)
+    maps = upright(np.moveaxis(picture.spread(np.eye(len(picture.keys))), 0, -1), view)  # (row, column, patch)
+    cells, patches = np.nonzero(maps.reshape(-1, len(picture.keys)))
+    shares = maps.reshape(-1, len(picture.keys))[cells, patches]
+    return {
+        "rows": picture.rows,
+        "columns": picture.columns,
+        "height": picture.grids[0].image_height,
+        "width": picture.grids[0].image_width,
+        "keys": picture.keys[patches].tolist(),
+        "cells": cells.tolist(),
+        "shares": None if picture.cells_are_patches else shares.tolist(),
+        "upright": view.upright,
+        "mirrored": view.mirrored,
+        "stored": item.episode.has(f"frames/{camera}"),
+        "note": map_note(item.tokens.layout, camera, None),
+    }
+
+
+def _closings(commands: Array) -> list[int]:
+    """The steps at whose end an open gripper was told to close, and stayed so."""
+    closed = commands > 0
+    return [
+        at + 1
+        for at in range(1, len(closed))
+        if closed[at] and not closed[at - 1] and closed[at : at + _FEWEST_CLOSED].all()
+    ]
+
+
+def _by_layer(frame: pl.DataFrame, column: str, layers: Sequence[str]) -> list[list[float | None]]:
+    """A column of a table of replans and layers as (replan, layer), null where there is no number."""
+    values = frame.select(pl.col(column).cast(pl.Float64)).to_series().to_numpy().reshape(-1, len(layers))
+    found: list[list[float | None]] = _numbers(values, exact=True)
+    return found
+
+
+def _numbers(values: Array, exact: bool = False) -> Any:
+    """Numbers as nested lists; to five digits, which no picture shows, unless `exact`; null for what is not finite."""
+    if values.ndim > 1:
+        return [_numbers(part, exact) for part in values]
+    return [(float(one) if exact else float(f"{one:.5g}")) if math.isfinite(one) else None for one in values.tolist()]
+
+
+def npy(array: Array) -> bytes:
+    """An array as a `.npy` file."""
+    file = io.BytesIO()
+    np.save(file, np.ascontiguousarray(array, dtype="<f4"), allow_pickle=False)
+    return file.getvalue()

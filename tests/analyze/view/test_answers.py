@@ -1,0 +1,240 @@
+"""What the server answers is what the commands print: rows, ratios, masses, maps, heads, effects, what happened."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import shutil
+from collections.abc import Iterator
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+import polars as pl
+import pytest
+from PIL import Image
+
+import vla_attention as va
+from tests.end_to_end.test_cameras_of_several_spans import write_spans_store
+from tests.kit.golden_stores import golden_store
+from tests.kit.viewer import ask, served
+from vla_attention.analyze.core.camera_maps import camera_names, episode_maps, stored_picture, upright
+from vla_attention.analyze.measures.question import ask as question_of
+from vla_attention.analyze.measures.question_settings import AnalysisSettings
+from vla_attention.analyze.view.episode_answers import MEAN, _closings
+from vla_attention.schemas.stores.reader import open_store
+from vla_attention.schemas.stores.seal import SEAL_FILE
+
+NAMES = ("joint", "cosmos", "masks", "effects", "steps", "spans")
+SITES = [("joint", "joint"), ("cosmos", "self"), ("cosmos", "cross"), ("masks", "joint"), ("spans", "joint")]
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("answered")
+    for name in NAMES[:-1]:
+        shutil.copytree(golden_store(name), folder / f"{name}.zarr")
+    write_spans_store(folder / "spans.zarr", "tiles and thumbnail")
+    return {name: folder / f"{name}.zarr" for name in NAMES}
+
+
+@pytest.fixture(scope="module")
+def server(places) -> Iterator[Any]:
+    with served(*places.values()) as running:
+        yield running
+
+
+def read(server, name: str, path: str = "", episode: int = 0) -> Any:
+    """What the server says of an episode of a store."""
+    run = read_path(server, "runs.json")["runs"][NAMES.index(name)]
+    return read_path(server, f"runs/{NAMES.index(name)}/{run['episodes'][episode]['name']}/{path}")
+
+
+def read_path(server, path: str) -> Any:
+    reply = ask(server, path)
+    assert reply.status == 200, (path, reply.body[:200])
+    if ".npy" in path:
+        return np.load(io.BytesIO(reply.body), allow_pickle=False)
+    return np.array(Image.open(io.BytesIO(reply.body))) if ".png" in path else json.loads(reply.body)
+
+
+def of_analysis(table: pl.DataFrame, column: str, episode: dict[str, int], **where: Any) -> np.ndarray:
+    """A column of a table of replans and layers, (replan, layer), the mean of all layers last; NaN for null."""
+    rows = table.filter(**episode, **where).sort("replan", "layer_number", nulls_last=True)
+    return rows[column].cast(pl.Float64).to_numpy().reshape(rows["replan"].n_unique(), -1)
+
+
+def numbers(values: Any) -> np.ndarray:
+    return np.array(values, dtype=float)  # None is NaN
+
+
+@pytest.mark.parametrize(("name", "site"), SITES)
+@pytest.mark.parametrize("asked", [{}, {"layers": [1], "denoise": "last", "heads": [0]}], ids=["all", "one"])
+def test_ratios_and_masses(server, places, name, site, asked):
+    run = va.open(places[name])
+    if asked and (name in ("masks", "spans") or site == "cross"):
+        asked = {**asked, "layers": [run.analyze(site=site)["replans"]["layer_number"].min()]}
+    query = "&".join(f"{key}={quote(','.join(map(str, np.atleast_1d(value))))}" for key, value in asked.items())
+    given = read(server, name, f"{site}/groups.json?{query}")
+    result = run.analyze(site=site, grouping="default", **asked)
+    about = read(server, name, "about.json")
+    episode = {"task_id": about["task"], "episode_index": about["episode"]}
+    for column in ("ratio", "uniform_ratio", "ratio_lift", "numerator_mass", "denominator_mass"):
+        if column in result["replans"].columns:
+            expected = of_analysis(result["replans"], column, episode)
+            expected = np.where(np.isfinite(expected), expected, np.nan)
+            np.testing.assert_array_equal(numbers(given[column]), expected)
+    for group, columns in given["groups"].items():
+        for column, values in columns.items():
+            expected = of_analysis(result["replans_groups"], column, episode, group=group)
+            np.testing.assert_array_equal(numbers(values), expected)
+
+
+@pytest.mark.parametrize(("name", "site"), SITES)
+def test_sums_of_rows_are_the_masses(server, name, site):
+    about = read(server, name, "about.json")
+    groups = read(server, name, f"{site}/groups.json")
+    camera_keys = [key for camera in about["sites"][site]["cameras"].values() for key in camera["keys"]]
+    for at, layer in enumerate(groups["layers"]):
+        rows, heads = (read(server, name, f"{site}/{kind}/{layer}.npy") for kind in ("rows", "heads"))
+        np.testing.assert_allclose(rows, heads.mean(axis=2), rtol=1e-5, atol=1e-9)
+        # Masses of whole spans are of the rows before storage rounded them.
+        total = sum(numbers(group["mass"])[:, at] for group in groups["groups"].values())
+        np.testing.assert_allclose(rows.sum(axis=-1).mean(axis=1), total, rtol=2**-11)
+        uniform = read(server, name, f"{site}/uniform/{layer}.npy")
+        np.testing.assert_allclose(uniform.sum(axis=-1), 1, rtol=1e-5)
+    if name == "joint":
+        visual = numbers(groups["groups"]["visual"]["mass"])[:, -1]
+        mean = read(server, name, f"{site}/rows/{MEAN}.npy").mean(axis=1)
+        np.testing.assert_allclose(mean[:, sorted(set(camera_keys))].sum(axis=-1), visual, rtol=2**-11)
+
+
+@pytest.mark.parametrize("name", ["joint", "spans"])
+def test_maps_of_the_page_are_those_of_overlay(server, places, name):
+    question = question_of([open_store(places[name])], AnalysisSettings())
+    item = question.selected[0]
+    maps = episode_maps(question, item, camera_names(question))
+    about, site = read(server, name, "about.json"), question.site
+    rows = read(server, name, f"{site}/rows/{MEAN}.npy").mean(axis=1)
+    for camera, one in maps.cameras.items():
+        how = about["sites"][site]["cameras"][camera]
+        shares = np.ones(len(how["keys"])) if how["shares"] is None else np.array(how["shares"])
+        given = np.zeros((len(rows), how["rows"] * how["columns"]))
+        np.add.at(given, (slice(None), how["cells"]), rows[:, how["keys"]] * shares)
+        for replan, cells in enumerate(given):
+            expected = upright(one.mass[replan], one.view)
+            np.testing.assert_allclose(cells.reshape(expected.shape), expected, rtol=1e-5, atol=1e-9)
+            picture = stored_picture(item, camera, replan)
+            if picture is not None:
+                shown = read(server, name, f"pictures/{camera}/{replan}.png")
+                np.testing.assert_array_equal(shown, picture)
+
+
+def test_heads_of_a_selector(server, places):
+    given = read(server, "joint", f"joint/heads.json?selector={quote('role:instruction')}")
+    result = va.open(places["joint"]).analyze(groups={"words": "role:instruction"}, by=("layer", "head"), tasks=0)
+    tables = {one.name: one for one in result.tables}
+    cells = tables["steps_groups"].shown.filter(group="words").group_by("replan", "layer", "head")
+    mass = cells.agg(pl.col("mass").mean()).sort("replan", "layer", "head")["mass"].to_numpy()
+    np.testing.assert_allclose(numbers(given["mass"]).ravel(), mass, rtol=1e-6)
+    lift = tables["by_groups"].shown.filter(group="words").sort("layer_number", "head")["lift"].to_numpy()
+    np.testing.assert_allclose(numbers(given["lift"]).mean(axis=0).ravel(), lift, rtol=1e-4)
+
+
+def test_keys_of_a_selector_and_what_is_wrong_with_one(server):
+    about = read(server, "joint", "about.json")
+    word = about["sites"]["joint"]["prompts"][0]["words"][1]
+    given = read(server, "joint", f"joint/keys.json?selector={quote('word:' + word['text'])}")
+    assert {key for key, weight in given["keys"][0] if weight == 1.0} >= set(word["keys"])
+    for path in ("keys", "heads"):
+        reply = ask(server, f"runs/0/task000_episode000/joint/{path}.json?selector=word:nothing")
+        assert reply.status == 422
+        assert "no instruction has the word 'nothing'" in json.loads(reply.body)["error"]
+    files = ask(server, f"runs/0/task000_episode000/joint/groups.json?grouping={quote('/etc/hosts', safe='')}")
+    assert "Existing: " in json.loads(files.body)["error"]
+
+
+def test_effects_are_those_of_the_command(server, places):
+    given = read(server, "effects", "effects.json")["items"]
+    table = va.open(places["effects"]).effects()["effects_episodes"].filter(task_id=0, episode_index=0)
+    expected = {row["condition"]: row for row in table.iter_rows(named=True)}
+    assert {one["condition"] for one in given} == set(expected)
+    for one in given:
+        row = expected[one["condition"]]
+        for mine, theirs in (("mean", "effect"), ("lift", "lift"), ("noise", "noise")):
+            assert (one[mine] is None) == (row[theirs] is None)
+            assert one[mine] is None or one[mine] == pytest.approx(row[theirs], rel=1e-6)
+        assert (one["item"], one["reader"]) == (row["item"], row["reader"])
+        of_replans = [value for value in one["effect"] if value is not None]
+        assert np.mean(of_replans) == pytest.approx(one["mean"], rel=1e-9)
+    episode = open_store(places["effects"]).episodes[0]
+    changed = read(server, "effects", f"actions/{given[0]['number']}.npy")
+    assert changed.shape == episode.read("actions").shape
+    with np.errstate(invalid="ignore"):
+        assert np.nanmax(np.abs(changed - episode.read("actions"))) > 0
+
+
+def test_what_happened(server):
+    failed, solved = (read(server, "steps", "about.json", episode) for episode in (0, 1))
+    assert "touched akita black bowl 1 first (step 5)" in failed["verdict"]
+    assert (failed["outcome"], solved["outcome"]) == (False, True)
+    touches = [event for event in failed["events"] if event["kind"] == "touch"]
+    assert (touches[0]["step"], touches[0]["text"]) == (5, "touches akita black bowl 1")
+    assert failed["starts"][touches[0]["replan"]] <= 4
+    assert [event["text"] for event in (failed["events"][-1], solved["events"][-1])] == ["not solved", "solved"]
+    courses = failed["courses"]
+    assert len(courses["places"][courses["hand"]]) == len(courses["executed"]) + 1
+    rerun = read(server, "effects", "about.json")
+    assert rerun["outcome"] is None
+    assert rerun["verdict"].startswith("Outcome not run")
+
+
+@pytest.mark.parametrize(
+    ("commands", "steps"),
+    [([1] * 6, []), ([-1, 1, 1, 1, -1, 1, 1, 1], [2, 6]), ([-1, 1, -1, 1, -1, -1], []), ([-1, -1, 0.2, 0.2, 1], [3])],
+)
+def test_the_gripper_closes_where_it_was_open_and_stays_closed(commands, steps):
+    assert _closings(np.array(commands, float)) == steps
+
+
+def test_covered_cells_are_those_of_the_coverage(server, places):
+    episode = open_store(places["joint"]).episodes[0]
+    given = read(server, "joint", "joint/objects.json")
+    for camera, objects in given.items():
+        coverage = episode.read(f"objects/{camera}")
+        names = [thing.name for thing in episode.attributes.objects]
+        for name, of_replans in objects.items():
+            expected = (coverage[:, :, names.index(name)] >= 0.25).sum(axis=1)
+            assert [len(cells) for cells in of_replans] == expected.tolist()
+    assert given
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["runs/", "runs/0", "runs/9/task000_episode000/about.json", "runs/0/task009_episode000/about.json",
+     "runs/0/task000_episode000/nothing.json", "runs/0/task000_episode000/other/groups.json", "runs/x/y/about.json",
+     "runs/0/task000_episode000/pictures/base_0_rgb/one.png", "runs/0/%2e%2e/about.json", "runs.json/x"],
+)  # fmt: skip
+def test_other_addresses_have_nothing(server, path):
+    assert ask(server, path).status == 404
+
+
+def test_an_episode_that_cannot_be_read_is_listed_with_the_reason(places, tmp_path):
+    broken = shutil.copytree(places["joint"], tmp_path / "broken.zarr")
+    (broken / "episodes/task000_episode000" / SEAL_FILE).write_text("{}")
+    with served(broken) as server:
+        lines = read_path(server, "runs.json")["runs"][0]["episodes"]
+        reply = ask(server, "runs/0/task000_episode000/about.json")
+    assert ["failed" in line for line in lines] == [True, False]
+    assert "Episode task000_episode000 cannot be read" in lines[0]["failed"]
+    assert (reply.status, json.loads(reply.body)["error"]) == (422, lines[0]["failed"])
+
+
+def test_the_run_says_what_the_commands_find(places):
+    with served(places["steps"], summaries=True) as server:
+        server.stores[0].summary.wait()
+        given = read_path(server, "runs/0/numbers.json")
+    said = {finding["sentence"] for finding in given["findings"]}
+    assert {one.sentence for one in va.open(places["steps"]).failures().findings} <= said
+    assert all(math.isfinite(row["ratio"]) for row in given["episodes"])
