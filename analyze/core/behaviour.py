@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import polars as pl
 
@@ -118,18 +118,25 @@ def row_of(
     }
 
 
-def verdict(store: Store, attributes: EpisodeAttributes) -> str:
-    """What an episode came to, in a line: ``Failed: told 'touch the red cube', touched blue cube first (step 17).``"""
+class Verdict(NamedTuple):
+    """What an episode came to, in a line; and whether it did or touched something else than it was told."""
+
+    sentence: str
+    other: bool = False
+
+
+def verdict(store: Store, attributes: EpisodeAttributes) -> Verdict:
+    """As ``Failed: told 'touch the red cube', touched blue cube first (step 17).``"""
     if store.attributes.rerun_of is not None:
-        return "Outcome not run: the policy calls of another run were made again, and nothing was executed."
+        return Verdict("Outcome not run: the policy calls of another run were made again, and nothing was executed.")
     told, steps = told_instruction(store, attributes), attributes.steps
     begin = {True: "Solved", False: "Failed", None: "Outcome not known"}[attributes.success]
     begin += f": told '{visible(told)}'"
     if steps is None:
-        return f"{begin}, {attributes.num_steps} steps." if attributes.num_steps else f"{begin}."
-    row = row_of(store.suite, attributes, told, steps, _same(store))
+        return Verdict(f"{begin}, {attributes.num_steps} steps." if attributes.num_steps else f"{begin}.")
     if attributes.success:
-        return f"{begin}, done after {attributes.num_steps} steps."
+        return Verdict(f"{begin}, done after {attributes.num_steps} steps.")
+    row = row_of(store.suite, attributes, told, steps, _same(store))
     did, touched = f"'{row['did']}' (step {row['did_at']})", f"{row['touched']} first (step {row['touched_at']})"
     came_to = {
         TOLD_SO: f"did so (step {row['did_at']}), which is not the task '{visible(attributes.instruction)}'",
@@ -138,7 +145,7 @@ def verdict(store: Store, attributes: EpisodeAttributes) -> str:
         UNFINISHED: f"touched {touched}, did not finish",
         NO_TOUCH: NO_TOUCH,
     }
-    return f"{begin}, {came_to[str(row['how'])]}."
+    return Verdict(f"{begin}, {came_to[str(row['how'])]}.", row["how"] in (OTHER_GOAL, OTHER_TOUCH))
 
 
 def key_of(goal: TaskGoal) -> str:

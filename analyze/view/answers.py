@@ -1,6 +1,7 @@
 """The answers that the page asks for, by their addresses; the server sends them, a site has them as files.
 
 runs.json                                   every run with its episodes
+runs/0/numbers.json                         of a run: what is computed meanwhile (`summaries`)
 runs/0/EPISODE/about.json                   what happened, and what every key is
 runs/0/EPISODE/effects.json                 how the action changes without a word, an object, a picture
 runs/0/EPISODE/actions/NUMBER.npy           the actions of the calls of one effect
@@ -8,9 +9,9 @@ runs/0/EPISODE/pictures/CAMERA/REPLAN.png
 runs/0/EPISODE/SITE/objects.json            which cells of the pictures objects cover
 runs/0/EPISODE/SITE/rows/LAYER.npy          rows of a layer, or of the mean of all; heads/LAYER.npy: of every head
 runs/0/EPISODE/SITE/uniform/LAYER.npy       what uniform attention gives in their place
-runs/0/EPISODE/SITE/groups.json             ratio and masses; ?grouping= &group= &ratio= &layers= &heads= &denoise=
-runs/0/EPISODE/SITE/heads.json?selector=    mass and lift in every head
-runs/0/EPISODE/SITE/keys.json?selector=     the keys of a selector
+runs/0/EPISODE/SITE/groups/all.json         ratio and masses of the grouping `default`; groups/denoise-0.head-3.json
+runs/0/EPISODE/SITE/grid/NUMBER.json        mass and lift in every head of one of the site's `targets`
+runs/0/EPISODE/SITE/grid.json?selector=     the same of a selector; keys.json?selector= has its keys
 """
 
 from __future__ import annotations
@@ -18,25 +19,26 @@ from __future__ import annotations
 import json
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 from typing import Any, TypeAlias
 
 from vla_attention.analyze.core.action_changes import ActionSpread, units_of_recorded
-from vla_attention.analyze.measures.question_settings import settings_from_keywords
-from vla_attention.analyze.view.episode_answers import ShownEpisode, npy
+from vla_attention.analyze.view.episode_answers import MEAN, ShownEpisode, npy
 from vla_attention.analyze.view.run_answers import runs_answer
 from vla_attention.analyze.view.served_stores import ServedStore
-from vla_attention.schemas.errors import BadArgument, unknown_name
-from vla_attention.schemas.groupings.builtin_groupings import BUILTIN_GROUPINGS
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.stores.reader import Store
 
 JSON, PNG, NPY = "application/json", "image/png", "application/octet-stream"
 #: Content and its type.
 Content: TypeAlias = tuple[bytes, str]
-#: What a query may say of `groups.json`, with what each is in Python.
-_SETTINGS = ("grouping", "group", "ratio", "layers", "heads", "denoise")
 #: Episodes that stay open: what was read of one is used again for its other answers.
 _OPEN = 8
+
+
+#: Conditions whose actions a copy of the page has: those that it draws.
+_DRAWN = "without"
 
 
 class NoAnswer(LookupError):
@@ -83,6 +85,39 @@ class Answers:
                 return _of_site(shown, site, of_site, query)
         raise NoAnswer
 
+    def of_episode(self, served: ServedStore, name: str, heads: bool) -> Iterator[tuple[str, bytes]]:
+        """All that a copy of the page has of an episode: addresses below it, and answers.
+
+        heads: with the rows of every head, which is most of it.
+        """
+        shown = self._shown(served.store, name)
+        about = shown.about()
+        yield "about.json", _json(about)[0]
+        for camera in {camera for site in about["sites"].values() for camera in site["cameras"]}:
+            for replan in range(about["num_replans"]) if shown.episode.has(f"frames/{camera}") else ():
+                yield f"pictures/{camera}/{replan}.png", shown.picture(camera, replan)
+        if about["effects"]:
+            effects = shown.effects(self._units_of(served.store))
+            yield "effects.json", _json(effects)[0]
+            for number in {one["number"] for one in (effects or {})["items"] if one["kind"] == _DRAWN}:
+                yield f"actions/{number}.npy", npy(shown.changed_actions(number))
+        recording = served.store.attributes
+        for site in about["sites"]:
+            axes = recording.recording_of(site)
+            for layer in [*map(str, axes.layer_labels), MEAN]:
+                yield f"{site}/rows/{layer}.npy", npy(shown.rows(site, layer))
+                yield f"{site}/uniform/{layer}.npy", npy(shown.uniform(site, layer))
+                if heads:
+                    yield f"{site}/heads/{layer}.npy", npy(shown.rows(site, layer, heads=True))
+            yield f"{site}/objects.json", _json(shown.covered(site))[0]
+            for number, target in enumerate(about["sites"][site]["targets"]):
+                yield f"{site}/grid/{number}.json", _json(shown.grid(site, target["selector"]))[0]
+            steps = ["", *(f"denoise-{step}" for step in axes.denoise_steps)]
+            of_heads = ["", *(f"head-{head}" for head in axes.heads if heads)]
+            for step, head in product(steps, of_heads):
+                chosen = ".".join(filter(None, (step, head))) or "all"
+                yield f"{site}/groups/{chosen}.json", _json(shown.groups(site, chosen))[0]
+
     def _shown(self, store: Store, name: str) -> ShownEpisode:
         """An episode that stays open for its other answers, unless the store was captured anew."""
         key = str(store.path), store.run, name
@@ -113,10 +148,14 @@ def _of_site(shown: ShownEpisode, site: str, names: Sequence[str], query: Mappin
             return npy(shown.rows(site, file.removesuffix(".npy"), heads=kind == "heads")), NPY
         case ["uniform", file] if file.endswith(".npy"):
             return npy(shown.uniform(site, file.removesuffix(".npy"))), NPY
-        case ["groups.json"]:
-            return _json(shown.groups(site, _settings(query)))
-        case ["heads.json"]:
-            return _json(shown.heads(site, _selector(query)))
+        case ["groups", file] if file.endswith(".json"):
+            return _json(shown.groups(site, file.removesuffix(".json")))
+        case ["grid", file]:
+            targets, number = shown.targets(site), _number(file, ".json")
+            if number < len(targets):
+                return _json(shown.grid(site, targets[number]["selector"]))
+        case ["grid.json"]:
+            return _json(shown.grid(site, _selector(query)))
         case ["keys.json"]:
             return _json(shown.keys(site, _selector(query)))
     raise NoAnswer
@@ -137,20 +176,3 @@ def _selector(query: Mapping[str, Sequence[str]]) -> str:
     if list(query) != ["selector"] or len(query["selector"]) != 1:
         raise BadArgument(f"Cannot use {', '.join(query) or 'no question'} here; expected ?selector=SELECTOR.")
     return query["selector"][0]
-
-
-def _settings(query: Mapping[str, Sequence[str]]) -> dict[str, Any]:
-    """The query as keywords of the Python API, checked by it: `group` may be repeated, others are joined by commas."""
-    unknown = [name for name in query if name not in _SETTINGS]
-    if unknown:
-        raise BadArgument(f"Cannot use {', '.join(unknown)} here; expected {', '.join(_SETTINGS)}.")
-    given: dict[str, Any] = {}
-    for name, values in query.items():
-        several = name in ("layers", "heads", "denoise")
-        given["groups" if name == "group" else name] = (
-            list(values) if name == "group" else values[-1].split(",") if several else values[-1]
-        )
-    if given.get("grouping", "default") not in BUILTIN_GROUPINGS:  # a file of this machine is no business of a page
-        raise unknown_name("built-in grouping", given["grouping"], BUILTIN_GROUPINGS)
-    asked = settings_from_keywords(**given)
-    return {name: getattr(asked, name) for name in given}

@@ -6,6 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from vla_attention.schemas.command_line import OneSentenceParser
+from vla_attention.schemas.stores.store_format import parse_episode_name
 from vla_attention.schemas.stores.store_url import store_place
 
 if TYPE_CHECKING:
@@ -21,7 +22,8 @@ _EXAMPLES = """examples:
   vla-attention view hf://datasets/ORG/NAME/libero_10.zarr
   vla-attention view runs/cubes.zarr --port 8765 --no-open           on another machine, with ssh -L 8765:127.0.0.1:8765
   vla-attention view runs/cubes.zarr --port 8765 --allow-host hub.example.org      behind a proxy, as JupyterHub
-  vla-attention view runs/cubes.zarr --output public/cubes             a folder for a web server
+  vla-attention view runs/cubes.zarr --site public/cubes               a folder for a web server
+  vla-attention view runs/cubes.zarr --file failed.html --task 3 --episode 1       one episode, to send
 
 The page is served to this machine only, to whoever has the printed link, until Ctrl-C. It asks nothing of any other
 place. With the same stores and the same --port the link stays the same.
@@ -49,11 +51,14 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--no-open", action="store_true", help="print the link only")
     parser.add_argument(
-        "--output",
-        type=Path,
-        metavar="FOLDER",
-        help="write the page, and links to the stores, into a folder that any web server can serve, and stop",
+        "--site", type=Path, metavar="FOLDER", help="write the page with all answers into a folder for any web server"
     )
+    parser.add_argument(
+        "--file", type=Path, metavar="PAGE.html", help="write one episode as a page in one file that opens from disk"
+    )
+    parser.add_argument("--task", type=int, metavar="N", help="of --file: the episode's task (default: the first)")
+    parser.add_argument("--episode", type=int, metavar="N", help="of --file: its number (default: the first)")
+    parser.add_argument("--heads", action="store_true", help="of --site and --file: with the rows of every head")
     return parser
 
 
@@ -62,36 +67,52 @@ def run(arguments: argparse.Namespace) -> int:
     from contextlib import ExitStack
 
     from vla_attention.analyze.view.served_stores import ServedStore
-    from vla_attention.analyze.view.static_site import check_site, check_uploads
+    from vla_attention.analyze.view.static_site import check_site
     from vla_attention.analyze.view.summaries import Summary
+    from vla_attention.schemas.errors import BadArgument
     from vla_attention.schemas.stores.reader import open_store
 
-    if arguments.output is not None:
-        check_site(arguments.output, arguments.stores)
+    if arguments.site is not None:
+        check_site(arguments.site)
     places: list[StorePlace] = list(dict.fromkeys(arguments.stores))
+    if arguments.file is not None and (len(places) > 1 or arguments.site is not None):
+        raise BadArgument("--file writes one episode of one store, and nothing else; leave out the other ones.")
     with ExitStack() as stack:
         stores = [ServedStore(open_store(place), stack.enter_context(Summary())) for place in places]
-        if arguments.output is not None:
-            check_uploads(arguments.output, [store.store for store in stores])
         for store in stores:
             store.summary.begin(store.store)
-        if arguments.output is not None:
-            _write(arguments, stores)
-        else:
+        if arguments.site is None and arguments.file is None:
             _serve(arguments, stores)
+        else:
+            _write(arguments, stores)
     return 0
 
 
 def _write(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None:
     import warnings
 
-    from vla_attention.analyze.view.static_site import write_site
-    from vla_attention.schemas.errors import Note
+    from vla_attention.analyze.view.static_site import site_size, write_page_file, write_site
+    from vla_attention.schemas.command_line import format_bytes
+    from vla_attention.schemas.errors import BadArgument, Note, listing
 
+    if arguments.site is not None:
+        about = format_bytes(site_size(stores, arguments.heads))
+        print(f"About {about} for {sum(len(store.store.episodes) for store in stores)} episodes.", flush=True)
     for store in stores:
         if failed := store.summary.wait():
             warnings.warn(f"Not every episode of {store.place} has numbers: {failed}", Note, stacklevel=2)
-    print(write_site(arguments.output, stores))
+    if arguments.site is not None:
+        print(write_site(arguments.site, stores, arguments.heads))
+        return
+    numbers = {episode.name: parse_episode_name(episode.name) for episode in stores[0].store.episodes}
+    fitting = [
+        name
+        for name, (task, episode) in numbers.items()
+        if arguments.task in (None, task) and arguments.episode in (None, episode)
+    ]
+    if not fitting:
+        raise BadArgument(f"{stores[0].place} has no such episode (--task, --episode); it has {listing(numbers, 20)}.")
+    print(write_page_file(arguments.file, stores[0], fitting[0], arguments.heads))
 
 
 def _notes(stores: Sequence[Store]) -> tuple[str, ...]:

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -40,7 +41,7 @@ from vla_attention.schemas.stores.reader import Store, StoredEpisode
 
 Array = NDArray[Any]
 #: An object is where it covers at least this part of a patch.
-_COVERED = 0.25
+_COVERED = 0.1
 #: A gripper that closes for fewer steps did not mean to.
 _FEWEST_CLOSED = 3
 #: The layer that stands for the mean of all.
@@ -98,21 +99,21 @@ class ShownEpisode:
     def _events(self, starts: NDArray[np.int64]) -> list[dict[str, Any]]:
         """Touches, reached goals and closings of the gripper, in the order of their steps; then the end."""
         attributes = self.episode.attributes
-        found: list[tuple[int, str, str]] = []
+        found: list[tuple[int, str, str, str]] = []
         if (steps := attributes.steps) is not None:
             for body, at in zip(steps.bodies, steps.first_touch, strict=True):
                 if at is not None:
-                    found.append((at, "touch", f"touches {body.replace('_', ' ')}"))
-            found += [(goal.first_held, "goal", goal.instruction) for goal in steps.goals if goal.first_held]
+                    found.append((at, "touch", f"touches {body.replace('_', ' ')}", body))
+            found += [(goal.first_held, "goal", goal.instruction, "") for goal in steps.goals if goal.first_held]
             closes = _closings(self.episode.read(EXECUTED)[:, GRIPPER])
-            found += [(at, "gripper", "gripper closes") for at in closes]
+            found += [(at, "gripper", "gripper closes", "") for at in closes]
         outcome = attributes.success if self.store.attributes.rerun_of is None else None
         ends = {True: "solved", False: "not solved", None: "end"}[outcome]
-        found = [*sorted(found), (attributes.num_steps, "end", ends)]
+        found = [*sorted(found), (attributes.num_steps, "end", ends, "")]
         replans = np.searchsorted(starts, [max(at - 1, 0) for at, *_ in found], side="right") - 1
         return [
-            {"step": at, "replan": int(replan), "kind": kind, "text": visible(text)}
-            for (at, kind, text), replan in zip(found, replans, strict=True)
+            {"step": at, "replan": int(replan), "kind": kind, "text": visible(text), "thing": thing}
+            for (at, kind, text, thing), replan in zip(found, replans, strict=True)
         ]
 
     def _courses(self) -> dict[str, Any] | None:
@@ -140,6 +141,7 @@ class ShownEpisode:
             "roles": [[Role(code).label for code in line] for line in tokens.static_roles.tolist()],
             "valid": item.valid.astype(int).tolist(),
             "cameras": {camera: _camera(item, camera) for camera in seen_cameras(item)},
+            "targets": self.targets(site),
             "prompts": [
                 {
                     "text": visible(prompt.text),
@@ -210,20 +212,19 @@ class ShownEpisode:
             raise BadArgument(f"There is no layer '{layer}'; expected its number, or {MEAN}.")
         return select(root, [int(layer)], site=site)
 
-    def groups(self, site: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """`groups.json`: the numbers of `vla-attention analyze` for one episode, by replan and layer, then their mean.
+    def groups(self, site: str, name: str) -> dict[str, Any]:
+        """`groups/NAME.json`: the numbers of `vla-attention analyze`, by replan and layer, the mean of all layers last.
 
-        settings: as of `AnalysisSettings`.
+        name: `all`, or a denoise step, a head or both, as in `denoise-0.head-3`.
         """
-        question = self.question(site, **settings)
+        question = self.question(site, **_chosen(name))
         levels = levels_of(question)
         replans = levels.replans().collect()
         groups = levels.groups("replan", "layer").collect()
         layers = [*map(str, question.selection.layer_labels), MEAN]
-        columns = ("ratio", "uniform_ratio", "ratio_lift", "numerator_mass", "denominator_mass")
+        columns = ("ratio", "uniform_ratio", "ratio_lift")
         ratio = question.grouping.ratio
         return {
-            "grouping": question.grouping.name,
             "layers": layers,
             "sides": None if ratio is None else [list(ratio.numerator), list(ratio.denominator)],
             **{name: _by_layer(replans, name, layers) for name in columns if ratio is not None},
@@ -236,8 +237,25 @@ class ShownEpisode:
             },
         }
 
-    def heads(self, site: str, selector: str) -> dict[str, Any]:
-        """`heads.json`: mass and lift of a selector's keys in every head, (replan, layer, head)."""
+    def targets(self, site: str) -> list[dict[str, str]]:
+        """What heads may look at: name and selector; objects that the task names first, then pictures and words."""
+        item = self.item(site)
+        seen = {name for things in self.covered(site).values() for name in things}
+        things = sorted((one for one in item.tokens.objects if one.name in seen), key=lambda one: not one.of_interest)
+        found = [
+            (visible(one.name.replace("_", " ")) + " (named)" * one.of_interest, f"object:{_quoted(one.name)}")
+            for one in things
+        ]
+        if seen_cameras(item):
+            found.append(("all pictures", "role:image"))
+        words = {word.text.casefold(): word.text for line in item.tokens.words for word in line}
+        if words:
+            found.append(("the instruction", "role:instruction"))
+        found += [(f"'{visible(text)}'", f"word:{_quoted(text)}") for text in words.values()]
+        return [{"name": name, "selector": selector} for name, selector in found]
+
+    def grid(self, site: str, selector: str) -> dict[str, Any]:
+        """`grid.json`: mass and lift of a selector's keys in every head, (replan, layer, head)."""
         question = self.question(site, groups=(f"group={selector}",))
         levels = levels_of(question, heads=True)
         frame = pl.concat(means(one, ("replan", "layer", "head")) for one in levels.measured)
@@ -296,6 +314,24 @@ class ShownEpisode:
         change = self.episode.read(CHANGE)[entries].astype(np.float64) * np.array(effects.units)
         changed[replans] = actions[replans] + change
         return changed
+
+
+def _quoted(name: str) -> str:
+    """A name as selectors have it; names that need quotes have one kind of them at most (`check_name`)."""
+    if re.fullmatch(r"\w+", name):
+        return name
+    return f"'{name}'" if '"' in name else f'"{name}"'
+
+
+def _chosen(name: str) -> dict[str, Any]:
+    """`denoise-0.head-3` as settings of a question."""
+    if name == "all":
+        return {}
+    parts = dict(part.partition("-")[::2] for part in name.split("."))
+    if not set(parts) <= {"denoise", "head"} or not all(value.isdecimal() for value in parts.values()):
+        raise BadArgument(f"There are no groups of '{name}'; expected all, or as in denoise-0.head-3.")
+    denoise = {"denoise": (parts["denoise"],)} if "denoise" in parts else {}
+    return denoise | ({"heads": (int(parts["head"]),)} if "head" in parts else {})
 
 
 def _camera(item: SelectedEpisode, camera: str) -> dict[str, Any]:

@@ -65,13 +65,14 @@ def episode_line(store: Store, episode: StoredEpisode) -> dict[str, Any]:
         attributes = episode.attributes
         told = told_instruction(store, attributes)
         pictured = [view.name for view in store.attributes.policy.cameras if episode.has(f"frames/{view.name}")]
-        last = attributes.num_replans - 1
+        last, came_to = attributes.num_replans - 1, verdict(store, attributes)
         return line | {
             "instruction": visible(attributes.instruction),
             "told": visible(told),
             "told_other": not same_words(told, attributes.instruction),
             "outcome": attributes.success if store.attributes.rerun_of is None else None,
-            "verdict": verdict(store, attributes),
+            "verdict": came_to.sentence,
+            "did_other": came_to.other,
             "num_steps": attributes.num_steps,
             "num_replans": attributes.num_replans,
             "picture": [pictured[0], last] if pictured and last >= 0 else None,

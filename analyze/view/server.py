@@ -8,39 +8,32 @@ asking for anything elsewhere, whatever a store holds.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
-from typing import Any
 
 from vla_attention.analyze.view.answers import Answers, NoAnswer
 from vla_attention.analyze.view.kept_token import kept_token, new_token
 from vla_attention.analyze.view.paths import (
     PAGE_FILES,
-    BadRange,
+    RUNS,
     NothingThere,
-    Wanted,
     WrongToken,
-    byte_range,
     is_allowed,
     name_of_host,
     wanted,
 )
-from vla_attention.analyze.view.served_stores import ServedStore, stores_document
+from vla_attention.analyze.view.served_stores import ServedStore
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stores.remote_source import RemoteFailure
 
 LOOPBACK = "127.0.0.1"
 _JSON = "application/json"
-#: A store's file is never anything that a browser shows or runs.
-_BYTES = "application/octet-stream"
-_TEXT = "text/plain; charset=utf-8"
-#: WebAssembly decompresses the chunks; the worker is the same script as the page.
 CONTENT_SECURITY_POLICY = (
-    "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src 'self'; style-src 'self'; "
-    "img-src 'self' data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 _HEADERS = {
     "Content-Security-Policy": CONTENT_SECURITY_POLICY,
@@ -57,27 +50,19 @@ _SILENT_S = 60
 
 @dataclass(frozen=True)
 class Answer:
-    """What is sent: a status, the bytes in pieces, how many they are, and further headers."""
+    """What is sent: a status, the content and its type, and further headers."""
 
     status: int
-    kind: str
-    length: int
-    pieces: Iterable[bytes] = ()
-    headers: dict[str, str] = field(default_factory=dict)
+    content: bytes
+    kind: str = "text/plain; charset=utf-8"
+    headers: Mapping[str, str] = field(default_factory=dict)
 
-    @classmethod
-    def of(cls, content: bytes, kind: str, status: int = HTTPStatus.OK, **headers: str) -> Answer:
-        """An answer of bytes that are there."""
-        return cls(status, kind, len(content), (content,), headers)
 
-    @classmethod
-    def refused(cls, status: int, sentence: str, **headers: str) -> Answer:
-        """An answer that is a sentence."""
-        return cls.of(f"{sentence}\n".encode(), _TEXT, status, **headers)
+_NOTHING = Answer(HTTPStatus.NOT_FOUND, b"There is nothing here.\n")
 
 
 class ViewerServer(ThreadingHTTPServer):
-    """The server of some stores. `link` opens the page; `sent` counts the bytes of the stores' files by path.
+    """The server of some stores. `link` opens the page.
 
     Args:
         stores: what the page shows.
@@ -101,7 +86,6 @@ class ViewerServer(ThreadingHTTPServer):
         self.stores = tuple(stores)
         folder = files("vla_attention.analyze.view") / "bundle"
         self.page = {name: (folder / name).read_bytes() for name in PAGE_FILES}
-        self.sent: dict[str, int] = {}
         self._answers = Answers()
         try:
             super().__init__((LOOPBACK, port), _Handler)
@@ -127,61 +111,33 @@ class ViewerServer(ThreadingHTTPServer):
     def handle_error(self, *_: object) -> None:
         """A browser that closes a connection is no error; every other one was answered."""
 
-    def answer(self, target: str, wanted_range: str | None) -> Answer:
-        """The answer to a request that was let in: `target` as it stands in the request, its `Range` header."""
+    def answer(self, target: str) -> Answer:
+        """The answer to a request that was let in: `target` as it stands in the request."""
         try:
-            asked = wanted(target, self.token, len(self.stores))
+            asked = wanted(target, self.token)
         except WrongToken:
-            return Answer.refused(403, "This is the page of vla-analyze view: open the whole link that it printed.")
+            return Answer(403, b"This is the page of vla-attention view: open the whole link that it printed.\n")
         except NothingThere:
-            return _nothing()
+            return _NOTHING
         if asked.page:
-            return Answer.of(self.page[asked.page], PAGE_FILES[asked.page])
-        if asked.document or asked.answer == ("runs.json",):
+            return Answer(200, self.page[asked.page], PAGE_FILES[asked.page])
+        if asked.answer == (RUNS,):
             for store in self.stores:
                 store.refresh()
-        if asked.document:
-            return _json(stores_document(self.stores, with_paths=True))
-        if asked.summary is not None:
-            return _json(self.stores[asked.summary].summary.document())
         try:
-            if asked.answer:
-                content, kind = self._answers.answer(self.stores, asked.answer, asked.query)
-                return Answer.of(content, kind)
-            return self._file(asked, wanted_range)
+            return Answer(200, *self._answers.answer(self.stores, asked.answer, asked.query))
         except NoAnswer:
-            return _nothing()
+            return _NOTHING
         except RemoteFailure as error:
-            return Answer.refused(502, str(error))
+            return Answer(HTTPStatus.BAD_GATEWAY, _said(error), _JSON)
         except UserError as error:
-            return Answer.of(json.dumps({"error": str(error)}).encode(), _JSON, HTTPStatus.UNPROCESSABLE_ENTITY)
-        except OSError:
-            return _nothing()
-
-    def _file(self, asked: Wanted, wanted_range: str | None) -> Answer:
-        assert asked.store is not None
-        store = self.stores[asked.store]
-        size = store.size(asked.file)
-        try:
-            part = byte_range(wanted_range, size)
-        except BadRange:
-            about = {"Content-Range": f"bytes */{size}"}
-            return Answer.refused(416, f"The file has {size} bytes.", **about)
-        first, end = part or (0, size)
-        headers = {"Accept-Ranges": "bytes"}
-        if part is not None:
-            headers["Content-Range"] = f"bytes {first}-{end - 1}/{size}"
-        pieces = self._counted(f"{asked.store}/{asked.file}", store.pieces(asked.file, first, end))
-        return Answer(200 if part is None else 206, _BYTES, end - first, pieces, headers)
-
-    def _counted(self, name: str, pieces: Iterator[bytes]) -> Iterator[bytes]:
-        for piece in pieces:
-            self.sent[name] = self.sent.get(name, 0) + len(piece)
-            yield piece
+            return Answer(HTTPStatus.UNPROCESSABLE_ENTITY, _said(error), _JSON)
+        except OSError as error:  # the store was moved, or changes
+            return Answer(HTTPStatus.UNPROCESSABLE_ENTITY, _said(error.strerror or error), _JSON)
 
 
-def _json(document: dict[str, Any]) -> Answer:
-    return Answer.of(json.dumps(document, allow_nan=False).encode(), _JSON)
+def _said(sentence: object) -> bytes:
+    return json.dumps({"error": str(sentence)}).encode()
 
 
 def _allowed_host(given: str) -> str:
@@ -199,10 +155,6 @@ def _other_host(name: str) -> str:
         f"The page of vla-attention view is asked for as {name}, a host that it does not know. If that is the proxy "
         f"through which you reach this machine (JupyterHub, Open OnDemand), start it again with --allow-host {name}."
     )
-
-
-def _nothing() -> Answer:
-    return Answer.refused(404, "There is nothing here.")
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -231,39 +183,19 @@ class _Handler(BaseHTTPRequestHandler):
         if "Content-Length" in self.headers or "Transfer-Encoding" in self.headers:
             self.send_error(400)
             return
-        answer = self.server.answer(self.path, self.headers.get("Range"))
-        self._send(answer)
+        self._send(self.server.answer(self.path))
 
     def _send(self, answer: Answer) -> None:
-        pieces = iter(answer.pieces)
-        sent = 0
-        try:
-            # What cannot be read at all is said before anything is sent.
-            first = next(pieces, b"") if self.command != "HEAD" else b""
-        except RemoteFailure as error:
-            self._send(Answer.refused(502, str(error)))
-            return
-        except OSError:
-            self._send(_nothing())
-            return
         self.send_response_only(answer.status)
-        headers = {"Content-Type": answer.kind, "Content-Length": str(answer.length), **_HEADERS, **answer.headers}
+        length = str(len(answer.content))
+        headers = {"Content-Type": answer.kind, "Content-Length": length, **_HEADERS, **answer.headers}
         for name, value in headers.items():
             self.send_header(name, value)
         if self.close_connection:
             self.send_header("Connection", "close")
         self.end_headers()
-        if self.command == "HEAD":
-            return
-        try:
-            while first:
-                self.wfile.write(first)
-                sent += len(first)
-                first = next(pieces, b"")
-        finally:
-            # A file that became shorter, or a network that failed: the browser sees that the answer is not whole.
-            if sent != answer.length:
-                self.close_connection = True
+        if self.command != "HEAD":
+            self.wfile.write(answer.content)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
         """Refuse a request, by `message` where it is a sentence of ours, and close the connection."""
@@ -273,7 +205,7 @@ class _Handler(BaseHTTPRequestHandler):
         headers = {"Allow": "GET, HEAD"} if code in (405, 501) else {}
         status = 405 if code == 501 else code
         sentence = message if status == HTTPStatus.FORBIDDEN and message else f"{HTTPStatus(status).phrase}."
-        self._send(Answer.refused(status, sentence, **headers))
+        self._send(Answer(status, f"{sentence}\n".encode(), headers=headers))
 
     def log_message(self, format: str, *args: object) -> None:
         """Nothing is printed: the terminal shows the link."""

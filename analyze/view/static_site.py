@@ -1,133 +1,130 @@
-"""The page as a folder of plain files, for any web server that sends parts of files (range requests)."""
+"""The page without a server: as a folder of plain files, or one episode as one file that opens from disk."""
 
 from __future__ import annotations
 
+import base64
+import gzip
+import hashlib
 import json
-from collections.abc import Sequence
+import shutil
+from collections.abc import Iterator, Sequence
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 from vla_attention.analyze.render.files import write_text, writing
-from vla_attention.analyze.view.paths import PAGE_FILES, STORES_DOCUMENT
-from vla_attention.analyze.view.served_stores import ServedStore, stores_document
-from vla_attention.schemas.errors import BadArgument, listing
-from vla_attention.schemas.stores.episode_files import foreign_in_episode, foreign_in_store
-from vla_attention.schemas.stores.reader import Store
+from vla_attention.analyze.view.answers import Answers
+from vla_attention.analyze.view.paths import PAGE_FILES, RUNS
+from vla_attention.analyze.view.run_answers import runs_answer
+from vla_attention.analyze.view.served_stores import ServedStore
+from vla_attention.schemas.command_line import format_bytes
+from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.progress_bar import progress_bar
 from vla_attention.schemas.stores.store_format import STORE_SUFFIX
 from vla_attention.schemas.stores.store_place import refuse_in_store
-from vla_attention.schemas.stores.store_url import HubAddress, StorePlace, StoreUrl
 
-#: Where browsers of others find the hub.
-HUB = "https://huggingface.co"
+#: What a page in one file may do: run its own script, and nothing else.
+_POLICY = (
+    "default-src 'none'; script-src 'sha256-{script}'; style-src 'sha256-{style}'; img-src data: blob:; "
+    "base-uri 'none'; form-action 'none'"
+)
 
 
-def check_site(folder: Path, stores: Sequence[StorePlace]) -> None:
-    """Raise `BadArgument` unless a site of these stores can be written into a folder.
-
-    An existing folder is written into only if it is empty or holds such a site.
-    """
+def check_site(folder: Path) -> None:
+    """Raise `BadArgument` unless a site can be written into a folder: a new or empty one, or one that holds a site."""
     refuse_in_store(folder, "write a site into")
     if folder.suffix == STORE_SUFFIX or (folder / "zarr.json").exists():
         raise BadArgument(f"Cannot write a site into {folder}: it is a store, or named like one; give another folder.")
     if folder.exists() and not folder.is_dir():
         raise BadArgument(f"Cannot write a site into {folder}: it is a file; give a folder.")
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / STORES_DOCUMENT).is_file():
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / RUNS).is_file():
         raise BadArgument(f"Cannot write a site into {folder}: it holds other files; give an empty or a new folder.")
+
+
+def site_size(stores: Sequence[ServedStore], heads: bool) -> int:
+    """About how many bytes a site has: those of the first episode of each store, for all of its replans."""
+    size = 0.0
     for store in stores:
-        if isinstance(store, StoreUrl):
-            web_address(store)
+        replans = [episode.attributes.num_replans for episode in store.store.episodes]
+        if replans and replans[0]:
+            first = store.store.episodes[0].name
+            written = sum(len(content) for _, content in _compressed(Answers().of_episode(store, first, heads)))
+            size += written * sum(replans) / replans[0]
+    return round(size)
 
 
-def check_uploads(folder: Path, stores: Sequence[Store]) -> None:
-    """Raise `BadArgument` where an upload that follows links would publish more than a site of these stores.
-
-    A site has links to the stores of this machine, so that whoever uploads it has to follow links.
-    """
-    for store in stores:
-        more = [*foreign_in_store(store), *(file for episode in store.episodes for file in foreign_in_episode(episode))]
-        if more:
-            raise BadArgument(
-                f"Cannot write a site of {store.path}: {listing(more, 5)} would be published with it, and "
-                f"{'is' if len(more) == 1 else 'are'} no part of the store. vla-attention store copy {store.path} "
-                "NAME.zarr makes a store without such files and links; or remove them."
-            )
-    links = [
-        entry.name if place == folder else f"{place.name}/{entry.name}"
-        for place in (folder, folder / "stores")
-        if place.is_dir()
-        for entry in place.iterdir()
-        if entry.is_symlink() and not (place.name == "stores" and entry.name.isdecimal())
-    ]
-    if links:
-        raise BadArgument(
-            f"Cannot write a site into {folder}: it has the {'link' if len(links) == 1 else 'links'} "
-            f"{listing(sorted(links), 5)}, and an upload that follows links would publish what is there; remove them."
-        )
-
-
-def web_address(place: StoreUrl) -> str:
-    """The address under which a browser reads the files of a store; ends with /.
-
-    Raises:
-        BadArgument: browsers cannot read addresses of this kind.
-    """
-    if place.protocol == "hf":
-        return f"{HubAddress.of(place.url).file_address(HUB)}/"
-    if place.protocol in ("http", "https"):
-        return f"{place.url.rstrip('/')}/"
-    raise BadArgument(
-        f"Browsers cannot read {place}: give its address as https://..., or copy the store here "
-        f"(vla-attention store copy {place} NAME.zarr) and upload it with the site."
+def write_site(folder: Path, stores: Sequence[ServedStore], heads: bool) -> str:
+    """Write the page and all answers, compressed; the summaries are complete. Returns what was written, in words."""
+    page = files("vla_attention.analyze.view") / "bundle"
+    runs = _runs(stores, heads)
+    places = [(number, store, episode.name) for number, store in enumerate(stores) for episode in store.store.episodes]
+    size = 0
+    with writing("site", folder, instead="another --site"), progress_bar(len(places), "episodes") as advance:
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(folder / "runs", ignore_errors=True)  # of an earlier site
+        for name in PAGE_FILES:
+            write_text(folder / name, (page / name).read_text(encoding="utf-8"))
+        for number, store in enumerate(stores):
+            size += _write(folder / f"runs/{number}/numbers.json.gz", _packed(json.dumps(_numbers(store)).encode()))
+        answers = Answers()
+        for number, store, episode in places:
+            for path, content in _compressed(answers.of_episode(store, episode, heads)):
+                size += _write(folder / f"runs/{number}/{episode}/{path}", content)
+            advance(1)
+        # Last: a folder with it is a whole site.
+        write_text(folder / RUNS, json.dumps(runs) + "\n")
+    return (
+        f"{folder}: {format_bytes(size)}, a page for any web server, for instance `python -m http.server -d {folder}`."
     )
 
 
-def write_site(folder: Path, stores: Sequence[ServedStore]) -> str:
-    """Write the page, its documents and links to the stores of this machine; returns what is to be uploaded, in words.
-
-    The summaries must be complete.
-    """
-    document = stores_document(stores)
+def write_page_file(path: Path, store: ServedStore, episode: str, heads: bool) -> str:
+    """Write one episode as one HTML file; returns what was written, in words."""
     page = files("vla_attention.analyze.view") / "bundle"
-    uploads = []
-    with writing("site", folder, instead="another --site"):
-        (folder / "stores").mkdir(parents=True, exist_ok=True)
-        _remove_earlier(folder / "stores", len(stores))
-        for number, (store, entry) in enumerate(zip(stores, document["stores"], strict=True)):
-            link = folder / "stores" / str(number)
-            if link.is_symlink():
-                link.unlink()
-            elif link.exists():
-                raise BadArgument(f"{link} is no link, so it is not replaced; remove it, or give another --site.")
-            if isinstance(store.place, StoreUrl):
-                entry["root"] = web_address(store.place)
-            else:
-                link.symlink_to(store.place.resolve(), target_is_directory=True)
-                uploads.append(f"stores/{number} (a link to {store.place})")
-            summary = json.dumps(store.summary.document(), allow_nan=False)
-            write_text(folder / entry["summary"], summary + "\n")
-        write_text(folder / STORES_DOCUMENT, json.dumps(document, indent=1) + "\n")
-        for name in PAGE_FILES:
-            write_text(folder / name, (page / name).read_text(encoding="utf-8"))
-    return _uploads(folder, uploads, stores)
+    runs = _runs([store], heads)
+    runs["runs"][0]["episodes"] = [line for line in runs["runs"][0]["episodes"] if line["name"] == episode]
+    content = {"runs.json": json.dumps(runs).encode(), "runs/0/numbers.json": json.dumps(_numbers(store)).encode()}
+    within = {name: base64.b64encode(_packed(one)).decode() for name, one in content.items()}
+    for address, one in _compressed(Answers().of_episode(store, episode, heads)):
+        within[f"runs/0/{episode}/{address.removesuffix('.gz')}"] = base64.b64encode(one).decode()
+    script, style = ((page / name).read_text(encoding="utf-8") for name in ("main.js", "main.css"))
+    script = script.replace("</script", "<\\/script")
+    hashes = {
+        name: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        for name, text in (("script", script), ("style", style))
+    }
+    data = json.dumps(within).replace("<", "\\u003c")
+    text = (
+        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY.format(**hashes)}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<meta name="color-scheme" content="light dark">\n<title>Attention</title>\n'
+        f"<style>{style}</style>\n</head>\n<body>\n"
+        f'<main id="page"></main>\n<script type="application/json" id="answers">{data}</script>\n'
+        f'<script type="module">{script}</script>\n</body>\n</html>\n'
+    )
+    with writing("page", path, instead="another --file"):
+        write_text(path, text)
+    return f"{path}: {format_bytes(len(text.encode()))}, opens in a browser from disk."
 
 
-def _remove_earlier(folder: Path, count: int) -> None:
-    """Remove the links and summaries of stores that an earlier site in this place had beyond the first `count`."""
-    for entry in folder.iterdir():
-        number, _, rest = entry.name.partition(".")
-        is_ours = entry.is_symlink() if not rest else rest == "summary.json" and entry.is_file()
-        if is_ours and number.isdecimal() and number.isascii() and int(number) >= count:
-            entry.unlink()
+def _runs(stores: Sequence[ServedStore], heads: bool) -> dict[str, Any]:
+    return runs_answer([store.store for store in stores]) | {"copy": {"heads": heads}}
 
 
-def _uploads(folder: Path, uploads: Sequence[str], stores: Sequence[ServedStore]) -> str:
-    lines = [f"{folder}: a page for any web server that sends parts of files (range requests)."]
-    if uploads:
-        lines.append(f"Upload the folder with what its links lead to: {', '.join(uploads)}.")
-        lines.append(f"For instance: rsync -rL {folder}/ HOST:PATH")
-    elsewhere = ", ".join(str(store.place) for store in stores if isinstance(store.place, StoreUrl))
-    if elsewhere:
-        lines.append(
-            f"The page reads {elsewhere} there; that server has to let other sites read parts of files (CORS)."
-        )
-    return "\n".join(lines)
+def _numbers(store: ServedStore) -> dict[str, Any]:
+    return store.summary.document()
+
+
+def _packed(content: bytes) -> bytes:
+    return gzip.compress(content, 6, mtime=0)
+
+
+def _compressed(answers: Iterator[tuple[str, bytes]]) -> Iterator[tuple[str, bytes]]:
+    for path, content in answers:
+        yield (path, content) if path.endswith(".png") else (f"{path}.gz", _packed(content))
+
+
+def _write(path: Path, content: bytes) -> int:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path.write_bytes(content)

@@ -70,17 +70,15 @@ def numbers(values: Any) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("name", "site"), SITES)
-@pytest.mark.parametrize("asked", [{}, {"layers": [1], "denoise": "last", "heads": [0]}], ids=["all", "one"])
+@pytest.mark.parametrize("asked", [{}, {"denoise": "last", "heads": 0}], ids=["all", "one"])
 def test_ratios_and_masses(server, places, name, site, asked):
     run = va.open(places[name])
-    if asked and (name in ("masks", "spans") or site == "cross"):
-        asked = {**asked, "layers": [run.analyze(site=site)["replans"]["layer_number"].min()]}
-    query = "&".join(f"{key}={quote(','.join(map(str, np.atleast_1d(value))))}" for key, value in asked.items())
-    given = read(server, name, f"{site}/groups.json?{query}")
+    last = run.attributes.recording.denoise_steps[-1]
+    given = read(server, name, f"{site}/groups/{f'denoise-{last}.head-0' if asked else 'all'}.json")
     result = run.analyze(site=site, grouping="default", **asked)
     about = read(server, name, "about.json")
     episode = {"task_id": about["task"], "episode_index": about["episode"]}
-    for column in ("ratio", "uniform_ratio", "ratio_lift", "numerator_mass", "denominator_mass"):
+    for column in ("ratio", "uniform_ratio", "ratio_lift"):
         if column in result["replans"].columns:
             expected = of_analysis(result["replans"], column, episode)
             expected = np.where(np.isfinite(expected), expected, np.nan)
@@ -94,7 +92,7 @@ def test_ratios_and_masses(server, places, name, site, asked):
 @pytest.mark.parametrize(("name", "site"), SITES)
 def test_sums_of_rows_are_the_masses(server, name, site):
     about = read(server, name, "about.json")
-    groups = read(server, name, f"{site}/groups.json")
+    groups = read(server, name, f"{site}/groups/all.json")
     camera_keys = [key for camera in about["sites"][site]["cameras"].values() for key in camera["keys"]]
     for at, layer in enumerate(groups["layers"]):
         rows, heads = (read(server, name, f"{site}/{kind}/{layer}.npy") for kind in ("rows", "heads"))
@@ -132,7 +130,7 @@ def test_maps_of_the_page_are_those_of_overlay(server, places, name):
 
 
 def test_heads_of_a_selector(server, places):
-    given = read(server, "joint", f"joint/heads.json?selector={quote('role:instruction')}")
+    given = read(server, "joint", f"joint/grid.json?selector={quote('role:instruction')}")
     result = va.open(places["joint"]).analyze(groups={"words": "role:instruction"}, by=("layer", "head"), tasks=0)
     tables = {one.name: one for one in result.tables}
     cells = tables["steps_groups"].shown.filter(group="words").group_by("replan", "layer", "head")
@@ -142,17 +140,23 @@ def test_heads_of_a_selector(server, places):
     np.testing.assert_allclose(numbers(given["lift"]).mean(axis=0).ravel(), lift, rtol=1e-4)
 
 
+def test_targets_of_heads_are_selectors(server):
+    about = read(server, "joint", "about.json")
+    for number, target in enumerate(about["sites"]["joint"]["targets"]):
+        own = read(server, "joint", f"joint/grid/{number}.json")
+        assert own == read(server, "joint", f"joint/grid.json?selector={quote(target['selector'])}")
+    assert number > 3
+
+
 def test_keys_of_a_selector_and_what_is_wrong_with_one(server):
     about = read(server, "joint", "about.json")
     word = about["sites"]["joint"]["prompts"][0]["words"][1]
     given = read(server, "joint", f"joint/keys.json?selector={quote('word:' + word['text'])}")
     assert {key for key, weight in given["keys"][0] if weight == 1.0} >= set(word["keys"])
-    for path in ("keys", "heads"):
+    for path in ("keys", "grid"):
         reply = ask(server, f"runs/0/task000_episode000/joint/{path}.json?selector=word:nothing")
         assert reply.status == 422
         assert "no instruction has the word 'nothing'" in json.loads(reply.body)["error"]
-    files = ask(server, f"runs/0/task000_episode000/joint/groups.json?grouping={quote('/etc/hosts', safe='')}")
-    assert "Existing: " in json.loads(files.body)["error"]
 
 
 def test_effects_are_those_of_the_command(server, places):
@@ -205,7 +209,7 @@ def test_covered_cells_are_those_of_the_coverage(server, places):
         coverage = episode.read(f"objects/{camera}")
         names = [thing.name for thing in episode.attributes.objects]
         for name, of_replans in objects.items():
-            expected = (coverage[:, :, names.index(name)] >= 0.25).sum(axis=1)
+            expected = (coverage[:, :, names.index(name)] >= 0.1).sum(axis=1)
             assert [len(cells) for cells in of_replans] == expected.tolist()
     assert given
 
@@ -213,7 +217,7 @@ def test_covered_cells_are_those_of_the_coverage(server, places):
 @pytest.mark.parametrize(
     "path",
     ["runs/", "runs/0", "runs/9/task000_episode000/about.json", "runs/0/task009_episode000/about.json",
-     "runs/0/task000_episode000/nothing.json", "runs/0/task000_episode000/other/groups.json", "runs/x/y/about.json",
+     "runs/0/task000_episode000/nothing.json", "runs/0/task000_episode000/joint/grid/99.json", "runs/x/y/about.json",
      "runs/0/task000_episode000/pictures/base_0_rgb/one.png", "runs/0/%2e%2e/about.json", "runs.json/x"],
 )  # fmt: skip
 def test_other_addresses_have_nothing(server, path):

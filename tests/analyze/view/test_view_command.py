@@ -1,7 +1,9 @@
-"""`vla-attention view`: the numbers of its summary, the static site, its link, and its end."""
+"""`vla-attention view`: the numbers of its summary, the site, the page in one file, its link, and its end."""
 
 from __future__ import annotations
 
+import base64
+import gzip
 import json
 import re
 import shutil
@@ -29,7 +31,7 @@ def store(tmp_path_factory) -> Path:
 def test_the_summary_has_the_numbers_of_the_analysis(store):
     with served(store, summaries=True) as running:
         assert running.stores[0].summary.wait() is None
-        document = json.loads(ask(running, "stores/0.summary.json").body)
+        document = json.loads(ask(running, "runs/0/numbers.json").body)
     assert (document["complete"], document["failed"], document["site"]) == (True, None, "joint")
     assert document["grouping"] == "default"
     assert document["ratio"] == "visual / linguistic"
@@ -59,72 +61,55 @@ def test_a_damaged_episode_has_no_numbers_and_the_others_have(store, tmp_path):
     assert [rows[name]["ratio"] is None for name in sorted(rows)] == [False, False, True, False]
 
 
-def test_a_site_is_the_page_its_documents_and_a_link_to_the_store(store, tmp_path, capsys):
+def answers_in(folder: Path) -> dict[str, bytes]:
+    """The answers of a site by their addresses."""
+    paths = [path for path in (folder / "runs").rglob("*") if path.is_file()]
+    return {
+        path.relative_to(folder).as_posix().removesuffix(".gz"): gzip.decompress(path.read_bytes())
+        if path.suffix == ".gz"
+        else path.read_bytes()
+        for path in paths
+    }
+
+
+@pytest.mark.parametrize("heads", [False, True])
+def test_a_site_has_the_servers_answers(store, tmp_path, capsys, heads):
     folder = tmp_path / "site"
     for _ in range(2):  # a second time over the first
-        assert main(["view", str(store), "--output", str(folder)]) == 0
-        printed = capsys.readouterr().out
-        assert f"stores/0 (a link to {store})" in printed
-        assert "range requests" in printed
+        assert main(["view", str(store), "--site", str(folder), *(["--heads"] if heads else [])]) == 0
+        assert re.match(r"About [\d.]+ [kM]B for 4 episodes", capsys.readouterr().out)
+    answers = answers_in(folder)
     with served(store, summaries=True) as running:
         running.stores[0].summary.wait()
-        for name in (*PAGE_FILES, "stores.json", "stores/0.summary.json", "stores/0/zarr.json"):
-            live, written = ask(running, name).body, (folder / name).read_bytes()
-            if name == "stores.json":
-                shown, wrote = json.loads(live), json.loads(written)
-                assert shown["stores"][0].pop("path") == str(store)  # on the web nobody needs it
-                assert shown == wrote
-            elif name.endswith(".json"):
-                assert json.loads(live) == json.loads(written), name
-            else:
-                assert live == written, name
-    assert (folder / "stores/0").resolve() == store
-    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()}
-    assert files == {*PAGE_FILES, "stores.json", "stores/0.summary.json"} | ({"stores/0"} & files)
+        for name in PAGE_FILES:
+            assert ask(running, name).body == (folder / name).read_bytes()
+        for address, content in answers.items():
+            assert ask(running, address).body == content, address
+        live, copy = json.loads(ask(running, "runs.json").body), json.loads((folder / "runs.json").read_bytes())
+    assert live["runs"][0].pop("path") == str(store)  # elsewhere nobody needs it
+    assert copy == live | {"copy": {"heads": heads}}
+    kinds = {re.sub(r"\d+|mean", "N", address.split("/", 3)[-1]) for address in answers}
+    assert {"about.json", "joint/rows/N.npy", "joint/groups/denoise-N.json", "joint/grid/N.json"} <= kinds
+    assert ("joint/heads/N.npy" in kinds) == heads
+    assert not any(path.is_symlink() for path in folder.rglob("*"))
 
 
-def upload(folder: Path, target: Path) -> dict[str, bytes]:
-    """What a copy that follows links takes along, by path."""
-    shutil.copytree(folder, target, symlinks=False)
-    return {file.relative_to(target).as_posix(): file.read_bytes() for file in target.rglob("*") if file.is_file()}
-
-
-#: What somebody may put into a store, and what of it an upload that follows links would publish.
-FOREIGN = {
-    "notes.txt": lambda store, secret: (store / "notes.txt").write_text("mine"),
-    "keys": lambda store, secret: (store / "keys").symlink_to(secret),
-    "joint/rows/keys": lambda store, secret: (store / "episodes/task000_episode000/joint/rows/keys").symlink_to(secret),
-}
-
-
-@pytest.mark.filterwarnings("ignore:Ignored in")
-@pytest.mark.parametrize("name", FOREIGN)
-def test_a_site_publishes_nothing_but_the_store(store, tmp_path, capsys, name):
-    (tmp_path / "secret").mkdir()
-    (tmp_path / "secret/id").write_text("secret")
-    shutil.copytree(store, tmp_path / "a.zarr")
-    FOREIGN[name](tmp_path / "a.zarr", tmp_path / "secret")
-    assert main(["view", str(tmp_path / "a.zarr"), "--output", str(tmp_path / "site")]) == 2
-    assert f"Cannot write a site of {tmp_path / 'a.zarr'}: {name} would be published" in capsys.readouterr().err
-    assert not (tmp_path / "site").exists()
-
-
-@pytest.mark.thorough
-def test_what_an_upload_takes_along(store, tmp_path, capsys):
-    """Of a second site in the same place, too: the links of the first are gone, and others are refused."""
-    other = write_store(tmp_path / "b.zarr", spec=SPEC, suite="other")
-    site = tmp_path / "site"
-    assert main(["view", str(store), str(other), "--output", str(site)]) == 0
-    assert main(["view", str(store), "--output", str(site)]) == 0
-    published = upload(site, tmp_path / "uploaded")
-    files = {f"stores/0/{file.relative_to(store)}" for file in store.rglob("*") if file.is_file()}
-    assert set(published) == {*PAGE_FILES, "stores.json", "stores/0.summary.json", *files}
-    capsys.readouterr()
-    for link in ("mine", "stores/mine"):
-        (site / link).symlink_to(tmp_path)
-        assert main(["view", str(store), "--output", str(site)]) == 2
-        assert f"it has the link {link}, and an upload that follows links" in capsys.readouterr().err
-        (site / link).unlink()
+def test_one_episode_is_one_file(store, tmp_path, capsys):
+    path = tmp_path / "one.html"
+    assert main(["view", str(store), "--file", str(path), "--task", "1", "--episode", "1"]) == 0
+    text = path.read_text()
+    (data,) = re.findall(r'<script type="application/json" id="answers">(.*?)</script>', text)
+    within = {
+        name: gzip.decompress(base64.b64decode(one)) for name, one in json.loads(data).items() if "png" not in name
+    }
+    (entry,) = json.loads(within["runs.json"])["runs"]
+    assert [line["name"] for line in entry["episodes"]] == ["task001_episode001"]
+    with served(store) as running:
+        for name in ("about.json", "joint/rows/mean.npy", "joint/groups/all.json"):
+            address = f"runs/0/task001_episode001/{name}"
+            assert within[address] == ask(running, address).body
+    assert main(["view", str(store), "--file", str(path), "--task", "7"]) == 2
+    assert "it has task000_episode000" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("place", ["a.zarr", "file", "full", "hub/datasets"])
@@ -136,7 +121,7 @@ def test_a_site_is_written_into_no_store_and_over_nothing_else(store, tmp_path, 
         (tmp_path / place).mkdir(parents=True)
         (tmp_path / place / "zarr.json").write_text("{}")
     before = sorted(tmp_path.rglob("*"))
-    assert main(["view", str(store), "--output", str(tmp_path / place)]) == 2
+    assert main(["view", str(store), "--site", str(tmp_path / place)]) == 2
     assert "Cannot write a site into" in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == before
 

@@ -1,0 +1,272 @@
+/** What the server answers (analyze/view/answers.py has the addresses), as types, and how it is asked. */
+
+export type Grid = (number | null)[][];
+export type Outcome = boolean | null;
+
+export interface EpisodeLine {
+  readonly name: string;
+  readonly task: number;
+  readonly episode: number;
+  /** Why the episode cannot be read; nothing else is known of it then. */
+  readonly failed?: string;
+  readonly instruction: string;
+  readonly told: string;
+  readonly told_other: boolean;
+  readonly outcome: Outcome;
+  readonly verdict: string;
+  /** Whether it did or touched something else than it was told. */
+  readonly did_other: boolean;
+  readonly num_steps: number;
+  readonly num_replans: number;
+  /** Camera and replan. */
+  readonly picture: readonly [string, number] | null;
+}
+
+export interface SiteAxes {
+  readonly name: string;
+  readonly keys: number;
+  readonly layers: readonly number[];
+  readonly heads: readonly number[];
+  readonly denoise_steps: readonly number[];
+}
+
+export interface Run {
+  readonly name: string;
+  readonly path?: string;
+  readonly policy: string;
+  readonly suite: string;
+  readonly untrained: boolean;
+  readonly rerun: boolean;
+  readonly changed: readonly string[];
+  readonly sites: readonly SiteAxes[];
+  readonly episodes: readonly EpisodeLine[];
+}
+
+export interface Finding {
+  readonly asks: string;
+  readonly sentence: string;
+  readonly limit: string;
+}
+
+export interface Runs {
+  readonly runs: readonly Run[];
+  /** Of a folder or file of answers: whether it has each head's rows. */
+  readonly copy?: { readonly heads: boolean };
+}
+
+/** What is computed while the page is open. */
+export interface RunNumbers {
+  readonly complete: boolean;
+  readonly ratio: string | null;
+  readonly failed: string | null;
+  readonly findings: readonly Finding[] | null;
+  readonly leaves: Readonly<Record<string, number>> | null;
+  readonly episodes: readonly { name: string; ratio: number | null; lift: number | null }[];
+}
+
+export interface CameraLayout {
+  readonly rows: number;
+  readonly columns: number;
+  readonly height: number;
+  readonly width: number;
+  /** A part of a key's mass, and the cell of the map that it is added to. */
+  readonly keys: readonly number[];
+  readonly cells: readonly number[];
+  /** null: a cell is one key's. */
+  readonly shares: readonly number[] | null;
+  readonly upright: boolean;
+  readonly mirrored: boolean;
+  /** Whether pictures were stored. */
+  readonly stored: boolean;
+  readonly note: string;
+}
+
+export interface Word {
+  readonly text: string;
+  readonly keys: readonly number[];
+}
+
+export interface SiteLayout {
+  readonly spans: readonly { name: string; kind: string; start: number; stop: number }[];
+  readonly roles: readonly (readonly string[])[];
+  readonly valid: readonly (readonly number[])[];
+  readonly cameras: Readonly<Record<string, CameraLayout>>;
+  readonly prompts: readonly { text: string; words: readonly Word[] }[];
+  /** What heads may look at. */
+  readonly targets: readonly { name: string; selector: string }[];
+}
+
+export interface EpisodeEvent {
+  readonly step: number;
+  readonly replan: number;
+  readonly kind: "touch" | "goal" | "gripper" | "end" | "leaves";
+  readonly text: string;
+  /** The touched thing. */
+  readonly thing: string;
+}
+
+export interface SceneObject {
+  readonly name: string;
+  readonly shown: string;
+  readonly named: boolean;
+}
+
+export interface About extends EpisodeLine {
+  readonly env_step: readonly number[];
+  /** Executed steps before each replan. */
+  readonly starts: readonly number[];
+  readonly end: number;
+  readonly prompt_index: readonly number[];
+  readonly objects: readonly SceneObject[];
+  readonly events: readonly EpisodeEvent[];
+  readonly courses: {
+    readonly places: Readonly<Record<string, Grid>>;
+    readonly hand: string;
+    readonly gap: readonly (number | null)[];
+    readonly executed: Grid;
+  } | null;
+  /** (replan, step, dimension) */
+  readonly actions: readonly Grid[] | null;
+  readonly effects: boolean;
+  readonly sites: Readonly<Record<string, SiteLayout>>;
+}
+
+/** Numbers of a grouping, (replan, layer); the last layer is the mean of all. */
+export interface Groups {
+  readonly layers: readonly string[];
+  readonly sides: readonly [readonly string[], readonly string[]] | null;
+  readonly ratio?: Grid;
+  readonly uniform_ratio?: Grid;
+  readonly ratio_lift?: Grid;
+  readonly groups: Readonly<Record<string, { keys: Grid; mass: Grid; fraction: Grid; lift: Grid }>>;
+}
+
+/** (replan, layer, head) */
+export interface HeadLifts {
+  readonly layers: readonly number[];
+  readonly heads: readonly number[];
+  readonly mass: readonly Grid[];
+  readonly lift: readonly Grid[];
+}
+
+export interface Effect {
+  readonly condition: string;
+  readonly number: number;
+  readonly kind: string;
+  readonly item: string;
+  readonly item_kind: string;
+  readonly selector: string | null;
+  readonly reader: string | null;
+  readonly effect: readonly (number | null)[];
+  readonly mean: number | null;
+  /** Another noise seed's effect. */
+  readonly noise: number | null;
+  readonly lift: number | null;
+}
+
+export interface Effects {
+  readonly items: readonly Effect[];
+  readonly notes: readonly string[];
+}
+
+/** Cells of the maps that an object covers: camera -> object -> replan -> cells. */
+export type Covered = Readonly<Record<string, Readonly<Record<string, readonly (readonly number[])[]>>>>;
+
+export interface NumberArray {
+  readonly shape: readonly number[];
+  readonly data: Float32Array;
+}
+
+/** A page that is one file has its answers in itself: address -> base64 of compressed bytes. */
+const within: Record<string, string> | null = JSON.parse(document.getElementById("answers")?.textContent || "null");
+/** A folder of plain files: its answers are compressed files, and it answers no questions. */
+let isFolder = false;
+export const NEEDS_SERVER = "This is a copy of the page: for that, open the store itself with vla-attention view.";
+
+const kept = new Map<string, Promise<unknown>>();
+const MOST_KEPT = 60;
+
+async function unpacked(bytes: Uint8Array<ArrayBuffer>): Promise<ArrayBuffer> {
+  if (bytes[0] !== 0x1f || bytes[1] !== 0x8b) return bytes.buffer; // a server may have unpacked it
+  return new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
+}
+
+function inside(address: string): Uint8Array<ArrayBuffer> {
+  const text = within?.[address];
+  if (text === undefined) throw new Error(NEEDS_SERVER);
+  return Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+}
+
+async function bytesOf(address: string): Promise<ArrayBuffer> {
+  if (within) return unpacked(inside(address));
+  if (isFolder && address.includes("?")) throw new Error(NEEDS_SERVER);
+  const reply = await fetch(isFolder ? `${address}.gz` : address);
+  if (reply.ok) return unpacked(new Uint8Array(await reply.arrayBuffer()));
+  if (isFolder) throw new Error(NEEDS_SERVER);
+  const said = (await reply.json().catch(() => null)) as { error?: string } | null;
+  throw new Error(said?.error ?? `The server says ${reply.status} of ${address}.`);
+}
+
+/** Asks for an address once while it is kept; an answer that says what is wrong is an `Error` with its sentence. */
+function once<T>(address: string, read: (bytes: ArrayBuffer) => T): Promise<T> {
+  const known = kept.get(address);
+  if (known) return known as Promise<T>;
+  const answer = bytesOf(address).then(read);
+  kept.set(address, answer);
+  answer.catch(() => kept.delete(address));
+  for (const oldest of kept.keys()) {
+    if (kept.size <= MOST_KEPT) break;
+    kept.delete(oldest);
+  }
+  return answer;
+}
+
+export function readJson<T>(address: string): Promise<T> {
+  return once(address, (bytes) => JSON.parse(new TextDecoder().decode(bytes)) as T);
+}
+
+/** Asks anew each time. */
+export function readJsonNow<T>(address: string): Promise<T> {
+  kept.delete(address);
+  return readJson<T>(address);
+}
+
+export function readArray(address: string): Promise<NumberArray> {
+  return once(address, parseNpy);
+}
+
+/** What the page can show. Of a folder it is the one file that is not compressed, and says so. */
+export async function readRuns(): Promise<Runs> {
+  const runs = within ? await readJson<Runs>("runs.json") : ((await (await fetch("runs.json")).json()) as Runs);
+  isFolder = runs.copy !== undefined && !within;
+  return runs;
+}
+
+/** Where an `<img>` finds a picture. */
+export function pictureAt(address: string): string {
+  if (!within) return address;
+  const known = pictures.get(address);
+  if (known) return known;
+  const made = within[address] === undefined ? "" : URL.createObjectURL(new Blob([inside(address)], { type: "image/png" }));
+  pictures.set(address, made);
+  return made;
+}
+const pictures = new Map<string, string>();
+
+/** A `.npy` file of version 1, little-endian float32 in C order. */
+export function parseNpy(bytes: ArrayBuffer): NumberArray {
+  const view = new DataView(bytes);
+  const length = view.getUint16(8, true);
+  const header = new TextDecoder("latin1").decode(new Uint8Array(bytes, 10, length));
+  const shape = /'shape': \(([^)]*)\)/.exec(header)?.[1];
+  if (shape === undefined || !header.includes("'<f4'")) throw new Error("An array came in another format than this page reads.");
+  const data = new Float32Array(bytes.slice(10 + length));
+  return { shape: shape.split(",").filter((part) => part.trim()).map(Number), data };
+}
+
+export const address = {
+  numbers: (run: number): string => `runs/${run}/numbers.json`,
+  episode: (run: number, episode: string): string => `runs/${run}/${episode}`,
+  picture: (run: number, episode: string, camera: string, replan: number): string =>
+    pictureAt(`runs/${run}/${episode}/pictures/${encodeURIComponent(camera)}/${replan}.png`),
+};

@@ -1,0 +1,189 @@
+/** One episode: what it came to, the instruction, the pictures, the timeline; and beside them the numbers. */
+import { signal } from "@preact/signals";
+
+import { Actions } from "./actions";
+import { kindOf } from "./overview";
+import { HeadGrid } from "./heads";
+import { OwnGroup, Ratio } from "./numbers";
+import { Legend, Pictures } from "./pictures";
+import {
+  about, axes, beside, besideReplan, denoise, episodeName, groups, head, layer, layerPlace, main, onlyEpisode, part, replan, rows, run, runNumber, runs,
+  setPart, site,
+} from "./state";
+import { shown } from "./sums";
+import { Timeline } from "./timeline";
+import { AboutWords, ChooseShade, Title } from "./words";
+
+const more = signal(false);
+
+function Choose({ name, title, known, value }: { name: "layer" | "head" | "denoise"; title: string; known: readonly number[]; value: number | "mean" }) {
+  return known.length < 2 ? null : (
+    <label>{title}{" "}
+      <select value={String(value)} onChange={(event) => setPart({ [name]: event.currentTarget.value })}>
+        <option value="mean">mean of {known.length}</option>
+        {known.map((one) => <option value={String(one)}>{one}</option>)}
+      </select>
+    </label>
+  );
+}
+
+function Controls() {
+  const sites = run.value?.sites ?? [];
+  return (
+    <div class={more.value ? "controls open" : "controls"}>
+      <ChooseShade />
+      {sites.length > 1 ? (
+        <label>site{" "}
+          <select value={site.value} onChange={(event) => setPart({ site: event.currentTarget.value, layer: "mean", head: "mean", group: "" })}>
+            {sites.map(({ name }) => <option value={name}>{name}</option>)}
+          </select>
+        </label>
+      ) : null}
+      <Choose name="layer" title="layer" known={axes.value?.layers ?? []} value={layer.value} />
+      <Choose name="head" title="head" known={runs.value.value?.copy?.heads === false ? [] : (axes.value?.heads ?? [])} value={head.value} />
+      <Choose name="denoise" title="denoise step" known={axes.value?.denoise_steps ?? []} value={denoise.value} />
+      <ChooseBeside />
+      <button aria-expanded={more.value} onClick={() => (more.value = !more.value)}>more</button>
+    </div>
+  );
+}
+
+/** Episodes that may stand beside this one: the same one of another run first, then those of its task. */
+function ChooseBeside() {
+  const episode = about.value.value;
+  if (!episode) return null;
+  const known = (runs.value.value?.runs ?? []).flatMap(({ name: ofRun, episodes }, i) =>
+    episodes.filter(({ name, task }) => (i !== runNumber.value && name === episode.name) || (task === episode.task && (i !== runNumber.value || name !== episode.name)))
+      .map((line) => ({ line, run: i, title: `${i === runNumber.value ? "" : `${ofRun}, `}episode ${line.episode}${line.outcome === false ? ", failed" : ""}` })),
+  );
+  known.sort((a, b) => Number(b.line.name === episode.name) - Number(a.line.name === episode.name));
+  return known.length ? (
+    <label>beside{" "}
+      <select value={part("beside")} onChange={(event) => setPart({ beside: event.currentTarget.value })}>
+        <option value="">-</option>
+        {known.map(({ line, run: i, title }) => <option value={`${i}:${line.name}`}>{title}</option>)}
+      </select>
+    </label>
+  ) : null;
+}
+
+/** Two episodes at the same step: pictures with the same lines, what they came to, and their ratios. */
+function SideBySide() {
+  const other = beside.about.value;
+  if (other.error) return <p class="error" role="alert">{other.error}</p>;
+  if (!other.value || !about.value.value) return <p class="soft">Reading …</p>;
+  const ratioOf = (numbers: typeof groups.value.value, at: number): string =>
+    numbers?.ratio ? `ratio ${shown(numbers.ratio[at]?.[layerPlace(numbers)])}, ${shown(numbers.ratio_lift?.[at]?.[layerPlace(numbers)])} times even` : "";
+  const sides = [
+    { scene: main, at: replan.value, episode: about.value.value },
+    { scene: beside, at: besideReplan.value, episode: other.value },
+  ];
+  return (
+    <div class="beside">
+      {sides.map(({ scene, at, episode }, i) => (
+        <div key={i}>
+          <p class={`verdict ${kindOf(episode)}`}>{episode.verdict}</p>
+          <Pictures scene={scene} at={at} />
+          <p class="soft">{scene.run.value === runNumber.value ? "" : `${runs.value.value?.runs[scene.run.value]?.name}: `}step {episode.starts[at]} of {episode.end}; {ratioOf(scene.groups.value.value, at)}</p>
+        </div>
+      ))}
+    </div>
+  );
+}
+
+/** The command that prints what is seen, as it is typed. */
+export function commandLine(): string {
+  const episode = about.value.value;
+  if (!run.value || !episode) return "";
+  const parts = ["vla-attention overlay", run.value.path ?? `${run.value.name}`, `--task ${episode.task}`, `--episode ${episode.episode}`, `--replan ${replan.value}`];
+  if (site.value !== run.value.sites[0]?.name) parts.push(`--site ${site.value}`);
+  if (layer.value !== "mean") parts.push(`--layers ${layer.value}`);
+  if (head.value !== "mean") parts.push(`--heads ${head.value}`);
+  if (denoise.value !== "mean") parts.push(`--denoise ${denoise.value}`);
+  return parts.join(" ");
+}
+
+/** The pictures with their lines as one PNG, in the pixels of the screen. */
+async function savePictures(): Promise<void> {
+  const stacks = [...document.querySelectorAll<HTMLElement>(".pictures .stack")];
+  const scale = 2;
+  const sizes = stacks.map((stack) => stack.getBoundingClientRect());
+  const canvas = document.createElement("canvas");
+  canvas.width = scale * sizes.reduce((sum, { width }) => sum + width + 8, -8);
+  canvas.height = scale * Math.max(...sizes.map(({ height }) => height));
+  const context = canvas.getContext("2d")!;
+  let x = 0;
+  for (const [i, stack] of stacks.entries()) {
+    const { width, height } = sizes[i]!;
+    const picture = stack.querySelector("img");
+    if (picture) context.drawImage(picture, scale * x, 0, scale * width, scale * height);
+    const lines = stack.querySelector("svg")!;
+    const copy = lines.cloneNode(true) as SVGElement;
+    const drawn = [...lines.querySelectorAll("path")];
+    copy.querySelectorAll("path").forEach((path, j) => {
+      const style = getComputedStyle(drawn[j]!);
+      for (const name of ["fill", "stroke", "stroke-width", "stroke-dasharray", "vector-effect"]) path.setAttribute(name, style.getPropertyValue(name));
+    });
+    copy.setAttribute("xmlns", "http://www.w3.org/2000/svg");
+    copy.setAttribute("width", String(width));
+    copy.setAttribute("height", String(height));
+    const image = new Image();
+    image.src = `data:image/svg+xml,${encodeURIComponent(new XMLSerializer().serializeToString(copy))}`;
+    await image.decode();
+    context.drawImage(image, scale * x, 0, scale * width, scale * height);
+    x += width + 8;
+  }
+  const link = document.createElement("a");
+  link.href = canvas.toDataURL("image/png");
+  link.download = `${episodeName.value}_call${replan.value}.png`;
+  link.click();
+}
+
+function Drawer() {
+  const copied = signal("");
+  const copy = (what: string, text: string): void => void navigator.clipboard.writeText(text).then(() => (copied.value = what));
+  const command = commandLine();
+  return (
+    <section class="drawer" aria-label="More">
+      <p>
+        <button onClick={() => copy("link", location.href)}>Copy link</button>{" "}
+        <button onClick={() => void savePictures()}>Save picture</button>{" "}
+        <button onClick={() => copy("command", command)}>Copy command</button> <span role="status">{copied}</span>
+      </p>
+      <p><code>{command}</code></p>
+      <p class="soft">Keys: ← → call, space plays, [ ] layer, , . head, - + denoise step, Esc overview.</p>
+    </section>
+  );
+}
+
+export function EpisodePage() {
+  const { value: episode, error } = about.value;
+  const back = onlyEpisode.value ? null : <button class="back" onClick={() => setPart({ episode: "" })}>← episodes</button>;
+  if (error) return <div class="episode">{back}<p class="error" role="alert">{error}</p></div>;
+  if (!episode || !run.value) return <div class="episode">{back}<p class="soft">Reading {part("episode")} …</p></div>;
+  return (
+    <div class="episode">
+      <header>
+        {back}
+        <p class={`verdict ${kindOf(episode)}`} role="status">{episode.verdict}</p>
+      </header>
+      {episode.told_other ? <p class="banner" role="alert">The policy was told '{episode.told}'; the task is '{episode.instruction}'.</p> : null}
+      {run.value.changed.map((line) => <p class="banner" key={line}>{line}</p>)}
+      <div class="top"><Title /><Controls /></div>
+      {more.value ? <Drawer /> : null}
+      {part("beside") ? <><SideBySide /><Legend /><div class="columns"><div class="main"><Timeline /></div><aside><Actions /><Ratio /></aside></div></> : (
+        <div class="columns">
+          <div class="main"><Pictures scene={main} at={replan.value} /><Legend /><Timeline /></div>
+          <aside>
+            <AboutWords />
+            <Ratio />
+            <HeadGrid />
+            <OwnGroup />
+            <Actions />
+          </aside>
+        </div>
+      )}
+      {rows.value.error ? <p class="error" role="alert">{rows.value.error}</p> : null}
+    </div>
+  );
+}

@@ -1,0 +1,49 @@
+/** The page: the overview of a run, or one of its episodes. */
+import { effect } from "@preact/signals";
+import { render } from "preact";
+
+import "./page.css";
+import { EpisodePage } from "./episode";
+import { Overview } from "./overview";
+import { axes, beside, denoise, effects, episodeName, head, layer, main, playing, replan, runs, setPart } from "./state";
+
+function App() {
+  if (runs.value.error) return <p class="error" role="alert">{runs.value.error}</p>;
+  if (!runs.value.value) return <p class="soft">Reading …</p>;
+  return episodeName.value ? <EpisodePage /> : <Overview />;
+}
+
+/** The choice before or after this one, the mean before the first. */
+function next(known: readonly number[] | undefined, now: number | "mean", by: number): number | "mean" {
+  const all = ["mean" as const, ...(known ?? [])];
+  return all[Math.max(0, Math.min(all.length - 1, all.indexOf(now) + by))]!;
+}
+
+addEventListener("keydown", (event) => {
+  const on = event.target as HTMLElement;
+  if (event.ctrlKey || event.metaKey || event.altKey || on.matches("input:not([type=range]), select, textarea") || !episodeName.value) return;
+  const acts: Record<string, () => void> = {
+    ArrowLeft: () => setPart({ replan: Math.max(0, replan.value - 1) }),
+    ArrowRight: () => setPart({ replan: replan.value + 1 }),
+    "[": () => setPart({ layer: next(axes.value?.layers, layer.value, -1) }),
+    "]": () => setPart({ layer: next(axes.value?.layers, layer.value, 1) }),
+    ",": () => setPart({ head: next(axes.value?.heads, head.value, -1) }),
+    ".": () => setPart({ head: next(axes.value?.heads, head.value, 1) }),
+    "-": () => setPart({ denoise: next(axes.value?.denoise_steps, denoise.value, -1) }),
+    "+": () => setPart({ denoise: next(axes.value?.denoise_steps, denoise.value, 1) }),
+    " ": () => (playing.value = !playing.value),
+    Escape: () => setPart({ episode: "" }),
+  };
+  const act = acts[event.key];
+  if (!act || (event.key === " " && on.matches("button")) || (event.key.startsWith("Arrow") && on.matches("input[type=range]"))) return;
+  event.preventDefault();
+  act();
+});
+
+const page = document.getElementById("page")!;
+render(<App />, page);
+// For who waits until all is drawn.
+effect(() => {
+  const ready = !runs.value.pending && (episodeName.value === "" || (main.ready.value && beside.ready.value && !effects.value.pending));
+  requestAnimationFrame(() => (page.dataset.ready = ready ? "1" : ""));
+});

@@ -1,0 +1,76 @@
+/** Numbers of this replan: the ratio, the parts of the attention, and the own group of clicked patches and words. */
+import { useState } from "preact/hooks";
+
+import { groups, layerPlace, layout, masses, massesAt, pick, picked, pickedKeys, replan, typed, uniformAt, words } from "./state";
+import { type Keys } from "./state";
+import { percent, range, shown, sumOf } from "./sums";
+
+export function Ratio() {
+  const numbers = groups.value.value;
+  if (groups.value.error) return <p class="soft">{groups.value.error}</p>;
+  if (!numbers) return null;
+  const at = (grid: typeof numbers.ratio): number | null => grid?.[replan.value]?.[layerPlace(numbers)] ?? null;
+  const parts = Object.entries(numbers.groups).map(([name, of]) => ({ name, fraction: at(of.fraction) ?? 0, mass: at(of.mass), keys: at(of.keys), lift: at(of.lift) })).filter(({ keys }) => (keys ?? 0) > 0);
+  return (
+    <section class="ratio" aria-label="Attention in this call">
+      {numbers.sides ? (
+        <p>
+          <b class="figure" data-number="ratio" data-value={at(numbers.ratio)}>{shown(at(numbers.ratio))}</b> pictures / text{" "}
+          <span class="soft">an even spread gives <span data-number="uniform" data-value={at(numbers.uniform_ratio)}>{shown(at(numbers.uniform_ratio))}</span>: this is <span data-number="lift" data-value={at(numbers.ratio_lift)}>{shown(at(numbers.ratio_lift))}</span> times that</span>
+          <span class="hint" title="Where the attention of the action queries went. It does not show what the policy used, and not why it acted: the effect of a word does.">?</span>
+        </p>
+      ) : null}
+      <div class="bar" role="img" aria-label={parts.map(({ name, fraction }) => `${name} ${percent(fraction)}`).join(", ")}>
+        {parts.map(({ name, fraction }, i) => <span key={name} class={`part part-${i % 6}`} style={{ flexGrow: String(fraction) }} title={`${name}: ${percent(fraction)}`} />)}
+      </div>
+      <table class="numbers">
+        <thead><tr><th /><th>keys</th><th>attention</th><th>times even</th></tr></thead>
+        <tbody>
+          {parts.map(({ name, mass, keys, lift }, i) => (
+            <tr key={name} data-group={name}><th><span class={`dot part-${i % 6}`} />{name}</th><td>{shown(keys)}</td><td data-number={`mass-${name}`} data-value={mass}>{percent(mass)}</td><td>{shown(lift)}</td></tr>
+          ))}
+        </tbody>
+      </table>
+    </section>
+  );
+}
+
+function Side({ name, keys }: { name: string; keys: Keys }) {
+  const [mass, even] = [massesAt(replan.value), uniformAt(replan.value)];
+  if (!keys.size || !mass || !even) return null;
+  const own = sumOf(mass, keys);
+  return <tr><th>{name}</th><td>{keys.size}</td><td data-number={`own-${name}`} data-value={own}>{percent(own)}</td><td>{shown(own / sumOf(even, keys))}</td></tr>;
+}
+
+/** Patches and words that were clicked, what they get, and their ratio. */
+export function OwnGroup() {
+  const [text, setText] = useState(picked.value.selector);
+  const { seen, read } = pickedKeys(replan.value);
+  const [mass, even] = [massesAt(replan.value), uniformAt(replan.value)];
+  const any = seen.size + read.size > 0;
+  const allWords = range(words.value.length);
+  const whole = Object.fromEntries(Object.entries(layout.value?.cameras ?? {}).map(([camera, { rows, columns }]) => [camera, range(rows * columns)]));
+  const ratio = seen.size && read.size && mass && even ? [sumOf(mass, seen) / sumOf(mass, read), sumOf(even, seen) / sumOf(even, read)] : null;
+  return (
+    <section class="own" aria-label="Own group">
+      <h2>Own group</h2>
+      {any || picked.value.selector ? null : <p class="soft">Click patches in the pictures and words in the title, or type a <span title="camera:NAME, object:NAME, word:bowl, role:image, patch:CAMERA[r0:r1,c0:c1], joined by | & -">selector</span>.</p>}
+      {any ? (
+        <table class="numbers">
+          <thead><tr><th /><th>keys</th><th>attention</th><th>times even</th></tr></thead>
+          <tbody><Side name="patches" keys={seen} /><Side name="words" keys={read} /></tbody>
+        </table>
+      ) : null}
+      {ratio ? <p><b class="figure" data-number="own-ratio">{shown(ratio[0])}</b> patches / words <span class="soft">an even spread gives {shown(ratio[1])}: this is {shown(ratio[0]! / ratio[1]!)} times that</span></p> : null}
+      {seen.size && !read.size && words.value.length ? <p><button onClick={() => pick({ words: allWords })}>Ratio to the whole instruction</button></p> : null}
+      {read.size && !seen.size && Object.keys(whole).length ? <p><button onClick={() => pick({ cells: whole })}>Ratio of all pictures to these words</button></p> : null}
+      <form onSubmit={(event) => { event.preventDefault(); pick({ selector: text.trim() }); }}>
+        <input aria-label="Selector" placeholder="object:red_cube | patch:…" value={text} onInput={(event) => setText(event.currentTarget.value)} />
+        <button>Add</button>
+        {any || picked.value.selector ? <button type="button" onClick={() => { setText(""); pick({ cells: {}, words: [], selector: "" }); }}>Clear</button> : null}
+      </form>
+      {typed.value.error ? <p class="error" role="alert">{typed.value.error}</p> : null}
+      {masses.value === null ? <p class="soft">reading …</p> : null}
+    </section>
+  );
+}

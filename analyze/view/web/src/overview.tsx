@@ -1,0 +1,137 @@
+/** The first page: what the run shows, and its episodes as pictures, task by task. */
+import { computed, signal } from "@preact/signals";
+
+import { address, type EpisodeLine } from "./answers";
+import { openEpisode, part, run, runNumber, runNumbers, runs, setPart } from "./state";
+import { shown } from "./sums";
+
+const FAILED = ["failed", "fails", "failure", "unsolved", "unsuccessful"];
+
+/** Whether an episode fits all words of a search; "failed", "not solved" and "solved" are outcomes. */
+export function fits(line: EpisodeLine, search: string): boolean {
+  const text = search.toLowerCase().replace(/\bnot (solved|successful)\b/g, "failed");
+  const known = [line.name, line.instruction, line.told, line.verdict, line.failed].join(" ").toLowerCase();
+  return text.split(/\s+/).filter(Boolean).every((word) => {
+    if (FAILED.includes(word)) return line.outcome === false;
+    if (["solved", "successful", "success"].includes(word)) return line.outcome === true;
+    return known.includes(word);
+  });
+}
+
+const chips: Record<string, { name: string; holds: (line: EpisodeLine, median: number) => boolean }> = {
+  all: { name: "all", holds: () => true },
+  failed: { name: "failed", holds: ({ outcome }) => outcome === false },
+  other: { name: "wrong object or goal", holds: ({ did_other }) => did_other === true },
+  long: { name: "long", holds: ({ num_steps }, median) => num_steps > 1.5 * median },
+  told: { name: "told something else", holds: (line) => line.told_other },
+  damaged: { name: "cannot be read", holds: ({ failed }) => failed !== undefined },
+};
+
+const medians = computed(() => {
+  const of = new Map<number, number[]>();
+  for (const line of run.value?.episodes ?? []) of.set(line.task, [...(of.get(line.task) ?? []), line.num_steps ?? 0]);
+  return new Map([...of].map(([task, steps]) => [task, steps.sort((a, b) => a - b)[Math.floor(steps.length / 2)]!]));
+});
+
+const listed = computed(() => {
+  const chip = chips[part("show")] ?? chips.all!;
+  return (run.value?.episodes ?? []).filter((line) => chip.holds(line, medians.value.get(line.task)!) && fits(line, part("find")));
+});
+
+const tasks = computed(() => {
+  const of = new Map<string, EpisodeLine[]>();
+  for (const line of listed.value) {
+    const title = line.failed === undefined ? `${line.task}\t${line.instruction}` : `${line.task}\t`;
+    of.set(title, [...(of.get(title) ?? []), line]);
+  }
+  return [...of].map(([title, lines]) => ({ task: title.split("\t")[0]!, instruction: title.split("\t")[1]!, lines }));
+});
+
+export function kindOf(line: EpisodeLine): "solved" | "failed" | "unknown" {
+  return line.outcome === true ? "solved" : line.outcome === false ? "failed" : "unknown";
+}
+
+function Card({ line }: { line: EpisodeLine }) {
+  const numbers = runNumbers.value?.episodes.find(({ name }) => name === line.name);
+  return (
+    <button class={`card ${kindOf(line)}`} title={line.failed ?? line.verdict} onClick={() => openEpisode(line.name)}>
+      {line.picture ? (
+        <img src={address.picture(runNumber.value, line.name, ...line.picture)} alt="" loading="lazy" />
+      ) : (
+        <span class="no-picture">{line.failed === undefined ? "no pictures" : "cannot be read"}</span>
+      )}
+      <span class="about">
+        <b>{line.outcome === true ? "✓" : line.outcome === false ? "✗" : "·"} {line.episode}</b>
+        {line.num_steps ? <span>{line.num_steps} steps</span> : null}
+        {numbers?.ratio != null ? <span class="soft" title={`ratio ${runNumbers.value?.ratio ?? ""}, and times what even attention gives`}>{shown(numbers.ratio)} (×{shown(numbers.lift)})</span> : null}
+      </span>
+    </button>
+  );
+}
+
+const FIRST_FINDINGS = 2;
+const all = signal(false);
+
+function Findings() {
+  const numbers = runNumbers.value;
+  if (numbers?.findings) {
+    return (
+      <section class="findings" aria-label="What the run shows">
+        {numbers.findings.slice(0, all.value ? undefined : FIRST_FINDINGS).map(({ asks, sentence, limit }) => (
+          <p key={sentence}>
+            <b>{asks}</b> {sentence} {limit ? <span class="soft">{limit}</span> : null}
+          </p>
+        ))}
+        {numbers.findings.length > FIRST_FINDINGS ? <button onClick={() => (all.value = !all.value)}>{all.value ? "fewer" : `${numbers.findings.length - FIRST_FINDINGS} more`}</button> : null}
+      </section>
+    );
+  }
+  return <section class="findings soft">{numbers?.failed ?? "What the run shows is being computed …"}</section>;
+}
+
+export function Overview() {
+  const shownRun = run.value;
+  if (!shownRun) return null;
+  const solved = shownRun.episodes.filter(({ outcome }) => outcome === true).length;
+  const known = shownRun.episodes.filter(({ outcome }) => outcome === true || outcome === false).length;
+  const used = Object.entries(chips).filter(([name, { holds }]) => name === "all" || shownRun.episodes.some((line) => holds(line, medians.value.get(line.task)!)));
+  return (
+    <div class="overview">
+      <header>
+        {(runs.value.value?.runs.length ?? 0) > 1 ? (
+          <nav>
+            {runs.value.value!.runs.map(({ name }, i) => (
+              <button aria-pressed={i === runNumber.value} onClick={() => setPart({ run: i, show: "all", find: "" })}>{name}</button>
+            ))}
+          </nav>
+        ) : null}
+        <h1>{shownRun.name}</h1>
+        <p>
+          {shownRun.policy}{shownRun.untrained ? " (random weights)" : ""} in {shownRun.suite}:{" "}
+          {shownRun.rerun ? "policy calls of another run, made again" : known ? `${solved} of ${known} episodes solved` : "outcomes not known"}
+        </p>
+        {shownRun.changed.map((line) => <p class="banner" key={line}>{line}</p>)}
+      </header>
+      <Findings />
+      <div class="filters" role="search">
+        {used.map(([name, { name: text }]) => (
+          <button class="chip" aria-pressed={part("show") === name} onClick={() => setPart({ show: name })}>{text}</button>
+        ))}
+        <input type="search" aria-label="Find episodes" placeholder="find: red, failed, not solved …" value={part("find")} onInput={(event) => setPart({ find: event.currentTarget.value })} />
+        <span class="soft" role="status">{listed.value.length} of {shownRun.episodes.length} episodes</span>
+      </div>
+      <div class={tasks.value.every(({ lines }) => lines.length <= 3) ? "tasks few" : "tasks"}>
+        {tasks.value.map(({ task, instruction, lines }) => (
+        <section class="task" key={`${task} ${instruction}`}>
+          <h2><span class="soft">task {task}</span> {instruction}</h2>
+          <div class="cards">{lines.map((line) => <Card key={line.name} line={line} />)}</div>
+        </section>
+        ))}
+      </div>
+      {!shownRun.episodes.length ? <p>The run has no episodes yet. Load the page again when it has.</p> : null}
+      {shownRun.episodes.length && !listed.value.length ? (
+        <p>No episode fits. <button onClick={() => setPart({ show: "all", find: "" })}>Show all</button></p>
+      ) : null}
+    </div>
+  );
+}

@@ -1,0 +1,128 @@
+/** The pictures of a replan. Attention is lines around patches: the picture itself stays as it was. */
+import { computed, signal } from "@preact/signals";
+
+import { address, type CameraLayout } from "./answers";
+import {
+  about, covered, evenOf, layout, main, massesAt, massesOf, numReplans, pick, picked, type Scene, setPart, toggled, uniformAt,
+} from "./state";
+import { cellLifts, cellSums, outline, percent, shown } from "./sums";
+
+/** Lines stand at this many times what even attention gives; the second is the highest that an episode's maps reach. */
+const FIRST = 2;
+const SECOND = [50, 20, 10, 5];
+
+/** The cell under the pointer. */
+const pointed = signal<{ scene: Scene; camera: string; cell: number } | null>(null);
+
+/** Of both lines, over the whole episode so that they mean the same at every replan. */
+export const levels = computed<readonly number[]>(() => {
+  let highest = 0;
+  for (let at = 0; at < numReplans.value; at++) {
+    const [mass, even] = [massesAt(at), uniformAt(at)];
+    if (mass && even) for (const camera of Object.values(layout.value?.cameras ?? {})) for (const lift of cellLifts(mass, even, camera)) if (lift > highest) highest = lift;
+  }
+  const second = SECOND.find((level) => level <= 0.8 * highest);
+  return second === undefined ? [FIRST] : [FIRST, second];
+});
+
+interface At {
+  readonly scene: Scene;
+  readonly camera: string;
+  readonly how: CameraLayout;
+  readonly at: number;
+}
+
+function Lines({ scene, camera, how, at }: At) {
+  const [mass, even] = [massesOf(scene, at), evenOf(scene, at)];
+  const lifts = mass && even ? cellLifts(mass, even, how) : null;
+  const own = scene === main ? (picked.value.cells[camera] ?? []) : [];
+  const things = scene.covered.value.value?.[camera] ?? {};
+  const episode = scene.about.value.value;
+  const touched = new Set(episode?.events.map(({ thing }) => thing));
+  return (
+    <>
+      {lifts ? levels.value.map((level, i) => {
+        const path = outline(how, (cell) => lifts[cell]! >= level);
+        return <g key={level} class={i ? "second" : "first"}><path class="casing" d={path} /><path class="line" d={path} /></g>;
+      }) : null}
+      {episode?.objects.filter(({ named, name }) => named || touched.has(name)).map(({ name, shown: title, named }) => {
+        const cells = new Set(things[name]?.[at] ?? []);
+        return cells.size ? <path key={name} class={named ? "object named" : "object touched"} d={outline(how, (cell) => cells.has(cell))}><title>{title}</title></path> : null;
+      })}
+      {own.length ? <path class="picked" d={outline(how, (cell) => own.includes(cell))} /> : null}
+    </>
+  );
+}
+
+function cellAt(event: MouseEvent & { currentTarget: Element }, how: CameraLayout): number {
+  const box = event.currentTarget.getBoundingClientRect();
+  const column = Math.floor(((event.clientX - box.left) / box.width) * how.columns);
+  const row = Math.floor(((event.clientY - box.top) / box.height) * how.rows);
+  return Math.max(0, Math.min(how.rows - 1, row)) * how.columns + Math.max(0, Math.min(how.columns - 1, column));
+}
+
+/** What is said of a cell: its share of attention, its lift, the objects that cover it. */
+function aboutCell({ scene, camera, how, at }: At, cell: number): string {
+  const [mass, even] = [massesOf(scene, at), evenOf(scene, at)];
+  if (!mass || !even) return "";
+  const sums = cellSums(mass, how);
+  const ofPicture = sums.reduce((a, b) => a + b, 0);
+  const things = Object.entries(scene.covered.value.value?.[camera] ?? {}).filter(([, ofReplans]) => ofReplans[at]?.includes(cell)).map(([name]) => name.replaceAll("_", " "));
+  const where = `row ${Math.floor(cell / how.columns)}, column ${cell % how.columns}`;
+  return `${where}: ${percent(sums[cell])} of all attention, ${percent(sums[cell]! / ofPicture)} of this picture's, ${shown(cellLifts(mass, even, how)[cell])} times even${things.length ? `, ${things.join(", ")}` : ""}`;
+}
+
+/** One camera at a replan. Clicks on the main episode's pick patches. */
+function Picture(one: At) {
+  const { scene, camera, how, at } = one;
+  const here = pointed.value?.camera === camera && pointed.value.scene === scene ? pointed.value.cell : null;
+  const toggle = (cell: number): void => pick({ cells: { ...picked.value.cells, [camera]: toggled(picked.value.cells[camera] ?? [], cell) } });
+  return (
+    <figure class="picture">
+      <div class="stack" data-camera={camera}>
+        {how.stored ? <img src={address.picture(scene.run.value, scene.name.value, camera, at)} alt={`${camera} at call ${at}`} width={how.width} height={how.height} /> : <div class="grey" />}
+        <svg
+          viewBox={`0 0 ${how.columns} ${how.rows}`} preserveAspectRatio="none" aria-hidden="true"
+          onMouseMove={(event) => (pointed.value = { scene, camera, cell: cellAt(event, how) })}
+          onMouseLeave={() => (pointed.value = null)}
+          onClick={(event) => scene === main && toggle(cellAt(event, how))}
+        >
+          <Lines {...one} />
+          {here === null ? null : <rect class="pointed" x={here % how.columns} y={Math.floor(here / how.columns)} width="1" height="1" />}
+        </svg>
+      </div>
+      <figcaption>
+        <b>{camera}</b>
+        {how.mirrored || !how.upright ? <span class="hint" title={`The policy sees it ${[how.mirrored && "mirrored", !how.upright && "upside down"].filter(Boolean).join(" and ")}; here it is as a person sees the scene.`}>?</span> : null}
+        {how.stored ? null : " no pictures were stored: attention alone"}
+        <span class="soft">{here !== null ? ` ${aboutCell(one, here)}` : how.note ? ` ${how.note}` : ""}</span>
+      </figcaption>
+    </figure>
+  );
+}
+
+/** All pictures of an episode at a replan. */
+export function Pictures({ scene, at }: { scene: Scene; at: number }) {
+  const cameras = Object.entries(scene.layout.value?.cameras ?? {});
+  const episode = scene.about.value.value;
+  if (!episode) return null;
+  if (!cameras.length) {
+    const other = Object.entries(episode.sites).find(([, { cameras: of }]) => Object.keys(of).length)?.[0];
+    return <p>The keys of this site are no patches of pictures. {other ? <button onClick={() => setPart({ site: other })}>Show site {other}</button> : null}</p>;
+  }
+  return (
+    <section class={`pictures of-${Math.min(cameras.length, 3)}`} aria-label="Pictures" aria-busy={scene.masses.value === null}>
+      {cameras.map(([camera, how]) => <Picture key={camera} scene={scene} camera={camera} how={how} at={at} />)}
+    </section>
+  );
+}
+
+export function Legend() {
+  return (
+    <p class="legend soft">
+      <svg viewBox="0 0 24 8" class="sample first"><path class="casing" d="M2 4H22" /><path class="line" d="M2 4H22" /></svg>{FIRST} times the attention of an even spread
+      {levels.value[1] ? <><svg viewBox="0 0 24 8" class="sample second"><path class="casing" d="M2 4H22" /><path class="line" d="M2 4H22" /></svg>{levels.value[1]} times</> : null}
+      {about.value.value?.objects.length && covered.value.value ? <><svg viewBox="0 0 24 8" class="sample"><path class="object named" d="M2 4H22" /></svg>named in the task <svg viewBox="0 0 24 8" class="sample"><path class="object touched" d="M2 4H22" /></svg>touched</> : null}
+    </p>
+  );
+}

@@ -1,0 +1,89 @@
+/** Sums of the arrays that the server sent, and nothing else that is computed here. Axes: (replan, denoise[, head], key). */
+import type { CameraLayout, NumberArray } from "./answers";
+
+/** A place on an axis, or the mean over it. */
+export type Choice = number | "mean";
+
+/** Masses of all keys at every replan, (replan) of (key): of a denoise step and head, or means over them. */
+export function keyMasses({ shape, data }: NumberArray, denoise: Choice, head: Choice): Float64Array[] {
+  const keys = shape.at(-1)!;
+  const [replans, steps] = [shape[0]!, shape[1]!];
+  const heads = shape.length === 4 ? shape[2]! : 1;
+  const ofSteps = denoise === "mean" || steps === 1 ? range(steps) : [denoise];
+  const ofHeads = head === "mean" || heads === 1 ? range(heads) : [head];
+  const share = 1 / (ofSteps.length * ofHeads.length);
+  return range(replans).map((replan) => {
+    const mean = new Float64Array(keys);
+    for (const step of ofSteps) {
+      for (const one of ofHeads) {
+        const first = ((replan * steps + step) * heads + one) * keys;
+        for (let key = 0; key < keys; key++) mean[key]! += data[first + key]! * share;
+      }
+    }
+    return mean;
+  });
+}
+
+/** The sum over some keys, each with a weight. */
+export function sumOf(masses: ArrayLike<number>, keys: Iterable<readonly [number, number]>): number {
+  let sum = 0;
+  for (const [key, weight] of keys) sum += masses[key]! * weight;
+  return sum;
+}
+
+/** Masses of keys as cells of a camera's map. */
+export function cellSums(masses: ArrayLike<number>, { rows, columns, keys, cells, shares }: CameraLayout): Float64Array {
+  const sums = new Float64Array(rows * columns);
+  keys.forEach((key, i) => (sums[cells[i]!]! += masses[key]! * (shares ? shares[i]! : 1)));
+  return sums;
+}
+
+/** Of every cell how many times what uniform attention gives it; NaN where that is nothing. */
+export function cellLifts(masses: ArrayLike<number>, uniform: ArrayLike<number>, camera: CameraLayout): Float64Array {
+  const even = cellSums(uniform, camera);
+  return cellSums(masses, camera).map((mass, cell) => (even[cell]! > 0 ? mass / even[cell]! : NaN));
+}
+
+/** Lines around the cells for which `inside` holds, as a path in units of cells. */
+export function outline({ rows, columns }: { rows: number; columns: number }, inside: (cell: number) => boolean): string {
+  const parts: string[] = [];
+  const holds = (row: number, column: number): boolean =>
+    row >= 0 && row < rows && column >= 0 && column < columns && inside(row * columns + column);
+  // Runs of edges become one line each.
+  for (let row = 0; row <= rows; row++) {
+    for (let column = 0, begin = -1; column <= columns; column++) {
+      const edge = column < columns && holds(row, column) !== holds(row - 1, column);
+      if (edge && begin < 0) begin = column;
+      if (!edge && begin >= 0) {
+        parts.push(`M${begin} ${row}H${column}`);
+        begin = -1;
+      }
+    }
+  }
+  for (let column = 0; column <= columns; column++) {
+    for (let row = 0, begin = -1; row <= rows; row++) {
+      const edge = row < rows && holds(row, column) !== holds(row, column - 1);
+      if (edge && begin < 0) begin = row;
+      if (!edge && begin >= 0) {
+        parts.push(`M${column} ${begin}V${row}`);
+        begin = -1;
+      }
+    }
+  }
+  return parts.join("");
+}
+
+export function range(count: number): number[] {
+  return Array.from({ length: count }, (_, i) => i);
+}
+
+/** Numbers as the commands print them: three digits. */
+export function shown(value: number | null | undefined): string {
+  if (value === null || value === undefined || !Number.isFinite(value)) return "-";
+  return String(Number(value.toPrecision(3)));
+}
+
+export function percent(value: number | null | undefined): string {
+  if (value === null || value === undefined || !Number.isFinite(value)) return "-";
+  return `${Number((100 * value).toPrecision(100 * value >= 10 ? 3 : 2))}%`;
+}

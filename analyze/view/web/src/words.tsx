@@ -1,0 +1,111 @@
+/** The instruction as a title: its words shaded by attention or by effect, and what is known of the picked one. */
+import { computed } from "@preact/signals";
+
+import type { Effect } from "./answers";
+import { about, effectOf, effects, massesAt, part, pick, picked, replan, setPart, toggled, uniformAt, words } from "./state";
+import { percent, shown, sumOf } from "./sums";
+
+/** attention, effect (of this replan), effects (over the episode); the effect where it was recorded. */
+type Shade = "attention" | "effect" | "effects";
+export const shade = computed<Shade>(() => {
+  const given = part("words");
+  if (given === "attention" || !effects.value.value?.items.length) return "attention";
+  return given === "effects" ? "effects" : "effect";
+});
+
+const once = (keys: readonly number[]): [number, number][] => keys.map((key) => [key, 1]);
+
+/** Attention to a word for its number of tokens: times what even attention gives. */
+function liftOf(keys: readonly number[], at: number): number {
+  const [mass, even] = [massesAt(at), uniformAt(at)];
+  return mass && even ? sumOf(mass, once(keys)) / sumOf(even, once(keys)) : NaN;
+}
+
+export function effectOfWord(text: string): Effect | null {
+  return effectOf(`'${text}'`) ?? effectOf(`'${text.toLowerCase()}'`);
+}
+
+/** Another noise seed's effect at a replan. */
+function noiseAt(at: number): number {
+  return effects.value.value?.items.find(({ kind }) => kind === "noise")?.effect[at] ?? NaN;
+}
+
+interface Shaded {
+  readonly strength: number;
+  /** Not more than another noise seed. */
+  readonly none: boolean;
+  readonly title: string;
+}
+
+const shades = computed<readonly Shaded[]>(() => {
+  const [at, whole] = [replan.value, shade.value === "effects"];
+  const values = words.value.map(({ text, keys }) => {
+    const effect = effectOfWord(text);
+    return { lift: liftOf(keys, at), effect: (whole ? effect?.mean : effect?.effect[at]) ?? NaN, noise: (whole ? effect?.noise : noiseAt(at)) ?? NaN };
+  });
+  const of = (one: (typeof values)[0]): number => (shade.value === "attention" ? one.lift : one.effect);
+  const highest = Math.max(shade.value === "attention" ? 4 : 0, ...values.map(of).filter(Number.isFinite));
+  return values.map((one) => {
+    const none = shade.value !== "attention" && !(of(one) > one.noise);
+    const read = `attention per token: ${shown(one.lift)} times even`;
+    const moved = Number.isFinite(one.effect) ? `; without it the action moves by ${shown(one.effect)} (another noise seed: ${shown(one.noise)})` : "";
+    return { strength: none || !Number.isFinite(of(one)) ? 0 : Math.max(0, of(one) / highest), none, title: `${read}${moved}` };
+  });
+});
+
+export function Title() {
+  const episode = about.value.value;
+  if (!episode) return null;
+  const chosen = picked.value.words;
+  return (
+    <div class="title">
+      <h1>
+        {words.value.length ? words.value.map(({ text }, i) => (
+          <button
+            key={i} class={`word${shades.value[i]!.none ? " none" : ""}`} aria-pressed={chosen.includes(i)} title={shades.value[i]!.title}
+            style={{ "--strength": shades.value[i]!.strength.toFixed(3) }} onClick={() => pick({ words: toggled(chosen, i) })}
+          >{text}</button>
+        )) : episode.told}
+      </h1>
+      {effects.value.error ? <span class="soft">{effects.value.error}</span> : null}
+    </div>
+  );
+}
+
+/** What the words are shaded by. */
+export function ChooseShade() {
+  if (!effects.value.value?.items.length) return <span class="soft">words shaded by attention per token</span>;
+  return (
+    <label>words by{" "}
+      <select value={shade.value} onChange={(event) => setPart({ words: event.currentTarget.value })}>
+        <option value="effect">effect, this call</option>
+        <option value="effects">effect, whole episode</option>
+        <option value="attention">attention per token</option>
+      </select>
+    </label>
+  );
+}
+
+/** What is known of the picked words. */
+export function AboutWords() {
+  const chosen = picked.value.words.filter((i) => words.value[i]);
+  if (!chosen.length) return null;
+  return (
+    <table class="numbers">
+      <thead><tr><th>word</th><th>attention</th><th>per token</th><th>without it the action moves</th></tr></thead>
+      <tbody>
+        {chosen.map((i) => {
+          const { text, keys } = words.value[i]!;
+          const effect = effectOfWord(text);
+          const mass = massesAt(replan.value);
+          return (
+            <tr key={i}>
+              <th>{text}</th><td>{percent(mass && sumOf(mass, once(keys)))}</td><td>{shown(liftOf(keys, replan.value))} times even</td>
+              <td>{effect ? `${shown(effect.effect[replan.value])}; over the episode ${shown(effect.mean)} (another noise seed ${shown(effect.noise)})` : "not recorded"}</td>
+            </tr>
+          );
+        })}
+      </tbody>
+    </table>
+  );
+}

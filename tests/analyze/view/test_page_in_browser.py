@@ -1,0 +1,214 @@
+"""The page in a real headless Chromium: Python's numbers in clicks, pictures as they were, hostile texts, copies."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import vla_attention as va
+from tests.kit.browser import Watched, needs_chromium, watched_page
+from tests.kit.http_ranges import serve
+from tests.kit.stores import StoreSpec, rerun_source, write_store
+from tests.kit.viewer import ask, served
+from vla_attention.analyze.__main__ import main
+from vla_attention.analyze.view.server import ViewerServer
+from vla_attention.schemas.interventions import Interventions, PromptChange
+
+pytestmark = needs_chromium
+
+SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=3, layers=(0, 1, 2, 3, 4, 5), num_layers=6)
+FIRST = "#episode=task000_episode000"
+SCRIPT = "<script>alert('bowl')</script>"
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory) -> Path:
+    return write_store(tmp_path_factory.mktemp("browsed") / "run.zarr", spec=SPEC)
+
+
+@pytest.fixture(scope="module")
+def rerun(store) -> Path:
+    changed = Interventions("no words", prompt=PromptChange("text", text="do nothing"))
+    spec = replace(SPEC, seed=7, interventions=changed, rerun_of=rerun_source(store))
+    return write_store(store.parent / "no_words.zarr", spec=spec)
+
+
+@pytest.fixture(scope="module")
+def server(store, rerun) -> Iterator[ViewerServer]:
+    with served(store, rerun, summaries=True) as running:
+        running.stores[0].summary.wait()
+        yield running
+
+
+def mass(store: Path, group: str, replan: int, **cell: int) -> float:
+    """Python's mass of a group in the first episode, the mean over the layers, denoise steps and heads of a cell."""
+    steps = va.open(store).analyze(per_head=True, tasks=0)["steps_groups"].filter(episode_index=0, replan=replan)
+    return float(steps.filter(group=group, **cell)["mass"].mean())
+
+
+def test_numbers_are_pythons_for_the_mean_a_layer_and_a_head(view, server, store):
+    ratios = va.open(store).analyze(tasks=0)["replans"].filter(episode_index=0, replan=1)
+    for link, layer, cell in (("", "layers_avg", {}), ("&layer=4", "4", {"layer": 4})):
+        view.open(f"{server.link}{FIRST}&replan=1{link}")
+        for group in ("visual", "linguistic", "state", "action"):
+            shown = view.value(f'[data-number="mass-{group}"]')
+            assert shown == pytest.approx(mass(store, group, 1, **cell), rel=1e-6)
+        (row,) = ratios.filter(layer=layer).iter_rows(named=True)
+        assert view.value('[data-number="ratio"]') == pytest.approx(row["ratio"], rel=1e-9)
+        assert view.value('[data-number="lift"]') == pytest.approx(row["ratio_lift"], rel=1e-9)
+    # One head by a click, the next replan by a key: the link names them and shows the same again.
+    view.page.locator(".heads td button").nth(3 * 2 + 1).click()
+    view.wait_for_link("head=1")
+    view.page.keyboard.press("ArrowRight")
+    view.wait_for_link("replan=2")
+    shown = view.value('[data-number="mass-visual"]')
+    assert shown == pytest.approx(mass(store, "visual", 2, layer=3, head=1), rel=1e-6)
+    view.open(view.page.url)
+    assert view.value('[data-number="mass-visual"]') == shown
+
+
+def test_clicked_patches_and_words_are_a_group_and_its_ratio(view, server, store):
+    view.open(f"{server.link}{FIRST}")
+    view.page.locator(".word").nth(1).click()
+    stack = view.page.locator(".stack svg").first
+    stack.click(position={"x": 1, "y": 1})
+    view.wait_for_link("group=")
+    camera = view.page.locator(".stack").first.get_attribute("data-camera")
+    about = view.page.evaluate("fetch('runs/0/task000_episode000/about.json').then((reply) => reply.json())")
+    how, word = about["sites"]["joint"]["cameras"][camera], about["sites"]["joint"]["prompts"][0]["words"][1]
+    key = how["keys"][how["cells"].index(0)]
+    selectors = {"patch": f"keys:{key}-{key}", "word": f"keys:{word['keys'][0]}-{word['keys'][-1]}"}
+    result = va.open(store).analyze(groups=selectors, ratio=("patch", "word"), tasks=0)["replans_groups"]
+    cells = result.filter(episode_index=0, replan=0, layer="layers_avg")
+    expected = dict(cells.select("group", "mass").iter_rows())
+    assert view.value('[data-number="own-patches"]') == pytest.approx(expected["patch"], rel=1e-5)
+    assert view.value('[data-number="own-words"]') == pytest.approx(expected["word"], rel=1e-5)
+    # A typed selector is resolved by the server, and so is what is wrong with it.
+    view.page.fill('[aria-label="Selector"]', "word:nothing")
+    view.page.locator(".own form button").first.click()
+    view.page.wait_for_selector('[role="alert"]')
+    assert "no instruction has the word 'nothing'" in view.page.inner_text('[role="alert"]')
+    view.complaints.clear()  # the browser reports every answer of 422
+
+
+def test_the_overview_finds_episodes(view, server, store):
+    view.open(server.link)
+    episodes = va.open(store).episodes
+    for text, solved in (("failed", False), ("not solved", False), ("solved", True)):
+        view.page.fill('input[type="search"]', text)
+        assert view.page.locator(".card").count() == episodes.filter(success=solved).height
+        assert (
+            view.page.locator(f".card.{'solved' if solved else 'failed'}").count() == view.page.locator(".card").count()
+        )
+    view.page.fill('input[type="search"]', "nothing like it")
+    assert view.page.locator(".card").count() == 0
+    view.page.get_by_text("Show all").click()
+    view.page.locator(".card").first.click()
+    view.wait_for_link("episode=task000_episode000")
+    ratios = va.open(store).analyze()["episodes"].filter(layer="layers_avg").sort("task_id", "episode_index")
+    view.page.go_back()
+    view.page.wait_for_selector(".card .soft")
+    shown = [float(text.split(" ")[0]) for text in view.page.locator(".card .soft").all_inner_texts()]
+    assert shown == [float(f"{ratio:.3g}") for ratio in ratios["geometric_mean"]]
+
+
+def test_outside_of_the_lines_no_pixel_of_a_picture_changes(view, server):
+    """The picture is laid out in its own size; where no line is drawn, the screen shows its pixels."""
+    view.open(f"{server.link}{FIRST}")
+    stack = view.page.locator(".stack").first
+    camera = stack.get_attribute("data-camera")
+    lines = np.array(Image.open(io.BytesIO(stack.screenshot())).convert("RGB")).astype(int)
+    view.page.evaluate("document.querySelectorAll('.stack svg').forEach((one) => one.remove())")
+    plain = np.array(Image.open(io.BytesIO(stack.screenshot())).convert("RGB")).astype(int)
+    reply = ask(server, f"runs/0/task000_episode000/pictures/{camera}/0.png")
+    assert reply.status == 200
+    changed = (lines != plain).any(axis=-1)
+    assert 0 < changed.mean() < 0.35
+    # What changed is lines: no changed area holds a square as wide as two lines.
+    width = 12
+    counts = np.lib.stride_tricks.sliding_window_view(changed, (width, width)).mean(axis=(2, 3))
+    assert counts.max() < 1
+
+
+def test_a_run_and_its_rerun_stand_side_by_side(view, server, rerun):
+    view.open(f"{server.link}{FIRST}&replan=1")
+    view.page.select_option(".controls select >> nth=-1", "1:task000_episode000")
+    view.wait_for_link("beside=1")
+    verdicts = view.page.locator(".beside .verdict").all_inner_texts()
+    assert verdicts[1].startswith("Outcome not run")
+    ratio = va.open(rerun).analyze(tasks=0)["replans"].filter(episode_index=0, replan=1, layer="layers_avg")["ratio"][0]
+    assert f"ratio {float(f'{ratio:.3g}'):g}," in view.page.locator(".beside > div").nth(1).inner_text()
+
+
+def test_another_prompt_is_a_banner(browser, server):
+    with watched_page(browser) as watched:
+        watched.open(f"{server.link}#run=1&episode=task000_episode000")
+        assert "do nothing" in watched.page.locator(".banner").first.inner_text()
+
+
+def texts_are_text(watched: Watched, link: str) -> None:
+    from tests.analyze.test_hostile_stores import INSTRUCTION
+
+    assert SCRIPT in INSTRUCTION
+    watched.open(f"{link}{FIRST}")
+    assert watched.complaints == []
+    assert watched.page.locator("iframe, object, embed, body script").count() == 0
+    assert "alert" in watched.page.inner_text("h1")
+    assert "\u202e" not in watched.page.inner_text("body")
+    assert watched.requests_beside(link) == []
+
+
+def test_texts_of_a_store_are_text(browser, tmp_path):
+    from tests.analyze.test_hostile_stores import hostile_texts
+
+    store = write_store(tmp_path / "a.zarr", spec=replace(SPEC, tasks=(0,), episodes=1))
+    hostile_texts(store)
+    with served(store, summaries=True) as running, watched_page(browser) as watched:
+        running.stores[0].summary.wait()
+        texts_are_text(watched, running.link)
+
+
+def test_a_damaged_chunk_is_a_sentence_and_no_number(browser, store, tmp_path):
+    damaged = shutil.copytree(store, tmp_path / "a.zarr")
+    (file,) = (damaged / "episodes/task000_episode000/joint/rows").glob("c*")
+    content = bytearray(file.read_bytes())
+    content[100] ^= 1  # in the first chunk: layer 0, denoise step 0
+    file.write_bytes(content)
+    with served(damaged) as running, watched_page(browser) as watched:
+        watched.page.goto(f"{running.link}{FIRST}&layer=0")
+        watched.page.wait_for_selector('[role="alert"]')
+        assert "cannot be read" in watched.page.locator('[role="alert"]').first.inner_text()
+        watched.open(f"{running.link}{FIRST}&layer=5")
+        assert watched.value('[data-number="mass-visual"]') > 0
+
+
+def shown_of(watched: Watched, link: str) -> list[Any]:
+    watched.open(link)
+    values = [watched.value(f'[data-number="{name}"]') for name in ("ratio", "mass-visual", "mass-linguistic")]
+    paths = watched.page.locator(".stack path").evaluate_all("all => all.map((one) => one.getAttribute('d'))")
+    widths = watched.page.locator(".stack img").evaluate_all("all => all.map((one) => one.naturalWidth)")
+    return [*values, *paths, *widths, *watched.page.locator(".heads p").all_inner_texts()[:1]]
+
+
+def test_copies_show_the_same_from_a_folder_below_a_path_and_from_disk(browser, server, store, tmp_path):
+    assert main(["view", str(store), "--site", str(tmp_path / "www/deep/site")]) == 0
+    assert main(["view", str(store), "--file", str(tmp_path / "one.html"), "--task", "0", "--episode", "0"]) == 0
+    state = f"{FIRST}&replan=1&layer=2&denoise=9"
+    with serve(tmp_path / "www") as site, watched_page(browser) as watched:
+        expected = shown_of(watched, f"{server.link}{state}")
+        assert len(expected) > 6
+        assert shown_of(watched, f"{site.url}/deep/site/index.html{state}") == expected
+        assert shown_of(watched, f"{(tmp_path / 'one.html').as_uri()}{state}") == expected
+        assert watched.complaints == []
+        watched.page.fill('[aria-label="Selector"]', "word:the")
+        watched.page.locator(".own form button").first.click()
+        watched.page.wait_for_selector('[role="alert"]')
+        assert "vla-attention view" in watched.page.inner_text('[role="alert"]')
