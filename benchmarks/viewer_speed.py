@@ -1,11 +1,6 @@
-"""How long the viewer's page takes: to the first picture, for another layer, head or step, and how many bytes it reads.
+"""How quickly the page answers: the list, the first picture, layers and replans, on a store of full size.
 
 Usage: python benchmarks/viewer_speed.py [--store PATH] [--rounds 5]
-
-Writes a store of the shape of pi0.5 in LIBERO unless it exists (978 keys, 18 layers, 8 heads, two denoise steps,
-pictures; episodes of 40 replans, two of which are made and the others are the same again, about 1 GB in all), serves it
-with the viewer's own server, and drives the machine's Chromium with playwright. It prints medians with the lowest and
-the highest, and asserts nothing.
 """
 
 from __future__ import annotations
@@ -16,7 +11,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,16 +20,16 @@ from repeated_store import repeat_store
 
 sys.path.insert(0, str(ROOT))
 
-from tests.kit.browser import Watched, chromium, watched_page
+from tests.kit.browser import chromium, watched_page
 from tests.kit.stores import StoreSpec, write_store
 from tests.kit.tokens import libero_tokens
-from tests.kit.viewer import served
+from tests.kit.viewer import ask, served
 
-EPISODES, REPLANS = 50, 40
+EPISODES, REPLANS = 500, 40
 
 
 def make_store(path: Path) -> None:
-    """Write the store; two episodes take half a minute."""
+    """Write the store: two episodes, repeated."""
     spec = StoreSpec(
         suite="libero_10",
         tasks=(0, 1),
@@ -50,72 +45,51 @@ def make_store(path: Path) -> None:
     repeat_store(source, path, EPISODES // 2)
 
 
-def shown(name: str, values: Sequence[float], unit: str) -> str:
-    """A line: the median, the lowest and the highest."""
-    middle = statistics.median(values)
-    return f"{name:<52} {middle:8.1f} {unit}  [{min(values):.1f}, {max(values):.1f}]  n={len(values)}"
-
-
-def first_pictures(browser: Any, server: Any, rounds: int) -> list[float]:
-    """Seconds from asking for the link to a whole page, each time in a browser that knows nothing of it."""
+def measured(name: str, act: Callable[[int], Any], rounds: int) -> None:
+    """Print the median, the lowest and the highest of some rounds."""
     found = []
-    for _ in range(rounds):
-        with watched_page(browser) as watched:
-            begun = time.perf_counter()
-            watched.open(server.link)
-            found.append(time.perf_counter() - begun)
-    return found
-
-
-def changes(watched: Watched, act: Callable[[], None], times: int) -> list[float]:
-    """Milliseconds from a change of the state until all is drawn, as the page measures it."""
-    found = []
-    for _ in range(times):
-        before = watched.page.evaluate("window.viewer.timings.length")
-        act()
-        while watched.page.evaluate("window.viewer.timings.length") == before:
-            time.sleep(0.005)
-        found.append(float(watched.page.evaluate("window.viewer.timings.at(-1).ms")))
-        # A person takes a moment, in which the page reads ahead.
-        time.sleep(0.4)
-    return found
+    for number in range(rounds):
+        begun = time.perf_counter()
+        act(number)
+        found.append(1000 * (time.perf_counter() - begun))
+    print(f"{name:<46} {statistics.median(found):8.1f} ms  [{min(found):.1f}, {max(found):.1f}]  n={rounds}")
 
 
 def measure(store: Path, rounds: int) -> None:
     """Print all figures of a store."""
-    size = sum(path.stat().st_size for path in store.rglob("*") if path.is_file())
-    print(f"{store}: {size / 1e9:.2f} GB in {EPISODES} episodes of {REPLANS} replans; load {os.getloadavg()[0]:.1f}")
+    print(f"{store}: {EPISODES} episodes of {REPLANS} replans; load {os.getloadavg()[0]:.1f}")
+    own = "runs/0/task000_episode000"
     with served(store) as server, chromium() as browser:
-        print(shown("first picture", first_pictures(browser, server, rounds), "s "))
-        server.sent.clear()
-        with watched_page(browser) as watched:
-            watched.open(server.link)
-            time.sleep(1)
-            rows = sum(count for name, count in server.sent.items() if "/rows/" in name)
-            print(
-                f"read for the first picture: {sum(server.sent.values()) / 1e6:.2f} MB, {rows / 1e6:.2f} MB of it rows"
-            )
-            press = watched.page.keyboard.press
-            for name, link, key, times in (
-                ("another replan, all layers", "?replan=3", "ArrowRight", 20),
-                ("another replan, one layer", "?layer=9&replan=3", "ArrowRight", 20),
-                ("the next layer, read ahead", "?layer=3", "]", 10),
-                ("another head", "?layer=9", ".", 7),
-                ("another denoise step", "?layer=9&head=3", "+", 2),
-                ("values: raw, rank, lift", "?layer=9", "v", 6),
-            ):
+
+        def get(path: str) -> None:
+            reply = ask(server, path)
+            assert reply.status == 200, reply.body[:200]
+
+        def shown(link: str) -> None:
+            with watched_page(browser) as watched:
                 watched.open(f"{server.link}{link}")
-                time.sleep(0.5)
-                print(shown(name, changes(watched, lambda key=key: press(key), times), "ms"))
-            watched.open(f"{server.link}?layer=0")
-            layers = iter((5, 10, 15, 7, 12, 17))
 
-            def far_layer() -> None:
-                watched.page.select_option('select[name="layer"]', str(next(layers)))
+        measured("the list of 500 episodes", lambda _: get("runs.json"), rounds)
+        measured("its page, drawn in a new browser window", lambda _: shown(""), rounds)
+        measured("an episode, first asked", lambda n: get(f"runs/0/task001_episode{n:03d}/about.json"), rounds)
+        measured("its page, drawn in a new browser window", lambda n: shown(f"#episode=task001_episode{n:03d}"), rounds)
+        get(f"{own}/about.json")
+        measured("a layer", lambda n: get(f"{own}/joint/rows/{n % 18}.npy"), 4 * rounds)
+        measured("the mean of all layers", lambda _: get(f"{own}/joint/rows/mean.npy"), rounds)
+        measured("every head of a layer", lambda n: get(f"{own}/joint/heads/{n % 18}.npy"), rounds)
+        measured("a picture", lambda n: get(f"{own}/pictures/base_0_rgb/{n % REPLANS}.png"), 4 * rounds)
+        measured("ratio and masses", lambda _: get(f"{own}/joint/groups/all.json"), rounds)
+        measured("all heads on an object", lambda _: get(f"{own}/joint/grid/0.json"), rounds)
+        with watched_page(browser) as watched:
+            watched.open(f"{server.link}#episode=task000_episode000&layer=3")
 
-            server.sent.clear()
-            print(shown("a layer that was not read before", changes(watched, far_layer, 6), "ms"))
-            print(f"read for each of them, with the layers beside it: {sum(server.sent.values()) / 6e6:.2f} MB")
+            def press(key: str) -> None:
+                watched.page.keyboard.press(key)
+                watched.page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+                watched.settle()
+
+            measured("the next replan, drawn", lambda _: press("ArrowRight"), 4 * rounds)
+            measured("the next layer, drawn", lambda _: press("]"), 2 * rounds)
 
 
 def main() -> None:

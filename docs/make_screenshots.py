@@ -1,6 +1,6 @@
-"""Draw `docs/pictures/viewer_*.png`: the viewer's page on a store of `make capture`, in the machine's Chromium.
+"""Draw `docs/pictures/viewer_*.png`: the page of `vla-attention view`, in the machine's Chromium.
 
-python docs/make_screenshots.py [STORE]
+python docs/make_screenshots.py [STORE], a store of `make capture ARGS="--effects text,objects"`
 """
 
 from __future__ import annotations
@@ -18,32 +18,23 @@ from tests.kit.viewer import served
 from vla_attention.schemas.errors import BadArgument
 
 FOLDER = Path(__file__).parent / "pictures"
-FIRST = {"episode": "task003_episode000", "replan": "2"}
-GROUPS = "cube = object:red_cube\ncolour = word:red\nverb = word:lift"
+FIRST = {"episode": "task003_episode000", "replan": "3"}
 
 
 @dataclass(frozen=True)
 class Screenshot:
-    """A picture: what the link names, the part of the page that is taken (without one the window), and its window."""
+    """A picture: what the link names, and the window."""
 
     link: dict[str, str]
-    part: str = ""
-    ready: str = ""
-    width: int = 1280
+    width: int = 1440
     height: int = 900
     options: dict[str, Any] = field(default_factory=dict)
 
 
 SCREENSHOTS = {
-    "viewer_episode": Screenshot({**FIRST, "layer": "2"}),
-    "viewer_groups": Screenshot(
-        {**FIRST, "grouping": GROUPS}, part='details.panel:has([data-panel="groups"])', ready='[data-panel="groups"]'
-    ),
-    "viewer_compare": Screenshot(
-        {**FIRST, "layer": "2", "other": "0:task004_episode000"},
-        part='details.panel:has([data-panel="compare"])',
-        ready='[data-panel="compare"][data-ready="1"]',
-    ),
+    "viewer_overview": Screenshot({}),
+    "viewer_episode": Screenshot({**FIRST, "group": "words:2"}),
+    "viewer_compare": Screenshot({**FIRST, "beside": "0:task003_episode001"}),
     "viewer_phone": Screenshot(
         FIRST, width=390, height=844, options={"color_scheme": "dark", "has_touch": True, "device_scale_factor": 2}
     ),
@@ -52,17 +43,9 @@ SCREENSHOTS = {
 
 def take(watched: Watched, link: str, wanted: Screenshot, path: Path) -> None:
     """Open the page and write one picture."""
-    watched.open(f"{link}?{urlencode(wanted.link)}")
+    watched.open(f"{link}#{urlencode(wanted.link)}")
     watched.page.wait_for_load_state("networkidle")
-    if not wanted.part:
-        watched.page.screenshot(path=path)
-        return
-    part = watched.page.locator(wanted.part)
-    if part.get_attribute("open") is None:
-        part.locator("summary").first.click()
-    watched.page.wait_for_selector(wanted.ready)
-    watched.page.wait_for_timeout(500)  # what is drawn after it was unfolded
-    part.screenshot(path=path)
+    watched.page.screenshot(path=path)
 
 
 def main() -> None:

@@ -52,6 +52,7 @@ class Answers:
         self._lock = threading.Lock()
         self._open: OrderedDict[tuple[str, str, str], ShownEpisode] = OrderedDict()
         self._units: dict[tuple[str, int], ActionSpread] = {}
+        self._lines: dict[tuple[str, str], dict[str, Any]] = {}
 
     def answer(
         self, stores: Sequence[ServedStore], names: Sequence[str], query: Mapping[str, Sequence[str]]
@@ -63,7 +64,7 @@ class Answers:
             UserError: what it names does not exist, or cannot be read.
         """
         if list(names) == ["runs.json"]:
-            return _json(runs_answer([one.store for one in stores], with_paths=True))
+            return _json(runs_answer([one.store for one in stores], True, self._lines))
         try:
             _, number, episode, *rest = names
             served = stores[int(number)]

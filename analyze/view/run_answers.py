@@ -15,24 +15,33 @@ from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import parse_episode_name
 
 
-def runs_answer(stores: Sequence[Store], with_paths: bool = False) -> dict[str, Any]:
+def runs_answer(
+    stores: Sequence[Store], with_paths: bool = False, known: dict[tuple[str, str], dict[str, Any]] | None = None
+) -> dict[str, Any]:
     """`runs.json`: the runs of the page, each with a line for every episode.
 
-    with_paths: also where the stores are on this machine, for commands to copy; sites of others do not say it.
+    Args:
+        stores: of the runs.
+        with_paths: also where the stores are on this machine, for commands to copy; sites of others do not say it.
+        known: lines of episodes by store's run and name, which are not made again; new ones are added.
     """
+    known = {} if known is None else known
     counts = Counter(store.path.name for store in stores)
     return {
         "runs": [
             {"name": store.path.name if counts[store.path.name] == 1 else str(store.path)}
-            | _run_answer(store)
+            | _run_answer(store, known)
             | ({"path": str(store.path)} if with_paths else {})
             for store in stores
         ]
     }
 
 
-def _run_answer(store: Store) -> dict[str, Any]:
+def _run_answer(store: Store, known: dict[tuple[str, str], dict[str, Any]]) -> dict[str, Any]:
     root = store.attributes
+    new = [episode for episode in store.episodes if (str(store.path) + store.run, episode.name) not in known]
+    for episode in read_one_by_one(new):
+        known[str(store.path) + store.run, episode.name] = episode_line(store, episode)
     return {
         "policy": visible(root.policy.name),
         "suite": root.protocol.suite,
@@ -50,7 +59,7 @@ def _run_answer(store: Store) -> dict[str, Any]:
             }
             for site in root.sites
         ],
-        "episodes": [episode_line(store, episode) for episode in read_one_by_one(store.episodes)],
+        "episodes": [known[str(store.path) + store.run, episode.name] for episode in store.episodes],
     }
 
 

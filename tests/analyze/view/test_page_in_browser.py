@@ -26,7 +26,6 @@ pytestmark = needs_chromium
 
 SPEC = StoreSpec(tasks=(0, 1), episodes=2, replans=3, layers=(0, 1, 2, 3, 4, 5), num_layers=6)
 FIRST = "#episode=task000_episode000"
-SCRIPT = "<script>alert('bowl')</script>"
 
 
 @pytest.fixture(scope="module")
@@ -155,13 +154,13 @@ def test_another_prompt_is_a_banner(browser, server):
 
 
 def texts_are_text(watched: Watched, link: str) -> None:
-    from tests.analyze.test_hostile_stores import INSTRUCTION
+    from tests.analyze.test_hostile_stores import MARKUP
 
-    assert SCRIPT in INSTRUCTION
     watched.open(f"{link}{FIRST}")
     assert watched.complaints == []
     assert watched.page.locator("iframe, object, embed, body script").count() == 0
-    assert "alert" in watched.page.inner_text("h1")
+    assert MARKUP in watched.page.inner_text(".heads")
+    assert watched.page.locator("img[src=x]").count() == 0
     assert "\u202e" not in watched.page.inner_text("body")
     assert watched.requests_beside(link) == []
 

@@ -95,7 +95,7 @@ function SideBySide() {
 export function commandLine(): string {
   const episode = about.value.value;
   if (!run.value || !episode) return "";
-  const parts = ["vla-attention overlay", run.value.path ?? `${run.value.name}`, `--task ${episode.task}`, `--episode ${episode.episode}`, `--replan ${replan.value}`];
+  const parts = ["vla-attention overlay", run.value.path ?? `${run.value.name}`, `--task ${episode.task}`, `--episode ${episode.episode}`, `--replans ${replan.value}`];
   if (site.value !== run.value.sites[0]?.name) parts.push(`--site ${site.value}`);
   if (layer.value !== "mean") parts.push(`--layers ${layer.value}`);
   if (head.value !== "mean") parts.push(`--heads ${head.value}`);

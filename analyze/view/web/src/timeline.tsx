@@ -1,4 +1,5 @@
 /** Below the pictures: events, curves, and the replan that is shown. Everything is clicked. */
+import { computed } from "@preact/signals";
 import { useEffect, useRef } from "preact/hooks";
 import uPlot from "uplot";
 import "uplot/dist/uPlot.min.css";
@@ -51,7 +52,7 @@ function Plot({ curves, title }: { curves: Curves; title: string }) {
     const place = host.current!;
     const css = getComputedStyle(place);
     const axis = { stroke: css.color, grid: { stroke: css.borderTopColor, width: 1 }, ticks: { show: false } };
-    const drawn = new uPlot(
+    const made = new uPlot(
       {
         width: place.clientWidth, height: 130, cursor: { drag: { x: false, y: false }, y: false }, legend: { live: true },
         scales: { x: { time: false, range: [0, end] } },
@@ -74,13 +75,13 @@ function Plot({ curves, title }: { curves: Curves; title: string }) {
       [curves.steps, ...curves.curves.map(({ values }) => values)] as uPlot.AlignedData,
       place,
     );
-    drawn.over.addEventListener("click", (event) => setPart({ replan: replanOf(drawn.posToVal(event.offsetX, "x")) }));
-    plot.current = drawn;
-    const watch = new ResizeObserver(() => drawn.setSize({ width: place.clientWidth, height: 130 }));
+    made.over.addEventListener("click", (event) => setPart({ replan: replanOf(made.posToVal(event.offsetX, "x")) }));
+    plot.current = made;
+    const watch = new ResizeObserver(() => made.setSize({ width: place.clientWidth, height: 130 }));
     watch.observe(place);
     return () => {
       watch.disconnect();
-      drawn.destroy();
+      made.destroy();
     };
   }, [curves, end]);
   const at = replan.value;
@@ -88,12 +89,17 @@ function Plot({ curves, title }: { curves: Curves; title: string }) {
   return <div class="plot" ref={host} role="img" aria-label={title} />;
 }
 
+/** The same object until other numbers are drawn: a plot is made anew for each. */
+const drawn = computed(() => {
+  const known = kinds();
+  const chosen = known[part("curve")] ? part("curve") : Object.keys(known)[0];
+  return { known, chosen, curves: chosen === undefined ? null : known[chosen]!.of() };
+});
+
 export function Timeline() {
   const episode = about.value.value;
   if (!episode || !layout.value) return null;
-  const known = kinds();
-  const chosen = known[part("curve")] ? part("curve") : Object.keys(known)[0];
-  const curves = chosen === undefined ? null : known[chosen]!.of();
+  const { known, chosen, curves } = drawn.value;
   const last = numReplans.value - 1;
   return (
     <section class="timeline" aria-label="Timeline">
