@@ -152,7 +152,7 @@ class _Shapes:
         error = call.product_error(rows, queries)
         self.errors.append(error)
         unfit = call.unfit(rows, error) if math.isfinite(error) else "or its output hold NaN or infinite numbers"
-        cache = self.caches.problem(call)
+        cache = self.caches.problem(call, call.shape.module)
         self.refused.append(f"its rows {unfit}" if unfit else cache)
 
 

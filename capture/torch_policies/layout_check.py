@@ -268,12 +268,9 @@ class _Keys:
         """Return selector -> site -> (key,) bool, the keys that it takes of those that the call has."""
         text = ReplanText(layout, tokenizer, self.ids, {0: ReplanInputs(env_step=0, instruction=instruction)})
         text.present = self.order.present
-        prompt = text.prompt(0, None)
+        prompt = text.prompt(0, {})
         sites = [layout.site(name) for name in self.values]
-        roles = {
-            site.name: text.roles(0, site, prompt, self.order.present[site.name], self.valid[site.name])
-            for site in sites
-        }
+        roles = {site.name: text.roles(0, site, prompt, self.valid[site.name]) for site in sites}
         layouts = [site.keys for site in sites]
         tokens = site_tokens(layouts, roles, prompt, (), {})
         vocabularies = run_vocabularies(layouts, [prompt.instruction_text], ())
@@ -292,7 +289,7 @@ class _Keys:
 def _keys_of(
     policy: FoundPolicy, layout: PolicyLayout, blocks: Mapping[str, int], call: Callable[[], object], what: str
 ) -> _Keys:
-    ids = PromptIds(embeddings_of(policy.policy, layout), batch=1)
+    ids = PromptIds(embeddings_of(policy.modules, layout), batch=1)
     name = type(policy.policy).__name__
     keys = _Keys(CallOrder(KnownCalls(layout), name), blocks, ids)
     with ids.watched(), watch_attention(policy, keys):

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from vla_attention.capture.torch_policies.unseen_attention import refuse_unseen_settings
-from vla_attention.schemas.errors import BadArgument, unknown_name
+from vla_attention.schemas.errors import BadArgument
 
 #: How deep modules are looked for in objects that are no modules.
 _DEPTH = 4
@@ -155,14 +155,6 @@ def _held(part: object, path: str, depth: int, seen: set[int]) -> Iterator[tuple
 
 def _joined(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
-
-
-def find_module(policy: object, path: str, what: str) -> nn.Module:
-    """Return the module at a path; the error says what it was wanted for, and the nearest that exists."""
-    modules = modules_of(policy)
-    if path not in modules:
-        raise unknown_name(f"module for {what}", path, [name for name in modules if name])
-    return modules[path]
 
 
 def root_modules(policy: object) -> dict[str, nn.Module]:

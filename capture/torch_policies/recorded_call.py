@@ -149,13 +149,13 @@ class WatchedCall:
         several = given_actions is not None and one.action_place is not None
         actions = read_actions(given_actions[one.action_place] if several else given_actions)
         for site in run._sites:
-            text.check_places(one.row, site, rows_of_sites[site.name].present, rows_of_sites[site.name].valid)
-        prompt = text.prompt(one.row, rows_of_sites)
+            text.check_places(one.row, site, rows_of_sites[site.name].valid)
+        prompt = text.prompt(one.row, {name: of_site.valid for name, of_site in rows_of_sites.items()})
         key_role: dict[str, NDArray[np.uint8]] = {}
         stored: dict[str, RecordedRows] = {}
         for site in run._sites:
             of_site = rows_of_sites[site.name]
-            key_role[site.name] = roles = text.roles(one.row, site, prompt, of_site.present, of_site.valid)
+            key_role[site.name] = roles = text.roles(one.row, site, prompt, of_site.valid)
             stored[site.name] = replace(of_site.rows, contribution=final_contribution(site, of_site, roles))
         if not all_finite(actions, stored):
             raise not_finite(
@@ -204,7 +204,7 @@ class WatchedCall:
         return None if bias is None else bias(row, place, shape)
 
     def _bias_of(self, one: RowOfCall) -> CallBias | None:
-        prompt = self._text.prompt(one.row, None)
+        prompt = self._text.prompt(one.row, {})
         given = CallInput({}, self._roles(one.row, self._run._sites, prompt), prompt, NO_STATE, {})
         editors = one.episode._changes.editors(self._run.attributes.sites, given, one.context)
         edits = {site: editor.edits for site, editor in (editors or {}).items()}
@@ -212,5 +212,4 @@ class WatchedCall:
 
     def _roles(self, row: int, sites: Sequence[RecordedSite], prompt: Prompt) -> dict[str, NDArray[np.uint8]]:
         """Return the roles of sites' keys, whatever masks hide."""
-        present = self._present
-        return {site.name: self._text.roles(row, site, prompt, present.get(site.name), None) for site in sites}
+        return {site.name: self._text.roles(row, site, prompt) for site in sites}

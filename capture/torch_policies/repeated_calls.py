@@ -326,7 +326,7 @@ class RepeatWatcher(ReplanRecorder):
         return False
 
 
-def _no_roles(row: int, site: Any, present: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def _no_roles(row: int, site: Any) -> NDArray[np.uint8]:
     raise AssertionError("A repeated call has no contributions.")
 
 

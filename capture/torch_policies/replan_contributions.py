@@ -22,7 +22,7 @@ from vla_attention.capture.torch_policies.policy_layout import RecordedSite
 from vla_attention.schemas.segments import segment_members, segments_of
 
 #: Row of the batch, site -> the role codes of its keys (key,), before masks are known.
-EarlyRoles = Callable[[int, RecordedSite, NDArray[np.bool_]], NDArray[np.uint8]]
+EarlyRoles = Callable[[int, RecordedSite], NDArray[np.uint8]]
 Cell = tuple[int, int]
 #: Largest distance from a whole number of what tells the rows of a batch apart.
 _MIXED = 0.05
@@ -63,23 +63,22 @@ class ReplanContributions:
         return grams
 
     def way(
-        self, call: AttentionCall, rows: Tensor, keys: NDArray[np.int64] | None, place: CallPlace, site: RecordedSite,
-        cell: Cell, *, by_part: bool,
-    ) -> OutputWay:  # fmt: skip
+        self, call: AttentionCall, rows: Tensor, place: CallPlace, site: RecordedSite, cell: Cell, *, by_part: bool
+    ) -> OutputWay:
         """Follow the output of a call.
 
-        rows: (batch, head, query, key) of its keys, which are the site's `keys`. by_part: for the contributions of each
+        rows: (batch, head, query, key) of its keys. by_part: for the contributions of each
         part; else all keys are one part, which is enough to tell whether the rows of a batch are apart.
         """
         of_site = self._sites[site.name]
         mixed = []
         for row in self._rows:
             if by_part and row not in of_site.roles:
-                of_site.roles[row] = roles = self._early_roles(row, site, self._order.present[site.name])
+                of_site.roles[row] = roles = self._early_roles(row, site)
                 of_site.members[row] = segment_members(site.keys, roles[None], segments_of(site.keys, roles))[0]
             parts: list[slice | Tensor] = [slice(None)]
             if by_part:
-                members = of_site.members[row] if keys is None else of_site.members[row][keys]
+                members = of_site.members[row][slice(None) if place.keys is None else place.keys]
                 parts = keys_of_parts(members, rows.device)
             values = part_values(rows[row], call.value[row], parts)
             values = values.view(*values.shape[:2], rows.shape[1], -1)

@@ -72,7 +72,7 @@ class RecordedRun:
         self.policy = policy
         self._found = find_policy(policy)
         self._weights = weights_state(policy)
-        self._embeddings = embeddings_of(policy, layout)
+        self._embeddings = embeddings_of(self._found.modules, layout)
         self.layout = layout
         self._known = KnownCalls(layout)
         self.attributes = attributes
