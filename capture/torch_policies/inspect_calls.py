@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import re
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 from torch import Tensor
@@ -102,18 +103,12 @@ class CallTable:
         rows = self.rows
         heading = ("module", "kind", "queries x keys", "heads", "dtype", "calls", "P·V error")
         shown = len(heading) if self.errors else len(heading) - 1
-        cells = [line[:shown] for line in (heading, *(_cells(row) for row in rows[:_SCREEN]))]
-        widths = [max(len(line[column]) for line in cells) for column in range(shown)]
-        lines = [
-            "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in cells
-        ]
+        lines = aligned([line[:shown] for line in (heading, *(_cells(row) for row in rows[:_SCREEN]))])
         if len(rows) > _SCREEN:
             lines.append(f"... and {len(rows) - _SCREEN} further rows: see `.rows`")
-        refused = [row for row in rows if row.refused]
-        for row in refused:
-            pattern, _, sizes, *_ = _cells(row)
-            lines.append(f"Recording refuses {pattern}, {sizes}: {row.refused}.")
-        if refused:
+        cells = [(_cells(row), row.refused) for row in rows if row.refused]
+        lines += [f"Recording refuses {pattern}, {sizes}: {refused}." for (pattern, _, sizes, *_), refused in cells]
+        if cells:
             lines.append("Calls that hold no action queries are left out by a rule without a site.")
         batch = sorted({call.batch for call in self.calls})
         if batch and batch[0] > 1 and self.errors:
@@ -143,7 +138,8 @@ class _Shapes:
         queries = slice(None, None, step)
         self.calls.append(call.shape)
         if self.first_rows is not None:
-            self.first_rows.append(None if call.refused else _first_row(call))
+            compared = slice(None, None, max(1, call.shape.queries // _COMPARED_QUERIES))
+            self.first_rows.append(None if call.refused else call.rows(compared, slice(0, 1))[0].cpu())
         if call.refused:
             self.errors.append(float("nan"))
             self.refused.append(f"it {call.refused}")
@@ -189,28 +185,15 @@ def inspect(policy: object, call: Callable[[], object], *, first_row: Callable[[
     return CallTable(type(policy).__name__, tuple(shapes.calls), tuple(shapes.errors), tuple(shapes.refused))
 
 
-def _first_row(call: AttentionCall) -> Tensor:
-    step = max(1, call.shape.queries // _COMPARED_QUERIES)
-    return call.rows(slice(None, None, step), slice(0, 1))[0].cpu()
-
-
-def _calls_by_module(calls: Sequence[CallShape]) -> dict[str, list[int]]:
-    """The numbers of the calls of each module, in order."""
-    numbers: dict[str, list[int]] = {}
-    for number, call in enumerate(calls):
-        numbers.setdefault(call.module, []).append(number)
-    return numbers
-
-
 def _compare_first_rows(shapes: _Shapes, alone: _Shapes) -> None:
     """Refuse calls whose first row is another one without the other rows of the batch."""
-    of_all, of_one = (_calls_by_module(watched.calls) for watched in (shapes, alone))
-    pairs = [
-        pair
-        for module, numbers in of_all.items()
-        if len(numbers) == len(of_one.get(module, ()))
-        for pair in zip(numbers, of_one[module], strict=True)
-    ]
+    of_all: defaultdict[str, list[int]] = defaultdict(list)
+    of_one: defaultdict[str, list[int]] = defaultdict(list)
+    for watched, numbers in ((shapes, of_all), (alone, of_one)):
+        for number, call in enumerate(watched.calls):
+            numbers[call.module].append(number)
+    as_often = [module for module in of_all if len(of_all[module]) == len(of_one.get(module, ()))]
+    pairs = [pair for module in as_often for pair in zip(of_all[module], of_one[module], strict=True)]
     if not pairs or of_all.keys() != of_one.keys():
         raise OtherCalls(
             f"The call given as first_row made {len(alone.calls)} attention calls in {len(of_one)} modules, and that "
@@ -237,24 +220,19 @@ def _compare_first_rows(shapes: _Shapes, alone: _Shapes) -> None:
 
 
 def _rows(calls: Sequence[CallShape], checks: Sequence[_Check]) -> Iterator[CallRow]:
-    # Of each module and shape the check of each call.
-    counts: dict[tuple[Any, ...], list[_Check]] = {}
+    # Of each module and shape: number of keys -> the checks of its calls.
+    counts: dict[tuple[Any, ...], dict[int, list[_Check]]] = {}
     for call, check in zip(calls, checks, strict=True):
-        counts.setdefault((call.module, *_shape(call), (call.keys, call.keys)), []).append(check)
-    # A module with many numbers of keys, such as a decoder with a cache, gets one row.
-    ranges: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
-    for entry in counts:
-        ranges.setdefault(entry[:-1], []).append(entry)
-    for shape, entries in ranges.items():
-        if len(entries) >= _RANGE:
-            numbers = [entry[-1][0] for entry in entries]
-            merged = [check for entry in entries for check in counts.pop(entry)]
-            counts[(*shape, (min(numbers), max(numbers)))] = merged
-    first = {(call.module, *_shape(call)): number for number, call in reversed(list(enumerate(calls)))}
+        shape = call.kind, call.batch, call.heads, call.kv_heads, call.queries, call.dtype
+        counts.setdefault((call.module, *shape), {}).setdefault(call.keys, []).append(check)
     folded: dict[tuple[Any, ...], list[tuple[str, list[_Check]]]] = {}
-    for entry in sorted(counts, key=lambda entry: first[entry[:-1]]):
-        module, refused = str(entry[0]), any(why for _, why in counts[entry])
-        folded.setdefault((re.sub(r"\d+", "{}", module), *entry[1:], refused), []).append((module, counts[entry]))
+    for (module, *sizes), by_keys in counts.items():
+        ranges = {(keys, keys): found for keys, found in by_keys.items()}
+        if len(by_keys) >= _RANGE:  # a module with many numbers of keys, such as a decoder with a cache, gets one row
+            ranges = {(min(by_keys), max(by_keys)): list(chain.from_iterable(by_keys.values()))}
+        for keys, found in ranges.items():
+            row = (re.sub(r"\d+", "{}", module), *sizes, keys, any(why for _, why in found))
+            folded.setdefault(row, []).append((module, found))
     for (_, kind, batch, heads, kv_heads, queries, dtype, keys, _), modules in folded.items():
         times = [len(checks) for _, checks in modules]
         yield CallRow(
@@ -265,14 +243,15 @@ def _rows(calls: Sequence[CallShape], checks: Sequence[_Check]) -> Iterator[Call
         )  # fmt: skip
 
 
-def _shape(call: CallShape) -> tuple[Any, ...]:
-    return call.kind, call.batch, call.heads, call.kv_heads, call.queries, call.dtype
+def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table as text."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]
 
 
 def _cells(row: CallRow) -> tuple[str, ...]:
-    keys = str(row.keys[0]) if row.keys[0] == row.keys[1] else f"{row.keys[0]}..{row.keys[1]}"
+    keys, times = (str(low) if low == high else f"{low}..{high}" for low, high in (row.keys, row.times))
     heads = str(row.heads) if row.heads == row.kv_heads else f"{row.heads} on {row.kv_heads}"
-    times = str(row.times[0]) if row.times[0] == row.times[1] else f"{row.times[0]}..{row.times[1]}"
     calls = f"{len(row.modules)} x {times}" if len(row.modules) > 1 else times
     pattern = row.pattern or "(policy)"
     error = "refused" if row.refused else f"{row.product_error:.0e}"
@@ -288,10 +267,7 @@ def folded_paths(paths: Sequence[str]) -> str:
         return paths[0]
     numbers = [[int(number) for number in re.findall(r"\d+", path)] for path in paths]
     columns = [sorted(set(column)) for column in zip(*numbers, strict=True)]
-    combinations = 1
-    for column in columns:
-        combinations *= len(column)
-    if combinations != len(paths):
+    if math.prod(map(len, columns)) != len(paths):
         return ", ".join(paths)
     written = iter(_listed(column) if len(column) == 1 else f"{{{_listed(column)}}}" for column in columns)
     return re.sub(r"\d+", lambda match: next(written), paths[0])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from vla_attention.capture.interventions.resolution import run_vocabularies, site_tokens
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
 from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace, KnownCalls
-from vla_attention.capture.torch_policies.inspect_calls import NoAttention
+from vla_attention.capture.torch_policies.inspect_calls import NoAttention, aligned
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
 from vla_attention.capture.torch_policies.policy_modules import FoundPolicy, find_policy
 from vla_attention.capture.torch_policies.prompts import TokenText
@@ -109,10 +109,7 @@ class LayoutCheck:
             (moved.selector, moved.site, moved.named(moved.expected), moved.named(moved.moved), moved.verdict)
             for moved in self.changes
         ]
-        widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
-        text = [
-            "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
-        ]
+        text = aligned(lines)
         wrong = sum(not change.fits for change in self.changes)
         found = (
             "every change moves its keys and no others" if not wrong else f"{wrong} of {len(self.changes)} do not fit"

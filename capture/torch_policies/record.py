@@ -15,9 +15,8 @@ from vla_attention.capture.effects.conditions import refuse_both
 from vla_attention.capture.engine.plan import recording_of, root_attributes
 from vla_attention.capture.engine.settings import RecordingSettings
 from vla_attention.capture.machine import describe_machine
-from vla_attention.capture.torch_policies.batch_rows import rows_apart
 from vla_attention.capture.torch_policies.knockouts import check_interventions
-from vla_attention.capture.torch_policies.own_setting import difference_to_own_setting
+from vla_attention.capture.torch_policies.own_setting import facts_of_own_setting
 from vla_attention.capture.torch_policies.policy_layout import (
     LayoutForAnotherVersion,
     PolicyLayout,
@@ -146,8 +145,7 @@ def record(
     facts |= {"layout for another version": other} if other is not None else {}
     facts["difference to own setting"] = "not measured"
     if own_setting is not None:
-        facts["difference to own setting"] = str(difference_to_own_setting(policy, own_setting))
-        facts["rows of the batch of own setting"] = rows_apart(policy, layout, own_setting)
+        facts |= facts_of_own_setting(policy, layout, own_setting)
     digest, unread = policy_digest(policy)
     if unread:
         facts["not in the digest of weights"] = listing(unread)

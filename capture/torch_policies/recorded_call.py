@@ -16,9 +16,9 @@ from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.recording.finite_numbers import all_finite, not_finite
 from vla_attention.capture.store.replan_records import RecordedRows, ReplanRecord
 from vla_attention.capture.torch_policies.attention_calls import CallShape
-from vla_attention.capture.torch_policies.batch_rows import BatchRowsMixed
 from vla_attention.capture.torch_policies.call_order import CallPlace
 from vla_attention.capture.torch_policies.knockouts import CallBias
+from vla_attention.capture.torch_policies.own_setting import BatchRowsMixed
 from vla_attention.capture.torch_policies.policy_layout import RecordedSite
 from vla_attention.capture.torch_policies.repeated_calls import OWN_NOISE, CallInput, CallToRepeat
 from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs, read_actions
