@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -170,24 +170,26 @@ class AttentionCall:
         return ""
 
 
-class Watcher(Protocol):
-    """Is told about every attention call of a watched block, in order.
+class Watcher:
+    """Is told about every attention call of a watched block, in order. This one takes and changes nothing.
 
-    It may have an attribute `changes`, False where it changes nothing: it is not asked then. It may have a method
-    `passes(shape) -> bool` too, asked when the kernel has run: whether the call is not wanted. It is not told of such a
-    call again, and nothing is made of its tensors.
+    changes: whether it is asked for changes at all.
     """
+
+    changes: Any = False
 
     def change(self, shape: CallShape) -> Tensor | None:
         """Return logits to add before the softmax, broadcastable to (batch, head, query, key), or None for no change.
 
         Asked before the kernel runs. -inf takes a key away.
         """
-        ...
+
+    def passes(self, shape: CallShape) -> bool:
+        """Return whether a call whose kernel has run is not wanted: nothing is made of its tensors then."""
+        return False
 
     def saw(self, call: AttentionCall) -> OutputWay | None:
         """Take what is wanted of a call, right after its kernel; in order. Return whether its output is followed."""
-        ...
 
 
 def exact() -> AbstractContextManager[object]:

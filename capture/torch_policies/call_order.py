@@ -13,9 +13,10 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.torch_policies.attention_calls import CallShape
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape, Watcher
 from vla_attention.capture.torch_policies.inspect_calls import CallTable, folded_paths
 from vla_attention.capture.torch_policies.key_caches import LOAD_WITH_DYNAMIC_CACHE
+from vla_attention.capture.torch_policies.output_ways import OutputWay
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
 from vla_attention.schemas.errors import BadArgument, UserError, listing
 
@@ -100,14 +101,17 @@ class KnownCalls:
         return np.concatenate(parts), given
 
 
-class CallOrder:
-    """Gives the calls of one replan their places, one after the other. Every replan needs a new one."""
+class CallOrder(Watcher):
+    """Gives the calls of one replan their places, one after the other, and takes some. Every replan needs a new one.
+
+    Who takes calls says which, with `wanted` and `take`.
+    """
 
     def __init__(self, known: KnownCalls, policy: str) -> None:
         self.known = known
         self.layout = known.layout
         self.policy = policy
-        self.seen: list[CallShape] = []
+        self.ran: list[CallShape] = []
         self.problems: dict[str, None] = {}
         self.fired: Counter[tuple[str, int]] = Counter()
         self.calls_of_rule: Counter[int] = Counter()
@@ -121,7 +125,7 @@ class CallOrder:
     def place(self, shape: CallShape) -> CallPlace | None:
         """Return what the next call is, or None if no rule names it.
 
-        Nothing is counted before `ran`: a softmax may turn out not to be attention.
+        Nothing is counted before it ran: a softmax may turn out not to be attention.
         """
         number, block = self.known.rule(shape.module, shape.kind, shape.queries, shape.keys)
         if number < 0:
@@ -151,9 +155,31 @@ class CallOrder:
         all_keys = len(keys) == self.known.sites[name].keys.num_keys
         return CallPlace(number, name, block, step, queries, None if all_keys else keys, (name, block))
 
-    def ran(self, shape: CallShape, place: CallPlace | None) -> None:
-        """Count a call that has run; `place`: what `place` returned for it."""
-        self.seen.append(shape)
+    def wanted(self, place: CallPlace) -> bool:
+        """Return whether a call of a site is taken."""
+        return False
+
+    def take(self, call: AttentionCall, place: CallPlace, site: RecordedSite) -> OutputWay | None:
+        """Take a call that is wanted, right after its kernel. Return whether its output is followed."""
+
+    def passes(self, shape: CallShape) -> bool:
+        """See `Watcher`; a call that is not wanted is counted here."""
+        place = self.place(shape)
+        if place is not None and place.site is not None and self.wanted(place):
+            return False
+        self._count(shape, place)
+        return True
+
+    def saw(self, call: AttentionCall) -> OutputWay | None:
+        """See `Watcher`."""
+        place = self.place(call.shape)
+        self._count(call.shape, place)
+        assert place is not None
+        assert place.site is not None
+        return self.take(call, place, self.known.sites[place.site])
+
+    def _count(self, shape: CallShape, place: CallPlace | None) -> None:
+        self.ran.append(shape)
         if place is None:
             self._unnamed.setdefault((shape.kind, shape.queries, shape.keys), {})[shape.module] = None
             return
@@ -188,7 +214,7 @@ class CallOrder:
             raise CallsDoNotFit(
                 f"The attention calls at {where} do not fit the layout '{self.layout.name}': "
                 f"{'; '.join(problems[:_SHOWN])}{more}. Change the layout's rules and sites to the calls, which were:\n"
-                f"{CallTable(self.policy, tuple(self.seen))}"
+                f"{CallTable(self.policy, tuple(self.ran))}"
             )
 
     def _missing(self) -> Iterator[str]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from vla_attention.capture.interventions.factors import QueryWithoutKeys
+from vla_attention.capture.interventions.factors import check_keys_left
 from vla_attention.capture.torch_policies.attention_calls import (
     MASKED_BELOW,
     CallShape,
@@ -54,15 +54,10 @@ def causal_mask(queries: Tensor, keys: int) -> Tensor:
     return torch.arange(keys, device=queries.device)[None, :] <= queries[:, None]
 
 
-def check_keys_left(before: Tensor, after: Tensor, shape: CallShape) -> None:
+def check_change(before: Tensor, after: Tensor, shape: CallShape) -> None:
     """Raise `QueryWithoutKeys` if a query that had a key has none after a change; logits (batch, head, query, key)."""
-    lost = (before.amax(-1) > MASKED_BELOW) & (after.amax(-1) <= MASKED_BELOW)
-    if bool(lost.any()):
-        batch, head, query = (int(i) for i in lost.nonzero()[0])
-        raise QueryWithoutKeys(
-            f"An intervention leaves a query without any key in the attention call {shape}, batch row {batch}, head "
-            f"{head}, query {query}. Take a smaller group, a weight below 1, or fewer heads or layers."
-        )
+    had, left = (logits.amax(-1) > MASKED_BELOW for logits in (before, after))
+    check_keys_left(had, left, f"the attention call {shape}")
 
 
 #: Where modules keep their number of heads; asked where a kernel gets (batch · head, query, dim).

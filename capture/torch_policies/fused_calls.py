@@ -27,7 +27,7 @@ from vla_attention.capture.torch_policies.call_tensors import (
     batch_and_heads,
     causal_mask,
     changed_mask,
-    check_keys_left,
+    check_change,
     fitted_change,
     normalised,
     part,
@@ -91,7 +91,7 @@ def watch_sdpa(
     else:
         change = fitted_change(change, shape, query.device)
         before, after = changed_mask(mask, given.is_causal, change, queries, keys)
-        check_keys_left(before, after, shape)
+        check_change(before, after, shape)
         # As the kernel wants it: as many axes as its queries have.
         logits = after.expand(batch, heads, -1, -1).reshape(*lead, kernel_queries, keys).to(dtype)
         options = {"scale": given.scale, "enable_gqa": given.enable_gqa}
@@ -207,7 +207,7 @@ def watch_flex(
     else:
         change = fitted_change(change, shape, query.device)
         before = logits_of(slice(None), slice(None))
-        check_keys_left(before, before + change, shape)
+        check_change(before, before + change, shape)
         full = change.expand(batch, heads, queries, keys)
 
         def changed_score(scores: Tensor, b: Tensor, h: Tensor, q: Tensor, k: Tensor, *others: Any) -> Tensor:

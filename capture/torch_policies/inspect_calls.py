@@ -12,7 +12,7 @@ from typing import Any
 
 from torch import Tensor
 
-from vla_attention.capture.torch_policies.attention_calls import TOLERANCE, AttentionCall, CallShape
+from vla_attention.capture.torch_policies.attention_calls import TOLERANCE, AttentionCall, CallShape, Watcher
 from vla_attention.capture.torch_policies.key_caches import KeyCaches
 from vla_attention.capture.torch_policies.unseen_attention import no_attention
 from vla_attention.capture.torch_policies.watch import RandomNumbers, watch_attention
@@ -120,7 +120,7 @@ class CallTable:
 
 
 @dataclass
-class _Shapes:
+class _Shapes(Watcher):
     """A watcher that keeps shapes and errors, and why calls would be refused."""
 
     calls: list[CallShape] = field(default_factory=list)
@@ -129,9 +129,6 @@ class _Shapes:
     caches: KeyCaches = field(default_factory=KeyCaches)
     #: Of every call the rows of the first row of its batch, (head, query, key), where they are wanted.
     first_rows: list[Tensor | None] | None = None
-
-    def change(self, shape: CallShape) -> Tensor | None:
-        return None
 
     def saw(self, call: AttentionCall) -> None:
         step = max(1, -(-call.shape.queries // _CHECKED_QUERIES))

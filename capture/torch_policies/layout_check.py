@@ -7,14 +7,14 @@ are compared, which hold what a token is; keys may have its position in them, to
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.interventions.resolution import run_vocabularies, site_tokens
-from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall
 from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.inspect_calls import NoAttention, aligned
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
@@ -175,7 +175,7 @@ def check_layout(
     text = None if tokenizer is None else TokenText(tokenizer)
     try:
         keys = _keys_of(known_policy, layout, blocks, call, "the unchanged call")
-        expected = keys.expected(layout, perturb, text, instruction)
+        expected = keys.expected(perturb, text, instruction)
         random.again()
         again = _keys_of(known_policy, layout, blocks, call, "the unchanged call, made again")
         _check_repeats(keys, again, layout)
@@ -203,42 +203,31 @@ def _first_blocks(layout: PolicyLayout, site: str | None) -> dict[str, int]:
     return {name: block for name, block in firsts.items() if block == min(firsts.values())}
 
 
-@dataclass
-class _Keys:
-    """A watcher that keeps the values of the first call of some sites' first blocks, and what tells their words.
+class _Keys(CallOrder):
+    """Keeps the values of the first call of some sites' first blocks, and what tells their words.
 
     values: site -> (key, number), NaN for keys that the call does not have. valid: site -> (key,) bool, keys that some
     action query may see. rounding: site -> see `_ROUNDING`.
     """
 
-    order: CallOrder
-    blocks: Mapping[str, int]
-    ids: PromptIds
-    values: dict[str, NDArray[np.float32]] = field(default_factory=dict)
-    valid: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
-    rounding: dict[str, float] = field(default_factory=dict)
+    def __init__(self, layout: PolicyLayout, policy: str, blocks: Mapping[str, int], ids: PromptIds) -> None:
+        super().__init__(KnownCalls(layout), policy)
+        self.blocks, self.ids = blocks, ids
+        self.values: dict[str, NDArray[np.float32]] = {}
+        self.valid: dict[str, NDArray[np.bool_]] = {}
+        self.rounding: dict[str, float] = {}
 
-    changes = False
+    def wanted(self, place: CallPlace) -> bool:
+        return place.site not in self.values and self.blocks.get(place.site or "") == place.block
 
-    def change(self, shape: CallShape) -> None:
-        return None
-
-    def saw(self, call: AttentionCall) -> None:
-        place = self.order.place(call.shape)
-        self.order.ran(call.shape, place)
-        name = None if place is None else place.site
-        if place is None or name is None or name in self.values or self.blocks.get(name) != place.block:
-            return
+    def take(self, call: AttentionCall, place: CallPlace, site: RecordedSite) -> None:
         if call.shape.batch != 1:
             raise BadArgument(
-                f"A call of site '{name}' has a batch of {call.shape.batch}; give va.check_layout policy calls for one "
-                "environment."
+                f"A call of site '{site.name}' has a batch of {call.shape.batch}; give va.check_layout policy calls "
+                "for one environment."
             )
-        self._keep(call, place, self.order.known.sites[name])
-
-    def _keep(self, call: AttentionCall, place: CallPlace, site: RecordedSite) -> None:
         count = site.keys.num_keys
-        positions = np.arange(count) if place.keys is None else place.keys
+        positions = slice(None) if place.keys is None else place.keys
         numbers = call.value[0].detach().transpose(0, 1).flatten(1).float().cpu().numpy()
         self.values[site.name] = values = np.full((count, numbers.shape[1]), np.nan, dtype=np.float32)
         values[positions] = numbers
@@ -260,13 +249,13 @@ class _Keys:
         return moved
 
     def expected(
-        self, layout: PolicyLayout, selectors: Mapping[str, object], tokenizer: TokenText | None, instruction: str
+        self, selectors: Mapping[str, object], tokenizer: TokenText | None, instruction: str
     ) -> dict[str, dict[str, NDArray[np.bool_]]]:
         """Return selector -> site -> (key,) bool, the keys that it takes of those that the call has."""
-        text = ReplanText(layout, tokenizer, self.ids, {0: ReplanInputs(env_step=0, instruction=instruction)})
-        text.present = self.order.present
+        text = ReplanText(self.layout, tokenizer, self.ids, {0: ReplanInputs(env_step=0, instruction=instruction)})
+        text.present = self.present
         prompt = text.prompt(0, {})
-        sites = [layout.site(name) for name in self.values]
+        sites = [self.known.sites[name] for name in self.values]
         roles = {site.name: text.roles(0, site, prompt, self.valid[site.name]) for site in sites}
         layouts = [site.keys for site in sites]
         tokens = site_tokens(layouts, roles, prompt, (), {})
@@ -287,13 +276,12 @@ def _keys_of(
     policy: FoundPolicy, layout: PolicyLayout, blocks: Mapping[str, int], call: Callable[[], object], what: str
 ) -> _Keys:
     ids = PromptIds(embeddings_of(policy.modules, layout), batch=1)
-    name = type(policy.policy).__name__
-    keys = _Keys(CallOrder(KnownCalls(layout), name), blocks, ids)
+    keys = _Keys(layout, type(policy.policy).__name__, blocks, ids)
     with ids.watched(), watch_attention(policy, keys):
         call()
-    if not keys.order.seen:
+    if not keys.ran:
         raise NoAttention(f"In {what}: {no_attention(policy.policy)}")
-    keys.order.check(what)
+    keys.check(what)
     return keys
 
 

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
-from vla_attention.capture.torch_policies.call_order import CallOrder, KnownCalls
+from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
-from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
+from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
 from vla_attention.capture.torch_policies.watch import RandomNumbers, watch_attention
 from vla_attention.schemas.errors import BadArgument
 
@@ -40,31 +40,31 @@ class BatchRowsMixed(BadArgument):
     """A policy whose rows of a batch are not apart in its attention calls."""
 
 
-class _RowChanged:
+class _RowChanged(CallOrder):
     """A watcher that changes the calls of the layout's sites in the first row of their batch.
 
     factor: that of the last key's weight; 1 for a change that changes nothing, None for none.
     """
 
     def __init__(self, layout: PolicyLayout, factor: float | None) -> None:
+        super().__init__(KnownCalls(layout), "")
         self.changes = factor is not None
         self.batches: set[int] = set()
-        self.order = CallOrder(KnownCalls(layout), "")
         self._factor = factor or 1.0
 
     def change(self, shape: CallShape) -> Tensor | None:
-        place = self.order.place(shape)
+        place = self.place(shape)
         if place is None or place.site is None:
             return None
         added = torch.zeros(shape.batch, 1, 1, shape.keys)
         added[0] = torch.linspace(0, float(np.log(self._factor)), shape.keys)
         return added
 
-    def saw(self, call: AttentionCall) -> None:
-        place = self.order.place(call.shape)
-        self.order.ran(call.shape, place)
-        if place is not None and place.site is not None:
-            self.batches.add(call.shape.batch)
+    def wanted(self, place: CallPlace) -> bool:
+        return True
+
+    def take(self, call: AttentionCall, place: CallPlace, site: RecordedSite) -> None:
+        self.batches.add(call.shape.batch)
 
 
 def facts_of_own_setting(policy: object, layout: PolicyLayout, call: Callable[[], Any]) -> dict[str, str]:
@@ -100,7 +100,7 @@ def facts_of_own_setting(policy: object, layout: PolicyLayout, call: Callable[[]
 
 
 def _difference(plain: list[NDArray[np.float64]], recorded: list[NDArray[np.float64]], watcher: _RowChanged) -> str:
-    if not watcher.order.seen:
+    if not watcher.ran:
         raise CannotCompare(
             "The call given as own_setting made no attention call when it was repeated: a policy that answers from a "
             "queue must be reset in it, as lambda: (policy.reset(), policy.select_action(batch))[1]."

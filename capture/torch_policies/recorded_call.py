@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -74,7 +75,7 @@ class WatchedCall:
         self._run, self._rows = run, rows
         self._where = ", ".join(one.where for one in rows[:2])
         self._ids = PromptIds(run._embeddings, batch)
-        self._text = ReplanText(run.layout, run._tokenizer, self._ids, {one.row: one.inputs for one in rows})
+        self._text = ReplanText(run.layout, run.tokenizer, self._ids, {one.row: one.inputs for one in rows})
         self.recorder = ReplanRecorder(
             run._known,
             type(run.policy).__name__,
@@ -86,8 +87,9 @@ class WatchedCall:
             self._where,
         )
         self._asks_of_batch = self.recorder.asks_of_batch = batch > 1 and not run._asked_of_batch
-        self._present = self._text.present = self.recorder.order.present
-        self._biases: dict[int, CallBias | None] = {}
+        self._present = self._text.present = self.recorder.present
+        #: Of a row of the batch, what changes it: asked at its first call.
+        self._bias_of = cache(self._row_bias)
         self._before = self._state_before(rows[0])
 
     def _state_before(self, one: RowOfCall) -> RandomNumbers | None:
@@ -196,16 +198,13 @@ class WatchedCall:
 
     def _bias(self, row: int, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
         """Return what knockouts add to the logits of a call, see `LogitBias`: looked up at the row's first call."""
-        if place.site is None:
-            return None
-        if row not in self._biases:
-            self._biases[row] = self._bias_of(next(one for one in self._rows if one.row == row))
-        bias = self._biases[row]
+        bias = None if place.site is None else self._bias_of(row)
         return None if bias is None else bias(row, place, shape)
 
-    def _bias_of(self, one: RowOfCall) -> CallBias | None:
-        prompt = self._text.prompt(one.row, {})
-        given = CallInput({}, self._roles(one.row, self._run._sites, prompt), prompt, NO_STATE, {})
+    def _row_bias(self, row: int) -> CallBias | None:
+        one = next(one for one in self._rows if one.row == row)
+        prompt = self._text.prompt(row, {})
+        given = CallInput({}, self._roles(row, self._run._sites, prompt), prompt, NO_STATE, {})
         editors = one.episode._changes.editors(self._run.attributes.sites, given, one.context)
         edits = {site: editor.edits for site, editor in (editors or {}).items()}
         return CallBias(self._run.layout, edits, self._present) if edits else None

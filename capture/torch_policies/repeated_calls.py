@@ -27,8 +27,7 @@ from vla_attention.capture.torch_policies.attention_calls import AttentionCall, 
 from vla_attention.capture.torch_policies.call_order import CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.knockouts import CallBias
-from vla_attention.capture.torch_policies.output_ways import OutputWay
-from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
+from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
 from vla_attention.capture.torch_policies.policy_modules import FoundPolicy
 from vla_attention.capture.torch_policies.replan_inputs import Repeat, RepeatedCall, read_actions
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder
@@ -251,12 +250,12 @@ class RepeatedPolicy:
         watcher = RepeatWatcher(self._known, self._identity.name, self._recording, bias)
         with watch_attention(self._found, watcher):
             result = call.repeat.call(given) if call.repeat.takes_call else call.repeat.call()
-        if not watcher.saw_attention:
+        if not watcher.ran:
             raise NotRepeated(
                 "The callable given as repeat made no attention call: a policy that answers from a queue must be reset "
                 "in it, as lambda call: (policy.reset(), policy.select_action(batch))[1]."
             )
-        watcher.order.check(f"the repeated call of {call.where}")
+        watcher.check(f"the repeated call of {call.where}")
         self._check_prefix(watcher, [edit for of_site in edits.values() for edit in of_site])
         actions = read_actions(result)
         if actions is None or actions.shape != call.actions.shape:
@@ -272,7 +271,7 @@ class RepeatedPolicy:
         passes = [number for number, rule in enumerate(self._known.layout.rules) if rule.is_prefix]
         if not passes or all(edit.queries == "action" for edit in edits):
             return
-        if not any(watcher.order.calls_of_rule[number] for number in passes):
+        if not any(watcher.calls_of_rule[number] for number in passes):
             raise ChangeRefused(
                 f"No call was a pass over the prefix, as the layout '{self._known.layout.name}' says with tokens=SITE: "
                 "keys cannot be cut off there. Change its rules, or measure with readers=('action',)."
@@ -305,25 +304,14 @@ class RepeatWatcher(ReplanRecorder):
             )
         return super().change(shape)
 
-    def passes(self, shape: CallShape) -> bool:
-        """See `Watcher`; of the first call of each site the mask is looked at."""
-        place = self.order.place(shape)
-        if place is not None and place.site is not None and place.site not in self.seen:
-            return False
-        return super().passes(shape)
+    def wanted(self, place: CallPlace) -> bool:
+        """Return whether a call is the first of its site: its mask is looked at."""
+        return place.site not in self.seen
 
-    def saw(self, call: AttentionCall) -> OutputWay | None:
-        """See `Watcher`."""
-        place = self.order.place(call.shape)
-        if place is not None and place.site is not None and place.site not in self.seen:
-            allowed = call.allowed(place.queries).any(dim=2).any(dim=1).any(dim=0).cpu().numpy()
-            seen = np.zeros(self.order.known.sites[place.site].keys.num_keys, dtype=bool)
-            seen[slice(None) if place.keys is None else place.keys] = allowed
-            self.seen[place.site] = seen
-        return super().saw(call)
-
-    def _wanted(self, place: CallPlace) -> bool:
-        return False
+    def _keep(self, call: AttentionCall, place: CallPlace, site: RecordedSite) -> None:
+        self.seen[site.name] = seen = np.zeros(site.keys.num_keys, dtype=bool)
+        allowed = call.allowed(place.queries).any(dim=2).any(dim=1).any(dim=0).cpu().numpy()
+        seen[slice(None) if place.keys is None else place.keys] = allowed
 
 
 def _no_roles(row: int, site: Any) -> NDArray[np.uint8]:

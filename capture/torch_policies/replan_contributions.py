@@ -16,7 +16,7 @@ from torch import Tensor
 
 from vla_attention.capture.recording.contributions import keys_of_parts, part_values
 from vla_attention.capture.torch_policies.attention_calls import TOLERANCE, AttentionCall
-from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace
+from vla_attention.capture.torch_policies.call_order import CallPlace
 from vla_attention.capture.torch_policies.output_ways import NotReplayed, OutputWay, Replay
 from vla_attention.capture.torch_policies.policy_layout import RecordedSite
 from vla_attention.schemas.segments import segment_members, segments_of
@@ -41,14 +41,14 @@ class ReplanContributions:
     """Collects the contributions of the recorded calls of one replan.
 
     Args:
-        order: the calls of the replan.
+        sites: the layout's.
         rows: the rows of the batch that are recorded.
         early_roles: the roles of keys before the masks are known.
     """
 
-    def __init__(self, order: CallOrder, rows: Sequence[int], early_roles: EarlyRoles) -> None:
-        self._order, self._rows, self._early_roles = order, rows, early_roles
-        self._sites = {site.name: _SiteParts() for site in order.layout.sites}
+    def __init__(self, sites: Sequence[str], rows: Sequence[int], early_roles: EarlyRoles) -> None:
+        self._rows, self._early_roles = rows, early_roles
+        self._sites = {site: _SiteParts() for site in sites}
         self._places: list[tuple[CallPlace, OutputWay]] = []
 
     def roles_of(self, site: str, row: int) -> NDArray[np.uint8] | None:

@@ -56,8 +56,8 @@ class SiteRows:
 _OfCalls = dict[tuple[int, int], list[Tensor]]
 
 
-class ReplanRecorder:
-    """Watches the calls of one replan (`Watcher`). Every replan needs a new one.
+class ReplanRecorder(CallOrder):
+    """Keeps the rows of the calls of one replan. Every replan needs a new one.
 
     Args:
         known: the layout, and what was found out about its calls.
@@ -81,12 +81,11 @@ class ReplanRecorder:
         bias: LogitBias | None = None,
         where: str = "",
     ) -> None:
-        self.layout = layout = known.layout
-        self.recordings = {name: chosen for name, chosen in recordings_of(recording, layout).items() if chosen}
+        super().__init__(known, policy)
+        self.recordings = {name: chosen for name, chosen in recordings_of(recording, self.layout).items() if chosen}
         self.batch = batch
         self.rows = tuple(rows)
-        self.order = CallOrder(known, policy)
-        self.contributions = ReplanContributions(self.order, self.rows, early_roles)
+        self.contributions = ReplanContributions(list(known.sites), self.rows, early_roles)
         self.bias = bias
         self._where = where
         self.largest_error = 0.0
@@ -102,11 +101,6 @@ class ReplanRecorder:
     def changes(self) -> bool:
         """Whether logits are changed at all."""
         return self.bias is not None
-
-    @property
-    def saw_attention(self) -> bool:
-        """Whether any attention call ran."""
-        return bool(self.order.seen)
 
     def change(self, shape: CallShape) -> Tensor | None:
         """Return what is added to the logits of a call, (batch, head or 1, query, key), or None for nothing."""
@@ -129,49 +123,22 @@ class ReplanRecorder:
 
     def changed_place(self, shape: CallShape) -> CallPlace | None:
         """Return the place of a call that may be changed; None for others."""
-        place = self.order.place(shape)
+        place = self.place(shape)
         if place is None or (place.site is None and not self.layout.rules[place.rule].is_prefix):
             return None
         return place
 
-    def passes(self, shape: CallShape) -> bool:
-        """Return whether a call that has run is not recorded; it is counted then, and `saw` not called."""
-        place = self.order.place(shape)
-        if place is not None and place.site is not None and self._wanted(place):
-            return False
-        self.order.ran(shape, place)
-        return True
-
-    def _wanted(self, place: CallPlace) -> bool:
+    def wanted(self, place: CallPlace) -> bool:
+        """Return whether the rows of a call are recorded."""
         recording = self.recordings.get(place.site or "")
         step = 0 if self.layout.autoregressive else place.step
         return recording is not None and place.block in recording.layers and step in recording.denoise_steps
 
     def saw(self, call: AttentionCall) -> OutputWay | None:
-        """Keep the rows of a call, if it is recorded; its output is followed for the contributions."""
-        shape = call.shape
-        place = self.order.place(shape)
-        self.order.ran(shape, place)
-        if place is None:
-            return None
-        if self.bias is not None and call.asked is not None:
-            self._check_changed(call.asked, shape, place)
-        if place.site is None or not self._wanted(place):
-            return None
-        site, recording = self.order.known.sites[place.site], self.recordings[place.site]
-        if shape.batch != self.batch:
-            self.order.problems[
-                f"a call of site '{site.name}' has a batch of {shape.batch}, and the replan one of {self.batch} "
-                "(several environments in one call, and guidance with and without the instruction: run.episodes)"
-            ] = None
-            return None
-        heads = site.keys.heads or self.layout.num_heads
-        if shape.heads != heads:
-            self.order.problems[f"a call of site '{site.name}' has {shape.heads} heads; the layout has {heads}"] = None
-            return None
-        step = 0 if self.layout.autoregressive else place.step
-        with torch.no_grad():
-            return self._take(call, place, site, recording, (place.block, step))
+        """See `Watcher`."""
+        if self.bias is not None and call.asked is not None and (place := self.place(call.shape)) is not None:
+            self._check_changed(call.asked, call.shape, place)
+        return super().saw(call)
 
     def _check_changed(self, asked: CallShape, shape: CallShape, place: CallPlace) -> None:
         """Raise `ChangeRefused` if a knockout of a call could not be made: the softmax showed other axes."""
@@ -184,10 +151,24 @@ class ReplanRecorder:
             "the call out of the knockout (knockout_layers)."
         )
 
-    def _take(
-        self, call: AttentionCall, place: CallPlace, site: RecordedSite, recording: Recording, cell: tuple[int, int]
-    ) -> OutputWay | None:
-        queries = place.queries
+    def take(self, call: AttentionCall, place: CallPlace, site: RecordedSite) -> OutputWay | None:
+        """Keep the rows of a call; its output is followed for the contributions."""
+        shape, heads = call.shape, site.keys.heads or self.layout.num_heads
+        if shape.batch != self.batch:
+            self.problems[
+                f"a call of site '{site.name}' has a batch of {shape.batch}, and the replan one of {self.batch} "
+                "(several environments in one call, and guidance with and without the instruction: run.episodes)"
+            ] = None
+        elif shape.heads != heads:
+            self.problems[f"a call of site '{site.name}' has {shape.heads} heads; the layout has {heads}"] = None
+        else:
+            with torch.no_grad():
+                return self._keep(call, place, site)
+        return None
+
+    def _keep(self, call: AttentionCall, place: CallPlace, site: RecordedSite) -> OutputWay | None:
+        queries, recording = place.queries, self.recordings[site.name]
+        cell = place.block, 0 if self.layout.autoregressive else place.step
         rows = call.rows(queries)
         error = call.product_error(rows, queries)
         if not math.isfinite(error) and not bool(torch.isfinite(call.output).all() & torch.isfinite(rows).all()):
@@ -200,7 +181,7 @@ class ReplanRecorder:
                 f"'{call.shape.module}') {problem}."
             )
         if self.layout.autoregressive and (problem := self._caches.problem(call, (site.name, place.block))):
-            self.order.problems[f"of a call of site '{site.name}', {problem}"] = None
+            self.problems[f"of a call of site '{site.name}', {problem}"] = None
         seen = call.allowed(queries)
         uniform = seen / seen.sum(dim=-1, keepdim=True).clamp(min=1)
         way, by_part = None, recording.contributions
@@ -233,7 +214,7 @@ class ReplanRecorder:
         Raises:
             CallsDoNotFit: the calls are not those of the layout.
         """
-        self.order.check(self._where)
+        self.check(self._where)
         unknown = self.contributions.unknown() is not None
         rows_of_sites: list[dict[str, SiteRows]] = [{} for _ in self.rows]
         for name, recording in self.recordings.items():

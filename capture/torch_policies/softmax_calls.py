@@ -27,7 +27,7 @@ from vla_attention.capture.torch_policies.attention_calls import (
 from vla_attention.capture.torch_policies.call_tensors import (
     ChangeRefused,
     batch_and_heads,
-    check_keys_left,
+    check_change,
     fitted_change,
     normalised,
 )
@@ -110,7 +110,7 @@ class Softmaxes:
             logits = logits.clone()  # the policy may write over them
             given = logits + change.expand(batch, heads, queries, keys).reshape(logits.shape).to(logits.dtype)
             size = batch, heads, queries, keys
-            check_keys_left(logits.reshape(size), given.reshape(size), shape)
+            check_change(logits.reshape(size), given.reshape(size), shape)
             name = "self" if "self" in kwargs else "input"
             result = function(given, *args[1:], **kwargs) if args else function(**{**kwargs, name: given})
             self.changed.append(shape)

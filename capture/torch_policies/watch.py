@@ -169,21 +169,17 @@ class AttentionMode(TorchFunctionMode):
 
     def change(self, shape: CallShape) -> Tensor | None:
         """Ask the watcher for a change of the call that comes next."""
-        if not getattr(self._watcher, "changes", True):
+        if not self._watcher.changes:
             return None
         with torch.no_grad(), self._failing():
             return self._watcher.change(shape)
 
     def passes(self, shape: CallShape) -> bool:
         """Return whether a call that has run is none of the watcher's, and count it then."""
-        ask = getattr(self._watcher, "passes", None)
-        if ask is None:
-            return False
         with self._failing():
-            if not ask(replace(shape, number=self._number)):
-                return False
-        self._number += 1
-        return True
+            passed = self._watcher.passes(replace(shape, number=self._number))
+        self._number += passed
+        return passed
 
     def saw(self, call: AttentionCall, probabilities: Sequence[Tensor] = ()) -> None:
         """Tell the watcher about a call, and count it; probabilities: tensors that the policy may use once more."""
