@@ -77,14 +77,9 @@ def changes_of_episode(
     return changes
 
 
-def edits_at(edits: Sequence[SiteEdit], place: CallPlace) -> list[SiteEdit]:
-    """Return the edits that change one call of a site."""
-    return [edit for edit in edits if edit.queries != "prefix" and edit.is_at(place.block, place.step)]
-
-
 @dataclass
 class CallBias:
-    """What edits add to the logits of the attention calls of one row; see `LogitBias`. Without edits, zeros.
+    """What edits add to the logits of the attention calls of one row; Without edits, zeros.
 
     edits: by site. present: site -> (key,) bool, the keys that the policy call has.
     """
@@ -94,13 +89,21 @@ class CallBias:
     present: Mapping[str, NDArray[np.bool_]]
     _known: dict[tuple[Any, ...], NDArray[np.float32]] = field(default_factory=dict)
 
-    def __call__(self, _row: int, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
+    def __call__(self, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
         """Return what is added, (head or 1, query, key). Calls to which the same is added get the same array."""
         rule = self.layout.rules[place.rule]
         if place.site is None and not rule.is_prefix:
             return None
         edits = self.edits.get(place.site or rule.tokens or "", ())
-        edits = edits_at(edits, place) if place.site else [edit for edit in edits if edit.queries != "action"]
+        edits = [
+            edit
+            for edit in edits
+            if (
+                edit.queries != "prefix" and edit.is_at(place.block, place.step)
+                if place.site
+                else edit.queries != "action"
+            )
+        ]
         if self.edits and not edits:
             return None
         token = -1 if place.keys is None else place.step

@@ -252,8 +252,8 @@ class _Keys(CallOrder):
         self, selectors: Mapping[str, object], tokenizer: TokenText | None, instruction: str
     ) -> dict[str, dict[str, NDArray[np.bool_]]]:
         """Return selector -> site -> (key,) bool, the keys that it takes of those that the call has."""
-        text = ReplanText(self.layout, tokenizer, self.ids, {0: ReplanInputs(env_step=0, instruction=instruction)})
-        text.present = self.present
+        inputs = {0: ReplanInputs(env_step=0, instruction=instruction)}
+        text = ReplanText(self.layout, tokenizer, self.ids, inputs, self.present)
         prompt = text.prompt(0, {})
         sites = [self.known.sites[name] for name in self.values]
         roles = {site.name: text.roles(0, site, prompt, self.valid[site.name]) for site in sites}

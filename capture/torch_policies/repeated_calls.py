@@ -293,12 +293,17 @@ class RepeatWatcher(ReplanRecorder):
     """
 
     def __init__(self, known: KnownCalls, policy: str, recording: Recording, bias: CallBias | None) -> None:
-        super().__init__(known, policy, recording, 1, [0], _no_roles, bias)
+        super().__init__(known, policy, recording, 1, [0], "")
         self.seen: dict[str, NDArray[np.bool_]] = {}
+        self.changes, self._bias = bias is not None, bias
+
+    def bias(self, row: int, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
+        """See `ReplanRecorder`."""
+        return None if self._bias is None else self._bias(place, shape)
 
     def change(self, shape: CallShape) -> Tensor | None:
         """See `Watcher`; a call of several rows cannot be changed."""
-        if self.bias is not None and shape.batch != self.batch and self.changed_place(shape) is not None:
+        if shape.batch != self.batch and self.changed_place(shape) is not None:
             raise ChangeRefused(
                 f"The attention call {shape} has a batch of {shape.batch}, and effects are of calls of one row."
             )
@@ -312,10 +317,6 @@ class RepeatWatcher(ReplanRecorder):
         self.seen[site.name] = seen = np.zeros(site.keys.num_keys, dtype=bool)
         allowed = call.allowed(place.queries).any(dim=2).any(dim=1).any(dim=0).cpu().numpy()
         seen[slice(None) if place.keys is None else place.keys] = allowed
-
-
-def _no_roles(row: int, site: Any) -> NDArray[np.uint8]:
-    raise AssertionError("A repeated call has no contributions.")
 
 
 class _Measurement(EffectMeasurement):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from typing import Any
 
@@ -113,21 +114,19 @@ def _same_weights(one: nn.Module, other: nn.Module) -> bool:
     return isinstance(first, Tensor) and isinstance(second, Tensor) and first.data_ptr() == second.data_ptr()
 
 
+@dataclass
 class ReplanText:
     """The text of one policy call, by row of the batch.
 
-    seen: the token ids of the call. inputs: row -> what the caller gave.
+    seen: the token ids of the call. inputs: row -> what the caller gave. present: site -> (key,) bool, the keys that
+    the site's calls had so far.
     """
 
-    def __init__(
-        self, layout: PolicyLayout, tokenizer: TokenText | None, seen: PromptIds, inputs: Mapping[int, ReplanInputs]
-    ) -> None:
-        self.layout = layout
-        self.tokenizer = tokenizer
-        self.seen = seen
-        self.inputs = inputs
-        #: Site -> (key,) bool, the keys that its calls had so far.
-        self.present: Mapping[str, NDArray[np.bool_]] = {}
+    layout: PolicyLayout
+    tokenizer: TokenText | None
+    seen: PromptIds
+    inputs: Mapping[int, ReplanInputs]
+    present: Mapping[str, NDArray[np.bool_]]
 
     def prompt(self, row: int, valid: Mapping[str, NDArray[np.bool_]]) -> Prompt:
         """Return the prompt of a row; special tokens and keys that the policy cannot see have no piece.

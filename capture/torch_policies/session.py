@@ -32,7 +32,6 @@ from vla_attention.capture.torch_policies.recorded_episodes import (
 from vla_attention.capture.torch_policies.repeated_calls import RepeatedPolicy
 from vla_attention.capture.torch_policies.replan_inputs import EpisodeFacts
 from vla_attention.capture.torch_policies.replan_text import embeddings_of
-from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stores.store_format import RootAttributes, StoreExists, episode_name
 
@@ -233,7 +232,7 @@ class RecordedRun:
         try:
             with call.watched():
                 yield replan
-            if call.recorder.ran:
+            if call.ran:
                 self._store_call(call, rows, replan, count)
             else:
                 self.num_dropped += 1
@@ -244,17 +243,17 @@ class RecordedRun:
 
     def _store_call(self, call: WatchedCall, rows: Sequence[RowOfCall], replan: Replan, count: int | None) -> None:
         rows_of_sites = call.finish()
-        self._check_contributions(call.recorder)
+        self._check_contributions(call)
         if count is not None:
             check_length("actions", replan.actions, count)
         replan.recorded = True
         for one, of_sites in zip(rows, rows_of_sites, strict=True):
-            one.episode.largest_error = max(one.episode.largest_error, call.recorder.largest_error)
+            one.episode.largest_error = max(one.episode.largest_error, call.largest_error)
             one.episode._append(call.record(one, of_sites, replan.actions))
 
-    def _check_contributions(self, recorder: ReplanRecorder) -> None:
+    def _check_contributions(self, call: WatchedCall) -> None:
         """Raise `ContributionsUnknown` if contributions are recorded, and those of a call are not known."""
-        unknown, of_batch = recorder.contributions.unknown(), f"; {self._of_batch}" if self._of_batch else ""
+        unknown, of_batch = call.contributions.unknown(), f"; {self._of_batch}" if self._of_batch else ""
         if unknown is not None and self.attributes.recording.contributions:
             raise ContributionsUnknown(
                 "Contributions cannot be recorded, because it is not known what each part of the keys adds to the "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -21,17 +21,13 @@ from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.key_caches import KeyCaches
 from vla_attention.capture.torch_policies.output_ways import OutputWay
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
-from vla_attention.capture.torch_policies.replan_contributions import EarlyRoles, ReplanContributions, spread
+from vla_attention.capture.torch_policies.replan_contributions import ReplanContributions, spread
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.segments import segment_members, segments_of
 from vla_attention.schemas.stores.store_format import Recording
 
 #: Copies with more numbers than this move to the CPU immediately instead of waiting on the device.
 _LARGE_COPY = 2**20
-
-#: What a row of the batch adds to the logits of a call (head or 1, query, key); None for nothing. The arrays live as
-#: long as the recorder, and are the same for calls to which the same is added.
-LogitBias = Callable[[int, CallPlace, CallShape], NDArray[np.float32] | None]
 
 
 class RowsDoNotMatch(UserError, ArithmeticError):
@@ -65,8 +61,6 @@ class ReplanRecorder(CallOrder):
         recording: what of them is recorded.
         batch: batch size that every call of the sites must have.
         rows: the rows of the batch that are recorded.
-        early_roles: the roles of keys before the masks are known, for contributions.
-        bias: what knockouts add to the logits.
         where: the replan in words.
     """
 
@@ -77,17 +71,14 @@ class ReplanRecorder(CallOrder):
         recording: Recording,
         batch: int,
         rows: Sequence[int],
-        early_roles: EarlyRoles,
-        bias: LogitBias | None = None,
-        where: str = "",
+        where: str,
     ) -> None:
         super().__init__(known, policy)
         self.recordings = {name: chosen for name, chosen in recordings_of(recording, self.layout).items() if chosen}
         self.batch = batch
         self.rows = tuple(rows)
-        self.contributions = ReplanContributions(list(known.sites), self.rows, early_roles)
-        self.bias = bias
-        self._where = where
+        self.contributions = ReplanContributions(list(known.sites), self.rows, self.early_roles)
+        self.where = where
         self.largest_error = 0.0
         #: Whether the output of the first recorded call is followed to see whether the rows of the batch are apart.
         self.asks_of_batch = False
@@ -97,14 +88,19 @@ class ReplanRecorder(CallOrder):
         self._rows: defaultdict[str, _OfCalls] = defaultdict(lambda: defaultdict(list))
         self._uniform: defaultdict[str, _OfCalls] = defaultdict(lambda: defaultdict(list))
 
-    @property
-    def changes(self) -> bool:
-        """Whether logits are changed at all."""
-        return self.bias is not None
+    def early_roles(self, row: int, site: RecordedSite) -> NDArray[np.uint8]:
+        """Return the roles of keys before the masks are known, for contributions."""
+        raise NotImplementedError
+
+    def bias(self, row: int, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
+        """Return what a row of the batch adds to the logits of a call (head or 1, query, key); None for nothing.
+
+        The arrays live as long as the recorder, and are the same for calls to which the same is added.
+        """
 
     def change(self, shape: CallShape) -> Tensor | None:
         """Return what is added to the logits of a call, (batch, head or 1, query, key), or None for nothing."""
-        if self.bias is None or (place := self.changed_place(shape)) is None or shape.batch != self.batch:
+        if (place := self.changed_place(shape)) is None or shape.batch != self.batch:
             return None
         added = {row: self.bias(row, place, shape) for row in self.rows}
         changed = [values for values in added.values() if values is not None]
@@ -136,13 +132,13 @@ class ReplanRecorder(CallOrder):
 
     def saw(self, call: AttentionCall) -> OutputWay | None:
         """See `Watcher`."""
-        if self.bias is not None and call.asked is not None and (place := self.place(call.shape)) is not None:
+        if self.changes and call.asked is not None and (place := self.place(call.shape)) is not None:
             self._check_changed(call.asked, call.shape, place)
         return super().saw(call)
 
     def _check_changed(self, asked: CallShape, shape: CallShape, place: CallPlace) -> None:
         """Raise `ChangeRefused` if a knockout of a call could not be made: the softmax showed other axes."""
-        if self.bias is None or all(self.bias(row, place, shape) is None for row in self.rows):
+        if all(self.bias(row, place, shape) is None for row in self.rows):
             return
         site = place.site or self.layout.rules[place.rule].tokens
         raise ChangeRefused(
@@ -173,7 +169,7 @@ class ReplanRecorder(CallOrder):
         error = call.product_error(rows, queries)
         if not math.isfinite(error) and not bool(torch.isfinite(call.output).all() & torch.isfinite(rows).all()):
             block = f"block {place.block} of site '{site.name}' (module '{call.shape.module}')"
-            raise not_finite(self._where, f"They begin before or at denoise step {place.step}, {block}", self.remedy)
+            raise not_finite(self.where, f"They begin before or at denoise step {place.step}, {block}", self.remedy)
         self.largest_error = max(self.largest_error, error)
         if problem := call.unfit(rows, error):
             raise RowsDoNotMatch(
@@ -214,7 +210,7 @@ class ReplanRecorder(CallOrder):
         Raises:
             CallsDoNotFit: the calls are not those of the layout.
         """
-        self.check(self._where)
+        self.check(self.where)
         unknown = self.contributions.unknown() is not None
         rows_of_sites: list[dict[str, SiteRows]] = [{} for _ in self.rows]
         for name, recording in self.recordings.items():
@@ -251,7 +247,7 @@ class ReplanRecorder(CallOrder):
     @property
     def remedy(self) -> str:
         """What to do where numbers are not finite."""
-        if self.bias is None:
+        if not self.changes:
             return "look at the policy's input and weights, or use float32"
         return "an intervention may leave a query without any key: take a smaller group, or fewer heads or layers"
 

@@ -129,7 +129,7 @@ def test_the_state_s_digits_in_the_prompt_are_state(case):
     start = text.index("put")
     prompt = Prompt(text, tuple(pieces), (start, start + len("put bowl")))
     site = case.layout.site("joint")
-    text = ReplanText(case.layout, None, PromptIds({}, 1), {0: ReplanInputs(env_step=0)})
+    text = ReplanText(case.layout, None, PromptIds({}, 1), {0: ReplanInputs(env_step=0)}, {})
     roles = [Role(int(code)).label for code in text.roles(0, site, prompt)]
     assert roles[2 * PATCHES :][: len(words)] == [
         *["template", "instruction", "instruction", "template"],
