@@ -6,7 +6,7 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain, pairwise
 from typing import Any
 
@@ -51,7 +51,7 @@ class CallRow:
 
     Attributes:
         modules: paths of the modules, in the order of their first calls.
-        kind, batch, heads, kv_heads, queries, dtype: see `CallShape`.
+        shape: of the first of them.
         keys: the smallest and the largest number of keys.
         times: how often each module made such a call, the least and the most.
         product_error: the largest error of rows times values, relative to the kernel's output.
@@ -59,13 +59,8 @@ class CallRow:
     """
 
     modules: tuple[str, ...]
-    kind: str
-    batch: int
-    heads: int
-    kv_heads: int
-    queries: int
+    shape: CallShape
     keys: tuple[int, int]
-    dtype: str
     times: tuple[int, int]
     product_error: float
     refused: str = ""
@@ -218,26 +213,27 @@ def _compare_first_rows(shapes: _Shapes, alone: _Shapes) -> None:
 
 def _rows(calls: Sequence[CallShape], checks: Sequence[_Check]) -> Iterator[CallRow]:
     # Of each module and shape: number of keys -> the checks of its calls.
-    counts: dict[tuple[Any, ...], dict[int, list[_Check]]] = {}
+    counts: dict[CallShape, dict[int, list[_Check]]] = {}
     for call, check in zip(calls, checks, strict=True):
-        shape = call.kind, call.batch, call.heads, call.kv_heads, call.queries, call.dtype
-        counts.setdefault((call.module, *shape), {}).setdefault(call.keys, []).append(check)
-    folded: dict[tuple[Any, ...], list[tuple[str, list[_Check]]]] = {}
-    for (module, *sizes), by_keys in counts.items():
+        counts.setdefault(replace(call, number=0, keys=0), {}).setdefault(call.keys, []).append(check)
+    folded: dict[tuple[Any, ...], list[tuple[CallShape, list[_Check]]]] = {}
+    for shape, by_keys in counts.items():
         ranges = {(keys, keys): found for keys, found in by_keys.items()}
         if len(by_keys) >= _RANGE:  # a module with many numbers of keys, such as a decoder with a cache, gets one row
             ranges = {(min(by_keys), max(by_keys)): list(chain.from_iterable(by_keys.values()))}
+        pattern = replace(shape, module=re.sub(r"\d+", "{}", shape.module))
         for keys, found in ranges.items():
-            row = (re.sub(r"\d+", "{}", module), *sizes, keys, any(why for _, why in found))
-            folded.setdefault(row, []).append((module, found))
-    for (_, kind, batch, heads, kv_heads, queries, dtype, keys, _), modules in folded.items():
-        times = [len(checks) for _, checks in modules]
+            folded.setdefault((pattern, keys, any(why for _, why in found)), []).append((shape, found))
+    for (_, keys, _), modules in folded.items():
+        times, found = [len(checks) for _, checks in modules], [check for _, checks in modules for check in checks]
         yield CallRow(
-            modules=tuple(module for module, _ in modules), kind=kind, batch=batch, heads=heads, kv_heads=kv_heads,
-            queries=queries, keys=keys, dtype=dtype, times=(min(times), max(times)),
-            product_error=max(error for _, checks in modules for error, _ in checks),
-            refused=next((why for _, checks in modules for _, why in checks if why), ""),
-        )  # fmt: skip
+            modules=tuple(shape.module for shape, _ in modules),
+            shape=modules[0][0],
+            keys=keys,
+            times=(min(times), max(times)),
+            product_error=max(error for error, _ in found),
+            refused=next((why for _, why in found if why), ""),
+        )
 
 
 def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
@@ -248,11 +244,12 @@ def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
 
 def _cells(row: CallRow) -> tuple[str, ...]:
     keys, times = (str(low) if low == high else f"{low}..{high}" for low, high in (row.keys, row.times))
-    heads = str(row.heads) if row.heads == row.kv_heads else f"{row.heads} on {row.kv_heads}"
+    shape = row.shape
+    heads = str(shape.heads) if shape.heads == shape.kv_heads else f"{shape.heads} on {shape.kv_heads}"
     calls = f"{len(row.modules)} x {times}" if len(row.modules) > 1 else times
     pattern = row.pattern or "(policy)"
     error = "refused" if row.refused else f"{row.product_error:.0e}"
-    return pattern, row.kind, f"{row.queries} x {keys}", heads, row.dtype, calls, error
+    return pattern, shape.kind, f"{shape.queries} x {keys}", heads, shape.dtype, calls, error
 
 
 def folded_paths(paths: Sequence[str]) -> str:

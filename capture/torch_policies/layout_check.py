@@ -18,7 +18,7 @@ from vla_attention.capture.torch_policies.attention_calls import AttentionCall
 from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.inspect_calls import NoAttention, aligned
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
-from vla_attention.capture.torch_policies.policy_modules import FoundPolicy, find_policy
+from vla_attention.capture.torch_policies.policy_modules import find_policy
 from vla_attention.capture.torch_policies.prompts import TokenText
 from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs
 from vla_attention.capture.torch_policies.replan_text import PromptIds, ReplanText, embeddings_of
@@ -72,7 +72,9 @@ class KeysMoved:
             in_span = [key for key in keys if span.start <= key < span.stop]
             if in_span:
                 whole = len(in_span) == sum(span.start <= key < span.stop for key in self.present)
-                words.append(span.name if whole else f"{span.name} ({_ranges(in_span)})")
+                runs = [str(run[0]) if len(run) == 1 else f"{run[0]}..{run[-1]}" for run in runs_of(in_span)]
+                part = f" ({'key' if len(in_span) == 1 else 'keys'} {listing(runs)})"
+                words.append(span.name + part * (not whole))
         return ", ".join(words) or "nothing"
 
     @property
@@ -111,9 +113,7 @@ class LayoutCheck:
         ]
         text = aligned(lines)
         wrong = sum(not change.fits for change in self.changes)
-        found = (
-            "every change moves its keys and no others" if not wrong else f"{wrong} of {len(self.changes)} do not fit"
-        )
+        found = f"{wrong} of {len(self.changes)} do not fit" if wrong else "every change moves its keys and no others"
         blocks = dict.fromkeys(f"'{moved.site}' at block {moved.block}" for moved in self.changes)
         text.insert(0, f"Layout '{self.layout}', keys of {' and '.join(blocks)}: {found}")
         if self.left_out:
@@ -170,37 +170,39 @@ def check_layout(
     for selector in perturb:
         if tokenizer is None and any(atom.kind in _OF_WORDS for atom in atoms_of(parse_selector(selector))):
             raise BadArgument(f"'{selector}' needs tokenizer= and instruction=, which say where the words are.")
-    blocks = _first_blocks(layout, site)
-    known_policy, random = find_policy(policy), RandomNumbers()
-    text = None if tokenizer is None else TokenText(tokenizer)
-    try:
-        keys = _keys_of(known_policy, layout, blocks, call, "the unchanged call")
-        expected = keys.expected(perturb, text, instruction)
+    firsts = {known.name: min(known.keys.layers, default=0) for known in layout.sites}
+    blocks = {name: block for name, block in firsts.items() if block == min(firsts.values())}
+    if site is not None:
+        blocks = {site: firsts[layout.site(site).name]}
+    found, random, changes = find_policy(policy), RandomNumbers(), []
+    embeddings = embeddings_of(found.modules, layout)
+
+    def keys_of(call: Callable[[], object], what: str) -> _Keys:
         random.again()
-        again = _keys_of(known_policy, layout, blocks, call, "the unchanged call, made again")
-        _check_repeats(keys, again, layout)
-        changes = []
+        keys = _Keys(layout, type(found.policy).__name__, blocks, PromptIds(embeddings, batch=1))
+        with keys.ids.watched(), watch_attention(found, keys):
+            call()
+        if not keys.ran:
+            raise NoAttention(f"In {what}: {no_attention(found.policy)}")
+        keys.check(what)
+        return keys
+
+    try:
+        keys = keys_of(call, "the unchanged call")
+        expected = keys.expected(perturb, None if tokenizer is None else TokenText(tokenizer), instruction)
+        keys.check_repeats(keys_of(call, "the unchanged call, made again"))
         for selector, changed_call in perturb.items():
-            random.again()
-            changed = _keys_of(known_policy, layout, blocks, changed_call, f"the call for '{selector}'")
+            changed = keys_of(changed_call, f"the call for '{selector}'")
             for name, block in blocks.items():
-                present = keys.there(name) | changed.there(name)
-                wanted, moved = _key_numbers(expected[selector][name]), _key_numbers(keys.moved(changed, name))
+                masks = expected[selector][name], keys.moved(changed, name), keys.there(name) | changed.there(name)
+                wanted, moved, present = (tuple(int(key) for key in np.flatnonzero(mask)) for mask in masks)
                 if wanted or moved:
                     spans = layout.site(name).keys.spans
-                    changes.append(KeysMoved(selector, name, block, wanted, moved, _key_numbers(present), spans))
+                    changes.append(KeysMoved(selector, name, block, wanted, moved, present, spans))
     finally:
         random.again()
-    left_out = tuple(other.name for other in layout.sites if other.name not in blocks) if site is None else ()
+    left_out = tuple(name for name in firsts if name not in blocks) if site is None else ()
     return LayoutCheck(layout.name, tuple(changes), left_out)
-
-
-def _first_blocks(layout: PolicyLayout, site: str | None) -> dict[str, int]:
-    """The sites to look at, and the block of each."""
-    if site is not None:
-        return {site: min(layout.site(site).keys.layers, default=0)}
-    firsts = {known.name: min(known.keys.layers, default=0) for known in layout.sites}
-    return {name: block for name, block in firsts.items() if block == min(firsts.values())}
 
 
 class _Keys(CallOrder):
@@ -271,38 +273,14 @@ class _Keys(CallOrder):
                 )
         return chosen
 
-
-def _keys_of(
-    policy: FoundPolicy, layout: PolicyLayout, blocks: Mapping[str, int], call: Callable[[], object], what: str
-) -> _Keys:
-    ids = PromptIds(embeddings_of(policy.modules, layout), batch=1)
-    keys = _Keys(layout, type(policy.policy).__name__, blocks, ids)
-    with ids.watched(), watch_attention(policy, keys):
-        call()
-    if not keys.ran:
-        raise NoAttention(f"In {what}: {no_attention(policy.policy)}")
-    keys.check(what)
-    return keys
-
-
-def _check_repeats(keys: _Keys, again: _Keys, layout: PolicyLayout) -> None:
-    """Raise `NotRepeatable` if keys move between two calls in which nothing was changed."""
-    for name in keys.values:
-        moved = keys.moved(again, name)
-        if moved.any():
-            spans = [span.name for span in layout.site(name).keys.spans if moved[span.start : span.stop].any()]
-            raise NotRepeatable(
-                f"The keys of the spans {listing(spans)} at site '{name}' are others when the unchanged call is made "
-                "again, with the same random numbers of torch. Give the policy its noise, or reset it in each call, as "
-                "lambda: (policy.reset(), policy.select_action(batch))[1]."
-            )
-
-
-def _key_numbers(chosen: NDArray[np.bool_]) -> tuple[int, ...]:
-    return tuple(int(key) for key in np.flatnonzero(chosen))
-
-
-def _ranges(keys: Sequence[int]) -> str:
-    """Return ascending numbers as text: `key 7`, `keys 4..6` or `keys 4..6, 9`."""
-    what = "key" if len(keys) == 1 else "keys"
-    return f"{what} {listing(str(run[0]) if len(run) == 1 else f'{run[0]}..{run[-1]}' for run in runs_of(keys))}"
+    def check_repeats(self, again: _Keys) -> None:
+        """Raise `NotRepeatable` if keys move between two calls in which nothing was changed."""
+        for name in self.values:
+            moved = self.moved(again, name)
+            spans = [span.name for span in self.known.sites[name].keys.spans if moved[span.start : span.stop].any()]
+            if spans:
+                raise NotRepeatable(
+                    f"The keys of the spans {listing(spans)} at site '{name}' are others when the unchanged call is "
+                    "made again, with the same random numbers of torch. Give the policy its noise, or reset it in each "
+                    "call, as lambda: (policy.reset(), policy.select_action(batch))[1]."
+                )

@@ -6,9 +6,10 @@ what the caller gives.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import accumulate, pairwise
 from typing import Any
 
@@ -25,9 +26,6 @@ from vla_attention.schemas.layout import ROLE_DTYPE, Piece, Prompt, Role, roles_
 
 class KeysShifted(BadArgument):
     """Keys of a row of the batch that are not at the places that the layout gives them."""
-
-
-_Look = Callable[[nn.Module, tuple[Any, ...], dict[str, Any]], None]
 
 
 def embeddings_of(modules: Mapping[str, nn.Module], layout: PolicyLayout) -> dict[str, nn.Module]:
@@ -64,24 +62,20 @@ class PromptIds:
     def watched(self) -> Iterator[None]:
         """Look at what the embeddings are given within the block."""
         with ExitStack() as stack:
-            for number, (path, module) in enumerate(self._embeddings.items()):
-                look = self._look(path, is_prompt=number == 0)
-                stack.callback(module.register_forward_pre_hook(look, with_kwargs=True).remove)
+            for path, module in self._embeddings.items():
+                handle = module.register_forward_pre_hook(partial(self._look, path), with_kwargs=True)
+                stack.callback(handle.remove)
             yield
 
-    def _look(self, path: str, *, is_prompt: bool) -> _Look:
-        def look(_module: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
-            given = next((value for value in (*arguments, *named.values()) if isinstance(value, Tensor)), None)
-            if given is None or given.is_floating_point():
-                return
-            self._called[path] = max(self._called.get(path, tuple(given.shape)), tuple(given.shape), key=np.prod)
-            rows = given[None] if given.ndim == 1 else given
-            if not is_prompt or rows.ndim != 2 or len(rows) != self._batch:
-                return
-            if self.ids is None or rows.shape[1] > self.ids.shape[1]:
-                self.ids = rows.detach().cpu().numpy().astype(np.int64)
-
-        return look
+    def _look(self, path: str, _module: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
+        given = next((value for value in (*arguments, *named.values()) if isinstance(value, Tensor)), None)
+        if given is None or given.is_floating_point():
+            return
+        self._called[path] = max(self._called.get(path, tuple(given.shape)), tuple(given.shape), key=np.prod)
+        rows = given[None] if given.ndim == 1 else given
+        is_prompt = path == next(iter(self._embeddings)) and rows.ndim == 2 and len(rows) == self._batch
+        if is_prompt and (self.ids is None or rows.shape[1] > self.ids.shape[1]):
+            self.ids = rows.detach().cpu().numpy().astype(np.int64)
 
     def missing(self) -> PromptDoesNotFit:
         """Return the error for a call in which the prompt's embedding was given no ids: it says which others were."""

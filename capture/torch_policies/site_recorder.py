@@ -20,7 +20,7 @@ from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.key_caches import KeyCaches
 from vla_attention.capture.torch_policies.output_ways import OutputWay
-from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
+from vla_attention.capture.torch_policies.policy_layout import RecordedSite
 from vla_attention.capture.torch_policies.replan_contributions import ReplanContributions, spread
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.segments import segment_members, segments_of
@@ -74,7 +74,12 @@ class ReplanRecorder(CallOrder):
         where: str,
     ) -> None:
         super().__init__(known, policy)
-        self.recordings = {name: chosen for name, chosen in recordings_of(recording, self.layout).items() if chosen}
+        #: By site: of the chosen layers and heads those that it has; not the sites that have none.
+        self.recordings = {
+            site.name: recording.of_site(site.keys)
+            for site in self.layout.sites
+            if not site.keys.layers or set(site.keys.layers) & set(recording.layers)
+        }
         self.batch = batch
         self.rows = tuple(rows)
         self.contributions = ReplanContributions(list(known.sites), self.rows, self.early_roles)
@@ -250,16 +255,6 @@ class ReplanRecorder(CallOrder):
         if not self.changes:
             return "look at the policy's input and weights, or use float32"
         return "an intervention may leave a query without any key: take a smaller group, or fewer heads or layers"
-
-
-def recordings_of(recording: Recording, layout: PolicyLayout) -> dict[str, Recording | None]:
-    """What is recorded of each site: of the chosen layers and heads those that it has; None where it has none."""
-    recordings: dict[str, Recording | None] = {}
-    for site in layout.sites:
-        layers = site.keys.layers
-        has_some = not layers or bool(set(layers) & set(recording.layers))
-        recordings[site.name] = recording.of_site(site.keys) if has_some else None
-    return recordings
 
 
 def final_contribution(
