@@ -11,8 +11,6 @@ from vla_attention.capture.interventions.factors import check_keys_left
 from vla_attention.capture.torch_policies.attention_calls import (
     MASKED_BELOW,
     CallShape,
-    Positions,
-    at_positions,
 )
 from vla_attention.schemas.errors import BadArgument
 
@@ -37,13 +35,6 @@ def fitted_change(change: Tensor, shape: CallShape, device: torch.device) -> Ten
             f"shape {full} (batch, head, query, key). Give a tensor that can be broadcast to it."
         )
     return fitted.reshape((1,) * (4 - fitted.ndim) + tuple(fitted.shape))
-
-
-def mask_as_logits(mask: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return a mask as logits to add: bool masks (True: keep) as 0 and -inf, additive masks as they are."""
-    if mask.dtype is torch.bool:
-        return torch.zeros(mask.shape, dtype=dtype, device=mask.device).masked_fill_(~mask, float("-inf"))
-    return mask.to(dtype)
 
 
 def causal_mask(queries: Tensor, keys: int) -> Tensor:
@@ -78,18 +69,18 @@ def normalised(logits: Tensor) -> Tensor:
     return rows.masked_fill_(logits.amax(-1, keepdim=True) == float("-inf"), 0.0).float()
 
 
-def part(tensor: Tensor, queries: Positions, batch: Positions) -> Tensor:
+def part(tensor: Tensor, queries: slice, batch: slice) -> Tensor:
     """Return the wanted queries and batch rows of (batch or 1, head or 1, query or 1, key)."""
-    if tensor.shape[0] > 1:
-        tensor = at_positions(tensor, 0, batch)
-    return at_positions(tensor, 2, queries) if tensor.shape[2] > 1 else tensor
+    return tensor[batch if tensor.shape[0] > 1 else slice(None), :, queries if tensor.shape[2] > 1 else slice(None)]
 
 
 def changed_mask(mask: Tensor | None, causal: bool, change: Tensor, queries: int, keys: int) -> tuple[Tensor, Tensor]:
     """Return the policy's mask and the changed one as float32 logits, (batch or 1, head or 1, query, key)."""
     before = torch.zeros((1, 1, queries, keys), device=change.device)
-    if mask is not None:
-        before = before + mask_as_logits(mask, torch.float32)
+    if mask is not None and mask.dtype is torch.bool:
+        before = before.masked_fill(~mask, float("-inf"))
+    elif mask is not None:
+        before = before + mask.to(torch.float32)
     if causal:
         seen = causal_mask(torch.arange(queries, device=change.device), keys)
         before = before.masked_fill(~seen, float("-inf"))

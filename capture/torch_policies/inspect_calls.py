@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, pairwise
@@ -122,16 +121,17 @@ class _Shapes(Watcher):
     errors: list[float] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
     caches: KeyCaches = field(default_factory=KeyCaches)
-    #: Of every call the rows of the first row of its batch, (head, query, key), where they are wanted.
-    first_rows: list[Tensor | None] | None = None
+    #: By module: of every call its number and the rows of the first row of its batch, (head, query, key), where wanted.
+    first_rows: dict[str, list[tuple[int, Tensor | None]]] | None = None
 
     def saw(self, call: AttentionCall) -> None:
         step = max(1, -(-call.shape.queries // _CHECKED_QUERIES))
         queries = slice(None, None, step)
-        self.calls.append(call.shape)
         if self.first_rows is not None:
             compared = slice(None, None, max(1, call.shape.queries // _COMPARED_QUERIES))
-            self.first_rows.append(None if call.refused else call.rows(compared, slice(0, 1))[0].cpu())
+            rows = None if call.refused else call.rows(compared, slice(0, 1))[0].cpu()
+            self.first_rows.setdefault(call.shape.module, []).append((len(self.calls), rows))
+        self.calls.append(call.shape)
         if call.refused:
             self.errors.append(float("nan"))
             self.refused.append(f"it {call.refused}")
@@ -162,14 +162,14 @@ def inspect(policy: object, call: Callable[[], object], *, first_row: Callable[[
         OtherCalls: `first_row` makes other attention calls.
         UserError: see `watch_attention`.
     """
-    shapes = _Shapes(first_rows=None if first_row is None else [])
+    shapes = _Shapes(first_rows=None if first_row is None else {})
     random = RandomNumbers()
     with watch_attention(policy, shapes):
         call()
     if not shapes.calls:
         raise NoAttention(no_attention(policy))
     if first_row is not None:
-        alone = _Shapes(first_rows=[])
+        alone = _Shapes(first_rows={})
         random.again()
         with watch_attention(policy, alone):
             first_row()
@@ -179,11 +179,7 @@ def inspect(policy: object, call: Callable[[], object], *, first_row: Callable[[
 
 def _compare_first_rows(shapes: _Shapes, alone: _Shapes) -> None:
     """Refuse calls whose first row is another one without the other rows of the batch."""
-    of_all: defaultdict[str, list[int]] = defaultdict(list)
-    of_one: defaultdict[str, list[int]] = defaultdict(list)
-    for watched, numbers in ((shapes, of_all), (alone, of_one)):
-        for number, call in enumerate(watched.calls):
-            numbers[call.module].append(number)
+    of_all, of_one = shapes.first_rows or {}, alone.first_rows or {}
     as_often = [module for module in of_all if len(of_all[module]) == len(of_one.get(module, ()))]
     pairs = [pair for module in as_often for pair in zip(of_all[module], of_one[module], strict=True)]
     if not pairs or of_all.keys() != of_one.keys():
@@ -191,10 +187,7 @@ def _compare_first_rows(shapes: _Shapes, alone: _Shapes) -> None:
             f"The call given as first_row made {len(alone.calls)} attention calls in {len(of_one)} modules, and that "
             f"of all rows {len(shapes.calls)} in {len(of_all)}: both must be the same policy call."
         )
-    assert shapes.first_rows is not None
-    assert alone.first_rows is not None
-    for number, other in pairs:
-        rows, expected, shape = shapes.first_rows[number], alone.first_rows[other], alone.calls[other]
+    for (number, rows), (other, expected) in pairs:
         if rows is None or expected is None or shapes.refused[number]:
             continue
         if rows.shape != expected.shape:
@@ -204,7 +197,7 @@ def _compare_first_rows(shapes: _Shapes, alone: _Shapes) -> None:
             )
             continue
         difference = float((rows - expected).abs().max()) if rows.numel() else 0.0
-        if not difference <= TOLERANCE.get(shape.dtype, TOLERANCE["float32"]):
+        if not difference <= TOLERANCE.get(alone.calls[other].dtype, TOLERANCE["float32"]):
             shapes.refused[number] = (
                 f"the first row of its batch differs by {difference:.2g} from that of the call of one row: the heads "
                 "are folded outside of the batch, or the two calls had other inputs. Record one environment at a time"

@@ -110,11 +110,13 @@ class CallBias:
         sizes = shape.heads, shape.queries, shape.keys, place.queries.start, place.queries.stop, token
         call = place.rule, place.site, tuple(id(edit) for edit in edits), *sizes
         if call not in self._known:
-            keys = (
-                CallKeys.of_prefix(self._tokens(rule.tokens or "", shape))
-                if place.site is None
-                else CallKeys(place.queries, self._own_keys(place.site, shape), place.keys)
-            )
+            if place.site is None:
+                keys = CallKeys.of_prefix(self._tokens(rule.tokens or "", shape))
+            else:
+                # The keys of the call's own queries are the last ones, of a site that has keys of actions.
+                has_actions = any(span.kind == "action" for span in self.layout.site(place.site).keys.spans)
+                own = slice(shape.keys - shape.queries, shape.keys) if has_actions else None
+                keys = CallKeys(place.queries, own if shape.keys >= shape.queries else None, place.keys)
             self._known[call] = logit_bias(edits, (shape.heads, shape.queries, shape.keys), keys)
         return self._known[call]
 
@@ -130,10 +132,3 @@ class CallBias:
                 "with these tokens in the layout."
             )
         return tokens
-
-    def _own_keys(self, site: str, shape: CallShape) -> slice | None:
-        """The keys of the call's own queries, the last ones; None for a site without keys of actions."""
-        spans = self.layout.site(site).keys.spans
-        if shape.keys < shape.queries or not any(span.kind == "action" for span in spans):
-            return None
-        return slice(shape.keys - shape.queries, shape.keys)

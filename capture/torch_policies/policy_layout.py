@@ -7,7 +7,7 @@ makes: `call_order.py` gives each call its site, block and denoise step, and say
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Literal
 
 from msgspec import field
@@ -164,6 +164,10 @@ class RecordedSite(Document, frozen=True):
     def name(self) -> str:
         """The site's name."""
         return self.keys.name
+
+    def is_in(self, layers: Sequence[int]) -> bool:
+        """Whether some of these layers have the site."""
+        return not self.keys.layers or not set(self.keys.layers).isdisjoint(layers)
 
     @property
     def num_action_queries(self) -> int:

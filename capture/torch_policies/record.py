@@ -123,6 +123,15 @@ def record(
     other = check_versions(layout, installed)
     if other is not None and not any_version:
         raise LayoutForAnotherVersion(other)
+    if queries not in ("mean", "all"):
+        raise BadArgument(f"Cannot record the queries '{queries}'; expected 'mean' or 'all'.")
+    if queries == "all" and layout.stops_early:
+        raise BadArgument(
+            f"Cannot record all action queries of '{layout.name}': it may generate fewer than "
+            f"{layout.num_action_tokens} tokens. Record their mean."
+        )
+    if not 1 <= bits <= FLOAT32_MANTISSA_BITS:
+        raise BadArgument(f"Cannot store rows with {bits} mantissa bits; expected 1 to {FLOAT32_MANTISSA_BITS}.")
     settings = RecordingSettings(
         layers=None if layers is None else tuple(layers),
         denoise_steps=(denoise_steps,) if isinstance(denoise_steps, (int, str)) else tuple(denoise_steps),
@@ -132,7 +141,7 @@ def record(
         frames=frames,
         contributions=contributions,
     )
-    recording = recording_of_layout(settings, layout)
+    recording, _ = recording_of(settings, layout, max(num_action_queries(layout, site) for site in layout.sites))
     changes = interventions or Interventions()
     check_interventions(changes, layout)
     planned = effects_of_layout(effects, layout)
@@ -176,21 +185,6 @@ def record(
     )
 
 
-def recording_of_layout(settings: RecordingSettings, layout: PolicyLayout) -> Recording:
-    """Return what is recorded; raise `BadArgument` for what the layout does not have."""
-    queries, bits = settings.queries, settings.mantissa_bits
-    if queries not in ("mean", "all"):
-        raise BadArgument(f"Cannot record the queries '{queries}'; expected 'mean' or 'all'.")
-    if queries == "all" and layout.stops_early:
-        raise BadArgument(
-            f"Cannot record all action queries of '{layout.name}': it may generate fewer than "
-            f"{layout.num_action_tokens} tokens. Record their mean."
-        )
-    if not 1 <= bits <= FLOAT32_MANTISSA_BITS:
-        raise BadArgument(f"Cannot store rows with {bits} mantissa bits; expected 1 to {FLOAT32_MANTISSA_BITS}.")
-    return recording_of(settings, layout, max(num_action_queries(layout, site) for site in layout.sites))[0]
-
-
 def num_action_queries(layout: PolicyLayout, site: RecordedSite) -> int:
     """Return how many action queries a policy call has at a site."""
     return layout.num_action_tokens if layout.autoregressive else site.num_action_queries
@@ -200,11 +194,9 @@ def recorded_sites(layout: PolicyLayout, recording: Recording) -> tuple[SiteLayo
     """Return the sites that some recorded layer has, as the store describes them."""
     stored = []
     for site in layout.sites:
-        if site.keys.layers and not set(site.keys.layers) & set(recording.layers):
-            continue
-        count = num_action_queries(layout, site)
-        num_queries = 0 if count == recording.num_action_queries else count
-        stored.append(replace(site.keys, num_action_queries=num_queries) if num_queries else site.keys)
+        if site.is_in(recording.layers):
+            count = num_action_queries(layout, site)
+            stored.append(replace(site.keys, num_action_queries=count * (count != recording.num_action_queries)))
     if not stored:
         raise BadArgument(f"The layers {listing(recording.layers)} have none of the sites.")
     return tuple(stored)

@@ -96,8 +96,10 @@ def whole_number(what: str, given: Any) -> int:
         raise BadArgument(f"The {what} is {given!r}; expected a whole number.") from None
 
 
-def _numbers(what: str, given: Any, axes: int, expected: str) -> NDArray[np.float64]:
-    """Return numbers as float64 (a further first axis of length 1 is left out), or raise `BadArgument`."""
+def _numbers(what: str, given: Any, axes: int, expected: str) -> NDArray[np.float64] | None:
+    """Return numbers as float64, or raise `BadArgument`; None for None. A first axis of length 1 may be left out."""
+    if given is None:
+        return None
     values = given.detach().float().cpu().numpy() if hasattr(given, "detach") else given
     try:
         # A copy: the policy may write its next actions to the same array.
@@ -159,20 +161,19 @@ def read_inputs(
     coverage = {camera: np.asarray(array, dtype=np.float32) for camera, array in values.get("coverage", {}).items()}
     for camera, mask in values.get("masks", {}).items():
         coverage[camera] = camera_coverage(np.asarray(mask), len(facts.objects), camera_grids(sites, camera))
-    seed, state, data = (values.get(name) for name in ("noise_seed", "state", "dataset_actions"))
-    seed = facts.seed if seed is None else seed
+    seed = values.get("noise_seed", facts.seed)
     if seed is not None and not -(2**63) <= (seed := whole_number("seed of a replan's noise", seed)) < 2**63:
         raise BadArgument(f"The seed of a replan's noise is {seed}; expected a number of 64 bits.")
     return ReplanInputs(
         env_step=whole_number("env_step of a replan", env_step),
         frames=frames,
-        state=None if state is None else _numbers("state", state, 1, "(state_dim,)"),
+        state=_numbers("state", values.get("state"), 1, "(state_dim,)"),
         instruction=values.get("instruction", facts.instruction),
         prompt=values.get("prompt"),
         roles=values.get("roles", {}),
         noise_seed=seed,
         coverage={camera: coverage[camera] for camera in cameras if camera in coverage},
-        dataset_actions=None if data is None else _numbers("dataset_actions", data, 2, "(step, action_dim)"),
+        dataset_actions=_numbers("dataset_actions", values.get("dataset_actions"), 2, "(step, action_dim)"),
         repeat=_repeat(values, facts),
     )
 
@@ -197,7 +198,7 @@ def _repeat(values: Mapping[str, Any], facts: EpisodeFacts) -> Repeat | None:
 
 def read_actions(given: Any) -> NDArray[np.float64] | None:
     """Return actions as (horizon, action_dim) float64; None where the caller gave none."""
-    return None if given is None else _numbers("actions", given, 2, "(horizon, action_dim) or (action_dim,)")
+    return _numbers("actions", given, 2, "(horizon, action_dim) or (action_dim,)")
 
 
 def model_picture(picture: Any, camera: str, size: tuple[int, int], fit: PictureFit) -> NDArray[np.uint8]:
@@ -219,9 +220,7 @@ def model_picture(picture: Any, camera: str, size: tuple[int, int], fit: Picture
     inner = _resized(levels, max(1, int(levels.shape[0] / factor)), max(1, int(levels.shape[1] / factor)))
     below, beside = height - inner.shape[0], width - inner.shape[1]
     top, left = (below, beside) if fit == "pad_left_top" else (below // 2, beside // 2)
-    fitted = np.zeros((height, width, 3), dtype=np.uint8)
-    fitted[top : top + inner.shape[0], left : left + inner.shape[1]] = inner
-    return fitted
+    return np.pad(inner, ((top, below - top), (left, beside - left), (0, 0)))
 
 
 def _levels(picture: Any, camera: str) -> NDArray[np.uint8]:

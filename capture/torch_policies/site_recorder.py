@@ -76,9 +76,7 @@ class ReplanRecorder(CallOrder):
         super().__init__(known, policy)
         #: By site: of the chosen layers and heads those that it has; not the sites that have none.
         self.recordings = {
-            site.name: recording.of_site(site.keys)
-            for site in self.layout.sites
-            if not site.keys.layers or set(site.keys.layers) & set(recording.layers)
+            site.name: recording.of_site(site.keys) for site in self.layout.sites if site.is_in(recording.layers)
         }
         self.batch = batch
         self.rows = tuple(rows)

@@ -21,7 +21,6 @@ from vla_attention.capture.torch_policies.attention_calls import (
     MASKED_BELOW,
     AttentionCall,
     CallShape,
-    at_positions,
     exact,
 )
 from vla_attention.capture.torch_policies.call_tensors import (
@@ -97,10 +96,10 @@ class Softmaxes:
         if not 3 <= logits.ndim <= 5 or axis not in (-1, logits.ndim - 1):
             return function(*args, **kwargs)
         *lead, queries, keys = logits.shape
-        where = self._mode.where()
+        path, module = self._mode.where()
         # Of (batch, kv_head, group, query, key), the heads are both; of one axis, the module tells the heads.
-        batch, heads = (lead[0], lead[1] * lead[2]) if len(lead) == 3 else batch_and_heads(lead, where.module)
-        shape = self._mode.new_shape(where, "softmax", (batch, heads, heads, queries, keys), logits.dtype)
+        batch, heads = (lead[0], lead[1] * lead[2]) if len(lead) == 3 else batch_and_heads(lead, module)
+        shape = self._mode.new_shape(path, "softmax", (batch, heads, heads, queries, keys), logits.dtype)
         batch, heads = shape.batch, shape.heads
         change, given = self._mode.change(shape), logits
         if change is None:
@@ -188,8 +187,8 @@ class Softmaxes:
                 shape,
                 values,
                 result.detach().permute(back).reshape(*sizes, dim),
-                lambda queries, batch: at_positions(at_positions(rows, 0, batch), 2, queries),
-                lambda queries: at_positions(seen, 2, queries),
+                lambda queries, batch: rows[batch, :, queries],
+                lambda queries: seen[:, :, queries],
                 lambda mixed: mixed.reshape(*multiplied.shape[:-1], dim).permute(product.output),
                 given.dtype,
                 None if shape == replace(before, kv_heads=kv_heads) else before,

@@ -171,11 +171,10 @@ def test_some_queries_and_batch_rows(attend):
     with watch_attention(policy, seen):
         policy(torch.randn(3, 5, 32), torch.randn(3, 7, 32))
     for call, rows in zip(seen.calls, seen.rows, strict=True):
-        for queries, batch in ((slice(1, 3), slice(None)), ([4, 0], [2, 1]), (slice(-1, None), slice(0, 1))):
-            places = range(5)[queries] if isinstance(queries, slice) else queries
-            some = call.rows(queries, batch)
-            torch.testing.assert_close(some, rows[batch][:, :, list(places)])
-            assert call.product_error(some, queries, batch) < 5e-6
+        torch.testing.assert_close(call.rows(slice(-1, None), slice(0, 1)), rows[:1, :, -1:])
+        some = call.rows(slice(0, 5, 2))
+        torch.testing.assert_close(some, rows[:, :, ::2])
+        assert call.product_error(some, slice(0, 5, 2)) < 5e-6
 
 
 def test_values_are_shared_where_they_are():
