@@ -158,16 +158,16 @@ class SiteEditor(FactorEditor):
                     self._operands[number, kind] = _operands_of(self.edits[number], call, logits)
                 logits = _applied(self._operands[number, kind], logits)
             groups = "; ".join(self.edits[number].group for number in numbers)
-            left = logits.amax(-1) > _LOWEST_LOGIT
-            check_keys_left(had_keys, left, f"site '{self.site}', {where}", f": {groups}")
+            check_keys_left(
+                had_keys & (logits.amax(-1) <= _LOWEST_LOGIT), f"site '{self.site}', {where}", f": {groups}"
+            )
             return logits
 
         return change
 
 
-def check_keys_left(had: Tensor, left: Tensor, where: str, why: str = "") -> None:
-    """Raise `QueryWithoutKeys` if a query that had keys, (batch, head, query) bool, has none any more."""
-    lost = had & ~left
+def check_keys_left(lost: Tensor, where: str, why: str = "") -> None:
+    """Raise `QueryWithoutKeys` if there are queries that had keys and have none any more, (batch, head, query) bool."""
     if bool(lost.any()):
         batch, head, query = (int(i) for i in lost.nonzero()[0])
         row = f", batch row {batch}" if len(lost) > 1 else ""

@@ -75,7 +75,9 @@ class KnownCalls:
         for number, rule in enumerate(self.layout.rules):
             match = rule.fits(module, kind, queries, keys)
             if match is not None:
-                return number, rule.block(match) if rule.site is not None else None
+                # The group may be no number, or not match.
+                digits = match["block"] or "" if rule.site is not None else ""
+                return number, int(digits) if digits.isdecimal() else None
         return -1, None
 
     def _keys(self, name: str, count: int, token: int) -> tuple[NDArray[np.int64] | str, int]:

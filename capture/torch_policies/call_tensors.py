@@ -47,8 +47,8 @@ def causal_mask(queries: Tensor, keys: int) -> Tensor:
 
 def check_change(before: Tensor, after: Tensor, shape: CallShape) -> None:
     """Raise `QueryWithoutKeys` if a query that had a key has none after a change; logits (batch, head, query, key)."""
-    had, left = (logits.amax(-1) > MASKED_BELOW for logits in (before, after))
-    check_keys_left(had, left, f"the attention call {shape}")
+    lost = (before.amax(-1) > MASKED_BELOW) & (after.amax(-1) <= MASKED_BELOW)
+    check_keys_left(lost, f"the attention call {shape}")
 
 
 #: Where modules keep their number of heads; asked where a kernel gets (batch · head, query, dim).

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, pairwise
 from typing import Any
@@ -91,7 +91,20 @@ class CallTable:
         """The calls, those of the same shape in modules of one pattern folded into one row."""
         count = len(self.calls)
         checks = zip(self.errors or (float("nan"),) * count, self.refused or ("",) * count, strict=True)
-        return tuple(_rows(self.calls, list(checks)))
+        # Of each module and shape: number of keys -> the checks of its calls.
+        counts: dict[CallShape, dict[int, list[_Check]]] = {}
+        for call, check in zip(self.calls, checks, strict=True):
+            counts.setdefault(replace(call, number=0, keys=0), {}).setdefault(call.keys, []).append(check)
+        folded: dict[tuple[Any, ...], list[tuple[CallShape, list[_Check]]]] = {}
+        for shape, by_keys in counts.items():
+            ranges = {(keys, keys): found for keys, found in by_keys.items()}
+            # A module with many numbers of keys, such as a decoder with a cache, gets one row.
+            if len(by_keys) >= _RANGE:
+                ranges = {(min(by_keys), max(by_keys)): list(chain.from_iterable(by_keys.values()))}
+            pattern = replace(shape, module=re.sub(r"\d+", "{}", shape.module))
+            for keys, found in ranges.items():
+                folded.setdefault((pattern, keys, any(why for _, why in found)), []).append((shape, found))
+        return tuple(_row(keys, modules) for (_, keys, _), modules in folded.items())
 
     def __str__(self) -> str:
         rows = self.rows
@@ -204,29 +217,16 @@ def _compare_first_rows(shapes: _Shapes, alone: _Shapes) -> None:
             )
 
 
-def _rows(calls: Sequence[CallShape], checks: Sequence[_Check]) -> Iterator[CallRow]:
-    # Of each module and shape: number of keys -> the checks of its calls.
-    counts: dict[CallShape, dict[int, list[_Check]]] = {}
-    for call, check in zip(calls, checks, strict=True):
-        counts.setdefault(replace(call, number=0, keys=0), {}).setdefault(call.keys, []).append(check)
-    folded: dict[tuple[Any, ...], list[tuple[CallShape, list[_Check]]]] = {}
-    for shape, by_keys in counts.items():
-        ranges = {(keys, keys): found for keys, found in by_keys.items()}
-        if len(by_keys) >= _RANGE:  # a module with many numbers of keys, such as a decoder with a cache, gets one row
-            ranges = {(min(by_keys), max(by_keys)): list(chain.from_iterable(by_keys.values()))}
-        pattern = replace(shape, module=re.sub(r"\d+", "{}", shape.module))
-        for keys, found in ranges.items():
-            folded.setdefault((pattern, keys, any(why for _, why in found)), []).append((shape, found))
-    for (_, keys, _), modules in folded.items():
-        times, found = [len(checks) for _, checks in modules], [check for _, checks in modules for check in checks]
-        yield CallRow(
-            modules=tuple(shape.module for shape, _ in modules),
-            shape=modules[0][0],
-            keys=keys,
-            times=(min(times), max(times)),
-            product_error=max(error for error, _ in found),
-            refused=next((why for _, why in found if why), ""),
-        )
+def _row(keys: tuple[int, int], modules: Sequence[tuple[CallShape, Sequence[_Check]]]) -> CallRow:
+    times, found = [len(checks) for _, checks in modules], [check for _, checks in modules for check in checks]
+    return CallRow(
+        modules=tuple(shape.module for shape, _ in modules),
+        shape=modules[0][0],
+        keys=keys,
+        times=(min(times), max(times)),
+        product_error=max(error for error, _ in found),
+        refused=next((why for _, why in found if why), ""),
+    )
 
 
 def aligned(lines: Sequence[Sequence[str]]) -> list[str]:

@@ -79,7 +79,7 @@ def changes_of_episode(
 
 @dataclass
 class CallBias:
-    """What edits add to the logits of the attention calls of one row; Without edits, zeros.
+    """What edits add to the logits of the attention calls of one row. Without edits, zeros.
 
     edits: by site. present: site -> (key,) bool, the keys that the policy call has.
     """
@@ -95,15 +95,10 @@ class CallBias:
         if place.site is None and not rule.is_prefix:
             return None
         edits = self.edits.get(place.site or rule.tokens or "", ())
-        edits = [
-            edit
-            for edit in edits
-            if (
-                edit.queries != "prefix" and edit.is_at(place.block, place.step)
-                if place.site
-                else edit.queries != "action"
-            )
-        ]
+        if place.site:
+            edits = [edit for edit in edits if edit.queries != "prefix" and edit.is_at(place.block, place.step)]
+        else:
+            edits = [edit for edit in edits if edit.queries != "action"]
         if self.edits and not edits:
             return None
         token = -1 if place.keys is None else place.step

@@ -103,11 +103,6 @@ class CallRule(Document, frozen=True):
             return None
         return re.fullmatch(self.modules, module)
 
-    def block(self, match: re.Match[str]) -> int | None:
-        """Return the number of the block in a module's path, None where the group is no number or did not match."""
-        digits = match["block"]
-        return int(digits) if digits is not None and digits.isdecimal() else None
-
 
 class RecordedSite(Document, frozen=True):
     r"""One family of softmaxes: its keys and its action queries.

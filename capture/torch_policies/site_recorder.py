@@ -21,7 +21,7 @@ from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.key_caches import KeyCaches
 from vla_attention.capture.torch_policies.output_ways import OutputWay
 from vla_attention.capture.torch_policies.policy_layout import RecordedSite
-from vla_attention.capture.torch_policies.replan_contributions import ReplanContributions, spread
+from vla_attention.capture.torch_policies.replan_contributions import ReplanContributions
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.segments import segment_members, segments_of
 from vla_attention.schemas.stores.store_format import Recording
@@ -80,7 +80,7 @@ class ReplanRecorder(CallOrder):
         }
         self.batch = batch
         self.rows = tuple(rows)
-        self.contributions = ReplanContributions(list(known.sites), self.rows, self.early_roles)
+        self.contributions = ReplanContributions(self.rows, self.early_roles)
         self.where = where
         self.largest_error = 0.0
         #: Whether the output of the first recorded call is followed to see whether the rows of the batch are apart.
@@ -187,9 +187,10 @@ class ReplanRecorder(CallOrder):
         if by_part or self.asks_of_batch:
             self.asks_of_batch = False
             way = self.contributions.way(call, rows, place, site, cell, by_part=by_part)
-        keys = None if place.keys is None else torch.from_numpy(place.keys).to(rows.device)
-        if keys is not None:
-            rows, uniform = spread(rows, keys, site.keys.num_keys), spread(uniform, keys, site.keys.num_keys)
+        if place.keys is not None:
+            keys, count = torch.from_numpy(place.keys).to(rows.device), site.keys.num_keys
+            parts = (rows, uniform)
+            rows, uniform = (part.new_zeros(*part.shape[:-1], count).index_copy_(-1, keys, part) for part in parts)
         chosen = [self._chosen(values, recording) for values in (rows, uniform)]
         large = chosen[0].numel() > _LARGE_COPY
         for kept, values in zip((self._rows, self._uniform), chosen, strict=True):

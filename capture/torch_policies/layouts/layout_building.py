@@ -88,23 +88,16 @@ class KeyOrder:
         """Number of keys so far."""
         return self.spans[-1].stop if self.spans else 0
 
-    def add(self, name: str, kind: SpanKind, count: int, role: str) -> None:
-        """Add `count` keys of one kind; none, no span."""
+    def add(self, name: str, kind: SpanKind, count: int, role: str, **others: Any) -> None:
+        """Add `count` keys of one kind; none, no span. others: as in `Span`."""
         if count:
-            self.spans.append(Span(name, kind, self.num_keys, self.num_keys + count))
+            self.spans.append(Span(name, kind, self.num_keys, self.num_keys + count, **others))
             self.roles[name] = role
 
     def add_picture(self, camera: str, rows: int, columns: int, height: int, width: int) -> None:
         """Add a camera's patches, row by row."""
-        start, grid = self.num_keys, PatchGrid(rows, columns, height, width)
-        self.spans.append(Span(camera, "image", start, start + grid.num_patches, camera, grid))
-        self.roles[camera] = "image"
-
-    def add_growing(self, name: str, count: int) -> None:
-        """Add the keys of generated tokens: action query q sees the first q."""
-        if count:
-            self.spans.append(Span(name, "action", self.num_keys, self.num_keys + count, growing=True))
-            self.roles[name] = "action"
+        grid = PatchGrid(rows, columns, height, width)
+        self.add(camera, "image", grid.num_patches, "image", camera=camera, grid=grid)
 
     def site(
         self, name: str, queries: tuple[int, int | None], *, layers: tuple[int, ...] = (), variable: str | None = None

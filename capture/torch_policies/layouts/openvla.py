@@ -37,7 +37,7 @@ def openvla(
     """
     found = FoundModule(policy, _CLASSES, "openvla")
     keys = _prefix(found, [camera], prompt_tokens, patches, 0, "openvla")
-    keys.add_growing("action_tokens", action_dim - 1)
+    keys.add("action_tokens", "action", action_dim - 1, "action", growing=True)
     return _layout(
         "openvla",
         found,

@@ -79,7 +79,7 @@ def pi0_fast(policy: object) -> PolicyLayout:
     cameras = [camera_name(feature) for feature in config.image_features]
     patch, longest = paligemma.vision_config.patch_size, config.tokenizer_max_length + 1
     keys = _prefix(cameras, tuple(config.image_resolution), patch, longest)
-    keys.add_growing("action_tokens", config.max_decoding_steps - 1)
+    keys.add("action_tokens", "action", config.max_decoding_steps - 1, "action", growing=True)
     decoder = "model.paligemma_with_expert.paligemma.model.language_model"
     return keys.layout(
         "pi0_fast",
