@@ -121,11 +121,6 @@ class PiConfig:
         """Queries of a denoise step: [state token, pi0 only] and the actions."""
         return self.first_action_query + self.action_horizon
 
-    @property
-    def key_len(self) -> int:
-        """Keys of a denoise step: prefix and suffix."""
-        return self.prefix_len + self.suffix_len
-
 
 #: Full-size models by openpi's names for its configurations of LIBERO and DROID.
 NAMED_CONFIGS: dict[str, PiConfig] = {

@@ -21,7 +21,6 @@ from vla_attention.capture.foreign_files.checked_files import check_folder
 from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint, read_json_object
 from vla_attention.capture.policies.hub import first_line
 from vla_attention.capture.policies.pi.config import PiConfig
-from vla_attention.capture.policies.pi.formats import detect_format
 from vla_attention.capture.policies.pi.jax_weights import merge_lora, plan_leaves
 from vla_attention.capture.policies.pi.model import PiModel, build_model, expected_shapes, expected_tensors
 from vla_attention.capture.policies.pi.sizes import check_jax_heads
@@ -124,20 +123,12 @@ def import_tensorstore() -> Any:
     return tensorstore
 
 
-def load_openpi_jax(
-    folder: str | Path,
-    *,
-    config: PiConfig,
-    dtype: torch.dtype = torch.float32,
-    device: str | torch.device = "cpu",
-) -> PiModel:
+def load_openpi_jax(folder: Path, config: PiConfig, dtype: torch.dtype, device: str | torch.device) -> PiModel:
     """Load a checkpoint in openpi's JAX format.
 
     Such a checkpoint does not state its configuration. All shapes are checked against the given one; the action horizon
     is in none of them. LoRA arrays are merged into the weights that they adapt.
     """
-    folder = Path(folder)
-    detect_format(folder, "openpi_jax")
     params = folder / "params"
     leaves = list_leaves(params)
     plans, pairs = plan_leaves(leaf.path for leaf in leaves)

@@ -179,7 +179,7 @@ class PiPolicy:
         """Return the model's input; pictures: slot -> the stored picture and the model's, as in `pictures_of_frame`."""
         config, device = self.model.config, self.model.device
         size = config.siglip.image_size
-        normalised = self.processing.normalise_state(state)
+        normalised = self.processing.state.normalise(state)
         layout = self.sites[0]
         prompt_span = layout.span(PROMPT_SPAN)
         tokenized = self.tokenizer.tokenize(

@@ -32,12 +32,9 @@ ENVIRONMENT_ACTION_DIM = 7
 RELATIVE_ACTIONS = 6
 
 
-def model_image(frame: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
-    """Return the model's image (size, size, 3) of a raw camera frame (height, width, 3).
-
-    Rotated by 180°, resized by PIL's bilinear filter with the aspect ratio kept, centred on black.
-    """
-    return resize_with_pad(np.ascontiguousarray(frame[::-1, ::-1]), size)
+def turn(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a simulator's picture turned by 180°, as policies of LIBERO see it."""
+    return np.ascontiguousarray(picture[::-1, ::-1])
 
 
 def resize_with_pad(image: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
@@ -74,6 +71,37 @@ def libero_state(
 
 
 @dataclass(frozen=True)
+class Normaliser:
+    """Normalisation of one vector: (x - offset) / divisor, and where that is a share of a range, 0..1 becomes -1..1.
+
+    mode: its name, for the store. offset, divisor, factor: each (dim,), in the precision of the arithmetic; the factor
+    undoes the divisor.
+    """
+
+    mode: str
+    offset: NDArray[np.floating]
+    divisor: NDArray[np.floating]
+    factor: NDArray[np.floating]
+    is_range: bool = False
+
+    def normalise(self, x: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Map (..., dim) to the model's range, without clipping.
+
+        Statistics longer than the data are cut to it (older checkpoints hold padded ones).
+        """
+        dim = x.shape[-1]
+        scaled: NDArray[np.floating] = (np.asarray(x, dtype=self.offset.dtype) - self.offset[:dim]) / self.divisor[:dim]
+        return scaled * 2.0 - 1.0 if self.is_range else scaled
+
+    def unnormalise(self, x: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Invert `normalise` on (..., dim); dimensions beyond the statistics pass through."""
+        x = np.asarray(x, dtype=self.offset.dtype)
+        dim = min(x.shape[-1], len(self.offset))
+        known = (x[..., :dim] + 1.0) / 2.0 if self.is_range else x[..., :dim]
+        return np.concatenate([known * self.factor[:dim] + self.offset[:dim], x[..., dim:]], axis=-1)
+
+
+@dataclass(frozen=True)
 class Statistics:
     """Statistics of one vector, each (dim,) float64; the quantiles are absent in some checkpoints."""
 
@@ -82,32 +110,14 @@ class Statistics:
     q01: NDArray[np.float64] | None = None
     q99: NDArray[np.float64] | None = None
 
-    def normalise(self, x: NDArray[np.floating], mode: NormalisationMode) -> NDArray[np.float64]:
-        """Map (..., dim) to the model's range: (x - mean)/(std + eps), or q01..q99 to -1..1 without clipping.
-
-        Statistics longer than the data are cut to it (older checkpoints hold padded ones).
-        """
-        dim = x.shape[-1]
+    def normaliser(self, mode: NormalisationMode) -> Normaliser:
+        """Return openpi's normalisation: (x - mean)/(std + eps), or q01..q99 to -1..1."""
         if mode == "z-score":
-            return (x - self.mean[:dim]) / (self.std[:dim] + NORMALISATION_EPS)
-        low, high = self._quantiles()
-        return (x - low[:dim]) / (high[:dim] - low[:dim] + NORMALISATION_EPS) * 2.0 - 1.0
-
-    def unnormalise(self, x: NDArray[np.floating], mode: NormalisationMode) -> NDArray[np.float64]:
-        """Invert `normalise` on (..., dim); dimensions beyond the statistics pass through."""
-        dim = min(x.shape[-1], len(self.mean))
-        known = x[..., :dim]
-        if mode == "z-score":
-            known = known * (self.std[:dim] + NORMALISATION_EPS) + self.mean[:dim]
-        else:
-            low, high = self._quantiles()
-            known = (known + 1.0) / 2.0 * (high[:dim] - low[:dim] + NORMALISATION_EPS) + low[:dim]
-        return np.concatenate([known, x[..., dim:]], axis=-1, dtype=np.float64)
-
-    def _quantiles(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+            return Normaliser(mode, self.mean, self.std + NORMALISATION_EPS, self.std + NORMALISATION_EPS)
         if self.q01 is None or self.q99 is None:
             raise UnreadableCheckpoint("The normalisation statistics have no q01 and q99, which quantile mode needs.")
-        return self.q01, self.q99
+        span = self.q99 - self.q01 + NORMALISATION_EPS
+        return Normaliser(mode, self.q01, span, span, is_range=True)
 
 
 @dataclass(frozen=True)
@@ -117,51 +127,22 @@ class NormStats:
     state: Statistics
     actions: Statistics
 
-    def check(
-        self, mode: NormalisationMode, state_dim: int, padded_dim: int, action_dim: int = ENVIRONMENT_ACTION_DIM
-    ) -> None:
-        """Raise `UnreadableCheckpoint` unless they fit the state and the environment's actions in this mode.
+    def check(self, state_dim: int, action_dim: int, padded_dim: int) -> None:
+        """Raise `UnreadableCheckpoint` unless they fit the state and the environment's actions.
 
         Older checkpoints hold statistics padded to the model's `padded_dim`; any other length belongs to another robot.
         """
-        for name, statistics, needed in (
-            ("state", self.state, state_dim),
-            ("actions", self.actions, action_dim),
-        ):
+        for name, statistics, needed in (("state", self.state, state_dim), ("actions", self.actions, action_dim)):
             if len(statistics.mean) not in (needed, padded_dim):
                 raise UnreadableCheckpoint(
                     f"The normalisation statistics of '{name}' have {len(statistics.mean)} numbers; {needed} are "
                     f"needed (or {padded_dim}, padded)."
-                )
-            if mode == "quantile" and (statistics.q01 is None or statistics.q99 is None):
-                raise UnreadableCheckpoint(
-                    f"The normalisation statistics of '{name}' lack q01 and q99 for quantile mode."
                 )
 
 
 def pad_to(x: NDArray[np.floating], dim: int) -> NDArray[np.float64]:
     """Return (..., dim) with zeros after the given dimensions."""
     return np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, dim - x.shape[-1])])
-
-
-def environment_actions(
-    model_actions: NDArray[np.floating],
-    stats: NormStats,
-    mode: NormalisationMode,
-    *,
-    relative_to: NDArray[np.floating] | None = None,
-    action_dim: int = ENVIRONMENT_ACTION_DIM,
-    num_relative: int = RELATIVE_ACTIONS,
-) -> NDArray[np.float64]:
-    """Return a robot's actions (..., horizon, `action_dim`) of model outputs (..., horizon, action dim of the model).
-
-    `relative_to` (..., state) is the unnormalised state for policies trained on differences to it (openpi's
-    pi0_libero): its first `num_relative` numbers are added; the gripper is absolute.
-    """
-    actions = stats.actions.unnormalise(model_actions, mode)[..., :action_dim]
-    if relative_to is not None:
-        actions[..., :num_relative] += relative_to[..., None, :num_relative]
-    return actions
 
 
 class _Numbers(msgspec.Struct, frozen=True):
@@ -214,7 +195,7 @@ def read_norm_stats(checkpoint: str | Path, given: Path | None = None, asset_id:
     if given is not None:
         return _read_norm_stats(given.expanduser(), inside=None)
     folder = Path(checkpoint)
-    by_name = {path.parent.relative_to(folder / "assets").as_posix(): path for path in find_norm_stats(folder)}
+    by_name = find_norm_stats(folder)
     if not by_name:
         raise CheckpointNotFound(
             f"The checkpoint '{checkpoint}' has no norm_stats.json below '{folder / 'assets'}'; give the one of its "
@@ -242,6 +223,8 @@ def _read_norm_stats(path: Path, inside: Path | None) -> NormStats:
     return parse_norm_stats(content, f"'{path}'")
 
 
-def find_norm_stats(checkpoint: Path) -> list[Path]:
-    """Return the files norm_stats.json below the folder `assets` of a checkpoint, in the order of their paths."""
-    return sorted(path for path in (checkpoint / "assets").glob("**/norm_stats.json") if not path.is_dir())
+def find_norm_stats(checkpoint: Path) -> dict[str, Path]:
+    """Return asset id -> norm_stats.json of the files below the folder `assets` of a checkpoint, in their order."""
+    assets = checkpoint / "assets"
+    files = sorted(path for path in assets.glob("**/norm_stats.json") if not path.is_dir())
+    return {path.parent.relative_to(assets).as_posix(): path for path in files}
