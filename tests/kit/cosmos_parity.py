@@ -23,7 +23,7 @@ from vla_attention.capture.policies.cosmos.config import (
 from vla_attention.capture.policies.cosmos.dit import Attention, Dit
 from vla_attention.capture.policies.cosmos.dit_weights import build_dit, dit_tensors, infer_dit_config
 from vla_attention.capture.policies.cosmos.latents import actions_of_frame, condition_mask, read_value
-from vla_attention.capture.policies.cosmos.model import CallTrace, CosmosModel
+from vla_attention.capture.policies.cosmos.model import CosmosModel
 from vla_attention.capture.policies.cosmos.preprocess import compressed_picture, make_ranges
 from vla_attention.capture.policies.cosmos.sampler import sample, seeded_noise
 from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
@@ -186,6 +186,23 @@ class ParityReport:
 
 
 @dataclass
+class CallTrace:
+    """Inputs and outputs of each network evaluation."""
+
+    noisy: list[Tensor] = field(default_factory=list)
+    net_input: list[Tensor] = field(default_factory=list)
+    times: list[Tensor] = field(default_factory=list)
+    net_output: list[Tensor] = field(default_factory=list)
+    clean: list[Tensor] = field(default_factory=list)
+
+    def network(self, dit: Dit, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        """Keep what the network gets and gives; a forward hook."""
+        self.net_input.append(inputs[0])
+        self.times.append(inputs[1].to(dit.dtype).float())
+        self.net_output.append(output.float())
+
+
+@dataclass
 class EverythingObserver:
     """Keeps the rows of all queries, and the norms of updates and of each frame's contribution, for all blocks.
 
@@ -214,10 +231,6 @@ class EverythingObserver:
                 self._contributions.setdefault(layer, []).append(parts)
 
         return take
-
-    def takes_updates(self, layer: int) -> bool:
-        """Return True: updates of every block."""
-        return True
 
     def updates(self, layer: int, updates: dict[str, Tensor], gates: dict[str, Tensor], block_input: Tensor) -> None:
         """Keep the norms (batch, token, 4) of updates and input, and (batch, token, frame + 1) of contributions."""
@@ -323,9 +336,15 @@ def _sample(
 
     def denoise(noisy: Tensor, sigma: float, step: int) -> Tensor:
         observer = observers[step] if has_rows else None
-        return model.denoise(noisy, sigma, given, mask, text, observer, trace)
+        trace.noisy.append(noisy)
+        trace.clean.append(model.denoise(noisy, sigma, given, mask, text, observer))
+        return trace.clean[-1]
 
-    return sample(denoise, noise, model.levels)
+    hook = model.dit.register_forward_hook(trace.network)
+    try:
+        return sample(denoise, noise, model.levels)
+    finally:
+        hook.remove()
 
 
 def _compare_call(

@@ -69,10 +69,6 @@ class CallObserver:
             self._seen[site] = value, attention.output_proj.weight
         return recorder.sink(layer, self.denoise_step, self._queries)
 
-    def takes_updates(self, layer: int) -> bool:
-        """Return whether contributions of this block are recorded at any site."""
-        return bool(self._update_sinks(layer))
-
     def updates(self, layer: int, updates: dict[str, Tensor], gates: dict[str, Tensor], block_input: Tensor) -> None:
         """Pass values, projection and update of the recorded queries on to the recorders."""
         for site, sink in self._update_sinks(layer).items():
@@ -104,17 +100,6 @@ class CallEditor:
 
 
 PROPRIO_FRAME = "proprio"
-
-
-@dataclass
-class CallTrace:
-    """Inputs and outputs of each network evaluation, kept for a comparison with the reference only."""
-
-    noisy: list[Tensor] = field(default_factory=list)
-    net_input: list[Tensor] = field(default_factory=list)
-    times: list[Tensor] = field(default_factory=list)
-    net_output: list[Tensor] = field(default_factory=list)
-    clean: list[Tensor] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -179,7 +164,6 @@ class CosmosModel(nn.Module):
         mask: Tensor,
         text: Tensor,
         observer: BlockObserver | None = None,
-        trace: CallTrace | None = None,
         editor: BlockEditor | None = None,
     ) -> Tensor:
         """Return the estimate of the clean latents (float32) from latents with noise `sigma`; given frames are kept."""
@@ -190,51 +174,24 @@ class CosmosModel(nn.Module):
         padding = torch.zeros(len(noisy), 1, size, size, device=noisy.device)
         net_output = self.dit(net_input, times, mask, padding, text, observer, editor).float()
         clean: Tensor = (1 - t) * noisy - t * net_output
-        clean = mask * given + (1 - mask) * clean
-        if trace is not None:
-            trace.noisy.append(noisy)
-            trace.net_input.append(net_input)
-            trace.times.append(times.to(self.dtype).float())
-            trace.net_output.append(net_output)
-            trace.clean.append(clean)
-        return clean
+        return mask * given + (1 - mask) * clean
 
     @torch.no_grad()
-    def sample_latents(
-        self, given: Tensor, text: Tensor, seed: int, recorders: Recorders | None = None, trace: CallTrace | None = None
-    ) -> Tensor:
+    def sample_latents(self, given: Tensor, text: Tensor, seed: int, recorders: Recorders | None = None) -> Tensor:
         """Return the clean latent video (1, channel, frame, row, column) float32.
 
         given: from `given_latents`. text: (1, position, text width). seed: of the noise, made by numpy's legacy
         generator.
         """
-        config = self.config
+        config, wanted = self.config, recorders or Recorders()
         noise = torch.from_numpy(seeded_noise(seed, config.latent_shape)).to(self.device)
         mask = condition_mask(config).to(self.device)
         text = text.to(self.device)
+        frame, tokens = wanted.query_frame, config.tokens_per_frame
 
         def denoise(noisy: Tensor, sigma: float, step: int) -> Tensor:
-            observer, editor = self._observer(recorders, step), self._editor(recorders, step)
-            return self.denoise(noisy, sigma, given, mask, text, observer, trace, editor)
+            observer = CallObserver(step, frame, tokens, wanted.rows) if wanted.rows else None
+            editor = CallEditor(step, frame, tokens, wanted.editors) if wanted.editors else None
+            return self.denoise(noisy, sigma, given, mask, text, observer, editor)
 
         return sample(denoise, noise, self.levels)
-
-    def _observer(self, recorders: Recorders | None, step: int) -> CallObserver | None:
-        if recorders is None or not recorders.rows:
-            return None
-        return CallObserver(
-            denoise_step=step,
-            query_frame=recorders.query_frame,
-            tokens_per_frame=self.config.tokens_per_frame,
-            recorders=recorders.rows,
-        )
-
-    def _editor(self, recorders: Recorders | None, step: int) -> CallEditor | None:
-        if recorders is None or not recorders.editors:
-            return None
-        return CallEditor(
-            denoise_step=step,
-            query_frame=recorders.query_frame,
-            tokens_per_frame=self.config.tokens_per_frame,
-            editors=recorders.editors,
-        )

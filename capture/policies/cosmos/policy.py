@@ -106,17 +106,13 @@ class CosmosPolicy:
         """
         return run_seed
 
-    def action_shares(self) -> NDArray[np.float64]:
-        """Return the shares (query, step, dim) of action numbers in each recorded query of the action frame."""
+    def query_pools(self) -> NDArray[np.float64]:
+        """Return weights (pool, query) that pool the recorded queries by action step and dimension, step-major."""
         if self.query_frame != ACTION_FRAME:
             raise BadArgument(
                 f"Queries of latent frame '{self.query_frame}' do not stand for action steps; use --query-frame action."
             )
-        return action_shares(self.config)
-
-    def query_pools(self) -> NDArray[np.float64]:
-        """Return weights (pool, query) that pool the recorded queries by action step and dimension, step-major."""
-        return query_pools(self.action_shares())
+        return query_pools(action_shares(self.config))
 
     @cached_property
     def _digest(self) -> str:

@@ -11,7 +11,7 @@ import torch
 from vla_attention.capture.environments.episode_protocol import CAMERAS
 from vla_attention.capture.policies.checkpoints import UnsupportedCheckpoint, read_json_object
 from vla_attention.capture.policies.family import UNTRAINED, UNTRAINED_TINY
-from vla_attention.capture.policies.hub import downloads, lasting_name
+from vla_attention.capture.policies.hub import downloads, lasting_name, would_be_fetched
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.pi.config import (
     CAMERA_SLOTS,
@@ -29,7 +29,7 @@ from vla_attention.capture.policies.pi.formats import CheckpointFormat, detect_f
 from vla_attention.capture.policies.pi.lerobot import lerobot_arm, lerobot_model, lerobot_processing
 from vla_attention.capture.policies.pi.lerobot_config import read_lerobot_config
 from vla_attention.capture.policies.pi.lerobot_pipeline import read_lerobot_pipeline
-from vla_attention.capture.policies.pi.locate import find_checkpoint, find_tokenizer, would_be_fetched
+from vla_attention.capture.policies.pi.locate import find_checkpoint, find_tokenizer
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.openpi_jax import OpenLeaf, list_leaves, load_openpi_jax
 from vla_attention.capture.policies.pi.openpi_torch import load_safetensors, open_tensors

@@ -28,7 +28,7 @@ from vla_attention.capture.policies.weights import dtype_name, weights_digest
 from vla_attention.capture.recording.attention import AttentionEditor, BatchCollector, RowCollector
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.jsonable import to_json
-from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, roles_from_spans
+from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, SpanKind, roles_from_spans
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.store_format import PolicyCameraView, PolicyIdentity
 
@@ -37,29 +37,18 @@ PROMPT_SPAN, STATE_SPAN, ACTION_SPAN = "prompt", "state", "actions"
 
 def site_layout(config: PiConfig) -> SiteLayout:
     """Return the key axis of a denoise step: cameras, prompt, state token (pi0 only), actions."""
-    lengths = [(camera, config.siglip.num_tokens) for camera in config.cameras]
-    lengths.append((PROMPT_SPAN, config.max_token_len))
+    parts: list[tuple[str, SpanKind, int]] = [(camera, "image", config.siglip.num_tokens) for camera in config.cameras]
+    parts.append((PROMPT_SPAN, "text", config.max_token_len))
     if not config.pi05:
-        lengths.append((STATE_SPAN, 1))
-    lengths.append((ACTION_SPAN, config.action_horizon))
-    spans: list[Span] = []
-    start = 0
-    for name, length in lengths:
-        stop = start + length
-        if name in config.cameras:
-            spans.append(Span(name, "image", start, stop, camera=name, grid=patch_grid(config)))
-        elif name == PROMPT_SPAN:
-            spans.append(Span(name, "text", start, stop))
-        else:
-            spans.append(Span(name, "state" if name == STATE_SPAN else "action", start, stop))
-        start = stop
+        parts.append((STATE_SPAN, "state", 1))
+    parts.append((ACTION_SPAN, "action", config.action_horizon))
+    siglip, start, spans = config.siglip, 0, []
+    grid = PatchGrid(siglip.grid, siglip.grid, siglip.image_size, siglip.image_size)
+    for name, kind, length in parts:
+        camera = name if kind == "image" else None
+        spans.append(Span(name, kind, start, start + length, camera, grid if camera else None))
+        start += length
     return SiteLayout(name="joint", spans=tuple(spans))
-
-
-def patch_grid(config: PiConfig) -> PatchGrid:
-    """Return how the patches of each camera tile its model image."""
-    siglip = config.siglip
-    return PatchGrid(siglip.grid, siglip.grid, siglip.image_size, siglip.image_size)
 
 
 class PiPolicy:

@@ -69,8 +69,8 @@ def test_another_query_frame_has_other_rows(dummy, prepared):
     assert np.array_equal(other.act(prepared, 195, theirs), actions)
     assert not np.array_equal(ours["self"].finish().rows, theirs["self"].finish().rows)
     with pytest.raises(BadArgument, match="latent frame 'primary' do not stand for action steps"):
-        other.action_shares()
-    assert dummy.action_shares().shape == (16, 16, 7)
+        other.query_pools()
+    assert dummy.query_pools().shape == (16 * 7, 16)
 
 
 def test_the_published_layout():
