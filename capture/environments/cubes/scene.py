@@ -6,7 +6,6 @@ control: they need not read.
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,12 +40,6 @@ class Scene:
 
     positions: NDArray[np.float64]
     yaws: NDArray[np.float64]
-
-
-def scene_seed(purpose: str, index: int) -> int:
-    """Return the seed of a scene, the same on every machine."""
-    digest = hashlib.sha256(f"{purpose}/{index}".encode()).digest()
-    return int.from_bytes(digest[:4], "little")
 
 
 def draw_scene(seed: int, num_cubes: int) -> Scene:
