@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 
 from vla_attention.capture.policies.family import PolicyFamily
-from vla_attention.schemas.errors import unknown_name
+from vla_attention.schemas.errors import look_up
 
 #: Modules with a `FAMILY`. `--help` imports them, so they import neither torch nor numpy at the top.
 FAMILY_MODULES = (
@@ -27,9 +27,7 @@ def default_family() -> PolicyFamily:
 def family_of_kind(kind: str) -> PolicyFamily:
     """Return the family whose policies stores name `kind`; `UnknownName` lists the kinds of all families."""
     kinds = {known: family for family in policy_families() for known in family.kinds or (family.name,)}
-    if kind not in kinds:
-        raise unknown_name("kind of policy", kind, kinds)
-    return kinds[kind]
+    return look_up("kind of policy", kind, kinds)
 
 
 def _load(module: str) -> PolicyFamily:

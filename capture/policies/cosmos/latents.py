@@ -1,4 +1,4 @@
-"""Numbers in latent frames: proprioception is written into one frame, actions and the value are read from others.
+"""Numbers in latent frames: proprioception is written into one frame, actions are read from another.
 
 A latent frame is a volume (channel, row, column), read as one long list in that order. The frames are the key axis of
 the site `self`; that of `cross` has the text positions.
@@ -78,11 +78,6 @@ def actions_of_frame(frame: Tensor, chunk_size: int, action_dim: int) -> Tensor:
     size = chunk_size * action_dim
     copies = frame.numel() // size
     return frame.reshape(-1)[: copies * size].reshape(copies, chunk_size, action_dim).mean(dim=0)
-
-
-def read_value(frame: Tensor) -> float:
-    """Return the value that the last frame holds: its mean, from -1..1 to 0..1 and cut there."""
-    return float(((frame.mean() + 1) / 2).clamp(0, 1))
 
 
 def action_shares(config: CosmosConfig) -> NDArray[np.float64]:

@@ -6,11 +6,10 @@ import dataclasses
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import torch
 
-from vla_attention.capture.policies.cosmos.config import DEFAULT_CONFIG_NAME, CosmosConfig, find_config
+from vla_attention.capture.policies.cosmos.config import CosmosConfig, find_config
 from vla_attention.capture.policies.cosmos.dit_weights import build_dit, dit_tensors, infer_dit_config
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, random_policy
 from vla_attention.capture.policies.cosmos.family import CosmosSettings
@@ -129,20 +128,14 @@ def check_cosmos_files(settings: CosmosSettings) -> None:
             read_tensors(file)  # mapped into memory: the numbers are not read
 
 
-def select_call(config: CosmosConfig, prefer_s: int | None, prefer_call: Literal["last", "first"]) -> int:
-    """Return the denoise step that `--prefer-S` and `--prefer-call` choose.
-
-    prefer_s: sequence length that the call must have; None takes any. prefer_call: `last` or `first` of those.
-    Raises `BadArgument` when no call has that length.
-    """
-    count = len(noise_levels(config.sampler))
-    length = config.frames.count * config.tokens_per_frame
-    if prefer_s is not None and prefer_s != length:
+def check_call_length(config: CosmosConfig, length: int | None) -> None:
+    """Raise `BadArgument` unless the policy's calls have the sequence length of `--prefer-S`; None takes any."""
+    found = config.frames.count * config.tokens_per_frame
+    if length not in (None, found):
         raise BadArgument(
-            f"No call has --prefer-S {prefer_s}: all {count} calls of this policy have S = {length} "
-            f"({config.frames.count} latent frames of {config.tokens_per_frame} tokens)."
+            f"No call has --prefer-S {length}: all {len(noise_levels(config.sampler))} calls of this policy have S = "
+            f"{found} ({config.frames.count} latent frames of {config.tokens_per_frame} tokens)."
         )
-    return 0 if prefer_call == "first" else count - 1
 
 
 _UNTRAINED = {UNTRAINED: EMBEDDED_CONFIG, UNTRAINED_TINY: DUMMY_CONFIG}
@@ -158,25 +151,15 @@ def build_cosmos_policy(settings: CosmosSettings, device: str) -> CosmosPolicy:
     policy = _untrained(settings, device) if untrained else load_cosmos_policy(settings, device)
     for frame in (settings.visual_frame, settings.text_frame):
         policy.config.frames.index(frame)
-    select_call(policy.config, settings.prefer_s, settings.prefer_call)
+    check_call_length(policy.config, settings.prefer_s)
     return policy
 
 
 def _untrained(settings: CosmosSettings, device: str) -> CosmosPolicy:
-    name = settings.checkpoint
-    files = (
-        settings.dataset_stats_path,
-        settings.t5_text_embeddings_path,
-        settings.vae_path,
-        settings.t5_tokenizer,
-        settings.t5_encoder,
+    settings.refuse_for_untrained(
+        "config_name", "dataset_stats_path", "t5_text_embeddings_path", "t5_tokenizer", "t5_encoder", "vae_path"
     )
-    if any(files) or settings.dtype == "bfloat16" or settings.config_name != DEFAULT_CONFIG_NAME:
-        raise BadArgument(
-            f"The policy '{name}' comes with the program, in float32; --config-name, --dataset-stats-path, "
-            "--t5-text-embeddings-path, --t5-tokenizer, --t5-encoder, --vae-path and --dtype bfloat16 are for "
-            "checkpoints."
-        )
+    name = settings.checkpoint
     config = settings.apply(_UNTRAINED[name])
     return random_policy(
         name,

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from vla_attention.capture.policies.pi.config import CAMERA_SLOTS
-from vla_attention.capture.policies.pi.lerobot_config import IMAGES, LerobotConfig
+from vla_attention.capture.policies.pi.lerobot_config import LerobotConfig
 from vla_attention.capture.policies.pi.preprocess import NormStats
-from vla_attention.capture.policies.robot import Robot, RobotData
+from vla_attention.capture.policies.robot import IMAGES, Robot, RobotData
 from vla_attention.schemas.errors import BadArgument
 
 #: Slots of openpi's models -> the columns of its own conversions of LIBERO, DROID and ALOHA, and of LeRobot's.

@@ -19,12 +19,11 @@ from torch import Tensor
 from vla_attention.capture.environments.episode_protocol import LEROBOT
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnsupportedCheckpoint
 from vla_attention.capture.policies.pi.config import PiConfig
-from vla_attention.capture.policies.pi.lerobot_config import IMAGES, LerobotConfig
+from vla_attention.capture.policies.pi.lerobot_config import LerobotConfig
 from vla_attention.capture.policies.pi.lerobot_pipeline import LerobotPipeline
 from vla_attention.capture.policies.pi.processing import Processing, simulated_arm, simulator_cameras
 from vla_attention.capture.policies.pi.sizes import stated_config
-from vla_attention.capture.policies.pi.tokenizer import PromptFormat
-from vla_attention.capture.policies.robot import Robot
+from vla_attention.capture.policies.robot import IMAGES, Robot
 
 #: LeRobot's names for the pictures of its LIBERO environment -> the simulator's cameras.
 LIBERO_CAMERAS = {IMAGES + "image": "agentview", IMAGES + "image2": "robot0_eye_in_hand"}
@@ -76,7 +75,6 @@ def lerobot_processing(config: LerobotConfig, pipeline: LerobotPipeline, robot: 
                 f"The policy has {what}s of {given} numbers, and those of the environments have {needed}: it was "
                 "made for another robot."
             )
-    without_state: PromptFormat = "raw-instruction-newline" if pipeline.new_line else "raw-instruction"
     return Processing(
         "lerobot",
         robot,
@@ -86,7 +84,7 @@ def lerobot_processing(config: LerobotConfig, pipeline: LerobotPipeline, robot: 
         resize=lerobot_pictures,
         image_resize="torch bilinear without antialiasing",
         whole_grey_levels=False,
-        prompt_format="task-state-action" if pipeline.state_in_prompt else without_state,
+        prompt_format=pipeline.prompt_format,
         cut_long_prompts=pipeline.cut_long_prompts,
         protocol=LEROBOT,
         default_replan_steps=config.n_action_steps,

@@ -17,12 +17,14 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint, UnsupportedCheckpoint, read_typed
+from vla_attention.capture.policies.pi.formats import PREPROCESSOR
 from vla_attention.capture.policies.pi.lerobot_config import ACTION_FEATURE, STATE_FEATURE, LerobotConfig
 from vla_attention.capture.policies.pi.preprocess import Normaliser
+from vla_attention.capture.policies.pi.tokenizer import PromptFormat
 from vla_attention.capture.policies.safetensors_file import open_safetensors
 from vla_attention.schemas.errors import listing
 
-PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
+POSTPROCESSOR = "policy_postprocessor.json"
 
 _RENAME, _NORMALIZE, _UNNORMALIZE = "rename_observations_processor", "normalizer_processor", "unnormalizer_processor"
 _NEW_LINE, _STATE_PROMPT = "pi0_new_line_processor", "pi05_prepare_state_tokenizer_processor_step"
@@ -68,8 +70,7 @@ class LerobotPipeline:
     """Content of the two saved pipelines: camera names, prompt format, normalisation of state and action."""
 
     rename: dict[str, str]
-    state_in_prompt: bool
-    new_line: bool
+    prompt_format: PromptFormat
     cut_long_prompts: bool
     state: Normaliser
     action: Normaliser
@@ -101,10 +102,10 @@ def read_lerobot_pipeline(folder: Path, config: LerobotConfig) -> LerobotPipelin
             raise UnsupportedCheckpoint(
                 f"'{folder / PREPROCESSOR}' tokenizes with {setting} {given!r}; expected {wanted!r}."
             )
+    without_state: PromptFormat = "raw-instruction-newline" if new_line else "raw-instruction"
     return LerobotPipeline(
         rename=before.get(_RENAME, _Step()).config.rename_map or {},
-        state_in_prompt=state_in_prompt,
-        new_line=new_line,
+        prompt_format="task-state-action" if state_in_prompt else without_state,
         cut_long_prompts=tokenizer.truncation,
         state=_normaliser(folder / PREPROCESSOR, before.get(_NORMALIZE), "STATE", STATE_FEATURE, config),
         action=_normaliser(folder / POSTPROCESSOR, after.get(_UNNORMALIZE), "ACTION", ACTION_FEATURE, config),

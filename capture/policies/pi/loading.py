@@ -83,18 +83,17 @@ class ChosenConfig:
     """The configuration that a checkpoint is loaded with.
 
     config: None for what a LeRobot checkpoint states itself. source: where it is from, in words. name: openpi's for it,
-    empty without one. stated: the user named it; otherwise the checkpoint's files imply the name.
+    empty without one.
     """
 
     config: PiConfig | None
     source: str
     name: str = ""
-    stated: bool = False
 
     @classmethod
-    def named(cls, name: str, why: str = "", *, stated: bool = False) -> ChosenConfig:
+    def named(cls, name: str, why: str = "") -> ChosenConfig:
         """Openpi's configuration of that name."""
-        return cls(find_config(name), f"openpi's {name}{why}", name, stated)
+        return cls(find_config(name), f"openpi's {name}{why}", name)
 
 
 def choose_config(
@@ -127,7 +126,7 @@ def choose_config(
         if is_wrong:
             raise BadArgument(said)
     if settings.config_name is not None:
-        return ChosenConfig.named(settings.config_name, stated=True)
+        return ChosenConfig.named(settings.config_name)
     if settings.model_config is not None:
         path = settings.model_config.expanduser()
         return ChosenConfig(read_config(path), str(path))
@@ -207,13 +206,9 @@ def _chosen_cameras(settings: PiSettings) -> dict[str, str]:
 
 
 def _build_untrained(settings: PiSettings, device: str) -> PiPolicy:
-    sizes = (settings.checkpoint_format, settings.config_name, settings.model_config, *settings.stored())
-    if any(sizes) or settings.discrete_state_input or settings.dtype == "bfloat16":
-        raise BadArgument(
-            f"The policy '{settings.checkpoint}' comes with the program, in float32; --checkpoint-format, "
-            "--config-name, --model-config, --discrete-state-input, --norm-stats, --asset-id and --dtype bfloat16 are "
-            "for checkpoints."
-        )
+    settings.refuse_for_untrained(
+        "checkpoint_format", "config_name", "model_config", "discrete_state_input", "norm_stats", "asset_id"
+    )
     robot, cameras = settings.robot, _chosen_cameras(settings)
     if settings.robot_data is not None:
         robot = openpi_robot(settings.robot_data, None)
@@ -273,7 +268,7 @@ def _plan(settings: PiSettings) -> _Planned:
         checkpoint_format=found,
         untrained=False,
         configuration=chosen.source,
-        config_name=chosen.name if chosen.stated else "",
+        config_name=settings.config_name or "",
         options=settings.stored(),
         downloads=downloads(folder, tokenizer),
     )

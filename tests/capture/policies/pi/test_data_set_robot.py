@@ -72,7 +72,7 @@ def test_openpi_s_configuration_of_droid_is_known_by_its_statistics(tmp_path, ca
     (folder / "config.json").write_text(json.dumps({"action_dim": 32, "action_horizon": 15}))
     chosen = choose_config(folder, "openpi_torch", PiSettings(), of_data_set=True)
     assert chosen.config == find_config(name)
-    assert (chosen.name, chosen.stated) == (name, False)
+    assert chosen.name == name
     assert name in chosen.source
     with pytest.raises(CheckpointMismatch, match="does not state its attention heads"):
         choose_config(folder, "openpi_torch", PiSettings())

@@ -107,8 +107,9 @@ def test_a_changed_picture_and_no_words_reach_the_model(policy, observation):
     assert changed.prompt.instruction_text == ""
     assert Role.INSTRUCTION not in changed.key_role["joint"]
     assert np.isfinite(policy.act(changed, 3)).all()
-    with pytest.raises(BadArgument, match="a policy needs at least one word"):
-        policy.prepare(observation, "")
+    for empty in ("", "__"):
+        with pytest.raises(BadArgument, match="is empty: a policy needs at least one word"):
+            policy.prepare(observation, empty)
 
 
 def test_roles_agree_with_the_keys_that_get_attention(policy, observation):
