@@ -16,7 +16,7 @@ FAMILY_MODULES = (
 
 def policy_families() -> tuple[PolicyFamily, ...]:
     """Return every registered family, in the order of the help text."""
-    return tuple(_load(module) for module in FAMILY_MODULES)
+    return tuple(import_module(module).FAMILY for module in FAMILY_MODULES)
 
 
 def default_family() -> PolicyFamily:
@@ -28,10 +28,3 @@ def family_of_kind(kind: str) -> PolicyFamily:
     """Return the family whose policies stores name `kind`; `UnknownName` lists the kinds of all families."""
     kinds = {known: family for family in policy_families() for known in family.kinds or (family.name,)}
     return look_up("kind of policy", kind, kinds)
-
-
-def _load(module: str) -> PolicyFamily:
-    family = import_module(module).FAMILY
-    if not isinstance(family, PolicyFamily):
-        raise TypeError(f"FAMILY of {module} is a {type(family).__name__}, not a PolicyFamily")
-    return family

@@ -25,7 +25,6 @@ from vla_attention.capture.recording.attention import (
     LogitChange,
     RowCollector,
     RowSink,
-    UpdateSink,
 )
 from vla_attention.capture.recording.contributions import Projection
 
@@ -48,13 +47,6 @@ class CallObserver:
     def _queries(self) -> slice:
         return slice(0, self.tokens_per_frame)
 
-    def _update_sinks(self, layer: int) -> dict[str, UpdateSink]:
-        sinks = {
-            site: recorder.update_sink(layer, self.denoise_step, self._queries)
-            for site, recorder in self.recorders.items()
-        }
-        return {site: sink for site, sink in sinks.items() if sink is not None}
-
     def begin_block(self, layer: int) -> None:
         """Tell the recorders that this block begins."""
         for recorder in self.recorders.values():
@@ -71,9 +63,11 @@ class CallObserver:
 
     def updates(self, layer: int, updates: dict[str, Tensor], gates: dict[str, Tensor], block_input: Tensor) -> None:
         """Pass values, projection and update of the recorded queries on to the recorders."""
-        for site, sink in self._update_sinks(layer).items():
-            value, weight = self._seen.pop(site)
-            sink(value, Projection(weight, gates[site][0, self.query_frame]), updates[site][:, self.query_frame])
+        for site, recorder in self.recorders.items():
+            sink = recorder.update_sink(layer, self.denoise_step, self._queries)
+            if sink is not None:
+                value, weight = self._seen.pop(site)
+                sink(value, Projection(weight, gates[site][0, self.query_frame]), updates[site][:, self.query_frame])
 
 
 @dataclass(frozen=True)
@@ -100,18 +94,6 @@ class CallEditor:
 
 
 PROPRIO_FRAME = "proprio"
-
-
-@dataclass(frozen=True)
-class Recorders:
-    """The row collector of each site, and the latent frame whose queries they get. Sampling does not depend on them.
-
-    editors: the editor of each site whose attention changes; for them the queries of that frame are the action queries.
-    """
-
-    rows: Mapping[str, RowCollector] = field(default_factory=dict)
-    query_frame: int = 4
-    editors: Mapping[str, AttentionEditor] = field(default_factory=dict)
 
 
 class CosmosModel(nn.Module):
@@ -177,21 +159,29 @@ class CosmosModel(nn.Module):
         return mask * given + (1 - mask) * clean
 
     @torch.no_grad()
-    def sample_latents(self, given: Tensor, text: Tensor, seed: int, recorders: Recorders | None = None) -> Tensor:
-        """Return the clean latent video (1, channel, frame, row, column) float32.
+    def sample_latents(
+        self,
+        given: Tensor,
+        text: Tensor,
+        seed: int,
+        query_frame: int,
+        recorders: Mapping[str, RowCollector] | None,
+        editors: Mapping[str, AttentionEditor] | None,
+    ) -> Tensor:
+        """Return the clean latent video (1, channel, frame, row, column) float32; it does not depend on recorders.
 
         given: from `given_latents`. text: (1, position, text width). seed: of the noise, made by numpy's legacy
-        generator.
+        generator. query_frame: whose queries are the action queries. recorders, editors: of sites.
         """
-        config, wanted = self.config, recorders or Recorders()
+        config = self.config
         noise = torch.from_numpy(seeded_noise(seed, config.latent_shape)).to(self.device)
         mask = condition_mask(config).to(self.device)
         text = text.to(self.device)
-        frame, tokens = wanted.query_frame, config.tokens_per_frame
 
         def denoise(noisy: Tensor, sigma: float, step: int) -> Tensor:
-            observer = CallObserver(step, frame, tokens, wanted.rows) if wanted.rows else None
-            editor = CallEditor(step, frame, tokens, wanted.editors) if wanted.editors else None
+            call = step, query_frame, config.tokens_per_frame
+            observer = CallObserver(*call, recorders) if recorders else None
+            editor = CallEditor(*call, editors) if editors else None
             return self.denoise(noisy, sigma, given, mask, text, observer, editor)
 
         return sample(denoise, noise, self.levels)

@@ -21,7 +21,7 @@ from vla_attention.capture.policies.cosmos.latents import (
     query_pools,
     self_roles,
 )
-from vla_attention.capture.policies.cosmos.model import CosmosModel, Recorders
+from vla_attention.capture.policies.cosmos.model import CosmosModel
 from vla_attention.capture.policies.cosmos.preprocess import Ranges, compressed_picture, proprio_of, upright
 from vla_attention.capture.policies.cosmos.sampler import flow_time
 from vla_attention.capture.policies.cosmos.text import TextSource
@@ -169,9 +169,9 @@ class CosmosPolicy:
     ) -> NDArray[np.float64]:
         """Return the action chunk (horizon, 7) for the environment; it does not depend on the recorders."""
         config = self.config
-        wanted = Recorders(recorders or {}, config.frames.index(self.query_frame), editors or {})
-        tensors = policy_input.tensors
-        clean = self.model.sample_latents(tensors["given"], tensors["text"], noise_seed, wanted)[0].cpu()
+        given, text = policy_input.tensors["given"], policy_input.tensors["text"]
+        queries = config.frames.index(self.query_frame)
+        clean = self.model.sample_latents(given, text, noise_seed, queries, recorders, editors)[0].cpu()
         frame = clean[:, config.frames.index(ACTION_FRAME)]
         actions = actions_of_frame(frame, config.chunk_size, config.action_dim).numpy()
         return self.statistics.environment_actions(actions)

@@ -107,18 +107,16 @@ def choose_config(
         BadArgument: settings contradict each other or the format.
         UnsupportedCheckpoint: nothing states the configuration.
     """
-    of_config = settings.config_name is not None or settings.discrete_state_input
-    of_statistics = settings.norm_stats is not None or settings.asset_id is not None
     for is_wrong, said in (
         (settings.config_name and settings.model_config, "Give --config-name or --model-config, not both."),
         (settings.norm_stats and settings.asset_id, "Give --norm-stats or --asset-id, not both."),
         (
-            found == "lerobot" and of_config,
+            found == "lerobot" and (settings.config_name or settings.discrete_state_input),
             "A LeRobot checkpoint states its configuration in config.json; leave --config-name and "
             "--discrete-state-input out.",
         ),
         (
-            found == "lerobot" and of_statistics,
+            found == "lerobot" and (settings.norm_stats or settings.asset_id),
             "A LeRobot checkpoint has its statistics in its saved pipelines (policy_preprocessor.json); leave "
             "--norm-stats and --asset-id out.",
         ),
@@ -135,19 +133,15 @@ def choose_config(
         return ChosenConfig(read_config(beside), f"{CASE_FILE} beside the checkpoint")
     if found == "openpi_torch" and states_sizes(folder / CONFIG_FILE):
         return ChosenConfig(read_config(folder / CONFIG_FILE), CONFIG_FILE)
-    if (
-        of_data_set
-        and found != "lerobot"
-        and ([settings.asset_id] if settings.asset_id else [*find_norm_stats(folder)]) == [DROID_ASSET]
-    ):
-        name = "pi05_droid" if _is_pi05(folder, found) else "pi0_droid"
-        return ChosenConfig.named(name, f" (its statistics are those of '{DROID_ASSET}')")
-    if found == "openpi_jax":
-        name = "pi05_libero" if _is_pi05(folder, found) else "pi0_libero"
-        return ChosenConfig.named(name, " (not stated by the checkpoint)")
     if found == "lerobot":
         return ChosenConfig(None, CONFIG_FILE)
     has_pi05 = _is_pi05(folder, found)  # whatever else it may be comes first
+    kind = "pi05" if has_pi05 else "pi0"
+    of_statistics = [settings.asset_id] if settings.asset_id else list(find_norm_stats(folder))
+    if of_data_set and of_statistics == [DROID_ASSET]:
+        return ChosenConfig.named(f"{kind}_droid", f" (its statistics are those of '{DROID_ASSET}')")
+    if found == "openpi_jax":
+        return ChosenConfig.named(f"{kind}_libero", " (not stated by the checkpoint)")
     if not (folder / CONFIG_FILE).is_file():
         raise UnsupportedCheckpoint(
             f"'{folder}' has no {CONFIG_FILE}, as openpi's train_pytorch.py leaves it, so that nothing states its "
