@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from vla_attention.capture.environments.episode_protocol import OPENPI_REPLAN_STEPS
@@ -69,10 +68,11 @@ def builtin_stats(robot: Robot | None = None) -> NormStats:
     if robot is not None and (robot.state_dim, robot.action_dim) != (STATE_DIM, ENVIRONMENT_ACTION_DIM):
         state, actions = (([-1.0] * dim, [1.0] * dim) for dim in (robot.state_dim, robot.action_dim))
 
-    def statistics(low: NDArray[np.float64], high: NDArray[np.float64]) -> Statistics:
-        return Statistics(mean=(low + high) / 2, std=(high - low) / np.sqrt(12), q01=low, q99=high)
+    def statistics(low: list[float], high: list[float]) -> Statistics:
+        middle, width = (np.array(low) + high) / 2, np.array(high) - low
+        return Statistics(mean=middle.tolist(), std=(width / np.sqrt(12)).tolist(), q01=low, q99=high)
 
-    return NormStats(statistics(*map(np.array, state)), statistics(*map(np.array, actions)))
+    return NormStats(statistics(*state), statistics(*actions))
 
 
 def random_weights(config: PiConfig, seed: int) -> dict[str, Tensor]:

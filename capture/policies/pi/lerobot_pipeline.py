@@ -79,11 +79,6 @@ class LerobotPipeline:
 def read_lerobot_pipeline(folder: Path, config: LerobotConfig) -> LerobotPipeline:
     """Read both pipelines of a checkpoint folder; an error names an unsupported step or setting."""
     before, after = _steps(folder, PREPROCESSOR, _BEFORE), _steps(folder, POSTPROCESSOR, _AFTER)
-    for steps, name, where in ((before, _RELATIVE, PREPROCESSOR), (after, _ABSOLUTE, POSTPROCESSOR)):
-        if name in steps and steps[name].config.enabled:
-            raise UnsupportedCheckpoint(
-                f"'{folder / where}' has {name} enabled: actions relative to the state are not supported."
-            )
     state_in_prompt, new_line = _STATE_PROMPT in before, _NEW_LINE in before
     if state_in_prompt != config.pi05 or (new_line and config.pi05):
         raise UnsupportedCheckpoint(
@@ -126,6 +121,10 @@ def _steps(folder: Path, name: str, known: set[str]) -> dict[str, _Step]:
             raise UnsupportedCheckpoint(f"'{path}' has a step that is not supported: {called!r}.")
         if step.registry_name in by_name and step.registry_name not in _NOTHING:
             raise UnsupportedCheckpoint(f"'{path}' has the step {step.registry_name} twice.")
+        if step.registry_name in (_RELATIVE, _ABSOLUTE) and step.config.enabled:
+            raise UnsupportedCheckpoint(
+                f"'{path}' has {step.registry_name} enabled: actions relative to the state are not supported."
+            )
         by_name[step.registry_name] = step
     return by_name
 

@@ -101,27 +101,34 @@ class Normaliser:
         return np.concatenate([known * self.factor[:dim] + self.offset[:dim], x[..., dim:]], axis=-1)
 
 
-@dataclass(frozen=True)
-class Statistics:
-    """Statistics of one vector, each (dim,) float64; the quantiles are absent in some checkpoints."""
+class Statistics(msgspec.Struct, frozen=True):
+    """Statistics of one vector, each a number per dimension; the quantiles are absent in some checkpoints."""
 
-    mean: NDArray[np.float64]
-    std: NDArray[np.float64]
-    q01: NDArray[np.float64] | None = None
-    q99: NDArray[np.float64] | None = None
+    mean: list[float]
+    std: list[float]
+    q01: list[float] | None = None
+    q99: list[float] | None = None
+
+    def check(self, name: str) -> None:
+        """Raise `UnreadableCheckpoint` for unequal lengths, NaN and infinity."""
+        for key, numbers in msgspec.structs.asdict(self).items():
+            if not np.isfinite(numbers or 0).all():
+                raise UnreadableCheckpoint(f"The statistics have NaN or infinity in '{key}' of '{name}'.")
+            if numbers is not None and len(numbers) != len(self.mean):
+                raise UnreadableCheckpoint(f"The statistics '{key}' and 'mean' of '{name}' have unequal lengths.")
 
     def normaliser(self, mode: NormalisationMode) -> Normaliser:
         """Return openpi's normalisation: (x - mean)/(std + eps), or q01..q99 to -1..1."""
         if mode == "z-score":
-            return Normaliser(mode, self.mean, self.std + NORMALISATION_EPS, self.std + NORMALISATION_EPS)
+            divisor = np.array(self.std) + NORMALISATION_EPS
+            return Normaliser(mode, np.array(self.mean), divisor, divisor)
         if self.q01 is None or self.q99 is None:
             raise UnreadableCheckpoint("The normalisation statistics have no q01 and q99, which quantile mode needs.")
-        span = self.q99 - self.q01 + NORMALISATION_EPS
-        return Normaliser(mode, self.q01, span, span, is_range=True)
+        span = np.array(self.q99) - np.array(self.q01) + NORMALISATION_EPS
+        return Normaliser(mode, np.array(self.q01), span, span, is_range=True)
 
 
-@dataclass(frozen=True)
-class NormStats:
+class NormStats(msgspec.Struct, frozen=True):
     """Statistics of state and actions."""
 
     state: Statistics
@@ -145,41 +152,19 @@ def pad_to(x: NDArray[np.floating], dim: int) -> NDArray[np.float64]:
     return np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, dim - x.shape[-1])])
 
 
-class _Numbers(msgspec.Struct, frozen=True):
-    mean: list[float]
-    std: list[float]
-    q01: list[float] | None = None
-    q99: list[float] | None = None
-
-    def statistics(self, name: str) -> Statistics:
-        """Return them as arrays; raise `UnreadableCheckpoint` for unequal lengths, NaN and infinity."""
-        arrays = {
-            key: np.array(numbers) for key, numbers in msgspec.structs.asdict(self).items() if numbers is not None
-        }
-        for key, array in arrays.items():
-            if not np.isfinite(array).all():
-                raise UnreadableCheckpoint(f"The statistics have NaN or infinity in '{key}' of '{name}'.")
-            if len(array) != len(self.mean):
-                raise UnreadableCheckpoint(f"The statistics '{key}' and 'mean' of '{name}' have unequal lengths.")
-        return Statistics(**arrays)
-
-
-class _Groups(msgspec.Struct, frozen=True):
-    state: _Numbers
-    actions: _Numbers
-
-
 class _File(msgspec.Struct, frozen=True):
-    norm_stats: _Groups
+    norm_stats: NormStats
 
 
 def parse_norm_stats(content: object, where: str) -> NormStats:
     """Build the statistics from the content of openpi's norm_stats.json; `where` names it in errors."""
     try:
-        groups = from_json(_File, content, where).norm_stats
-        return NormStats(groups.state.statistics("state"), groups.actions.statistics("actions"))
+        stats = from_json(_File, content, where).norm_stats
+        stats.state.check("state")
+        stats.actions.check("actions")
     except (MalformedDocument, UnreadableCheckpoint) as error:
         raise UnreadableCheckpoint(f"{where} has no statistics that can be used: {error}") from None
+    return stats
 
 
 def read_norm_stats(checkpoint: str | Path, given: Path | None = None, asset_id: str | None = None) -> NormStats:
