@@ -24,7 +24,7 @@ from vla_attention.capture.policies.cosmos.dit import Attention, Dit
 from vla_attention.capture.policies.cosmos.dit_weights import build_dit, dit_tensors, infer_dit_config
 from vla_attention.capture.policies.cosmos.latents import actions_of_frame, condition_mask
 from vla_attention.capture.policies.cosmos.model import CosmosModel
-from vla_attention.capture.policies.cosmos.preprocess import compressed_picture, make_ranges
+from vla_attention.capture.policies.cosmos.preprocess import Ranges, compressed_picture
 from vla_attention.capture.policies.cosmos.sampler import sample, seeded_noise
 from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
 from vla_attention.capture.policies.cosmos.vae import build_encoder
@@ -301,7 +301,7 @@ def _run_policy(case: CosmosCase, device: str) -> ParityReport:
     compare("preprocessed_images", np.stack(pictures), PICTURES)
     if case.facts.get("pillow") != PIL.__version__ and "preprocessed_images" in expected:
         pictures = list(expected["preprocessed_images"])  # so that later stages do not depend on the JPEG decoder
-    statistics = make_ranges(inputs, f"of the case '{case.name}'", config.action_dim, config.proprio_dim)
+    statistics = Ranges(**{name: inputs[name].tolist() for name in Ranges.__struct_fields__})
     proprio = statistics.normalise_proprio(inputs["proprio"])
     compare("proprio_normalized", proprio, OUTPUTS)
     given, count = model.given_latents(pictures, proprio), config.frames.num_conditioned

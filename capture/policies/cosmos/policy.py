@@ -30,6 +30,7 @@ from vla_attention.capture.policies.policy import GivenInputs, PolicyInput, came
 from vla_attention.capture.policies.weights import dtype_name, weights_digest
 from vla_attention.capture.recording.attention import AttentionEditor, RowCollector
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.stores.store_format import PolicyIdentity
 
 ACTION_FRAME = "action"
@@ -111,7 +112,7 @@ class CosmosPolicy:
             "config": json.loads(json.dumps(asdict(self.config))),
             "dtype": dtype_name(self.model.dtype),
             "normalisation": "min-max",
-            "statistics": self.statistics.as_json(),
+            "statistics": to_json(self.statistics),
             "query_frame": self.query_frame,
             "noise": "the same at every replan",
             **self.text.provenance(),
