@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.environments.cubes.tasks import COLOURS, Target
-from vla_attention.schemas.errors import BadArgument, unknown_name
+from vla_attention.schemas.errors import BadArgument
 
 #: Half of a cube's edge, in metres.
 HALF_SIZE = 0.022
@@ -98,12 +98,3 @@ def paste_mark(picture: NDArray[np.uint8], colour_index: int, verb_index: int) -
     left = (verb_index + 1) * side
     marked[: height // _GRID, left : left + side] = _MARK_RGB[colour_index]
     return marked
-
-
-def verb_index(instruction: str) -> int:
-    """Return the index in `MARK_VERBS` of what an instruction of the suite asks for."""
-    words = instruction.split()
-    verb = {"put": "put_on", "push": f"push_{words[-1]}"}.get(words[0], words[0]) if words else ""
-    if verb not in MARK_VERBS:
-        raise unknown_name("verb of the instruction", instruction, MARK_VERBS)
-    return MARK_VERBS.index(verb)
