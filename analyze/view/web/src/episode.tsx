@@ -103,54 +103,71 @@ export function commandLine(): string {
   return parts.join(" ");
 }
 
-/** The pictures with their lines as one PNG, in the pixels of the screen. */
-async function savePictures(): Promise<void> {
-  const stacks = [...document.querySelectorAll<HTMLElement>(".pictures .stack")];
-  const scale = 2;
-  const sizes = stacks.map((stack) => stack.getBoundingClientRect());
-  const canvas = document.createElement("canvas");
-  canvas.width = scale * sizes.reduce((sum, { width }) => sum + width + 8, -8);
-  canvas.height = scale * Math.max(...sizes.map(({ height }) => height));
-  const context = canvas.getContext("2d")!;
+const LINE_STYLES = ["fill", "stroke", "stroke-width", "stroke-dasharray", "vector-effect"];
+const GAP = 8;
+
+/** The pictures with their lines as an SVG that needs no other file. */
+function picturesAsSvg(): { text: string; width: number; height: number } {
   let x = 0;
-  for (const [i, stack] of stacks.entries()) {
-    const { width, height } = sizes[i]!;
-    const picture = stack.querySelector("img");
-    if (picture) context.drawImage(picture, scale * x, 0, scale * width, scale * height);
+  let height = 0;
+  const parts = [...document.querySelectorAll<HTMLElement>(".pictures .stack")].map((stack) => {
+    const box = stack.getBoundingClientRect();
     const lines = stack.querySelector("svg")!;
     const copy = lines.cloneNode(true) as SVGElement;
     const drawn = [...lines.querySelectorAll("path")];
-    copy.querySelectorAll("path").forEach((path, j) => {
-      const style = getComputedStyle(drawn[j]!);
-      for (const name of ["fill", "stroke", "stroke-width", "stroke-dasharray", "vector-effect"]) path.setAttribute(name, style.getPropertyValue(name));
+    copy.querySelectorAll("path").forEach((path, i) => {
+      for (const name of LINE_STYLES) path.setAttribute(name, getComputedStyle(drawn[i]!).getPropertyValue(name));
     });
-    copy.setAttribute("xmlns", "http://www.w3.org/2000/svg");
-    copy.setAttribute("width", String(width));
-    copy.setAttribute("height", String(height));
-    const image = new Image();
-    image.src = `data:image/svg+xml,${encodeURIComponent(new XMLSerializer().serializeToString(copy))}`;
-    await image.decode();
-    context.drawImage(image, scale * x, 0, scale * width, scale * height);
-    x += width + 8;
-  }
+    copy.querySelector("rect")?.remove();
+    const place = { x, y: 0, width: box.width, height: box.height };
+    for (const [name, value] of Object.entries(place)) copy.setAttribute(name, String(value));
+    const picture = stack.querySelector("img");
+    let image = "";
+    if (picture) {
+      const canvas = document.createElement("canvas");
+      [canvas.width, canvas.height] = [picture.naturalWidth, picture.naturalHeight];
+      canvas.getContext("2d")!.drawImage(picture, 0, 0);
+      image = `<image x="${x}" width="${box.width}" height="${box.height}" preserveAspectRatio="none" href="${canvas.toDataURL("image/png")}"/>`;
+    }
+    x += box.width + GAP;
+    height = Math.max(height, box.height);
+    return image + new XMLSerializer().serializeToString(copy);
+  });
+  const width = Math.max(1, x - GAP);
+  return { text: `<svg xmlns="http://www.w3.org/2000/svg" width="${width}" height="${height}">${parts.join("")}</svg>`, width, height };
+}
+
+async function savePictures(kind: "png" | "svg"): Promise<void> {
+  const { text, width, height } = picturesAsSvg();
   const link = document.createElement("a");
-  link.href = canvas.toDataURL("image/png");
-  link.download = `${episodeName.value}_call${replan.value}.png`;
+  link.href = `data:image/svg+xml,${encodeURIComponent(text)}`;
+  if (kind === "png") {
+    const image = new Image();
+    image.src = link.href;
+    await image.decode();
+    const canvas = document.createElement("canvas");
+    [canvas.width, canvas.height] = [2 * width, 2 * height];
+    canvas.getContext("2d")!.drawImage(image, 0, 0, 2 * width, 2 * height);
+    link.href = canvas.toDataURL("image/png");
+  }
+  link.download = `${episodeName.value}_call${replan.value}.${kind}`;
   link.click();
 }
 
+const copied = signal("");
+
 function Drawer() {
-  const copied = signal("");
-  const copy = (what: string, text: string): void => void navigator.clipboard.writeText(text).then(() => (copied.value = what));
+  const copy = (what: string, text: string): void => void navigator.clipboard.writeText(text).then(() => (copied.value = `${what} copied`));
   const command = commandLine();
   return (
     <section class="drawer" aria-label="More">
       <p>
         <button onClick={() => copy("link", location.href)}>Copy link</button>{" "}
-        <button onClick={() => void savePictures()}>Save picture</button>{" "}
+        <button onClick={() => void savePictures("png")}>Save PNG</button>{" "}
+        <button onClick={() => void savePictures("svg")}>Save SVG</button>{" "}
         <button onClick={() => copy("command", command)}>Copy command</button> <span role="status">{copied}</span>
       </p>
-      <p><code>{command}</code></p>
+      <p><code>{command}</code> <span class="soft">draws the same; with --video gif instead of --replans a film.</span></p>
       <p class="soft">Keys: ← → call, space plays, [ ] layer, , . head, - + denoise step, Esc overview.</p>
     </section>
   );

@@ -24,7 +24,7 @@ export function Ratio() {
         {parts.map(({ name, fraction }, i) => <span key={name} class={`part part-${i % 6}`} style={{ flexGrow: String(fraction) }} title={`${name}: ${percent(fraction)}`} />)}
       </div>
       <table class="numbers">
-        <thead><tr><th /><th>keys</th><th>attention</th><th>times even</th></tr></thead>
+        <thead><tr><td /><th>keys</th><th>attention</th><th>times even</th></tr></thead>
         <tbody>
           {parts.map(({ name, mass, keys, lift }, i) => (
             <tr key={name} data-group={name}><th><span class={`dot part-${i % 6}`} />{name}</th><td>{shown(keys)}</td><td data-number={`mass-${name}`} data-value={mass}>{percent(mass)}</td><td>{shown(lift)}</td></tr>
@@ -57,7 +57,7 @@ export function OwnGroup() {
       {any || picked.value.selector ? null : <p class="soft">Click patches in the pictures and words in the title, or type a <span title="camera:NAME, object:NAME, word:bowl, role:image, patch:CAMERA[r0:r1,c0:c1], joined by | & -">selector</span>.</p>}
       {any ? (
         <table class="numbers">
-          <thead><tr><th /><th>keys</th><th>attention</th><th>times even</th></tr></thead>
+          <thead><tr><td /><th>keys</th><th>attention</th><th>times even</th></tr></thead>
           <tbody><Side name="patches" keys={seen} /><Side name="words" keys={read} /></tbody>
         </table>
       ) : null}

@@ -111,7 +111,7 @@ export function Pictures({ scene, at }: { scene: Scene; at: number }) {
     return <p>The keys of this site are no patches of pictures. {other ? <button onClick={() => setPart({ site: other })}>Show site {other}</button> : null}</p>;
   }
   return (
-    <section class={`pictures of-${Math.min(cameras.length, 3)}`} aria-label="Pictures" aria-busy={scene.masses.value === null}>
+    <section class={`pictures of-${Math.min(cameras.length, 3)}`} aria-label={`Pictures of ${episode.name}${scene === main ? "" : " beside it"}`} aria-busy={scene.masses.value === null}>
       {cameras.map(([camera, how]) => <Picture key={camera} scene={scene} camera={camera} how={how} at={at} />)}
     </section>
   );
