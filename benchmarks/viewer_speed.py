@@ -69,10 +69,17 @@ def measure(store: Path, rounds: int) -> None:
             with watched_page(browser) as watched:
                 watched.open(f"{server.link}{link}")
 
+        def first_picture(number: int) -> None:
+            with watched_page(browser) as watched:
+                watched.page.goto(f"{server.link}#episode=task000_episode{number + 1:03d}")
+                while not watched.page.evaluate("document.querySelector('.stack img')?.naturalWidth > 0"):
+                    time.sleep(0.005)
+
         measured("the list of 500 episodes", lambda _: get("runs.json"), rounds)
-        measured("its page, drawn in a new browser window", lambda _: shown(""), rounds)
+        measured("its page in a new browser window", lambda _: shown(""), rounds)
         measured("an episode, first asked", lambda n: get(f"runs/0/task001_episode{n:03d}/about.json"), rounds)
-        measured("its page, drawn in a new browser window", lambda n: shown(f"#episode=task001_episode{n:03d}"), rounds)
+        measured("the first picture in a new browser window", first_picture, rounds)
+        measured("all of its page", lambda n: shown(f"#episode=task001_episode{n:03d}"), rounds)
         get(f"{own}/about.json")
         measured("a layer", lambda n: get(f"{own}/joint/rows/{n % 18}.npy"), 4 * rounds)
         measured("the mean of all layers", lambda _: get(f"{own}/joint/rows/mean.npy"), rounds)

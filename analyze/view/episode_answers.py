@@ -60,6 +60,11 @@ class ShownEpisode:
         """The questions about the episode that were asked last."""
         return {}
 
+    @cached_property
+    def mean_rows(self) -> dict[str, Array]:
+        """The rows of the mean of all layers by site, for which every layer is read."""
+        return {}
+
     def question(self, site: str, **settings: Any) -> Question:
         """A question about this episode alone, as the commands ask it."""
         asked = AnalysisSettings(site=site, **settings)
@@ -189,13 +194,19 @@ class ShownEpisode:
 
         heads: each head's, (replan, denoise, head, key).
         """
+        if layer == MEAN and not heads and site in self.mean_rows:
+            return self.mean_rows[site]
         selection = replace(self._selection(site, layer), per_head=heads)
         parts: list[Array] = [np.zeros(())] * len(selection.denoise)
         for part in layer_rows(self.store.attributes, self.episode, selection, site):
             if part.layer in selection.once:
                 parts[part.denoise] = parts[part.denoise] + part.rows.astype(np.float64)
         rows = np.stack(parts, axis=1) / len(selection.once)
-        return rows if heads else rows[:, :, 0]
+        if heads:
+            return rows
+        if layer == MEAN:
+            self.mean_rows[site] = rows[:, :, 0]
+        return rows[:, :, 0]
 
     def uniform(self, site: str, layer: str) -> Array:
         """What uniform attention gives in the place of `rows`, (replan or 1, denoise or 1, key)."""
