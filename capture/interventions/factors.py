@@ -157,21 +157,24 @@ class SiteEditor(FactorEditor):
                 if (number, kind) not in self._operands:
                     self._operands[number, kind] = _operands_of(self.edits[number], call, logits)
                 logits = _applied(self._operands[number, kind], logits)
-            self._check_keys_left(numbers, had_keys, logits, where)
+            groups = "; ".join(self.edits[number].group for number in numbers)
+            check_keys_left(
+                had_keys & (logits.amax(-1) <= _LOWEST_LOGIT), f"site '{self.site}', {where}", f": {groups}"
+            )
             return logits
 
         return change
 
-    def _check_keys_left(self, numbers: Sequence[int], had_keys: Tensor, after: Tensor, where: str) -> None:
-        """Raise `QueryWithoutKeys` if a query that had keys, (batch, head, query), has none any more."""
-        lost = had_keys & (after.amax(-1) <= _LOWEST_LOGIT)
-        if bool(lost.any()):
-            _, head, query = (int(i) for i in lost.nonzero()[0])
-            groups = "; ".join(self.edits[number].group for number in numbers)
-            raise QueryWithoutKeys(
-                f"An intervention leaves a query without any key at site '{self.site}', {where}, head {head}, query "
-                f"{query}: {groups}. Take a smaller group, a weight below 1, or fewer heads or layers."
-            )
+
+def check_keys_left(lost: Tensor, where: str, why: str = "") -> None:
+    """Raise `QueryWithoutKeys` if there are queries that had keys and have none any more, (batch, head, query) bool."""
+    if bool(lost.any()):
+        batch, head, query = (int(i) for i in lost.nonzero()[0])
+        row = f", batch row {batch}" if len(lost) > 1 else ""
+        raise QueryWithoutKeys(
+            f"An intervention leaves a query without any key at {where}{row}, head {head}, query {query}"
+            f"{why}. Take a smaller group, a weight below 1, or fewer heads or layers."
+        )
 
 
 def _operands_of(edit: SiteEdit, call: CallKeys, logits: Tensor) -> _Operands:

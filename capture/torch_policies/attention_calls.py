@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -21,8 +21,6 @@ from vla_attention.schemas.errors import BadArgument
 #: multiplied with values. `multihead`: `multi_head_attention_forward`, which `nn.MultiheadAttention` calls. `flex`:
 #: `flex_attention`. transformers' attention interface calls one of these.
 Kind = Literal["sdpa", "softmax", "multihead", "flex"]
-#: Which queries or batch rows: a slice, or their positions (count,) int64, which may count from the end.
-Positions = slice | Tensor | Sequence[int]
 #: Logits at or below this are of masked keys: masks are written as -inf, as the lowest number of a dtype, as -1e9, or
 #: as -1e4, the smallest in use.
 MASKED_BELOW = -5000.0
@@ -84,8 +82,8 @@ class AttentionCall:
     shape: CallShape
     values: Tensor
     output: Tensor
-    rows_of: Callable[[Positions, Positions], Tensor]
-    allowed_of: Callable[[Positions], Tensor]
+    rows_of: Callable[[slice, slice], Tensor]
+    allowed_of: Callable[[slice], Tensor]
     laid_out: Callable[[Tensor], Tensor]
     multiplied: torch.dtype | None = None
     asked: CallShape | None = None
@@ -97,7 +95,7 @@ class AttentionCall:
         self._check_refused()
         return self.values
 
-    def rows(self, queries: Positions = slice(None), batch: Positions = slice(None)) -> Tensor:
+    def rows(self, queries: slice = slice(None), batch: slice = slice(None)) -> Tensor:
         """Return the probabilities of these queries, (batch, head, query, key) float32, exact zeros where masked.
 
         Raises:
@@ -111,7 +109,7 @@ class AttentionCall:
         if self.refused:
             raise RowsRefused(f"The attention call {self.shape} cannot be recorded: it {self.refused}.")
 
-    def allowed(self, queries: Positions = slice(None)) -> Tensor:
+    def allowed(self, queries: slice = slice(None)) -> Tensor:
         """Return (batch, head or 1, query, key) bool: keys that the policy's own mask lets the query see.
 
         The axis of heads has length 1 where all of them have the same mask.
@@ -126,19 +124,19 @@ class AttentionCall:
         dtypes += [] if self.multiplied is None else [self.multiplied]
         return str(max(dtypes, key=lambda dtype: torch.finfo(dtype).eps)).removeprefix("torch.")
 
-    def product_error(self, rows: Tensor, queries: Positions = slice(None), batch: Positions = slice(None)) -> float:
+    def product_error(self, rows: Tensor, queries: slice = slice(None)) -> float:
         """Return the largest |rows V - output| of these queries, relative to the largest |output| among them.
 
-        rows: (batch, head, query, key) of the same queries and batch rows. Rows that are those of the kernel give
+        rows: (batch, head, query, key) of the same queries. Rows that are those of the kernel give
         rounding errors: some 1e-7 where it computes in float32, some 1e-3 to 1e-2 where in bfloat16.
         """
         with exact():
-            value = at_positions(self.value, 0, batch).float()
+            value = self.value.float()
             size, heads, count, keys = rows.shape
             # Heads that share a value head become extra queries of that head, without copies of the values.
             stacked = rows.reshape(size, value.shape[1], heads // value.shape[1] * count, keys)
             mixed = torch.matmul(stacked, value).reshape(size, heads, count, value.shape[3])
-            output = at_positions(at_positions(self.output, 0, batch), 2, queries).float()
+            output = self.output[:, :, queries].float()
             difference = (mixed - output).abs()
             if not difference.numel():
                 return 0.0
@@ -170,24 +168,26 @@ class AttentionCall:
         return ""
 
 
-class Watcher(Protocol):
-    """Is told about every attention call of a watched block, in order.
+class Watcher:
+    """Is told about every attention call of a watched block, in order. This one takes and changes nothing.
 
-    It may have an attribute `changes`, False where it changes nothing: it is not asked then. It may have a method
-    `passes(shape) -> bool` too, asked when the kernel has run: whether the call is not wanted. It is not told of such a
-    call again, and nothing is made of its tensors.
+    changes: whether it is asked for changes at all.
     """
+
+    changes: Any = False
 
     def change(self, shape: CallShape) -> Tensor | None:
         """Return logits to add before the softmax, broadcastable to (batch, head, query, key), or None for no change.
 
         Asked before the kernel runs. -inf takes a key away.
         """
-        ...
+
+    def passes(self, shape: CallShape) -> bool:
+        """Return whether a call whose kernel has run is not wanted: nothing is made of its tensors then."""
+        return False
 
     def saw(self, call: AttentionCall) -> OutputWay | None:
         """Take what is wanted of a call, right after its kernel; in order. Return whether its output is followed."""
-        ...
 
 
 def exact() -> AbstractContextManager[object]:
@@ -202,23 +202,3 @@ def _without_autocast(devices: Sequence[str]) -> Iterator[None]:
         for device in devices:
             stack.enter_context(torch.autocast(device, enabled=False))
         yield
-
-
-def at_positions(tensor: Tensor, axis: int, positions: Positions) -> Tensor:
-    """Return the positions of an axis: a view for a slice, a copy for a list of positions."""
-    if isinstance(positions, slice):
-        start, stop, step = positions.indices(tensor.shape[axis])
-        if (start, stop, step) == (0, tensor.shape[axis], 1):
-            return tensor
-        if step > 0:
-            return tensor[(slice(None),) * axis + (slice(start, stop, step),)]
-    return tensor.index_select(axis, position_numbers(positions, tensor.shape[axis], tensor.device))
-
-
-def position_numbers(positions: Positions, size: int, device: torch.device | str = "cpu") -> Tensor:
-    """Return positions on an axis of `size` as (count,) int64 without negative numbers."""
-    if isinstance(positions, slice):
-        chosen = range(size)[positions]
-        return torch.arange(len(chosen), device=device) * chosen.step + chosen.start
-    numbers = torch.as_tensor(positions, dtype=torch.int64, device=device)
-    return torch.where(numbers < 0, numbers + size, numbers)

@@ -7,12 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from vla_attention.capture.interventions.factors import QueryWithoutKeys
+from vla_attention.capture.interventions.factors import check_keys_left
 from vla_attention.capture.torch_policies.attention_calls import (
     MASKED_BELOW,
     CallShape,
-    Positions,
-    at_positions,
 )
 from vla_attention.schemas.errors import BadArgument
 
@@ -39,13 +37,6 @@ def fitted_change(change: Tensor, shape: CallShape, device: torch.device) -> Ten
     return fitted.reshape((1,) * (4 - fitted.ndim) + tuple(fitted.shape))
 
 
-def mask_as_logits(mask: Tensor, dtype: torch.dtype) -> Tensor:
-    """Return a mask as logits to add: bool masks (True: keep) as 0 and -inf, additive masks as they are."""
-    if mask.dtype is torch.bool:
-        return torch.zeros(mask.shape, dtype=dtype, device=mask.device).masked_fill_(~mask, float("-inf"))
-    return mask.to(dtype)
-
-
 def causal_mask(queries: Tensor, keys: int) -> Tensor:
     """Return (query, key) bool, True where `is_causal` lets a query see a key: aligned to the top left.
 
@@ -54,15 +45,10 @@ def causal_mask(queries: Tensor, keys: int) -> Tensor:
     return torch.arange(keys, device=queries.device)[None, :] <= queries[:, None]
 
 
-def check_keys_left(before: Tensor, after: Tensor, shape: CallShape) -> None:
+def check_change(before: Tensor, after: Tensor, shape: CallShape) -> None:
     """Raise `QueryWithoutKeys` if a query that had a key has none after a change; logits (batch, head, query, key)."""
     lost = (before.amax(-1) > MASKED_BELOW) & (after.amax(-1) <= MASKED_BELOW)
-    if bool(lost.any()):
-        batch, head, query = (int(i) for i in lost.nonzero()[0])
-        raise QueryWithoutKeys(
-            f"An intervention leaves a query without any key in the attention call {shape}, batch row {batch}, head "
-            f"{head}, query {query}. Take a smaller group, a weight below 1, or fewer heads or layers."
-        )
+    check_keys_left(lost, f"the attention call {shape}")
 
 
 #: Where modules keep their number of heads; asked where a kernel gets (batch · head, query, dim).
@@ -83,18 +69,18 @@ def normalised(logits: Tensor) -> Tensor:
     return rows.masked_fill_(logits.amax(-1, keepdim=True) == float("-inf"), 0.0).float()
 
 
-def part(tensor: Tensor, queries: Positions, batch: Positions) -> Tensor:
+def part(tensor: Tensor, queries: slice, batch: slice) -> Tensor:
     """Return the wanted queries and batch rows of (batch or 1, head or 1, query or 1, key)."""
-    if tensor.shape[0] > 1:
-        tensor = at_positions(tensor, 0, batch)
-    return at_positions(tensor, 2, queries) if tensor.shape[2] > 1 else tensor
+    return tensor[batch if tensor.shape[0] > 1 else slice(None), :, queries if tensor.shape[2] > 1 else slice(None)]
 
 
 def changed_mask(mask: Tensor | None, causal: bool, change: Tensor, queries: int, keys: int) -> tuple[Tensor, Tensor]:
     """Return the policy's mask and the changed one as float32 logits, (batch or 1, head or 1, query, key)."""
     before = torch.zeros((1, 1, queries, keys), device=change.device)
-    if mask is not None:
-        before = before + mask_as_logits(mask, torch.float32)
+    if mask is not None and mask.dtype is torch.bool:
+        before = before.masked_fill(~mask, float("-inf"))
+    elif mask is not None:
+        before = before + mask.to(torch.float32)
     if causal:
         seen = causal_mask(torch.arange(queries, device=change.device), keys)
         before = before.masked_fill(~seen, float("-inf"))

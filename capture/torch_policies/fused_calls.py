@@ -19,15 +19,12 @@ from torch.nn.attention import SDPBackend, sdpa_kernel
 from vla_attention.capture.torch_policies.attention_calls import (
     MASKED_BELOW,
     AttentionCall,
-    Positions,
-    at_positions,
-    position_numbers,
 )
 from vla_attention.capture.torch_policies.call_tensors import (
     batch_and_heads,
     causal_mask,
     changed_mask,
-    check_keys_left,
+    check_change,
     fitted_change,
     normalised,
     part,
@@ -72,14 +69,14 @@ def watch_sdpa(
     dtype = query.dtype
     if torch.is_autocast_enabled(query.device.type):
         dtype = torch.get_autocast_dtype(query.device.type)
-    where = mode.where()
+    path, module = mode.where()
     lead, kernel_queries, dim = _lead(given), query.shape[-2], query.shape[-1]
     keys = key.shape[-2]
-    batch, kernel_heads = batch_and_heads(lead, where.module)
+    batch, kernel_heads = batch_and_heads(lead, module)
     kv_heads = key.shape[-3] if given.enable_gqa and len(lead) >= 2 else kernel_heads
-    group = _packed_heads(where.module, query, key)
+    group = _packed_heads(module, query, key)
     heads, queries = kernel_heads * group, kernel_queries // group
-    shape = mode.new_shape(where, "sdpa", (batch, heads, kv_heads, queries, keys), dtype)
+    shape = mode.new_shape(path, "sdpa", (batch, heads, kv_heads, queries, keys), dtype)
     mask = None
     if given.attn_mask is not None:
         mask = _folded_mask(given.attn_mask.detach(), lead, batch, kernel_heads)
@@ -91,7 +88,7 @@ def watch_sdpa(
     else:
         change = fitted_change(change, shape, query.device)
         before, after = changed_mask(mask, given.is_causal, change, queries, keys)
-        check_keys_left(before, after, shape)
+        check_change(before, after, shape)
         # As the kernel wants it: as many axes as its queries have.
         logits = after.expand(batch, heads, -1, -1).reshape(*lead, kernel_queries, keys).to(dtype)
         options = {"scale": given.scale, "enable_gqa": given.enable_gqa}
@@ -105,19 +102,18 @@ def watch_sdpa(
     )  # fmt: skip
     scale = dim**-0.5 if given.scale is None else given.scale
 
-    def rows_of(wanted: Positions, rows: Positions) -> Tensor:
-        chosen = at_positions(at_positions(folded_query, 0, rows), 2, wanted)
-        logits = query_key_logits(chosen, at_positions(folded_key, 0, rows), scale)
+    def rows_of(wanted: slice, rows: slice) -> Tensor:
+        logits = query_key_logits(folded_query[rows, :, wanted], folded_key[rows], scale)
         if mask is not None:
             seen = part(mask, wanted, rows)
             logits = logits.masked_fill_(~seen, float("-inf")) if seen.dtype is torch.bool else logits.add_(seen)
         if given.is_causal:
-            numbers = position_numbers(wanted, queries, logits.device)
+            numbers = torch.arange(queries, device=logits.device)[wanted]
             logits.masked_fill_(~causal_mask(numbers, keys), float("-inf"))
         return normalised(logits if change is None else logits.add_(part(change, wanted, rows)))
 
-    def allowed_of(wanted: Positions) -> Tensor:
-        numbers = position_numbers(wanted, queries, query.device)
+    def allowed_of(wanted: slice) -> Tensor:
+        numbers = torch.arange(queries, device=query.device)[wanted]
         seen = torch.ones((batch, 1, len(numbers), keys), dtype=torch.bool, device=query.device)
         if mask is not None:
             chosen = part(mask, wanted, slice(None))
@@ -184,21 +180,23 @@ def watch_flex(
     mode.refuse_nested(query, key)
     batch, heads, queries, _ = query.shape
     keys = key.shape[2]
-    shape = mode.new_shape(mode.where(), "flex", (batch, heads, key.shape[1], queries, keys), query.dtype)
+    shape = mode.new_shape(mode.where()[0], "flex", (batch, heads, key.shape[1], queries, keys), query.dtype)
     score: Callable[..., Tensor] = given["score_mod"] or (lambda score, *_: score)
     kept_query, kept_key, kept_value = (tensor.detach().expand(batch, -1, -1, -1) for tensor in (query, key, value))
 
-    def allowed_of(wanted: Positions, rows: Positions = slice(None)) -> Tensor:
-        numbers = position_numbers(rows, batch, query.device), position_numbers(wanted, queries, query.device)
-        places = _places(*numbers, heads, keys)
-        seen = _over_places(given["block_mask"][-1], ())(*places, *given[buffers[1]])
-        return seen.expand([len(place) for place in places])
+    def places(wanted: slice, rows: slice) -> list[Tensor]:
+        """The numbers of (batch, head, query, key)."""
+        chosen = zip((batch, heads, queries, keys), (rows, slice(None), wanted, slice(None)), strict=True)
+        return [torch.arange(size, device=query.device)[some] for size, some in chosen]
 
-    def logits_of(wanted: Positions, rows: Positions) -> Tensor:
-        chosen = at_positions(at_positions(kept_query, 0, rows), 2, wanted)
-        logits = query_key_logits(chosen, at_positions(kept_key, 0, rows), given["scale"])
-        numbers = position_numbers(rows, batch, query.device), position_numbers(wanted, queries, query.device)
-        logits = _over_places(score, (0,))(logits, *_places(*numbers, heads, keys), *given[buffers[0]])
+    def allowed_of(wanted: slice, rows: slice = slice(None)) -> Tensor:
+        numbers = places(wanted, rows)
+        seen = _over_places(given["block_mask"][-1], ())(*numbers, *given[buffers[1]])
+        return seen.expand([len(axis) for axis in numbers])
+
+    def logits_of(wanted: slice, rows: slice) -> Tensor:
+        logits = query_key_logits(kept_query[rows, :, wanted], kept_key[rows], given["scale"])
+        logits = _over_places(score, (0,))(logits, *places(wanted, rows), *given[buffers[0]])
         return logits.masked_fill(~allowed_of(wanted, rows), float("-inf"))
 
     change = mode.change(shape)
@@ -207,7 +205,7 @@ def watch_flex(
     else:
         change = fitted_change(change, shape, query.device)
         before = logits_of(slice(None), slice(None))
-        check_keys_left(before, before + change, shape)
+        check_change(before, before + change, shape)
         full = change.expand(batch, heads, queries, keys)
 
         def changed_score(scores: Tensor, b: Tensor, h: Tensor, q: Tensor, k: Tensor, *others: Any) -> Tensor:
@@ -216,17 +214,12 @@ def watch_flex(
         result = function(**{**given, "score_mod": changed_score})
     if not mode.passes(shape):
 
-        def rows_of(wanted: Positions, rows: Positions) -> Tensor:
+        def rows_of(wanted: slice, rows: slice) -> Tensor:
             logits = logits_of(wanted, rows)
             return normalised(logits if change is None else logits + part(change, wanted, rows))
 
         mode.saw(AttentionCall(shape, kept_value, result[0].detach(), rows_of, allowed_of, lambda mixed: mixed))
     return result
-
-
-def _places(batches: Tensor, queries: Tensor, heads: int, keys: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    device = queries.device
-    return batches, torch.arange(heads, device=device), queries, torch.arange(keys, device=device)
 
 
 def _over_places(function: Callable[..., Tensor], score_axes: tuple[int, ...]) -> Callable[..., Tensor]:

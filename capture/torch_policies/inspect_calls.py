@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from itertools import pairwise
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain, pairwise
 from typing import Any
 
 from torch import Tensor
 
-from vla_attention.capture.torch_policies.attention_calls import TOLERANCE, AttentionCall, CallShape
+from vla_attention.capture.torch_policies.attention_calls import TOLERANCE, AttentionCall, CallShape, Watcher
 from vla_attention.capture.torch_policies.key_caches import KeyCaches
 from vla_attention.capture.torch_policies.unseen_attention import no_attention
 from vla_attention.capture.torch_policies.watch import RandomNumbers, watch_attention
@@ -50,7 +50,7 @@ class CallRow:
 
     Attributes:
         modules: paths of the modules, in the order of their first calls.
-        kind, batch, heads, kv_heads, queries, dtype: see `CallShape`.
+        shape: of the first of them.
         keys: the smallest and the largest number of keys.
         times: how often each module made such a call, the least and the most.
         product_error: the largest error of rows times values, relative to the kernel's output.
@@ -58,13 +58,8 @@ class CallRow:
     """
 
     modules: tuple[str, ...]
-    kind: str
-    batch: int
-    heads: int
-    kv_heads: int
-    queries: int
+    shape: CallShape
     keys: tuple[int, int]
-    dtype: str
     times: tuple[int, int]
     product_error: float
     refused: str = ""
@@ -96,24 +91,31 @@ class CallTable:
         """The calls, those of the same shape in modules of one pattern folded into one row."""
         count = len(self.calls)
         checks = zip(self.errors or (float("nan"),) * count, self.refused or ("",) * count, strict=True)
-        return tuple(_rows(self.calls, list(checks)))
+        # Of each module and shape: number of keys -> the checks of its calls.
+        counts: dict[CallShape, dict[int, list[_Check]]] = {}
+        for call, check in zip(self.calls, checks, strict=True):
+            counts.setdefault(replace(call, number=0, keys=0), {}).setdefault(call.keys, []).append(check)
+        folded: dict[tuple[Any, ...], list[tuple[CallShape, list[_Check]]]] = {}
+        for shape, by_keys in counts.items():
+            ranges = {(keys, keys): found for keys, found in by_keys.items()}
+            # A module with many numbers of keys, such as a decoder with a cache, gets one row.
+            if len(by_keys) >= _RANGE:
+                ranges = {(min(by_keys), max(by_keys)): list(chain.from_iterable(by_keys.values()))}
+            pattern = replace(shape, module=re.sub(r"\d+", "{}", shape.module))
+            for keys, found in ranges.items():
+                folded.setdefault((pattern, keys, any(why for _, why in found)), []).append((shape, found))
+        return tuple(_row(keys, modules) for (_, keys, _), modules in folded.items())
 
     def __str__(self) -> str:
         rows = self.rows
         heading = ("module", "kind", "queries x keys", "heads", "dtype", "calls", "P·V error")
         shown = len(heading) if self.errors else len(heading) - 1
-        cells = [line[:shown] for line in (heading, *(_cells(row) for row in rows[:_SCREEN]))]
-        widths = [max(len(line[column]) for line in cells) for column in range(shown)]
-        lines = [
-            "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in cells
-        ]
+        lines = aligned([line[:shown] for line in (heading, *(_cells(row) for row in rows[:_SCREEN]))])
         if len(rows) > _SCREEN:
             lines.append(f"... and {len(rows) - _SCREEN} further rows: see `.rows`")
-        refused = [row for row in rows if row.refused]
-        for row in refused:
-            pattern, _, sizes, *_ = _cells(row)
-            lines.append(f"Recording refuses {pattern}, {sizes}: {row.refused}.")
-        if refused:
+        cells = [(_cells(row), row.refused) for row in rows if row.refused]
+        lines += [f"Recording refuses {pattern}, {sizes}: {refused}." for (pattern, _, sizes, *_), refused in cells]
+        if cells:
             lines.append("Calls that hold no action queries are left out by a rule without a site.")
         batch = sorted({call.batch for call in self.calls})
         if batch and batch[0] > 1 and self.errors:
@@ -125,25 +127,24 @@ class CallTable:
 
 
 @dataclass
-class _Shapes:
+class _Shapes(Watcher):
     """A watcher that keeps shapes and errors, and why calls would be refused."""
 
     calls: list[CallShape] = field(default_factory=list)
     errors: list[float] = field(default_factory=list)
     refused: list[str] = field(default_factory=list)
     caches: KeyCaches = field(default_factory=KeyCaches)
-    #: Of every call the rows of the first row of its batch, (head, query, key), where they are wanted.
-    first_rows: list[Tensor | None] | None = None
-
-    def change(self, shape: CallShape) -> Tensor | None:
-        return None
+    #: By module: of every call its number and the rows of the first row of its batch, (head, query, key), where wanted.
+    first_rows: dict[str, list[tuple[int, Tensor | None]]] | None = None
 
     def saw(self, call: AttentionCall) -> None:
         step = max(1, -(-call.shape.queries // _CHECKED_QUERIES))
         queries = slice(None, None, step)
-        self.calls.append(call.shape)
         if self.first_rows is not None:
-            self.first_rows.append(None if call.refused else _first_row(call))
+            compared = slice(None, None, max(1, call.shape.queries // _COMPARED_QUERIES))
+            rows = None if call.refused else call.rows(compared, slice(0, 1))[0].cpu()
+            self.first_rows.setdefault(call.shape.module, []).append((len(self.calls), rows))
+        self.calls.append(call.shape)
         if call.refused:
             self.errors.append(float("nan"))
             self.refused.append(f"it {call.refused}")
@@ -152,7 +153,7 @@ class _Shapes:
         error = call.product_error(rows, queries)
         self.errors.append(error)
         unfit = call.unfit(rows, error) if math.isfinite(error) else "or its output hold NaN or infinite numbers"
-        cache = self.caches.problem(call)
+        cache = self.caches.problem(call, call.shape.module)
         self.refused.append(f"its rows {unfit}" if unfit else cache)
 
 
@@ -174,14 +175,14 @@ def inspect(policy: object, call: Callable[[], object], *, first_row: Callable[[
         OtherCalls: `first_row` makes other attention calls.
         UserError: see `watch_attention`.
     """
-    shapes = _Shapes(first_rows=None if first_row is None else [])
+    shapes = _Shapes(first_rows=None if first_row is None else {})
     random = RandomNumbers()
     with watch_attention(policy, shapes):
         call()
     if not shapes.calls:
         raise NoAttention(no_attention(policy))
     if first_row is not None:
-        alone = _Shapes(first_rows=[])
+        alone = _Shapes(first_rows={})
         random.again()
         with watch_attention(policy, alone):
             first_row()
@@ -189,37 +190,17 @@ def inspect(policy: object, call: Callable[[], object], *, first_row: Callable[[
     return CallTable(type(policy).__name__, tuple(shapes.calls), tuple(shapes.errors), tuple(shapes.refused))
 
 
-def _first_row(call: AttentionCall) -> Tensor:
-    step = max(1, call.shape.queries // _COMPARED_QUERIES)
-    return call.rows(slice(None, None, step), slice(0, 1))[0].cpu()
-
-
-def _calls_by_module(calls: Sequence[CallShape]) -> dict[str, list[int]]:
-    """The numbers of the calls of each module, in order."""
-    numbers: dict[str, list[int]] = {}
-    for number, call in enumerate(calls):
-        numbers.setdefault(call.module, []).append(number)
-    return numbers
-
-
 def _compare_first_rows(shapes: _Shapes, alone: _Shapes) -> None:
     """Refuse calls whose first row is another one without the other rows of the batch."""
-    of_all, of_one = (_calls_by_module(watched.calls) for watched in (shapes, alone))
-    pairs = [
-        pair
-        for module, numbers in of_all.items()
-        if len(numbers) == len(of_one.get(module, ()))
-        for pair in zip(numbers, of_one[module], strict=True)
-    ]
+    of_all, of_one = shapes.first_rows or {}, alone.first_rows or {}
+    as_often = [module for module in of_all if len(of_all[module]) == len(of_one.get(module, ()))]
+    pairs = [pair for module in as_often for pair in zip(of_all[module], of_one[module], strict=True)]
     if not pairs or of_all.keys() != of_one.keys():
         raise OtherCalls(
             f"The call given as first_row made {len(alone.calls)} attention calls in {len(of_one)} modules, and that "
             f"of all rows {len(shapes.calls)} in {len(of_all)}: both must be the same policy call."
         )
-    assert shapes.first_rows is not None
-    assert alone.first_rows is not None
-    for number, other in pairs:
-        rows, expected, shape = shapes.first_rows[number], alone.first_rows[other], alone.calls[other]
+    for (number, rows), (other, expected) in pairs:
         if rows is None or expected is None or shapes.refused[number]:
             continue
         if rows.shape != expected.shape:
@@ -229,54 +210,39 @@ def _compare_first_rows(shapes: _Shapes, alone: _Shapes) -> None:
             )
             continue
         difference = float((rows - expected).abs().max()) if rows.numel() else 0.0
-        if not difference <= TOLERANCE.get(shape.dtype, TOLERANCE["float32"]):
+        if not difference <= TOLERANCE.get(alone.calls[other].dtype, TOLERANCE["float32"]):
             shapes.refused[number] = (
                 f"the first row of its batch differs by {difference:.2g} from that of the call of one row: the heads "
                 "are folded outside of the batch, or the two calls had other inputs. Record one environment at a time"
             )
 
 
-def _rows(calls: Sequence[CallShape], checks: Sequence[_Check]) -> Iterator[CallRow]:
-    # Of each module and shape the check of each call.
-    counts: dict[tuple[Any, ...], list[_Check]] = {}
-    for call, check in zip(calls, checks, strict=True):
-        counts.setdefault((call.module, *_shape(call), (call.keys, call.keys)), []).append(check)
-    # A module with many numbers of keys, such as a decoder with a cache, gets one row.
-    ranges: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
-    for entry in counts:
-        ranges.setdefault(entry[:-1], []).append(entry)
-    for shape, entries in ranges.items():
-        if len(entries) >= _RANGE:
-            numbers = [entry[-1][0] for entry in entries]
-            merged = [check for entry in entries for check in counts.pop(entry)]
-            counts[(*shape, (min(numbers), max(numbers)))] = merged
-    first = {(call.module, *_shape(call)): number for number, call in reversed(list(enumerate(calls)))}
-    folded: dict[tuple[Any, ...], list[tuple[str, list[_Check]]]] = {}
-    for entry in sorted(counts, key=lambda entry: first[entry[:-1]]):
-        module, refused = str(entry[0]), any(why for _, why in counts[entry])
-        folded.setdefault((re.sub(r"\d+", "{}", module), *entry[1:], refused), []).append((module, counts[entry]))
-    for (_, kind, batch, heads, kv_heads, queries, dtype, keys, _), modules in folded.items():
-        times = [len(checks) for _, checks in modules]
-        yield CallRow(
-            modules=tuple(module for module, _ in modules), kind=kind, batch=batch, heads=heads, kv_heads=kv_heads,
-            queries=queries, keys=keys, dtype=dtype, times=(min(times), max(times)),
-            product_error=max(error for _, checks in modules for error, _ in checks),
-            refused=next((why for _, checks in modules for _, why in checks if why), ""),
-        )  # fmt: skip
+def _row(keys: tuple[int, int], modules: Sequence[tuple[CallShape, Sequence[_Check]]]) -> CallRow:
+    times, found = [len(checks) for _, checks in modules], [check for _, checks in modules for check in checks]
+    return CallRow(
+        modules=tuple(shape.module for shape, _ in modules),
+        shape=modules[0][0],
+        keys=keys,
+        times=(min(times), max(times)),
+        product_error=max(error for error, _ in found),
+        refused=next((why for _, why in found if why), ""),
+    )
 
 
-def _shape(call: CallShape) -> tuple[Any, ...]:
-    return call.kind, call.batch, call.heads, call.kv_heads, call.queries, call.dtype
+def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table as text."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines]
 
 
 def _cells(row: CallRow) -> tuple[str, ...]:
-    keys = str(row.keys[0]) if row.keys[0] == row.keys[1] else f"{row.keys[0]}..{row.keys[1]}"
-    heads = str(row.heads) if row.heads == row.kv_heads else f"{row.heads} on {row.kv_heads}"
-    times = str(row.times[0]) if row.times[0] == row.times[1] else f"{row.times[0]}..{row.times[1]}"
+    keys, times = (str(low) if low == high else f"{low}..{high}" for low, high in (row.keys, row.times))
+    shape = row.shape
+    heads = str(shape.heads) if shape.heads == shape.kv_heads else f"{shape.heads} on {shape.kv_heads}"
     calls = f"{len(row.modules)} x {times}" if len(row.modules) > 1 else times
     pattern = row.pattern or "(policy)"
     error = "refused" if row.refused else f"{row.product_error:.0e}"
-    return pattern, row.kind, f"{row.queries} x {keys}", heads, row.dtype, calls, error
+    return pattern, shape.kind, f"{shape.queries} x {keys}", heads, shape.dtype, calls, error
 
 
 def folded_paths(paths: Sequence[str]) -> str:
@@ -288,10 +254,7 @@ def folded_paths(paths: Sequence[str]) -> str:
         return paths[0]
     numbers = [[int(number) for number in re.findall(r"\d+", path)] for path in paths]
     columns = [sorted(set(column)) for column in zip(*numbers, strict=True)]
-    combinations = 1
-    for column in columns:
-        combinations *= len(column)
-    if combinations != len(paths):
+    if math.prod(map(len, columns)) != len(paths):
         return ", ".join(paths)
     written = iter(_listed(column) if len(column) == 1 else f"{{{_listed(column)}}}" for column in columns)
     return re.sub(r"\d+", lambda match: next(written), paths[0])

@@ -6,6 +6,7 @@ calls of one module are given, one after another, and not by a cache's class.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass, field
 
 import torch
@@ -19,21 +20,9 @@ LOAD_WITH_DYNAMIC_CACHE = (
 )
 
 
-def first_values(call: AttentionCall) -> Tensor:
-    """Return a copy of the values of a call's first two keys, (batch, kv_head, key, dim)."""
-    return call.value[:, :, :2].detach().clone()
-
-
-def slid(before: Tensor, now: Tensor) -> bool:
-    """Whether a cache has lost its first key between a call and the next one, of one query; both: `first_values`."""
-    if before.shape != now.shape or before.shape[2] < 2:
-        return False
-    return torch.equal(now[:, :, 0], before[:, :, 1]) and not torch.equal(now[:, :, 0], before[:, :, 0])
-
-
 @dataclass
 class _Calls:
-    """Of the calls of one module: their numbers of keys; the last one's first values, and keys that its query may see.
+    """Of the calls of one block: their numbers of keys; the last one's first values, and keys that its query may see.
 
     seen: (batch, key) bool; None after a call of several queries.
     """
@@ -44,21 +33,22 @@ class _Calls:
 
 
 class KeyCaches:
-    """Follows the keys of each module from call to call."""
+    """Follows the keys of each block, or module, from call to call."""
 
     def __init__(self) -> None:
-        self._modules: dict[str, _Calls] = {}
+        self._blocks: defaultdict[object, _Calls] = defaultdict(_Calls)
 
-    def problem(self, call: AttentionCall) -> str:
-        """Return why no layout can name the keys of the next call of a module, in words; "" where one can."""
-        shape = call.shape
-        calls = self._modules.setdefault(shape.module, _Calls())
+    def problem(self, call: AttentionCall, block: object) -> str:
+        """Return why no layout can name the keys of the next call of a block, in words; "" where one can."""
+        shape, calls = call.shape, self._blocks[block]
         calls.keys.append(shape.keys)
-        before, calls.first = calls.first, first_values(call)
+        before, calls.first = calls.first, call.value[:, :, :2].detach().clone()
         seen_before, calls.seen = calls.seen, call.allowed()[:, 0] if shape.queries == 1 else None
         if before is None or calls.seen is None:
             return ""
-        if slid(before, calls.first):
+        now, first = calls.first, before[:, :, 0]
+        two = before.shape == now.shape and before.shape[2] > 1
+        if two and torch.equal(now[:, :, 0], before[:, :, 1]) and not torch.equal(now[:, :, 0], first):
             return (
                 f"its cache of {shape.keys} keys loses its first key at each call (a sliding window), so that no key "
                 f"has a place of its own: {LOAD_WITH_DYNAMIC_CACHE}"

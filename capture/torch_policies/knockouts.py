@@ -77,14 +77,9 @@ def changes_of_episode(
     return changes
 
 
-def edits_at(edits: Sequence[SiteEdit], place: CallPlace) -> list[SiteEdit]:
-    """Return the edits that change one call of a site."""
-    return [edit for edit in edits if edit.queries != "prefix" and edit.is_at(place.block, place.step)]
-
-
 @dataclass
 class CallBias:
-    """What edits add to the logits of the attention calls of one row; see `LogitBias`. Without edits, zeros.
+    """What edits add to the logits of the attention calls of one row. Without edits, zeros.
 
     edits: by site. present: site -> (key,) bool, the keys that the policy call has.
     """
@@ -94,24 +89,29 @@ class CallBias:
     present: Mapping[str, NDArray[np.bool_]]
     _known: dict[tuple[Any, ...], NDArray[np.float32]] = field(default_factory=dict)
 
-    def __call__(self, _row: int, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
+    def __call__(self, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
         """Return what is added, (head or 1, query, key). Calls to which the same is added get the same array."""
         rule = self.layout.rules[place.rule]
         if place.site is None and not rule.is_prefix:
             return None
         edits = self.edits.get(place.site or rule.tokens or "", ())
-        edits = edits_at(edits, place) if place.site else [edit for edit in edits if edit.queries != "action"]
+        if place.site:
+            edits = [edit for edit in edits if edit.queries != "prefix" and edit.is_at(place.block, place.step)]
+        else:
+            edits = [edit for edit in edits if edit.queries != "action"]
         if self.edits and not edits:
             return None
         token = -1 if place.keys is None else place.step
         sizes = shape.heads, shape.queries, shape.keys, place.queries.start, place.queries.stop, token
         call = place.rule, place.site, tuple(id(edit) for edit in edits), *sizes
         if call not in self._known:
-            keys = (
-                CallKeys.of_prefix(self._tokens(rule.tokens or "", shape))
-                if place.site is None
-                else CallKeys(place.queries, self._own_keys(place.site, shape), place.keys)
-            )
+            if place.site is None:
+                keys = CallKeys.of_prefix(self._tokens(rule.tokens or "", shape))
+            else:
+                # The keys of the call's own queries are the last ones, of a site that has keys of actions.
+                has_actions = any(span.kind == "action" for span in self.layout.site(place.site).keys.spans)
+                own = slice(shape.keys - shape.queries, shape.keys) if has_actions else None
+                keys = CallKeys(place.queries, own if shape.keys >= shape.queries else None, place.keys)
             self._known[call] = logit_bias(edits, (shape.heads, shape.queries, shape.keys), keys)
         return self._known[call]
 
@@ -127,10 +127,3 @@ class CallBias:
                 "with these tokens in the layout."
             )
         return tokens
-
-    def _own_keys(self, site: str, shape: CallShape) -> slice | None:
-        """The keys of the call's own queries, the last ones; None for a site without keys of actions."""
-        spans = self.layout.site(site).keys.spans
-        if shape.keys < shape.queries or not any(span.kind == "action" for span in spans):
-            return None
-        return slice(shape.keys - shape.queries, shape.keys)

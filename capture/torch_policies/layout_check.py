@@ -7,18 +7,18 @@ are compared, which hold what a token is; keys may have its position in them, to
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.interventions.resolution import run_vocabularies, site_tokens
-from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall
 from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace, KnownCalls
-from vla_attention.capture.torch_policies.inspect_calls import NoAttention
+from vla_attention.capture.torch_policies.inspect_calls import NoAttention, aligned
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
-from vla_attention.capture.torch_policies.policy_modules import FoundPolicy, find_policy
+from vla_attention.capture.torch_policies.policy_modules import find_policy
 from vla_attention.capture.torch_policies.prompts import TokenText
 from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs
 from vla_attention.capture.torch_policies.replan_text import PromptIds, ReplanText, embeddings_of
@@ -72,7 +72,9 @@ class KeysMoved:
             in_span = [key for key in keys if span.start <= key < span.stop]
             if in_span:
                 whole = len(in_span) == sum(span.start <= key < span.stop for key in self.present)
-                words.append(span.name if whole else f"{span.name} ({_ranges(in_span)})")
+                runs = [str(run[0]) if len(run) == 1 else f"{run[0]}..{run[-1]}" for run in runs_of(in_span)]
+                part = f" ({'key' if len(in_span) == 1 else 'keys'} {listing(runs)})"
+                words.append(span.name + part * (not whole))
         return ", ".join(words) or "nothing"
 
     @property
@@ -109,14 +111,9 @@ class LayoutCheck:
             (moved.selector, moved.site, moved.named(moved.expected), moved.named(moved.moved), moved.verdict)
             for moved in self.changes
         ]
-        widths = [max(len(line[column]) for line in lines) for column in range(len(lines[0]))]
-        text = [
-            "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
-        ]
+        text = aligned(lines)
         wrong = sum(not change.fits for change in self.changes)
-        found = (
-            "every change moves its keys and no others" if not wrong else f"{wrong} of {len(self.changes)} do not fit"
-        )
+        found = f"{wrong} of {len(self.changes)} do not fit" if wrong else "every change moves its keys and no others"
         blocks = dict.fromkeys(f"'{moved.site}' at block {moved.block}" for moved in self.changes)
         text.insert(0, f"Layout '{self.layout}', keys of {' and '.join(blocks)}: {found}")
         if self.left_out:
@@ -173,75 +170,66 @@ def check_layout(
     for selector in perturb:
         if tokenizer is None and any(atom.kind in _OF_WORDS for atom in atoms_of(parse_selector(selector))):
             raise BadArgument(f"'{selector}' needs tokenizer= and instruction=, which say where the words are.")
-    blocks = _first_blocks(layout, site)
-    known_policy, random = find_policy(policy), RandomNumbers()
-    text = None if tokenizer is None else TokenText(tokenizer)
-    try:
-        keys = _keys_of(known_policy, layout, blocks, call, "the unchanged call")
-        expected = keys.expected(layout, perturb, text, instruction)
+    firsts = {known.name: min(known.keys.layers, default=0) for known in layout.sites}
+    blocks = {name: block for name, block in firsts.items() if block == min(firsts.values())}
+    if site is not None:
+        blocks = {site: firsts[layout.site(site).name]}
+    found, random, changes = find_policy(policy), RandomNumbers(), []
+    embeddings = embeddings_of(found.modules, layout)
+
+    def keys_of(call: Callable[[], object], what: str) -> _Keys:
         random.again()
-        again = _keys_of(known_policy, layout, blocks, call, "the unchanged call, made again")
-        _check_repeats(keys, again, layout)
-        changes = []
+        keys = _Keys(layout, type(found.policy).__name__, blocks, PromptIds(embeddings, batch=1))
+        with keys.ids.watched(), watch_attention(found, keys):
+            call()
+        if not keys.ran:
+            raise NoAttention(f"In {what}: {no_attention(found.policy)}")
+        keys.check(what)
+        return keys
+
+    try:
+        keys = keys_of(call, "the unchanged call")
+        expected = keys.expected(perturb, None if tokenizer is None else TokenText(tokenizer), instruction)
+        keys.check_repeats(keys_of(call, "the unchanged call, made again"))
         for selector, changed_call in perturb.items():
-            random.again()
-            changed = _keys_of(known_policy, layout, blocks, changed_call, f"the call for '{selector}'")
+            changed = keys_of(changed_call, f"the call for '{selector}'")
             for name, block in blocks.items():
-                present = keys.there(name) | changed.there(name)
-                wanted, moved = _key_numbers(expected[selector][name]), _key_numbers(keys.moved(changed, name))
+                masks = expected[selector][name], keys.moved(changed, name), keys.there(name) | changed.there(name)
+                wanted, moved, present = (tuple(int(key) for key in np.flatnonzero(mask)) for mask in masks)
                 if wanted or moved:
                     spans = layout.site(name).keys.spans
-                    changes.append(KeysMoved(selector, name, block, wanted, moved, _key_numbers(present), spans))
+                    changes.append(KeysMoved(selector, name, block, wanted, moved, present, spans))
     finally:
         random.again()
-    left_out = tuple(other.name for other in layout.sites if other.name not in blocks) if site is None else ()
+    left_out = tuple(name for name in firsts if name not in blocks) if site is None else ()
     return LayoutCheck(layout.name, tuple(changes), left_out)
 
 
-def _first_blocks(layout: PolicyLayout, site: str | None) -> dict[str, int]:
-    """The sites to look at, and the block of each."""
-    if site is not None:
-        return {site: min(layout.site(site).keys.layers, default=0)}
-    firsts = {known.name: min(known.keys.layers, default=0) for known in layout.sites}
-    return {name: block for name, block in firsts.items() if block == min(firsts.values())}
-
-
-@dataclass
-class _Keys:
-    """A watcher that keeps the values of the first call of some sites' first blocks, and what tells their words.
+class _Keys(CallOrder):
+    """Keeps the values of the first call of some sites' first blocks, and what tells their words.
 
     values: site -> (key, number), NaN for keys that the call does not have. valid: site -> (key,) bool, keys that some
     action query may see. rounding: site -> see `_ROUNDING`.
     """
 
-    order: CallOrder
-    blocks: Mapping[str, int]
-    ids: PromptIds
-    values: dict[str, NDArray[np.float32]] = field(default_factory=dict)
-    valid: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
-    rounding: dict[str, float] = field(default_factory=dict)
+    def __init__(self, layout: PolicyLayout, policy: str, blocks: Mapping[str, int], ids: PromptIds) -> None:
+        super().__init__(KnownCalls(layout), policy)
+        self.blocks, self.ids = blocks, ids
+        self.values: dict[str, NDArray[np.float32]] = {}
+        self.valid: dict[str, NDArray[np.bool_]] = {}
+        self.rounding: dict[str, float] = {}
 
-    changes = False
+    def wanted(self, place: CallPlace) -> bool:
+        return place.site not in self.values and self.blocks.get(place.site or "") == place.block
 
-    def change(self, shape: CallShape) -> None:
-        return None
-
-    def saw(self, call: AttentionCall) -> None:
-        place = self.order.place(call.shape)
-        self.order.ran(call.shape, place)
-        name = None if place is None else place.site
-        if place is None or name is None or name in self.values or self.blocks.get(name) != place.block:
-            return
+    def take(self, call: AttentionCall, place: CallPlace, site: RecordedSite) -> None:
         if call.shape.batch != 1:
             raise BadArgument(
-                f"A call of site '{name}' has a batch of {call.shape.batch}; give va.check_layout policy calls for one "
-                "environment."
+                f"A call of site '{site.name}' has a batch of {call.shape.batch}; give va.check_layout policy calls "
+                "for one environment."
             )
-        self._keep(call, place, self.order.known.sites[name])
-
-    def _keep(self, call: AttentionCall, place: CallPlace, site: RecordedSite) -> None:
         count = site.keys.num_keys
-        positions = np.arange(count) if place.keys is None else place.keys
+        positions = slice(None) if place.keys is None else place.keys
         numbers = call.value[0].detach().transpose(0, 1).flatten(1).float().cpu().numpy()
         self.values[site.name] = values = np.full((count, numbers.shape[1]), np.nan, dtype=np.float32)
         values[positions] = numbers
@@ -263,17 +251,14 @@ class _Keys:
         return moved
 
     def expected(
-        self, layout: PolicyLayout, selectors: Mapping[str, object], tokenizer: TokenText | None, instruction: str
+        self, selectors: Mapping[str, object], tokenizer: TokenText | None, instruction: str
     ) -> dict[str, dict[str, NDArray[np.bool_]]]:
         """Return selector -> site -> (key,) bool, the keys that it takes of those that the call has."""
-        text = ReplanText(layout, tokenizer, self.ids, {0: ReplanInputs(env_step=0, instruction=instruction)})
-        text.present = self.order.present
-        prompt = text.prompt(0, None)
-        sites = [layout.site(name) for name in self.values]
-        roles = {
-            site.name: text.roles(0, site, prompt, self.order.present[site.name], self.valid[site.name])
-            for site in sites
-        }
+        inputs = {0: ReplanInputs(env_step=0, instruction=instruction)}
+        text = ReplanText(self.layout, tokenizer, self.ids, inputs, self.present)
+        prompt = text.prompt(0, {})
+        sites = [self.known.sites[name] for name in self.values]
+        roles = {site.name: text.roles(0, site, prompt, self.valid[site.name]) for site in sites}
         layouts = [site.keys for site in sites]
         tokens = site_tokens(layouts, roles, prompt, (), {})
         vocabularies = run_vocabularies(layouts, [prompt.instruction_text], ())
@@ -288,39 +273,14 @@ class _Keys:
                 )
         return chosen
 
-
-def _keys_of(
-    policy: FoundPolicy, layout: PolicyLayout, blocks: Mapping[str, int], call: Callable[[], object], what: str
-) -> _Keys:
-    ids = PromptIds(embeddings_of(policy.policy, layout), batch=1)
-    name = type(policy.policy).__name__
-    keys = _Keys(CallOrder(KnownCalls(layout), name), blocks, ids)
-    with ids.watched(), watch_attention(policy, keys):
-        call()
-    if not keys.order.seen:
-        raise NoAttention(f"In {what}: {no_attention(policy.policy)}")
-    keys.order.check(what)
-    return keys
-
-
-def _check_repeats(keys: _Keys, again: _Keys, layout: PolicyLayout) -> None:
-    """Raise `NotRepeatable` if keys move between two calls in which nothing was changed."""
-    for name in keys.values:
-        moved = keys.moved(again, name)
-        if moved.any():
-            spans = [span.name for span in layout.site(name).keys.spans if moved[span.start : span.stop].any()]
-            raise NotRepeatable(
-                f"The keys of the spans {listing(spans)} at site '{name}' are others when the unchanged call is made "
-                "again, with the same random numbers of torch. Give the policy its noise, or reset it in each call, as "
-                "lambda: (policy.reset(), policy.select_action(batch))[1]."
-            )
-
-
-def _key_numbers(chosen: NDArray[np.bool_]) -> tuple[int, ...]:
-    return tuple(int(key) for key in np.flatnonzero(chosen))
-
-
-def _ranges(keys: Sequence[int]) -> str:
-    """Return ascending numbers as text: `key 7`, `keys 4..6` or `keys 4..6, 9`."""
-    what = "key" if len(keys) == 1 else "keys"
-    return f"{what} {listing(str(run[0]) if len(run) == 1 else f'{run[0]}..{run[-1]}' for run in runs_of(keys))}"
+    def check_repeats(self, again: _Keys) -> None:
+        """Raise `NotRepeatable` if keys move between two calls in which nothing was changed."""
+        for name in self.values:
+            moved = self.moved(again, name)
+            spans = [span.name for span in self.known.sites[name].keys.spans if moved[span.start : span.stop].any()]
+            if spans:
+                raise NotRepeatable(
+                    f"The keys of the spans {listing(spans)} at site '{name}' are others when the unchanged call is "
+                    "made again, with the same random numbers of torch. Give the policy its noise, or reset it in each "
+                    "call, as lambda: (policy.reset(), policy.select_action(batch))[1]."
+                )

@@ -7,8 +7,7 @@ makes: `call_order.py` gives each call its site, block and denoise step, and say
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from functools import lru_cache
+from collections.abc import Iterator, Sequence
 from typing import Literal
 
 from msgspec import field
@@ -68,6 +67,12 @@ class CallRule(Document, frozen=True):
             groups = re.compile(self.modules).groupindex
         except re.error as error:
             raise BadArgument(f"The rule '{self.modules}' is no regular expression: {error}.") from None
+        for call in self.sequence:
+            if not isinstance(call, tuple | list) or [*map(type, call)] != [str, int]:
+                raise BadArgument(
+                    f"The rule '{self.modules}' has {call!r} in its sequence; expected site and block of each call of "
+                    "a denoise step, as ('self', 0). Calls without a site get a rule of their own before this one."
+                )
         if self.site is not None and self.sequence:
             raise BadArgument(f"The rule '{self.modules}' has both a site and a sequence; give one of them.")
         if self.tokens is not None and (self.sequence or self.site not in (None, self.tokens)):
@@ -96,20 +101,7 @@ class CallRule(Document, frozen=True):
         wanted = ((self.kind, kind), (self.queries, queries), (self.keys, keys))
         if any(condition is not None and condition != given for condition, given in wanted):
             return None
-        return _compiled(self.modules).fullmatch(module)
-
-    def block(self, match: re.Match[str]) -> int | None:
-        """Return the number of the block in a module's path, None where the group is no number or did not match."""
-        digits = match["block"]
-        return int(digits) if digits is not None and digits.isdecimal() else None
-
-    def describe(self) -> str:
-        """The rule on one line."""
-        named = (("kind", self.kind), ("queries", self.queries), ("keys", self.keys))
-        conditions = "".join(f", {name} {value}" for name, value in named if value is not None)
-        conditions += f", tokens of '{self.tokens}'" if self.tokens else ""
-        what = f"site '{self.site}'" if self.site else f"{len(self.sequence)} blocks" if self.sequence else "no site"
-        return f"{self.modules}{conditions}: {what}"
+        return re.fullmatch(self.modules, module)
 
 
 class RecordedSite(Document, frozen=True):
@@ -167,6 +159,10 @@ class RecordedSite(Document, frozen=True):
     def name(self) -> str:
         """The site's name."""
         return self.keys.name
+
+    def is_in(self, layers: Sequence[int]) -> bool:
+        """Whether some of these layers have the site."""
+        return not self.keys.layers or not set(self.keys.layers).isdisjoint(layers)
 
     @property
     def num_action_queries(self) -> int:
@@ -387,8 +383,3 @@ def check_versions(layout: PolicyLayout, installed: dict[str, str | None]) -> st
         f"The layout '{layout.name}' was written for {' and '.join(others)}; another version may compute in other "
         "modules or order. Compare va.inspect(...) with the layout, and record with any_version=True if it fits."
     )
-
-
-@lru_cache(maxsize=1024)
-def _compiled(expression: str) -> re.Pattern[str]:
-    return re.compile(expression)

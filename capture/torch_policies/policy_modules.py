@@ -5,12 +5,13 @@ from __future__ import annotations
 import types
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import nn
 
 from vla_attention.capture.torch_policies.unseen_attention import refuse_unseen_settings
-from vla_attention.schemas.errors import BadArgument, unknown_name
+from vla_attention.schemas.errors import BadArgument
 
 #: How deep modules are looked for in objects that are no modules.
 _DEPTH = 4
@@ -70,15 +71,11 @@ def modules_of(policy: object) -> dict[str, nn.Module]:
     """
     policy = getattr(policy, "__self__", policy) if isinstance(policy, types.MethodType) else policy
     modules: dict[str, nn.Module] = {}
-    seen: set[int] = set()
-    for path, part in _parts(policy, "", 0, seen):
-        name = f"{type(part).__module__}.{type(part).__qualname__}"
-        if isinstance(part, nn.Module):
-            graphed = getattr(part.__dict__.get("forward"), "__module__", "") == "torch.cuda.graphs"
-            name = "a CUDA graph of make_graphed_callables" if graphed else name
-        else:
-            graphed = False
+    for path, part in _parts(policy, "", 0, set()):
+        name, forward = _class_name(part), getattr(part, "__dict__", {}).get("forward")
+        graphed = isinstance(part, nn.Module) and getattr(forward, "__module__", "") == "torch.cuda.graphs"
         if graphed or isinstance(part, torch.jit.ScriptModule) or name.startswith(_COMPILED):
+            name = "a CUDA graph of make_graphed_callables" if graphed else name
             raise CannotRunEager(
                 f"{path or 'The policy'} is a compiled program ({name}): its attention cannot be seen, and it cannot "
                 "be made eager. Load the policy as an ordinary torch module; torch.compile is fine."
@@ -95,74 +92,49 @@ def modules_of(policy: object) -> dict[str, nn.Module]:
 
 def _parts(part: object, path: str, depth: int, seen: set[int]) -> Iterator[tuple[str, object]]:
     """Yield modules and compiled programs of an object by path, each once."""
-    if id(part) in seen:
+    if isinstance(part, _PLAIN) or id(part) in seen:
         return
     seen.add(id(part))
-    if isinstance(part, nn.Module):
-        scripted = isinstance(part, torch.jit.ScriptModule)
-        inner = None if scripted else part._modules.get("_orig_mod")
-        if inner is not None:
+    if isinstance(part, nn.Module) and not isinstance(part, torch.jit.ScriptModule):
+        if part._modules.get("_orig_mod") is not None:
             # torch.compile's wrapper gives way to what it wraps, which runs in the block.
-            yield from _parts(inner, path, depth, seen)
+            yield from _parts(part._modules["_orig_mod"], path, depth, seen)
             return
         yield path, part
-        if scripted:
-            return
         for name, child in part._modules.items():
-            if child is not None:
-                yield from _parts(child, _joined(path, name), depth, seen)
-        attributes = {name: held for name, held in part.__dict__.items() if name not in _MODULE_ATTRIBUTES}
-        if depth < _DEPTH:
-            for name, held in attributes.items():
-                yield from _held(held, _joined(path, name), depth + 1, seen)
-    else:
-        yield from _held(part, path, depth, seen)
+            yield from _parts(child, _joined(path, name), depth, seen)
+    elif isinstance(part, nn.Module) or _class_name(part).startswith(_COMPILED):
+        yield path, part
+        return
+    if depth < _DEPTH:
+        for name, held in _held(part):
+            yield from _parts(held, _joined(path, str(name)), depth + 1, seen)
 
 
+#: What holds no modules.
+_PLAIN = (str, bytes, int, float, complex, bool, type(None), torch.Tensor, type, types.ModuleType, torch.dtype)
 #: What every nn.Module has.
 _MODULE_ATTRIBUTES = frozenset(nn.Module().__dict__)
 
 
-def _held(part: object, path: str, depth: int, seen: set[int]) -> Iterator[tuple[str, object]]:
-    """Yield what an object that is no module holds."""
-    if isinstance(part, nn.Module):
-        yield from _parts(part, path, depth, seen)
-        return
-    plain = (str, bytes, int, float, complex, bool, type(None), torch.Tensor, type, types.ModuleType, torch.dtype)
-    if isinstance(part, plain):
-        return
-    if id(part) in seen and depth:
-        return
-    seen.add(id(part))
-    if f"{type(part).__module__}.{type(part).__qualname__}".startswith(_COMPILED):
-        yield path, part
-        return
-    if depth >= _DEPTH:
-        return
-    if isinstance(part, dict | list | tuple | set | frozenset) and len(part) > _MANY:
-        return  # vocabularies and data, no modules
-    if isinstance(part, dict):
-        items = [(str(name), held) for name, held in part.items()]
-    elif isinstance(part, list | tuple | set | frozenset):
-        items = [(str(number), held) for number, held in enumerate(part)]
-    elif isinstance(part, types.MethodType):
-        items = []
-    else:
-        items = list(getattr(part, "__dict__", {}).items()) if not callable(type(part).__dict__.get("__get__")) else []
-    for name, held in items:
-        yield from _held(held, _joined(path, name), depth + 1, seen)
+def _held(part: object) -> list[tuple[Any, object]]:
+    """What an object holds, with the names of its attributes and the keys or numbers of its entries."""
+    if isinstance(part, dict | list | tuple | set | frozenset):
+        if len(part) > _MANY:
+            return []  # vocabularies and data, no modules
+        return list(part.items() if isinstance(part, dict) else enumerate(part))
+    if isinstance(part, types.MethodType) or callable(type(part).__dict__.get("__get__")):
+        return []
+    held = getattr(part, "__dict__", {}).items()
+    return [item for item in held if not isinstance(part, nn.Module) or item[0] not in _MODULE_ATTRIBUTES]
 
 
 def _joined(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
 
 
-def find_module(policy: object, path: str, what: str) -> nn.Module:
-    """Return the module at a path; the error says what it was wanted for, and the nearest that exists."""
-    modules = modules_of(policy)
-    if path not in modules:
-        raise unknown_name(f"module for {what}", path, [name for name in modules if name])
-    return modules[path]
+def _class_name(part: object) -> str:
+    return f"{type(part).__module__}.{type(part).__qualname__}"
 
 
 def root_modules(policy: object) -> dict[str, nn.Module]:

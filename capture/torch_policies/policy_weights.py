@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import io
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -129,11 +130,9 @@ def _place(weight: Tensor) -> tuple[int, int]:
 
 def device_and_dtype(policy: object) -> tuple[str, str]:
     """Return the device and the type of most weights, such as `cuda:0` and `bfloat16`."""
-    counts: dict[tuple[str, str], int] = {}
+    counts: Counter[tuple[str, str]] = Counter()
     for module in root_modules(policy).values():
         for weight in module.parameters():
-            if weight.is_meta or nn.parameter.is_lazy(weight):
-                continue
-            place = str(weight.device), str(weight.dtype).removeprefix("torch.")
-            counts[place] = counts.get(place, 0) + weight.numel()
-    return max(counts, key=lambda place: counts[place]) if counts else ("cpu", "float32")
+            if not weight.is_meta and not nn.parameter.is_lazy(weight):
+                counts[str(weight.device), str(weight.dtype).removeprefix("torch.")] += weight.numel()
+    return counts.most_common(1)[0][0] if counts else ("cpu", "float32")

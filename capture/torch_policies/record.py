@@ -15,9 +15,8 @@ from vla_attention.capture.effects.conditions import refuse_both
 from vla_attention.capture.engine.plan import recording_of, root_attributes
 from vla_attention.capture.engine.settings import RecordingSettings
 from vla_attention.capture.machine import describe_machine
-from vla_attention.capture.torch_policies.batch_rows import rows_apart
 from vla_attention.capture.torch_policies.knockouts import check_interventions
-from vla_attention.capture.torch_policies.own_setting import difference_to_own_setting
+from vla_attention.capture.torch_policies.own_setting import facts_of_own_setting
 from vla_attention.capture.torch_policies.policy_layout import (
     LayoutForAnotherVersion,
     PolicyLayout,
@@ -124,6 +123,15 @@ def record(
     other = check_versions(layout, installed)
     if other is not None and not any_version:
         raise LayoutForAnotherVersion(other)
+    if queries not in ("mean", "all"):
+        raise BadArgument(f"Cannot record the queries '{queries}'; expected 'mean' or 'all'.")
+    if queries == "all" and layout.stops_early:
+        raise BadArgument(
+            f"Cannot record all action queries of '{layout.name}': it may generate fewer than "
+            f"{layout.num_action_tokens} tokens. Record their mean."
+        )
+    if not 1 <= bits <= FLOAT32_MANTISSA_BITS:
+        raise BadArgument(f"Cannot store rows with {bits} mantissa bits; expected 1 to {FLOAT32_MANTISSA_BITS}.")
     settings = RecordingSettings(
         layers=None if layers is None else tuple(layers),
         denoise_steps=(denoise_steps,) if isinstance(denoise_steps, (int, str)) else tuple(denoise_steps),
@@ -133,7 +141,7 @@ def record(
         frames=frames,
         contributions=contributions,
     )
-    recording = recording_of_layout(settings, layout)
+    recording, _ = recording_of(settings, layout, max(num_action_queries(layout, site) for site in layout.sites))
     changes = interventions or Interventions()
     check_interventions(changes, layout)
     planned = effects_of_layout(effects, layout)
@@ -146,8 +154,7 @@ def record(
     facts |= {"layout for another version": other} if other is not None else {}
     facts["difference to own setting"] = "not measured"
     if own_setting is not None:
-        facts["difference to own setting"] = str(difference_to_own_setting(policy, own_setting))
-        facts["rows of the batch of own setting"] = rows_apart(policy, layout, own_setting)
+        facts |= facts_of_own_setting(policy, layout, own_setting)
     digest, unread = policy_digest(policy)
     if unread:
         facts["not in the digest of weights"] = listing(unread)
@@ -178,21 +185,6 @@ def record(
     )
 
 
-def recording_of_layout(settings: RecordingSettings, layout: PolicyLayout) -> Recording:
-    """Return what is recorded; raise `BadArgument` for what the layout does not have."""
-    queries, bits = settings.queries, settings.mantissa_bits
-    if queries not in ("mean", "all"):
-        raise BadArgument(f"Cannot record the queries '{queries}'; expected 'mean' or 'all'.")
-    if queries == "all" and layout.stops_early:
-        raise BadArgument(
-            f"Cannot record all action queries of '{layout.name}': it may generate fewer than "
-            f"{layout.num_action_tokens} tokens. Record their mean."
-        )
-    if not 1 <= bits <= FLOAT32_MANTISSA_BITS:
-        raise BadArgument(f"Cannot store rows with {bits} mantissa bits; expected 1 to {FLOAT32_MANTISSA_BITS}.")
-    return recording_of(settings, layout, max(num_action_queries(layout, site) for site in layout.sites))[0]
-
-
 def num_action_queries(layout: PolicyLayout, site: RecordedSite) -> int:
     """Return how many action queries a policy call has at a site."""
     return layout.num_action_tokens if layout.autoregressive else site.num_action_queries
@@ -202,11 +194,9 @@ def recorded_sites(layout: PolicyLayout, recording: Recording) -> tuple[SiteLayo
     """Return the sites that some recorded layer has, as the store describes them."""
     stored = []
     for site in layout.sites:
-        if site.keys.layers and not set(site.keys.layers) & set(recording.layers):
-            continue
-        count = num_action_queries(layout, site)
-        num_queries = 0 if count == recording.num_action_queries else count
-        stored.append(replace(site.keys, num_action_queries=num_queries) if num_queries else site.keys)
+        if site.is_in(recording.layers):
+            count = num_action_queries(layout, site)
+            stored.append(replace(site.keys, num_action_queries=count * (count != recording.num_action_queries)))
     if not stored:
         raise BadArgument(f"The layers {listing(recording.layers)} have none of the sites.")
     return tuple(stored)

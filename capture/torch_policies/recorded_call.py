@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -16,9 +17,9 @@ from vla_attention.capture.interventions.changed_inputs import CallContext
 from vla_attention.capture.recording.finite_numbers import all_finite, not_finite
 from vla_attention.capture.store.replan_records import RecordedRows, ReplanRecord
 from vla_attention.capture.torch_policies.attention_calls import CallShape
-from vla_attention.capture.torch_policies.batch_rows import BatchRowsMixed
 from vla_attention.capture.torch_policies.call_order import CallPlace
 from vla_attention.capture.torch_policies.knockouts import CallBias
+from vla_attention.capture.torch_policies.own_setting import BatchRowsMixed
 from vla_attention.capture.torch_policies.policy_layout import RecordedSite
 from vla_attention.capture.torch_policies.repeated_calls import OWN_NOISE, CallInput, CallToRepeat
 from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs, read_actions
@@ -63,32 +64,25 @@ class RowOfCall:
         )
 
 
-class WatchedCall:
-    """One policy call. rows: those of its batch that are recorded. batch: how many it has.
+class WatchedCall(ReplanRecorder):
+    """One policy call. calls: those of its batch that are recorded. batch: how many it has.
 
     Raises:
         BadArgument: its effects are to be measured, and it cannot be repeated.
     """
 
-    def __init__(self, run: RecordedRun, rows: Sequence[RowOfCall], batch: int) -> None:
-        self._run, self._rows = run, rows
-        self._where = ", ".join(one.where for one in rows[:2])
+    def __init__(self, run: RecordedRun, calls: Sequence[RowOfCall], batch: int) -> None:
+        where, rows = ", ".join(one.where for one in calls[:2]), [one.row for one in calls]
+        super().__init__(run._known, type(run.policy).__name__, run.attributes.recording, batch, rows, where)
+        self.changes = run.attributes.interventions.changes_attention
+        self._run, self._calls = run, {one.row: one for one in calls}
         self._ids = PromptIds(run._embeddings, batch)
-        self._text = ReplanText(run.layout, run._tokenizer, self._ids, {one.row: one.inputs for one in rows})
-        self.recorder = ReplanRecorder(
-            run._known,
-            type(run.policy).__name__,
-            run.attributes.recording,
-            batch,
-            [one.row for one in rows],
-            self._text.early_roles,
-            self._bias if run.attributes.interventions.changes_attention else None,
-            self._where,
-        )
-        self._asks_of_batch = self.recorder.asks_of_batch = batch > 1 and not run._asked_of_batch
-        self._present = self._text.present = self.recorder.order.present
-        self._biases: dict[int, CallBias | None] = {}
-        self._before = self._state_before(rows[0])
+        inputs = {one.row: one.inputs for one in calls}
+        self._text = ReplanText(run.layout, run.tokenizer, self._ids, inputs, self.present)
+        self._asks_of_batch = self.asks_of_batch = batch > 1 and not run._asked_of_batch
+        #: Of a row of the batch, what changes it: asked at its first call.
+        self._bias_of = cache(self._row_bias)
+        self._before = self._state_before(calls[0])
 
     def _state_before(self, one: RowOfCall) -> RandomNumbers | None:
         """Return the random numbers before a policy call whose effects are measured; None where they are not."""
@@ -106,7 +100,7 @@ class WatchedCall:
     @contextmanager
     def watched(self) -> Iterator[None]:
         """Watch the call that is made within the block."""
-        with self._ids.watched(), watch_attention(self._run._found, self.recorder):
+        with self._ids.watched(), watch_attention(self._run._found, self):
             yield
 
     def finish(self) -> list[dict[str, SiteRows]]:
@@ -115,15 +109,15 @@ class WatchedCall:
         Raises:
             BatchRowsMixed: the rows of the batch are not those of the environments.
         """
-        rows_of_sites = self.recorder.finish()
+        rows_of_sites = super().finish()
         if self._asks_of_batch:
             self._check_batch()
         return rows_of_sites
 
     def _check_batch(self) -> None:
         """Raise `BatchRowsMixed` if the rows of a batch are not those of the environments; say where nothing tells."""
-        run, batch = self._run, self.recorder.batch
-        run._asked_of_batch, apart = True, self.recorder.contributions.rows_apart()
+        run, batch = self._run, self.batch
+        run._asked_of_batch, apart = True, self.contributions.rows_apart()
         if apart is None:
             run._of_batch = (
                 f"the rows of a batch of {batch} may be mixed, if heads are folded outside of the batch: compare them "
@@ -149,18 +143,16 @@ class WatchedCall:
         several = given_actions is not None and one.action_place is not None
         actions = read_actions(given_actions[one.action_place] if several else given_actions)
         for site in run._sites:
-            text.check_places(one.row, site, rows_of_sites[site.name].present, rows_of_sites[site.name].valid)
-        prompt = text.prompt(one.row, rows_of_sites)
+            text.check_places(one.row, site, rows_of_sites[site.name].valid)
+        prompt = text.prompt(one.row, {name: of_site.valid for name, of_site in rows_of_sites.items()})
         key_role: dict[str, NDArray[np.uint8]] = {}
         stored: dict[str, RecordedRows] = {}
         for site in run._sites:
             of_site = rows_of_sites[site.name]
-            key_role[site.name] = roles = text.roles(one.row, site, prompt, of_site.present, of_site.valid)
+            key_role[site.name] = roles = text.roles(one.row, site, prompt, of_site.valid)
             stored[site.name] = replace(of_site.rows, contribution=final_contribution(site, of_site, roles))
         if not all_finite(actions, stored):
-            raise not_finite(
-                one.where, "Its rows are finite, its actions or contributions are not", self.recorder.remedy
-            )
+            raise not_finite(one.where, "Its rows are finite, its actions or contributions are not", self.remedy)
         data = inputs.dataset_actions
         if data is not None and actions is not None:
             data = data[: len(actions)]  # beyond the policy's chunk there is nothing to compare
@@ -191,26 +183,26 @@ class WatchedCall:
         others = [site for site in run.layout.sites if site.name not in given.key_role]
         key_role = self._roles(one.row, others, given.prompt) | dict(given.key_role)
         given = replace(cast(CallInput, given), key_role=key_role, call=repeat.given)
-        run._repeats.take(CallToRepeat(repeat, given, before, actions, self._present, one.where))
+        run._repeats.take(CallToRepeat(repeat, given, before, actions, self.present, one.where))
         return replace(call, policy_input=given)
 
-    def _bias(self, row: int, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
-        """Return what knockouts add to the logits of a call, see `LogitBias`: looked up at the row's first call."""
-        if place.site is None:
-            return None
-        if row not in self._biases:
-            self._biases[row] = self._bias_of(next(one for one in self._rows if one.row == row))
-        bias = self._biases[row]
-        return None if bias is None else bias(row, place, shape)
+    def early_roles(self, row: int, site: RecordedSite) -> NDArray[np.uint8]:
+        """See `ReplanRecorder`."""
+        return self._text.early_roles(row, site)
 
-    def _bias_of(self, one: RowOfCall) -> CallBias | None:
-        prompt = self._text.prompt(one.row, None)
-        given = CallInput({}, self._roles(one.row, self._run._sites, prompt), prompt, NO_STATE, {})
+    def bias(self, row: int, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
+        """See `ReplanRecorder`."""
+        bias = None if place.site is None else self._bias_of(row)
+        return None if bias is None else bias(place, shape)
+
+    def _row_bias(self, row: int) -> CallBias | None:
+        one = self._calls[row]
+        prompt = self._text.prompt(row, {})
+        given = CallInput({}, self._roles(row, self._run._sites, prompt), prompt, NO_STATE, {})
         editors = one.episode._changes.editors(self._run.attributes.sites, given, one.context)
         edits = {site: editor.edits for site, editor in (editors or {}).items()}
-        return CallBias(self._run.layout, edits, self._present) if edits else None
+        return CallBias(self._run.layout, edits, self.present) if edits else None
 
     def _roles(self, row: int, sites: Sequence[RecordedSite], prompt: Prompt) -> dict[str, NDArray[np.uint8]]:
         """Return the roles of sites' keys, whatever masks hide."""
-        present = self._present
-        return {site.name: self._text.roles(row, site, prompt, present.get(site.name), None) for site in sites}
+        return {site.name: self._text.roles(row, site, prompt) for site in sites}

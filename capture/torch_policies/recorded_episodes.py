@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Never, SupportsIndex, overload
+from typing import TYPE_CHECKING, Any, Never, SupportsIndex
 
 import numpy as np
 
@@ -168,7 +168,7 @@ class Episode:
         self.run.largest_error = max(self.run.largest_error, self.largest_error)
 
 
-class EpisodeBatch(Sequence[Episode]):
+class EpisodeBatch(list[Episode]):
     """Several episodes whose policy calls are made together.
 
     Attributes:
@@ -177,23 +177,11 @@ class EpisodeBatch(Sequence[Episode]):
     """
 
     def __init__(self, run: RecordedRun, stack: ExitStack, rows: Sequence[int], batch: int) -> None:
+        super().__init__()
         self.rows = tuple(rows)
         self.batch = batch
         self._run = run
         self._stack = stack
-        self._episodes: list[Episode] = []
-
-    def __len__(self) -> int:
-        return len(self._episodes)
-
-    @overload
-    def __getitem__(self, number: int) -> Episode: ...
-
-    @overload
-    def __getitem__(self, number: slice) -> list[Episode]: ...
-
-    def __getitem__(self, number: int | slice) -> Episode | list[Episode]:
-        return self._episodes[number]
 
     @contextmanager
     def replan(
@@ -244,8 +232,8 @@ class EpisodeBatch(Sequence[Episode]):
     def next_episode(self, row: int, **facts: Any) -> Episode:
         """Store an episode of the batch, by its number, and begin another one in its row; facts as in `run.episode`."""
         self[row]._commit()
-        self._episodes[row] = self._begin(facts)
-        return self._episodes[row]
+        self[row] = self._begin(facts)
+        return self[row]
 
     def _begin(self, facts: Mapping[str, Any]) -> Episode:
         episode = self._run._begin(self._stack, EpisodeFacts(**facts))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -27,8 +28,7 @@ from vla_attention.capture.torch_policies.attention_calls import AttentionCall, 
 from vla_attention.capture.torch_policies.call_order import CallPlace, KnownCalls
 from vla_attention.capture.torch_policies.call_tensors import ChangeRefused
 from vla_attention.capture.torch_policies.knockouts import CallBias
-from vla_attention.capture.torch_policies.output_ways import OutputWay
-from vla_attention.capture.torch_policies.policy_layout import PolicyLayout
+from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
 from vla_attention.capture.torch_policies.policy_modules import FoundPolicy
 from vla_attention.capture.torch_policies.replan_inputs import Repeat, RepeatedCall, read_actions
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder
@@ -41,6 +41,8 @@ from vla_attention.schemas.stores.store_format import PolicyIdentity, Recording
 _SEED = 1
 #: Stands for the noise of the recorded call, whose seed may not be known.
 OWN_NOISE = -1
+#: Of a repeat: actions (horizon, action dim); site -> (key,) bool, the keys that its first call could see.
+_Repeated = tuple[NDArray[np.float64], Mapping[str, NDArray[np.bool_]]]
 
 _NO_SIBLINGS = "No word is exchanged: no instruction of run.episode(siblings=[...]) has other words in the same places."
 _TAKES_NO_CALL = (
@@ -132,11 +134,11 @@ class RepeatedPolicy:
             cast(Policy, self),
             recording.effects,
             self.siblings,
-            _say,
+            partial(warnings.warn, category=Note, stacklevel=2),
             no_siblings=_NO_SIBLINGS,
             no_pictures="",
         )
-        self.call: CallToRepeat | None = None
+        self.call: CallToRepeat
         self._found = found
         self._known = known
         self._identity = identity
@@ -157,15 +159,13 @@ class RepeatedPolicy:
 
     def action_units(self) -> NDArray[np.float64]:
         """Return ones, (action dim,): actions are in the caller's units."""
-        return np.ones(self._now.actions.shape[1])
+        return np.ones(self.call.actions.shape[1])
 
-    def replan_noise_seed(self, run_seed: int, task_id: int, episode_index: int, replan: int) -> int:
-        """Return the seed of another noise."""
-        return noise_seed(run_seed, task_id, episode_index, replan)
+    replan_noise_seed = staticmethod(noise_seed)
 
     def prepare_again(self, given: GivenInputs) -> PolicyInput:
         """Return the call's input with another instruction, and grey pictures where they are others."""
-        base = self._now.given
+        base = self.call.given
         frames = {
             camera: _grey(picture)
             if camera in base.frames and given.frames[camera] is not base.frames[camera]
@@ -187,44 +187,40 @@ class RepeatedPolicy:
         try:
             unchanged = self._made(variants[0])
             if unchanged is None or self._is_another(unchanged):
-                return [None if unchanged is None else unchanged.actions, *nothing]
+                return [None if unchanged is None else unchanged[0], *nothing]
             made = [self._compared(variant, unchanged) for variant in variants[1:]]
             # Once more: what the repeats before it left behind would be in them, too.
             last = self._made(variants[0])
             if last is None or self._is_another(last):
-                return [None if last is None else last.actions, *nothing]
-            return [unchanged.actions, *made]
+                return [None if last is None else last[0], *nothing]
+            return [unchanged[0], *made]
         finally:
             after.again()
 
-    @property
-    def _now(self) -> CallToRepeat:
-        assert self.call is not None
-        return self.call
-
     def _is_another(self, unchanged: _Repeated) -> bool:
         """Whether a repeat without a change gives other actions than rounding explains, which is said once."""
-        is_another = self.measurement.differs(unchanged.actions, self._now.actions)
+        is_another = self.measurement.differs(unchanged[0], self.call.actions)
         if is_another:
             self.measurement.say_once(_OTHER_ACTIONS)
         return is_another
 
     def _compared(self, variant: CallVariant, unchanged: _Repeated) -> NDArray[np.float64] | None:
         """Return the actions of a variant; None, and a line, where it is not the variant that it should be."""
-        say, exchanged = self.measurement.say_once, variant.policy_input is not self._now.given
-        if exchanged and not self._now.repeat.takes_call:
+        say, exchanged = self.measurement.say_once, variant.policy_input is not self.call.given
+        if exchanged and not self.call.repeat.takes_call:
             say(_TAKES_NO_CALL)
             return None
         made = self._made(variant)
         if made is None:
             return None
-        if exchanged and any((made.seen[site] != seen).any() for site, seen in unchanged.seen.items()):
+        actions, seen_now = made
+        if exchanged and any((seen_now[site] != seen).any() for site, seen in unchanged[1].items()):
             say("A call with an exchanged word is not measured where its prompt has another number of tokens.")
             return None
-        if variant.noise_seed != OWN_NOISE and np.array_equal(made.actions, unchanged.actions):
+        if variant.noise_seed != OWN_NOISE and np.array_equal(actions, unchanged[0]):
             say("The repeated call draws no global random numbers: another noise is not measured.")
             return None
-        return made.actions
+        return actions
 
     def _made(self, variant: CallVariant) -> _Repeated | None:
         """Repeat the call for one variant; None, and a line, where that fails: an episode never does."""
@@ -242,7 +238,7 @@ class RepeatedPolicy:
             return None
 
     def _repeated(self, variant: CallVariant) -> _Repeated:
-        call, given = self._now, cast(CallInput, variant.policy_input).call
+        call, given = self.call, cast(CallInput, variant.policy_input).call
         call.before.again()
         if variant.noise_seed != OWN_NOISE:
             call.before.reseed(variant.noise_seed)
@@ -251,12 +247,12 @@ class RepeatedPolicy:
         watcher = RepeatWatcher(self._known, self._identity.name, self._recording, bias)
         with watch_attention(self._found, watcher):
             result = call.repeat.call(given) if call.repeat.takes_call else call.repeat.call()
-        if not watcher.saw_attention:
+        if not watcher.ran:
             raise NotRepeated(
                 "The callable given as repeat made no attention call: a policy that answers from a queue must be reset "
                 "in it, as lambda call: (policy.reset(), policy.select_action(batch))[1]."
             )
-        watcher.order.check(f"the repeated call of {call.where}")
+        watcher.check(f"the repeated call of {call.where}")
         self._check_prefix(watcher, [edit for of_site in edits.values() for edit in of_site])
         actions = read_actions(result)
         if actions is None or actions.shape != call.actions.shape:
@@ -265,26 +261,18 @@ class RepeatedPolicy:
                 f"The callable given as repeat returned actions of the shape {shape}; expected {call.actions.shape}, "
                 "as replan.actions is set to."
             )
-        return _Repeated(actions, watcher.seen)
+        return actions, watcher.seen
 
     def _check_prefix(self, watcher: RepeatWatcher, edits: Sequence[SiteEdit]) -> None:
         """Raise `ChangeRefused` if edits of the prefix's queries reached no call."""
         passes = [number for number, rule in enumerate(self._known.layout.rules) if rule.is_prefix]
         if not passes or all(edit.queries == "action" for edit in edits):
             return
-        if not any(watcher.order.calls_of_rule[number] for number in passes):
+        if not any(watcher.calls_of_rule[number] for number in passes):
             raise ChangeRefused(
                 f"No call was a pass over the prefix, as the layout '{self._known.layout.name}' says with tokens=SITE: "
                 "keys cannot be cut off there. Change its rules, or measure with readers=('action',)."
             )
-
-
-@dataclass(frozen=True)
-class _Repeated:
-    """actions: (horizon, action dim). seen: site -> (key,) bool, the keys that its first call could see."""
-
-    actions: NDArray[np.float64]
-    seen: Mapping[str, NDArray[np.bool_]]
 
 
 class RepeatWatcher(ReplanRecorder):
@@ -294,40 +282,30 @@ class RepeatWatcher(ReplanRecorder):
     """
 
     def __init__(self, known: KnownCalls, policy: str, recording: Recording, bias: CallBias | None) -> None:
-        super().__init__(known, policy, recording, 1, [0], _no_roles, bias)
+        super().__init__(known, policy, recording, 1, [0], "")
         self.seen: dict[str, NDArray[np.bool_]] = {}
+        self.changes, self._bias = bias is not None, bias
+
+    def bias(self, row: int, place: CallPlace, shape: CallShape) -> NDArray[np.float32] | None:
+        """See `ReplanRecorder`."""
+        return None if self._bias is None else self._bias(place, shape)
 
     def change(self, shape: CallShape) -> Tensor | None:
         """See `Watcher`; a call of several rows cannot be changed."""
-        if self.bias is not None and shape.batch != self.batch and self.changed_place(shape) is not None:
+        if shape.batch != self.batch and self.changed_place(shape) is not None:
             raise ChangeRefused(
                 f"The attention call {shape} has a batch of {shape.batch}, and effects are of calls of one row."
             )
         return super().change(shape)
 
-    def passes(self, shape: CallShape) -> bool:
-        """See `Watcher`; of the first call of each site the mask is looked at."""
-        place = self.order.place(shape)
-        if place is not None and place.site is not None and place.site not in self.seen:
-            return False
-        return super().passes(shape)
+    def wanted(self, place: CallPlace) -> bool:
+        """Return whether a call is the first of its site: its mask is looked at."""
+        return place.site not in self.seen
 
-    def saw(self, call: AttentionCall) -> OutputWay | None:
-        """See `Watcher`."""
-        place = self.order.place(call.shape)
-        if place is not None and place.site is not None and place.site not in self.seen:
-            allowed = call.allowed(place.queries).any(dim=2).any(dim=1).any(dim=0).cpu().numpy()
-            seen = np.zeros(self.order.known.sites[place.site].keys.num_keys, dtype=bool)
-            seen[slice(None) if place.keys is None else place.keys] = allowed
-            self.seen[place.site] = seen
-        return super().saw(call)
-
-    def _wanted(self, place: CallPlace) -> bool:
-        return False
-
-
-def _no_roles(row: int, site: Any, present: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    raise AssertionError("A repeated call has no contributions.")
+    def _keep(self, call: AttentionCall, place: CallPlace, site: RecordedSite) -> None:
+        self.seen[site.name] = seen = np.zeros(site.keys.num_keys, dtype=bool)
+        allowed = call.allowed(place.queries).any(dim=2).any(dim=1).any(dim=0).cpu().numpy()
+        seen[slice(None) if place.keys is None else place.keys] = allowed
 
 
 class _Measurement(EffectMeasurement):
@@ -347,7 +325,3 @@ def _grey(picture: Any) -> Any:
         return torch.full_like(picture, GREY / 255 if picture.is_floating_point() else GREY)
     values = np.asarray(picture)
     return np.full_like(values, GREY / 255 if values.dtype.kind == "f" else GREY)
-
-
-def _say(line: str) -> None:
-    warnings.warn(line, Note, stacklevel=2)

@@ -6,8 +6,8 @@ the output took, and the parts have to add up to what was added.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -16,76 +16,67 @@ from torch import Tensor
 
 from vla_attention.capture.recording.contributions import keys_of_parts, part_values
 from vla_attention.capture.torch_policies.attention_calls import TOLERANCE, AttentionCall
-from vla_attention.capture.torch_policies.call_order import CallOrder, CallPlace
+from vla_attention.capture.torch_policies.call_order import CallPlace
 from vla_attention.capture.torch_policies.output_ways import NotReplayed, OutputWay, Replay
 from vla_attention.capture.torch_policies.policy_layout import RecordedSite
 from vla_attention.schemas.segments import segment_members, segments_of
 
 #: Row of the batch, site -> the role codes of its keys (key,), before masks are known.
-EarlyRoles = Callable[[int, RecordedSite, NDArray[np.bool_]], NDArray[np.uint8]]
+EarlyRoles = Callable[[int, RecordedSite], NDArray[np.uint8]]
 Cell = tuple[int, int]
 #: Largest distance from a whole number of what tells the rows of a batch apart.
 _MIXED = 0.05
-
-
-@dataclass
-class _SiteParts:
-    """Of one site. roles, members: by row of the batch, (key,) and (key, part). ways: of the calls of each cell."""
-
-    roles: dict[int, NDArray[np.uint8]] = field(default_factory=dict)
-    members: dict[int, NDArray[np.bool_]] = field(default_factory=dict)
-    ways: dict[Cell, list[OutputWay]] = field(default_factory=dict)
 
 
 class ReplanContributions:
     """Collects the contributions of the recorded calls of one replan.
 
     Args:
-        order: the calls of the replan.
         rows: the rows of the batch that are recorded.
         early_roles: the roles of keys before the masks are known.
     """
 
-    def __init__(self, order: CallOrder, rows: Sequence[int], early_roles: EarlyRoles) -> None:
-        self._order, self._rows, self._early_roles = order, rows, early_roles
-        self._sites = {site.name: _SiteParts() for site in order.layout.sites}
+    def __init__(self, rows: Sequence[int], early_roles: EarlyRoles) -> None:
+        self._rows, self._early_roles = rows, early_roles
+        #: By site and row of the batch: roles (key,), for which contributions are made, and members (key, part).
+        self._parts: dict[tuple[str, int], tuple[NDArray[np.uint8], NDArray[np.bool_]]] = {}
+        self._ways: defaultdict[tuple[str, Cell], list[OutputWay]] = defaultdict(list)
         self._places: list[tuple[CallPlace, OutputWay]] = []
 
     def roles_of(self, site: str, row: int) -> NDArray[np.uint8] | None:
         """Return the roles (key,) for which contributions were made; None without any."""
-        return self._sites[site].roles.get(row)
+        return self._parts[site, row][0] if (site, row) in self._parts else None
 
     def grams(self, site: str, cells: Sequence[Cell], row: int) -> NDArray[np.float32]:
         """Return the Gram matrices (cell, part + 1, part + 1) of a row; of several calls of a cell their mean."""
-        ways, place = self._sites[site].ways, self._rows.index(row)
-        each = [torch.stack([way.result()[place] for way in ways[cell]]).mean(dim=0) for cell in cells]
+        place = self._rows.index(row)
+        each = [torch.stack([way.result()[place] for way in self._ways[site, cell]]).mean(dim=0) for cell in cells]
         grams: NDArray[np.float32] = torch.stack(each).cpu().numpy()
         return grams
 
     def way(
-        self, call: AttentionCall, rows: Tensor, keys: NDArray[np.int64] | None, place: CallPlace, site: RecordedSite,
-        cell: Cell, *, by_part: bool,
-    ) -> OutputWay:  # fmt: skip
+        self, call: AttentionCall, rows: Tensor, place: CallPlace, site: RecordedSite, cell: Cell, *, by_part: bool
+    ) -> OutputWay:
         """Follow the output of a call.
 
-        rows: (batch, head, query, key) of its keys, which are the site's `keys`. by_part: for the contributions of each
+        rows: (batch, head, query, key) of its keys. by_part: for the contributions of each
         part; else all keys are one part, which is enough to tell whether the rows of a batch are apart.
         """
-        of_site = self._sites[site.name]
         mixed = []
         for row in self._rows:
-            if by_part and row not in of_site.roles:
-                of_site.roles[row] = roles = self._early_roles(row, site, self._order.present[site.name])
-                of_site.members[row] = segment_members(site.keys, roles[None], segments_of(site.keys, roles))[0]
             parts: list[slice | Tensor] = [slice(None)]
             if by_part:
-                members = of_site.members[row] if keys is None else of_site.members[row][keys]
-                parts = keys_of_parts(members, rows.device)
+                if (site.name, row) not in self._parts:
+                    roles = self._early_roles(row, site)
+                    members = segment_members(site.keys, roles[None], segments_of(site.keys, roles))[0]
+                    self._parts[site.name, row] = roles, members
+                members = self._parts[site.name, row][1]
+                parts = keys_of_parts(members if place.keys is None else members[place.keys], rows.device)
             values = part_values(rows[row], call.value[row], parts)
             values = values.view(*values.shape[:2], rows.shape[1], -1)
             mixed.append(values.permute(1, 2, 0, 3))  # (part, head, query, dim)
         way = OutputWay(lambda replay, added: self._added(call, mixed, place.queries, replay, added, way.dtypes))
-        of_site.ways.setdefault(cell, []).append(way)
+        self._ways[site.name, cell].append(way)
         self._places.append((place, way))
         return way
 
@@ -146,10 +137,3 @@ class ReplanContributions:
             if way.result() is None:
                 return f"in block {place.block} of site '{place.site}' (step {place.step}), {way.lost}"
         return None
-
-
-def spread(values: Tensor, keys: Tensor, count: int) -> Tensor:
-    """Values (..., key) with their keys at the places `keys` of an axis of `count`; 0 elsewhere."""
-    result = values.new_zeros((*values.shape[:-1], count))
-    result.index_copy_(-1, keys, values)
-    return result

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from vla_attention.capture.environments.coverage import camera_coverage
 from vla_attention.capture.torch_policies.policy_layout import PictureFit, PolicyLayout
-from vla_attention.schemas.errors import BadArgument, did_you_mean, listing, unknown_name
+from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.layout import Prompt, camera_grids, picture_size
 from vla_attention.schemas.safe_text import check_text
@@ -96,21 +96,21 @@ def whole_number(what: str, given: Any) -> int:
         raise BadArgument(f"The {what} is {given!r}; expected a whole number.") from None
 
 
-def _seed(given: Any) -> int:
-    seed = whole_number("seed of a replan's noise", given)
-    if not -(2**63) <= seed < 2**63:
-        raise BadArgument(f"The seed of a replan's noise is {seed}; expected a number of 64 bits.")
-    return seed
-
-
-def _as_float64(what: str, given: Any) -> NDArray[np.float64]:
-    """Return numbers as float64, or raise `BadArgument`."""
+def _numbers(what: str, given: Any, axes: int, expected: str) -> NDArray[np.float64] | None:
+    """Return numbers as float64, or raise `BadArgument`; None for None. A first axis of length 1 may be left out."""
+    if given is None:
+        return None
     values = given.detach().float().cpu().numpy() if hasattr(given, "detach") else given
     try:
         # A copy: the policy may write its next actions to the same array.
-        return np.array(values, dtype=np.float64)
+        values = np.array(values, dtype=np.float64)
     except (TypeError, ValueError):
-        raise BadArgument(f"The {what} of a replan is no array of numbers (given: {type(given).__name__}).") from None
+        raise BadArgument(f"The {what} of a replan: no array of numbers (given: {type(given).__name__}).") from None
+    numbers: NDArray[np.float64] = values[0] if values.ndim == axes + 1 and len(values) == 1 else values
+    numbers = numbers[None] if what == "actions" and numbers.ndim == 1 else numbers
+    if numbers.ndim != axes or (axes > 1 and not numbers.size):
+        raise BadArgument(f"The {what} of a replan: an array of the shape {values.shape}; expected {expected}.")
+    return numbers
 
 
 #: Parameters that take any number of arguments.
@@ -128,9 +128,7 @@ def read_inputs(
     """
     for name in given:
         if name not in _NAMES:
-            raise BadArgument(
-                f"replan() has no argument '{name}'.{did_you_mean(name, _NAMES)} Existing: {listing(_NAMES)}."
-            )
+            raise unknown_name("argument of replan()", name, _NAMES)
     values = {name: value for name, value in given.items() if value is not None}
     sites = [site.keys for site in layout.sites]
     fits = {camera.name: camera.fit for camera in layout.cameras}
@@ -164,16 +162,18 @@ def read_inputs(
     for camera, mask in values.get("masks", {}).items():
         coverage[camera] = camera_coverage(np.asarray(mask), len(facts.objects), camera_grids(sites, camera))
     seed = values.get("noise_seed", facts.seed)
+    if seed is not None and not -(2**63) <= (seed := whole_number("seed of a replan's noise", seed)) < 2**63:
+        raise BadArgument(f"The seed of a replan's noise is {seed}; expected a number of 64 bits.")
     return ReplanInputs(
         env_step=whole_number("env_step of a replan", env_step),
         frames=frames,
-        state=_state(values.get("state")),
+        state=_numbers("state", values.get("state"), 1, "(state_dim,)"),
         instruction=values.get("instruction", facts.instruction),
         prompt=values.get("prompt"),
         roles=values.get("roles", {}),
-        noise_seed=None if seed is None else _seed(seed),
+        noise_seed=seed,
         coverage={camera: coverage[camera] for camera in cameras if camera in coverage},
-        dataset_actions=_dataset_actions(values.get("dataset_actions")),
+        dataset_actions=_numbers("dataset_actions", values.get("dataset_actions"), 2, "(step, action_dim)"),
         repeat=_repeat(values, facts),
     )
 
@@ -196,39 +196,9 @@ def _repeat(values: Mapping[str, Any], facts: EpisodeFacts) -> Repeat | None:
     return Repeat(call, bool(needed), given)
 
 
-def _dataset_actions(given: Any) -> NDArray[np.float64] | None:
-    if given is None:
-        return None
-    actions = np.asarray(given, dtype=np.float64)
-    if actions.ndim != 2 or not len(actions):
-        raise BadArgument(
-            f"The dataset_actions of a replan have the shape {actions.shape}; expected (step, action_dim)."
-        )
-    return actions
-
-
-def _state(given: Any) -> NDArray[np.float64] | None:
-    if given is None:
-        return None
-    state = _as_float64("state", given)
-    state = state[0] if state.ndim == 2 and len(state) == 1 else state
-    if state.ndim != 1:
-        raise BadArgument(f"The state of a replan has the shape {state.shape}; expected (state_dim,).")
-    return state
-
-
 def read_actions(given: Any) -> NDArray[np.float64] | None:
     """Return actions as (horizon, action_dim) float64; None where the caller gave none."""
-    if given is None:
-        return None
-    actions = _as_float64("actions", given)
-    actions = actions[0] if actions.ndim == 3 and len(actions) == 1 else actions
-    actions = actions[None] if actions.ndim == 1 else actions
-    if actions.ndim != 2 or not actions.size:
-        raise BadArgument(
-            f"The actions of a replan have the shape {actions.shape}; expected (horizon, action_dim) or (action_dim,)."
-        )
-    return actions
+    return _numbers("actions", given, 2, "(horizon, action_dim) or (action_dim,)")
 
 
 def model_picture(picture: Any, camera: str, size: tuple[int, int], fit: PictureFit) -> NDArray[np.uint8]:
@@ -250,9 +220,7 @@ def model_picture(picture: Any, camera: str, size: tuple[int, int], fit: Picture
     inner = _resized(levels, max(1, int(levels.shape[0] / factor)), max(1, int(levels.shape[1] / factor)))
     below, beside = height - inner.shape[0], width - inner.shape[1]
     top, left = (below, beside) if fit == "pad_left_top" else (below // 2, beside // 2)
-    fitted = np.zeros((height, width, 3), dtype=np.uint8)
-    fitted[top : top + inner.shape[0], left : left + inner.shape[1]] = inner
-    return fitted
+    return np.pad(inner, ((top, below - top), (left, beside - left), (0, 0)))
 
 
 def _levels(picture: Any, camera: str) -> NDArray[np.uint8]:
@@ -262,24 +230,24 @@ def _levels(picture: Any, camera: str) -> NDArray[np.uint8]:
         picture = (picture.float() if picture.is_floating_point() else picture).numpy()
     values = np.asarray(picture)
     values = values[0] if values.ndim == 4 and len(values) == 1 else values
+    shape = values.shape
     if not values.size:
-        raise BadArgument(f"The picture of camera '{camera}' is empty: its shape is {values.shape}.")
-    if values.ndim == 3 and values.shape[-1] == 3 and values.dtype == np.uint8:
-        return np.ascontiguousarray(values)
-    if values.ndim == 3 and values.shape[0] == 3 and values.dtype == np.uint8:
-        return np.ascontiguousarray(values.transpose(1, 2, 0))
-    if values.ndim == 3 and 3 in (values.shape[0], values.shape[-1]) and values.dtype.kind == "f":
-        if values.min() >= 0 and values.max() <= 1:
-            channels_last = values if values.shape[-1] == 3 else values.transpose(1, 2, 0)
-            return np.ascontiguousarray(np.rint(channels_last * 255).astype(np.uint8))
+        raise BadArgument(f"The picture of camera '{camera}' is empty: its shape is {shape}.")
+    if values.ndim == 3 and shape[0] == 3 != shape[-1]:
+        values = values.transpose(1, 2, 0)
+    if values.ndim != 3 or values.shape[-1] != 3 or (values.dtype != np.uint8 and values.dtype.kind != "f"):
         raise BadArgument(
-            f"The picture of camera '{camera}' has numbers from {values.min():.3g} to {values.max():.3g}; give it "
-            "before normalising, as uint8 or from 0 to 1."
+            f"The picture of camera '{camera}' has the shape {shape} and type {values.dtype}; expected (height, "
+            "width, 3) uint8, or (3, height, width) with numbers from 0 to 1."
         )
-    raise BadArgument(
-        f"The picture of camera '{camera}' has the shape {values.shape} and type {values.dtype}; expected (height, "
-        "width, 3) uint8, or (3, height, width) with numbers from 0 to 1."
-    )
+    if values.dtype != np.uint8:
+        if not (values.min() >= 0 and values.max() <= 1):
+            raise BadArgument(
+                f"The picture of camera '{camera}' has numbers from {values.min():.3g} to {values.max():.3g}; give it "
+                "before normalising, as uint8 or from 0 to 1."
+            )
+        values = np.rint(values * 255).astype(np.uint8)
+    return np.ascontiguousarray(values)
 
 
 def _resized(picture: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:

@@ -1,9 +1,16 @@
-"""The prompt of the rows of one policy call: token ids that the policy embeds, or what the caller gives."""
+"""The prompt of the rows of one policy call, and the roles of its keys.
+
+It comes from the token ids that the policy's own embedding was given, since a second tokenization could differ, or from
+what the caller gives.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -11,30 +18,17 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, RecordedSite
-from vla_attention.capture.torch_policies.policy_modules import find_module, modules_of
-from vla_attention.capture.torch_policies.prompts import (
-    PromptDoesNotFit,
-    TokenText,
-    prompt_from_ids,
-    prompt_from_pieces,
-    prompt_without_pieces,
-    roles_of_keys,
-    text_keys,
-)
+from vla_attention.capture.torch_policies.prompts import PromptDoesNotFit, TokenText, find_instruction, state_pieces
 from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs
-from vla_attention.capture.torch_policies.site_recorder import SiteRows
-from vla_attention.schemas.errors import BadArgument, listing
-from vla_attention.schemas.layout import Prompt
+from vla_attention.schemas.errors import BadArgument, listing, unknown_name
+from vla_attention.schemas.layout import ROLE_DTYPE, Piece, Prompt, Role, roles_from_spans
 
 
 class KeysShifted(BadArgument):
     """Keys of a row of the batch that are not at the places that the layout gives them."""
 
 
-_Look = Callable[[nn.Module, tuple[Any, ...], dict[str, Any]], None]
-
-
-def embeddings_of(policy: object, layout: PolicyLayout) -> dict[str, nn.Module]:
+def embeddings_of(modules: Mapping[str, nn.Module], layout: PolicyLayout) -> dict[str, nn.Module]:
     """Return the embeddings of a policy by path, that of the layout's prompt first; none where it has no prompt.
 
     Raises:
@@ -43,8 +37,9 @@ def embeddings_of(policy: object, layout: PolicyLayout) -> dict[str, nn.Module]:
     if layout.text is None:
         return {}
     path = layout.text.embedding
-    first = {path: find_module(policy, path, "token ids")}
-    return first | {name: module for name, module in modules_of(policy).items() if isinstance(module, nn.Embedding)}
+    if path not in modules:
+        raise unknown_name("module for token ids", path, [name for name in modules if name])
+    return {path: modules[path]} | {name: part for name, part in modules.items() if isinstance(part, nn.Embedding)}
 
 
 class PromptIds:
@@ -67,24 +62,20 @@ class PromptIds:
     def watched(self) -> Iterator[None]:
         """Look at what the embeddings are given within the block."""
         with ExitStack() as stack:
-            for number, (path, module) in enumerate(self._embeddings.items()):
-                look = self._look(path, is_prompt=number == 0)
-                stack.callback(module.register_forward_pre_hook(look, with_kwargs=True).remove)
+            for path, module in self._embeddings.items():
+                handle = module.register_forward_pre_hook(partial(self._look, path), with_kwargs=True)
+                stack.callback(handle.remove)
             yield
 
-    def _look(self, path: str, *, is_prompt: bool) -> _Look:
-        def look(_module: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
-            given = next((value for value in (*arguments, *named.values()) if isinstance(value, Tensor)), None)
-            if given is None or given.is_floating_point():
-                return
-            self._called[path] = max(self._called.get(path, tuple(given.shape)), tuple(given.shape), key=np.prod)
-            rows = given[None] if given.ndim == 1 else given
-            if not is_prompt or rows.ndim != 2 or len(rows) != self._batch:
-                return
-            if self.ids is None or rows.shape[1] > self.ids.shape[1]:
-                self.ids = rows.detach().cpu().numpy().astype(np.int64)
-
-        return look
+    def _look(self, path: str, _module: nn.Module, arguments: tuple[Any, ...], named: dict[str, Any]) -> None:
+        given = next((value for value in (*arguments, *named.values()) if isinstance(value, Tensor)), None)
+        if given is None or given.is_floating_point():
+            return
+        self._called[path] = max(self._called.get(path, tuple(given.shape)), tuple(given.shape), key=np.prod)
+        rows = given[None] if given.ndim == 1 else given
+        is_prompt = path == next(iter(self._embeddings)) and rows.ndim == 2 and len(rows) == self._batch
+        if is_prompt and (self.ids is None or rows.shape[1] > self.ids.shape[1]):
+            self.ids = rows.detach().cpu().numpy().astype(np.int64)
 
     def missing(self) -> PromptDoesNotFit:
         """Return the error for a call in which the prompt's embedding was given no ids: it says which others were."""
@@ -117,107 +108,141 @@ def _same_weights(one: nn.Module, other: nn.Module) -> bool:
     return isinstance(first, Tensor) and isinstance(second, Tensor) and first.data_ptr() == second.data_ptr()
 
 
+@dataclass
 class ReplanText:
     """The text of one policy call, by row of the batch.
 
-    seen: the token ids of the call. inputs: row -> what the caller gave.
+    seen: the token ids of the call. inputs: row -> what the caller gave. present: site -> (key,) bool, the keys that
+    the site's calls had so far.
     """
 
-    def __init__(
-        self, layout: PolicyLayout, tokenizer: TokenText | None, seen: PromptIds, inputs: Mapping[int, ReplanInputs]
-    ) -> None:
-        self.layout = layout
-        self.tokenizer = tokenizer
-        self.seen = seen
-        self.inputs = inputs
-        #: Site -> (key,) bool, the keys that its calls had so far.
-        self.present: Mapping[str, NDArray[np.bool_]] = {}
+    layout: PolicyLayout
+    tokenizer: TokenText | None
+    seen: PromptIds
+    inputs: Mapping[int, ReplanInputs]
+    present: Mapping[str, NDArray[np.bool_]]
 
-    def prompt(self, row: int, rows_of_sites: Mapping[str, SiteRows] | None) -> Prompt:
-        """Return the prompt of a row; `rows_of_sites`: what the call's sites gave, None before the call has ended.
+    def prompt(self, row: int, valid: Mapping[str, NDArray[np.bool_]]) -> Prompt:
+        """Return the prompt of a row; special tokens and keys that the policy cannot see have no piece.
+
+        valid: site -> (key,) bool, the keys that the call's action queries can see; of no site before it has ended.
 
         Raises:
-            PromptDoesNotFit: the ids of its words are wanted and were not seen, or do not fit; see `prompt_from_ids`.
+            PromptDoesNotFit: the ids of its words are wanted and were not seen, or the numbers of ids and keys differ,
+                or the instruction is not in the text.
         """
-        given = self.inputs[row]
+        given, sites = self.inputs[row], self.layout.text_sites
         if isinstance(given.prompt, Prompt):
             return given.prompt
-        sites = self.layout.text_sites
-        if self.layout.text is None or not sites:
-            return prompt_without_pieces(given.instruction)
-        if given.prompt is not None:
-            keys = self._keys(rows_of_sites, len(given.prompt))
-            return prompt_from_pieces(given.prompt, keys, given.instruction)
-        if self.tokenizer is None:
-            return prompt_without_pieces(given.instruction)
-        if self.seen.ids is None:
-            raise self.seen.missing()
-        valid = None
-        if rows_of_sites is not None and any(site.name in rows_of_sites for site in sites):
-            # The prompt has the same keys at every site; what else the sites hold differs.
-            valid = np.zeros(max(site.keys.num_keys for site in sites), dtype=bool)
-            for site in sites:
-                if site.name in rows_of_sites:
-                    valid[: site.keys.num_keys] |= rows_of_sites[site.name].valid
-        ids = self._text_ids(row)
-        keys = self._keys(rows_of_sites, len(ids))
-        return prompt_from_ids(ids, keys, self.tokenizer, given.instruction, valid)
+        kept: list[tuple[Any, int]]
+        if sites and given.prompt is not None:
+            keys = self._keys(len(given.prompt))
+            if len(keys) != len(given.prompt):
+                raise PromptDoesNotFit(
+                    f"The prompt was given as {len(given.prompt)} pieces, and the layout's prompt has {len(keys)} "
+                    "keys: give one piece for each key, None where it has no text."
+                )
+            kept = [(piece, key) for piece, key in zip(given.prompt, keys, strict=True) if piece]
+            text = "".join(piece for piece, _ in kept)
+            ranges = tuple(pairwise(accumulate((len(piece) for piece, _ in kept), initial=0)))
+        elif sites and self.tokenizer is not None:
+            if self.seen.ids is None:
+                raise self.seen.missing()
+            ids = self._text_ids(row)
+            keys = self._keys(len(ids))
+            if len(ids) != len(keys):
+                raise PromptDoesNotFit(
+                    f"The policy embedded {len(ids)} text tokens, and the layout's prompt has {len(keys)} keys: change "
+                    "its spans, or its skip_ids (placeholders for patches)."
+                )
+            # The prompt has the same keys at every site.
+            seen = [valid[site.name] for site in sites if site.name in valid]
+            kept = [
+                (token, key)
+                for token, key in zip(ids, keys, strict=True)
+                if token not in self.tokenizer.special and (not seen or any(of_site[key] for of_site in seen))
+            ]
+            text, ranges = self.tokenizer.pieces(tuple(token for token, _ in kept))
+        else:
+            return Prompt(given.instruction, (), (0, len(given.instruction)))
+        pieces = tuple(Piece(key, text[a:b], a, b) for (_, key), (a, b) in zip(kept, ranges, strict=True))
+        return Prompt(text, pieces, find_instruction(text, given.instruction))
 
-    def _keys(self, rows_of_sites: Mapping[str, SiteRows] | None, count: int) -> list[int]:
+    def _keys(self, count: int) -> list[int]:
         """Return the keys of the prompt's tokens, the same at every site that has them; count: number of tokens."""
-        assert self.layout.text is not None
-        spans, sites = self.layout.text.spans, self.layout.text_sites
-        present = {**self.present, **{name: of.present for name, of in (rows_of_sites or {}).items()}}
+        sites = self.layout.text_sites
         for site in sites:
-            if site.name in present:
-                return text_keys(site, spans, present[site.name])
+            if site.name in self.present:
+                return [key for key in self._text_keys(site) if self.present[site.name][key]]
         # None of these calls has run yet. Then the number of tokens says how long a prompt of changing length is.
-        keys = text_keys(sites[0], spans, None)
-        if sites[0].variable_span in spans and count < len(keys):
+        keys = self._text_keys(sites[0])
+        if sites[0].variable_span in self.spans and count < len(keys):
             variable = sites[0].keys.span(sites[0].variable_span)
             keys = [key for key in keys if not variable.stop - (len(keys) - count) <= key < variable.stop]
         return keys
 
     def roles(
-        self,
-        row: int,
-        site: RecordedSite,
-        prompt: Prompt,
-        present: NDArray[np.bool_] | None,
-        valid: NDArray[np.bool_] | None,
+        self, row: int, site: RecordedSite, prompt: Prompt, valid: NDArray[np.bool_] | None = None
     ) -> NDArray[np.uint8]:
-        """Return the role codes of a site's keys, (key,), see `roles_of_keys`."""
-        bos = None
-        if self.layout.text is not None and self.seen.ids is not None and self.tokenizer is not None:
-            ids = self._text_ids(row)
-            first = text_keys(site, self.layout.text.spans, None) if site in self.layout.text_sites else []
-            if ids and first and ids[0] == self.tokenizer.bos:
-                bos = first[0]
-        return roles_of_keys(site, self.layout, prompt, present, valid, bos, self.inputs[row].roles)
+        """Return the role codes of a site's keys, (key,).
 
-    def early_roles(self, row: int, site: RecordedSite, present: NDArray[np.bool_]) -> NDArray[np.uint8]:
+        Keys of the prompt are `instruction` inside the instruction's characters and `template` elsewhere, where pieces
+        are known. Keys that exist in no call are `absent`; keys that no action query may see are `masked_image` or
+        `padding`; `valid`: (key,) bool, those that some may see, None for all.
+        """
+        given, present = self.inputs[row].roles, self.present.get(site.name)
+        if site.name in given:
+            roles = np.array(given[site.name], dtype=ROLE_DTYPE)
+            if roles.shape != (site.keys.num_keys,):
+                raise BadArgument(
+                    f"The roles given for site '{site.name}' have the shape {roles.shape}; expected one code for each "
+                    f"of {site.keys.num_keys} keys."
+                )
+        else:
+            roles = roles_from_spans(site.keys, {span.name: site.role_of(span) for span in site.keys.spans})
+            if prompt.pieces and site in self.layout.text_sites:
+                self._name_text(roles, row, site, prompt)
+        for span in site.keys.spans:
+            keys_of_span = slice(span.start, span.stop)
+            if valid is not None:
+                roles[keys_of_span][~valid[keys_of_span]] = site.masked_role(span)
+            if present is not None:
+                roles[keys_of_span][~present[keys_of_span]] = Role.ABSENT
+        return roles
+
+    def _name_text(self, roles: NDArray[np.uint8], row: int, site: RecordedSite, prompt: Prompt) -> None:
+        """Give the keys of the prompt the roles of their pieces."""
+        assert self.layout.text is not None
+        keys = self._text_keys(site)
+        roles[[key for key in keys if roles[key] == Role.INSTRUCTION]] = Role.TEMPLATE
+        first, last = prompt.instruction
+        for piece in prompt.pieces:
+            roles[piece.key] = Role.INSTRUCTION if piece.start < last and piece.stop > first else Role.TEMPLATE
+        for piece in state_pieces(prompt, self.layout.text.state_between) if self.layout.text.state_between else ():
+            roles[piece.key] = Role.STATE
+        if self.tokenizer is not None and self._text_ids(row)[:1] == [self.tokenizer.bos]:
+            roles[keys[0]] = Role.BOS
+
+    def early_roles(self, row: int, site: RecordedSite) -> NDArray[np.uint8]:
         """Return the roles of a site's keys before the masks are known."""
-        self.check_places(row, site, present, None)
+        self.check_places(row, site, None)
         # Where none of them is the prompt's, its token ids need not have been seen yet.
-        of_text = site in self.layout.text_sites
-        prompt = self.prompt(row, None) if of_text else prompt_without_pieces(self.inputs[row].instruction)
-        return self.roles(row, site, prompt, present, None)
+        prompt = self.prompt(row, {}) if site in self.layout.text_sites else Prompt("", (), (0, 0))
+        return self.roles(row, site, prompt)
 
-    def check_places(
-        self, row: int, site: RecordedSite, present: NDArray[np.bool_] | None, valid: NDArray[np.bool_] | None
-    ) -> None:
+    def check_places(self, row: int, site: RecordedSite, valid: NDArray[np.bool_] | None) -> None:
         """Raise `KeysShifted` where a row's keys are not at the places of the layout, as padding on the left does.
 
         Token ids with placeholders for patches tell it for each key. Without them, patches do whose first keys nothing
         may see while no key behind them is padding, of the patches or of the text: a camera without a picture is masked
         whole, and the edges of a picture that is not square on both sides.
         """
-        given, text = self.inputs[row].roles, self.layout.text if site in self.layout.text_sites else None
+        text = self.layout.text if site in self.layout.text_sites else None
         spans = text.spans if text is not None else [span.name for span in site.keys.spans if span.kind == "text"]
-        if not spans or (given and site.name in given):
+        if not spans or site.name in self.inputs[row].roles:
             return
-        keys = np.arange(site.keys.num_keys) if present is None else np.flatnonzero(present)
-        of_text = np.isin(keys, text_keys(site, spans, None))
+        keys = np.flatnonzero(self.present[site.name])
+        of_text = np.isin(keys, _keys_of(site, spans))
         wrong, known = None, False
         if self.seen.ids is not None and text is not None and text.skip_ids:
             ids = self.seen.ids[row]
@@ -244,7 +269,20 @@ class ReplanText:
             )
 
     def _text_ids(self, row: int) -> list[int]:
-        assert self.seen.ids is not None
-        assert self.layout.text is not None
+        if self.seen.ids is None or self.layout.text is None:
+            return []
         skipped = set(self.layout.text.skip_ids)
         return [token for token in self.seen.ids[row, self.layout.text.skip_first :].tolist() if token not in skipped]
+
+    @property
+    def spans(self) -> tuple[str, ...]:
+        """The spans of the prompt's tokens."""
+        return () if self.layout.text is None else self.layout.text.spans
+
+    def _text_keys(self, site: RecordedSite) -> list[int]:
+        return _keys_of(site, self.spans)
+
+
+def _keys_of(site: RecordedSite, spans: Sequence[str]) -> list[int]:
+    """The keys of spans, in their order."""
+    return [key for name in spans for key in range(site.keys.span(name).start, site.keys.span(name).stop)]

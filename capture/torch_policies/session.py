@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -31,7 +32,6 @@ from vla_attention.capture.torch_policies.recorded_episodes import (
 from vla_attention.capture.torch_policies.repeated_calls import RepeatedPolicy
 from vla_attention.capture.torch_policies.replan_inputs import EpisodeFacts
 from vla_attention.capture.torch_policies.replan_text import embeddings_of
-from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stores.store_format import RootAttributes, StoreExists, episode_name
 
@@ -44,6 +44,7 @@ class ContributionsUnknown(UserError, RuntimeError):
     """Contributions of a policy of which it cannot be said what its keys add to its residual stream."""
 
 
+@dataclass(eq=False, repr=False)
 class RecordedRun:
     """A store that is being filled; `va.record` makes it. Use it in a `with` block.
 
@@ -56,44 +57,36 @@ class RecordedRun:
             episodes.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        policy: object,
-        layout: PolicyLayout,
-        attributes: RootAttributes,
-        mode: WriteMode,
-        *,
-        allow_empty: bool,
-        tokenizer: TokenText | None,
-        durable: bool = True,
-    ) -> None:
-        self.path = path
-        self.policy = policy
-        self._found = find_policy(policy)
-        self._weights = weights_state(policy)
-        self._embeddings = embeddings_of(policy, layout)
-        self.layout = layout
-        self._known = KnownCalls(layout)
-        self.attributes = attributes
-        self.num_dropped = 0
-        self.largest_error = 0.0
-        self._allow_empty = allow_empty
-        self._mode = mode
-        self._tokenizer = tokenizer
-        self._durable = durable
-        #: None outside of the block.
-        self._store: RunStore | None = None
-        self._in_block = False
-        #: Whether it was asked if the rows of a batch are apart, and what stands in sentences where that is not known.
-        self._asked_of_batch, self._of_batch = False, ""
-        self._sites = tuple(layout.site(site.name) for site in attributes.sites)
+    path: Path
+    policy: object
+    layout: PolicyLayout
+    attributes: RootAttributes
+    mode: WriteMode
+    allow_empty: bool = False
+    tokenizer: TokenText | None = None
+    durable: bool = True
+    num_dropped: int = field(default=0, init=False)
+    largest_error: float = field(default=0.0, init=False)
+    #: None outside of the block.
+    _store: RunStore | None = field(default=None, init=False)
+    _in_block: bool = field(default=False, init=False)
+    #: Whether it was asked if the rows of a batch are apart, and what stands in sentences where that is not known.
+    _asked_of_batch: bool = field(default=False, init=False)
+    _of_batch: str = field(default="", init=False)
+
+    def __post_init__(self) -> None:
+        """Look for the policy's modules, and at its weights."""
+        self._found, self._known = find_policy(self.policy), KnownCalls(self.layout)
+        self._weights = weights_state(self.policy)
+        self._embeddings = embeddings_of(self._found.modules, self.layout)
+        self._sites = tuple(self.layout.site(site.name) for site in self.attributes.sites)
         self._repeats: RepeatedPolicy | None = None
-        if attributes.recording.effects is not None:
-            self._repeats = RepeatedPolicy(self._found, self._known, attributes.policy, attributes.recording)
+        if self.attributes.recording.effects is not None:
+            identity, recording = self.attributes.policy, self.attributes.recording
+            self._repeats = RepeatedPolicy(self._found, self._known, identity, recording)
 
     def __enter__(self) -> RecordedRun:
-        self._store = open_run(self.path, self.attributes, self._mode, durable=self._durable)
+        self._store = open_run(self.path, self.attributes, self.mode, durable=self.durable)
         self.path = self._store.path
         return self
 
@@ -176,7 +169,7 @@ class RecordedRun:
         with ExitStack() as stack:
             joined = EpisodeBatch(self, stack, chosen, size)
             for facts in episodes:
-                joined._episodes.append(joined._begin(facts))
+                joined.append(joined._begin(facts))
             with _committing(joined):
                 yield joined
 
@@ -200,7 +193,7 @@ class RecordedRun:
                 "another store."
             )
         interventions, sites = self.attributes.interventions, self.attributes.sites
-        changes = changes_of_episode(interventions, sites, facts, allow_empty=self._allow_empty)
+        changes = changes_of_episode(interventions, sites, facts, allow_empty=self.allow_empty)
         episode = Episode(self, facts, changes, _stack=stack)
         if self._repeats is not None:
             self._repeats.siblings[facts.task_id] = facts.siblings
@@ -239,7 +232,7 @@ class RecordedRun:
         try:
             with call.watched():
                 yield replan
-            if call.recorder.saw_attention:
+            if call.ran:
                 self._store_call(call, rows, replan, count)
             else:
                 self.num_dropped += 1
@@ -250,17 +243,17 @@ class RecordedRun:
 
     def _store_call(self, call: WatchedCall, rows: Sequence[RowOfCall], replan: Replan, count: int | None) -> None:
         rows_of_sites = call.finish()
-        self._check_contributions(call.recorder)
+        self._check_contributions(call)
         if count is not None:
             check_length("actions", replan.actions, count)
         replan.recorded = True
         for one, of_sites in zip(rows, rows_of_sites, strict=True):
-            one.episode.largest_error = max(one.episode.largest_error, call.recorder.largest_error)
+            one.episode.largest_error = max(one.episode.largest_error, call.largest_error)
             one.episode._append(call.record(one, of_sites, replan.actions))
 
-    def _check_contributions(self, recorder: ReplanRecorder) -> None:
+    def _check_contributions(self, call: WatchedCall) -> None:
         """Raise `ContributionsUnknown` if contributions are recorded, and those of a call are not known."""
-        unknown, of_batch = recorder.contributions.unknown(), f"; {self._of_batch}" if self._of_batch else ""
+        unknown, of_batch = call.contributions.unknown(), f"; {self._of_batch}" if self._of_batch else ""
         if unknown is not None and self.attributes.recording.contributions:
             raise ContributionsUnknown(
                 "Contributions cannot be recorded, because it is not known what each part of the keys adds to the "

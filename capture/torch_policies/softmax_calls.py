@@ -21,13 +21,12 @@ from vla_attention.capture.torch_policies.attention_calls import (
     MASKED_BELOW,
     AttentionCall,
     CallShape,
-    at_positions,
     exact,
 )
 from vla_attention.capture.torch_policies.call_tensors import (
     ChangeRefused,
     batch_and_heads,
-    check_keys_left,
+    check_change,
     fitted_change,
     normalised,
 )
@@ -97,10 +96,10 @@ class Softmaxes:
         if not 3 <= logits.ndim <= 5 or axis not in (-1, logits.ndim - 1):
             return function(*args, **kwargs)
         *lead, queries, keys = logits.shape
-        where = self._mode.where()
+        path, module = self._mode.where()
         # Of (batch, kv_head, group, query, key), the heads are both; of one axis, the module tells the heads.
-        batch, heads = (lead[0], lead[1] * lead[2]) if len(lead) == 3 else batch_and_heads(lead, where.module)
-        shape = self._mode.new_shape(where, "softmax", (batch, heads, heads, queries, keys), logits.dtype)
+        batch, heads = (lead[0], lead[1] * lead[2]) if len(lead) == 3 else batch_and_heads(lead, module)
+        shape = self._mode.new_shape(path, "softmax", (batch, heads, heads, queries, keys), logits.dtype)
         batch, heads = shape.batch, shape.heads
         change, given = self._mode.change(shape), logits
         if change is None:
@@ -110,7 +109,7 @@ class Softmaxes:
             logits = logits.clone()  # the policy may write over them
             given = logits + change.expand(batch, heads, queries, keys).reshape(logits.shape).to(logits.dtype)
             size = batch, heads, queries, keys
-            check_keys_left(logits.reshape(size), given.reshape(size), shape)
+            check_change(logits.reshape(size), given.reshape(size), shape)
             name = "self" if "self" in kwargs else "input"
             result = function(given, *args[1:], **kwargs) if args else function(**{**kwargs, name: given})
             self.changed.append(shape)
@@ -188,8 +187,8 @@ class Softmaxes:
                 shape,
                 values,
                 result.detach().permute(back).reshape(*sizes, dim),
-                lambda queries, batch: at_positions(at_positions(rows, 0, batch), 2, queries),
-                lambda queries: at_positions(seen, 2, queries),
+                lambda queries, batch: rows[batch, :, queries],
+                lambda queries: seen[:, :, queries],
                 lambda mixed: mixed.reshape(*multiplied.shape[:-1], dim).permute(product.output),
                 given.dtype,
                 None if shape == replace(before, kv_heads=kv_heads) else before,

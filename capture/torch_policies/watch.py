@@ -13,7 +13,7 @@ import threading
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -54,14 +54,6 @@ class NotFollowed(BadArgument):
     """A policy that ran in another thread than the block that records it."""
 
 
-@dataclass(frozen=True)
-class Where:
-    """The innermost module that is running: its path in the policy, and itself (None outside every module)."""
-
-    path: str
-    module: nn.Module | None
-
-
 class AttentionMode(TorchFunctionMode):
     """Sees every function of torch that the thread of one block calls, and tells the watcher of attention.
 
@@ -74,7 +66,7 @@ class AttentionMode(TorchFunctionMode):
         self._policy, self._watcher = known.policy, watcher
         self._paths = {id(module): path for path, module in known.modules.items()}
         self._softmaxes = Softmaxes(self)
-        self.outputs = OutputWays(lambda: f"module '{self.where().path}'", self.computing)
+        self.outputs = OutputWays(lambda: f"module '{self.where()[0]}'", self.computing)
         self._handlers: dict[Any, Callable[[Any, tuple[Any, ...], Mapping[str, Any]], Any]] = {
             **dict.fromkeys(SDPA_FUNCTIONS, lambda *call: watch_sdpa(self, *call)),
             **dict.fromkeys(FLEX_FUNCTIONS, lambda *call: watch_flex(self, *call)),
@@ -130,8 +122,10 @@ class AttentionMode(TorchFunctionMode):
                 UnseenAttention(f"The operator {name} computes attention in a way that gives no rows. {LOAD_WITH_SDPA}")
             )
 
-    def where(self) -> Where:
-        """Return the innermost module of the policy that is running: in its forward, or in another of its methods.
+    def where(self) -> tuple[str, nn.Module | None]:
+        """Return the path of the policy's innermost module that runs, in its forward or another method, and the module.
+
+        That is None outside of all modules.
 
         Raises:
             OtherPolicy: a module that the policy does not hold is running, and none of the policy's is.
@@ -139,13 +133,13 @@ class AttentionMode(TorchFunctionMode):
         foreign = None
         for owner in _frame_owners():
             if id(owner) in self._paths:
-                return Where(self._paths[id(owner)], owner if isinstance(owner, nn.Module) else None)
+                return self._paths[id(owner)], owner if isinstance(owner, nn.Module) else None
             if owner is self._policy:
-                return Where("", None)
+                return "", None
             if foreign is None and isinstance(owner, nn.Module):
                 foreign = owner
         if foreign is None:
-            return Where("", None)
+            return "", None
         raise self.failed(
             OtherPolicy(
                 f"Attention ran in a module of class {type(foreign).__name__}, which the watched policy "
@@ -155,7 +149,7 @@ class AttentionMode(TorchFunctionMode):
         )
 
     def new_shape(
-        self, where: Where, kind: Kind, sizes: tuple[int, int, int, int, int], dtype: torch.dtype
+        self, module: str, kind: Kind, sizes: tuple[int, int, int, int, int], dtype: torch.dtype
     ) -> CallShape:
         """Return the shape of the call that comes next; sizes: batch, heads, kv_heads, queries, keys."""
         batch, heads, kv_heads, queries, keys = sizes
@@ -163,27 +157,23 @@ class AttentionMode(TorchFunctionMode):
             kind, batch, heads = "multihead", batch * heads // self._multihead_heads, self._multihead_heads
             kv_heads = heads
         return CallShape(
-            module=where.path, kind=kind, number=self._number, batch=batch, heads=heads, kv_heads=kv_heads,
+            module=module, kind=kind, number=self._number, batch=batch, heads=heads, kv_heads=kv_heads,
             queries=queries, keys=keys, dtype=str(dtype).removeprefix("torch."),
         )  # fmt: skip
 
     def change(self, shape: CallShape) -> Tensor | None:
         """Ask the watcher for a change of the call that comes next."""
-        if not getattr(self._watcher, "changes", True):
+        if not self._watcher.changes:
             return None
         with torch.no_grad(), self._failing():
             return self._watcher.change(shape)
 
     def passes(self, shape: CallShape) -> bool:
         """Return whether a call that has run is none of the watcher's, and count it then."""
-        ask = getattr(self._watcher, "passes", None)
-        if ask is None:
-            return False
         with self._failing():
-            if not ask(replace(shape, number=self._number)):
-                return False
-        self._number += 1
-        return True
+            passed = self._watcher.passes(replace(shape, number=self._number))
+        self._number += passed
+        return passed
 
     def saw(self, call: AttentionCall, probabilities: Sequence[Tensor] = ()) -> None:
         """Tell the watcher about a call, and count it; probabilities: tensors that the policy may use once more."""
@@ -212,7 +202,7 @@ class AttentionMode(TorchFunctionMode):
         elif any(tensor.is_nested for tensor in tensors):
             reason = "of nested tensors, whose rows cannot be recorded. Call the policy with padded tensors and a mask."
         if reason:
-            raise self.failed(UnseenAttention(f"{self.where().path or 'The policy'} computes attention {reason}"))
+            raise self.failed(UnseenAttention(f"{self.where()[0] or 'The policy'} computes attention {reason}"))
 
     def failed(self, error: BaseException) -> BaseException:
         """Remember an error of watching, and return it."""

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape
+from vla_attention.capture.torch_policies.attention_calls import AttentionCall, CallShape, Watcher
 
 
 @dataclass
-class Seen:
+class Seen(Watcher):
     """A watcher that takes everything of every call, and changes calls with `changes`."""
 
     changes: Callable[[CallShape], Tensor | None] = lambda shape: None

@@ -27,7 +27,8 @@ from tests.policies.policy_checks import (
     rows_of,
 )
 from tests.policies.word_tokenizer import INSTRUCTION
-from vla_attention.capture.torch_policies.prompts import roles_of_keys
+from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs
+from vla_attention.capture.torch_policies.replan_text import PromptIds, ReplanText
 from vla_attention.schemas.layout import Piece, Prompt, Role
 
 PATCHES, TOKENS, PADDING, LAYERS = 16, 5, 3, 3
@@ -128,7 +129,8 @@ def test_the_state_s_digits_in_the_prompt_are_state(case):
     start = text.index("put")
     prompt = Prompt(text, tuple(pieces), (start, start + len("put bowl")))
     site = case.layout.site("joint")
-    roles = [Role(int(code)).label for code in roles_of_keys(site, case.layout, prompt)]
+    text = ReplanText(case.layout, None, PromptIds({}, 1), {0: ReplanInputs(env_step=0)}, {})
+    roles = [Role(int(code)).label for code in text.roles(0, site, prompt)]
     assert roles[2 * PATCHES :][: len(words)] == [
         *["template", "instruction", "instruction", "template"],
         *["state", "state", "template"],

@@ -6,13 +6,8 @@ There is no text: ACT reads no instruction, and ratios of vision to language are
 
 from __future__ import annotations
 
-from vla_attention.capture.torch_policies.layouts.layout_building import (
-    KeyOrder,
-    camera_name,
-    find_module,
-    rule_path,
-)
-from vla_attention.capture.torch_policies.policy_layout import CallRule, CameraPicture, PolicyLayout
+from vla_attention.capture.torch_policies.layouts.layout_building import FoundModule, KeyOrder, camera_name
+from vla_attention.capture.torch_policies.policy_layout import CameraPicture, PolicyLayout
 
 _NAME = "act"
 #: Pixels of the picture for one token, with and without LeRobot's `replace_final_stride_with_dilation`.
@@ -27,8 +22,8 @@ def act(policy: object) -> PolicyLayout:
     Raises:
         NotThisPolicy: no ACTPolicy.
     """
-    path, module = find_module(policy, ("ACTPolicy",), _NAME)
-    config = module.config
+    found = FoundModule(policy, ("ACTPolicy",), _NAME)
+    config = found.module.config
     keys = KeyOrder()
     keys.add("latent", "state", 1, "learned")
     keys.add("state", "state", int(bool(config.robot_state_feature)), "state")
@@ -43,15 +38,12 @@ def act(policy: object) -> PolicyLayout:
     return PolicyLayout(
         name=_NAME,
         family="act",
-        sites=(
-            keys.site("cross", queries),
-            chunk.site("self", queries),
-        ),
+        sites=(keys.site("cross", queries), chunk.site("self", queries)),
         rules=(
-            CallRule(rule_path(path, r"model\.decoder\.layers\.(?P<block>\d+)\.multihead_attn"), "cross"),
-            CallRule(rule_path(path, r"model\.decoder\.layers\.(?P<block>\d+)\.self_attn"), "self"),
-            CallRule(rule_path(path, r"model\.encoder\..*"), None, tokens="cross"),
-            CallRule(rule_path(path, r"model\.vae_encoder\..*"), None),
+            found.rule(r"model\.decoder\.layers\.(?P<block>\d+)\.multihead_attn", "cross"),
+            found.rule(r"model\.decoder\.layers\.(?P<block>\d+)\.self_attn", "self"),
+            found.rule(r"model\.encoder\..*", tokens="cross"),
+            found.rule(r"model\.vae_encoder\..*"),
         ),
         num_layers=config.n_decoder_layers,
         num_heads=config.n_heads,

@@ -8,23 +8,12 @@ pictures only (`cross_image`), so that a ratio of both inside one block is undef
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
+from operator import attrgetter
 from typing import Any
 
-from vla_attention.capture.torch_policies.layouts.layout_building import (
-    KeyOrder,
-    NotThisPolicy,
-    find_module,
-    inside,
-    rule_path,
-    square,
-)
-from vla_attention.capture.torch_policies.policy_layout import (
-    CallRule,
-    CameraPicture,
-    PolicyLayout,
-    PromptText,
-    RecordedSite,
-)
+from vla_attention.capture.torch_policies.layouts.layout_building import FoundModule, KeyOrder, NotThisPolicy, square
+from vla_attention.capture.torch_policies.policy_layout import CameraPicture, PolicyLayout, PromptText
 from vla_attention.schemas.errors import BadArgument
 
 _NAME = "gr00t"
@@ -56,9 +45,9 @@ def gr00t(
         NotThisPolicy: no GR00TN15 or GR00TN17.
         BadArgument: the ids do not hold one picture for each camera.
     """
-    path, module = find_module(policy, ("GR00TN15", "GR00TN17"), _NAME)
-    head = module.action_head
-    placeholder = _placeholder(module) if image_token is None else image_token
+    found = FoundModule(policy, ("GR00TN15", "GR00TN17"), _NAME)
+    head = found.module.action_head
+    placeholder = _placeholder(found.module.backbone) if image_token is None else image_token
     ids = [int(token) for token in input_ids]
     keys, texts = _encoder_keys(ids, placeholder, cameras, picture_size, prompt_tokens)
     blocks = len(head.model.transformer_blocks)
@@ -69,70 +58,62 @@ def gr00t(
     learned = head.future_tokens.num_embeddings if hasattr(head, "future_tokens") else 0
     queries = (-horizon, None)
     every = getattr(head.model, "attend_text_every_n_blocks", None)
-    groups = {"cross": cross} if every is None else _by_turns(cross, every)
-    sites: list[RecordedSite] = [
-        keys.site(name, queries, layers=layers, variable=texts[-1]) for name, layers in groups.items() if layers
-    ]
+    groups = {"cross": cross}
+    if every is not None:
+        text = tuple(block for block in cross if block % (2 * every) == 0)
+        groups = {"cross_text": text, "cross_image": tuple(block for block in cross if block not in text)}
+    groups = {name: layers for name, layers in groups.items() if layers}
+    sites = [keys.site(name, queries, layers=layers, variable=texts[-1]) for name, layers in groups.items()]
     if self_blocks:
         tokens = KeyOrder()
         tokens.add("state", "state", state_tokens, "state")
         tokens.add("learned", "state", learned, "learned")
         tokens.add("actions", "action", horizon, "action")
+        groups["self"] = self_blocks
         sites.append(tokens.site("self", queries, layers=self_blocks))
-    steps = int(head.num_inference_timesteps)
+    steps, head_blocks = int(head.num_inference_timesteps), r"action_head\.model\.transformer_blocks\."
     return PolicyLayout(
         name="gr00t_n1.7" if every is not None else "gr00t_n1.5",
         family="gr00t",
         sites=tuple(sites),
         rules=(
-            *(_block_rule(path, layers, name) for name, layers in (*groups.items(), ("self", self_blocks)) if layers),
-            CallRule(rule_path(path, r"action_head\.vl_self_attention\..*"), None),
-            CallRule(rule_path(path, r"backbone\..*"), None),
+            *(
+                found.rule(rf"{head_blocks}(?P<block>{'|'.join(map(str, groups[name]))})\.attn1", name)
+                for name in groups
+            ),
+            found.rule(r"action_head\.vl_self_attention\..*"),
+            found.rule(r"backbone\..*"),
         ),
         num_layers=blocks,
         num_heads=head.model.config.num_attention_heads,
         num_denoise_steps=steps,
         denoise_times=tuple(step / steps for step in range(steps)),
         cameras=tuple(CameraPicture(camera) for camera in cameras),
-        text=PromptText(tuple(texts), _embedding(path, module), skip_ids=(placeholder,)),
+        text=PromptText(tuple(texts), _embedding(found), skip_ids=(placeholder,)),
         action_horizon=horizon,
         action_dim=int(head.action_dim),
         versions={"lerobot": ("0.4.",)} if every is None else {},
     )
 
 
-def _block_rule(path: str, layers: tuple[int, ...], site: str) -> CallRule:
-    numbers = "|".join(str(block) for block in layers)
-    return CallRule(rule_path(path, rf"action_head\.model\.transformer_blocks\.(?P<block>{numbers})\.attn1"), site)
-
-
-def _by_turns(cross: tuple[int, ...], every: int) -> dict[str, tuple[int, ...]]:
-    text = tuple(block for block in cross if block % (2 * every) == 0)
-    return {"cross_text": text, "cross_image": tuple(block for block in cross if block not in text)}
-
-
-def _placeholder(module: Any) -> int:
-    backbone = module.backbone
-    for model, name in (("eagle_model", "image_token_index"), ("model", "config.image_token_id")):
-        thing: Any = getattr(backbone, model, None)
-        for part in name.split("."):
-            thing = getattr(thing, part, None)
-        if thing is not None:
-            return int(thing)
+def _placeholder(backbone: Any) -> int:
+    for path in ("eagle_model.image_token_index", "model.config.image_token_id"):
+        try:
+            return int(attrgetter(path)(backbone))
+        except AttributeError:
+            continue
     raise NotThisPolicy("The model does not say which id stands for a patch; give gr00t(..., image_token=...).")
 
 
-def _embedding(path: str, module: Any) -> str:
+def _embedding(found: FoundModule) -> str:
     names = (
         *("backbone.eagle_model.language_model.model.embed_tokens", "backbone.model.language_model.embed_tokens"),
         "backbone.model.model.language_model.embed_tokens",
     )
+    known = dict(found.module.named_modules())
     for name in names:
-        thing: Any = module
-        for part in name.split("."):
-            thing = getattr(thing, part, None)
-        if thing is not None:
-            return inside(path, name)
+        if name in known:
+            return found.inside(name)
     raise NotThisPolicy(
         f"The model's text embedding is at none of the places of GR00T N1.5 and N1.7: {', '.join(names)}."
     )
@@ -142,13 +123,7 @@ def _encoder_keys(
     ids: list[int], placeholder: int, cameras: Sequence[str], size: int, longest: int
 ) -> tuple[KeyOrder, list[str]]:
     """The keys of the vision-language model's tokens, and the names of its text spans in order."""
-    runs: list[tuple[bool, int]] = []
-    for token in ids:
-        picture = token == placeholder
-        if runs and runs[-1][0] == picture:
-            runs[-1] = picture, runs[-1][1] + 1
-        else:
-            runs.append((picture, 1))
+    runs = [(picture, len(list(run))) for picture, run in groupby(ids, lambda token: token == placeholder)]
     if sum(picture for picture, _ in runs) != len(cameras) or not runs or runs[-1][0]:
         raise BadArgument(
             f"The ids of one call hold {sum(picture for picture, _ in runs)} runs of placeholders for patches (id "

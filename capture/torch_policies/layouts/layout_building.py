@@ -5,9 +5,15 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
-from vla_attention.capture.torch_policies.policy_layout import RecordedSite
+from vla_attention.capture.torch_policies.policy_layout import (
+    CallRule,
+    CameraPicture,
+    PictureFit,
+    PolicyLayout,
+    RecordedSite,
+)
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.layout import PatchGrid, SiteLayout, Span, SpanKind
 
@@ -18,36 +24,38 @@ class NotThisPolicy(BadArgument):
     """A layout asked for a policy of another class, or with settings that it does not cover."""
 
 
-def find_module(policy: object, classes: Sequence[str], layout: str) -> tuple[str, Any]:
-    """Return the path of the first module of one of these classes, as the recorder names modules, and the module.
+class FoundModule:
+    """The first module of some classes in a policy. Classes are compared by name, also those that one is derived from.
 
-    The path is "" for the policy itself. Classes are compared by name, also those that a class is derived from.
+    Attributes:
+        path: as the recorder names modules, "" for the policy itself.
+        module: the module.
 
     Raises:
         NotThisPolicy: there is none.
     """
-    from vla_attention.capture.torch_policies.policy_modules import modules_of
 
-    modules = modules_of(policy)
-    for path, module in modules.items():
-        if {base.__name__ for base in type(module).__mro__} & set(classes):
-            return path, module
-    raise NotThisPolicy(
-        f"The layout '{layout}' is for {' or '.join(classes)}, but a {type(policy).__name__} was given, with modules "
-        "of "
-        f"{listing(sorted({type(module).__name__ for module in modules.values()}))}. Give the policy itself, or write "
-        "a layout (docs/your-policy.md)."
-    )
+    def __init__(self, policy: object, classes: Sequence[str], layout: str) -> None:
+        from vla_attention.capture.torch_policies.policy_modules import modules_of
 
+        modules = modules_of(policy)
+        for path, module in modules.items():
+            if {base.__name__ for base in type(module).__mro__} & set(classes):
+                self.path, self.module = path, cast(Any, module)
+                return
+        raise NotThisPolicy(
+            f"The layout '{layout}' is for {' or '.join(classes)}, but a {type(policy).__name__} was given, with "
+            f"modules of {listing(sorted({type(module).__name__ for module in modules.values()}))}. Give the policy "
+            "itself, or write a layout (docs/your-policy.md)."
+        )
 
-def inside(path: str, name: str) -> str:
-    """Return the path of a module inside the module at `path`."""
-    return f"{path}.{name}" if path else name
+    def inside(self, name: str) -> str:
+        """Return the path of a module inside."""
+        return f"{self.path}.{name}" if self.path else name
 
-
-def rule_path(path: str, name: str) -> str:
-    """Return a rule's regular expression: the path as it is, then `name`, which is a regular expression."""
-    return re.escape(path + ".") + name if path else name
+    def rule(self, modules: str, site: str | None = None, **others: Any) -> CallRule:
+        """Return the rule of modules inside: a regular expression behind the path as it is; others as in `CallRule`."""
+        return CallRule(re.escape(self.path + ".") + modules if self.path else modules, site, **others)
 
 
 def camera_name(feature: str) -> str:
@@ -80,38 +88,43 @@ class KeyOrder:
         """Number of keys so far."""
         return self.spans[-1].stop if self.spans else 0
 
-    def add(self, name: str, kind: SpanKind, count: int, role: str) -> None:
-        """Add `count` keys of one kind; none, no span."""
+    def add(self, name: str, kind: SpanKind, count: int, role: str, **others: Any) -> None:
+        """Add `count` keys of one kind; none, no span. others: as in `Span`."""
         if count:
-            self.spans.append(Span(name, kind, self.num_keys, self.num_keys + count))
+            self.spans.append(Span(name, kind, self.num_keys, self.num_keys + count, **others))
             self.roles[name] = role
 
-    def add_picture(
-        self, camera: str, rows: int, columns: int, height: int, width: int, role: str = "image", *, named: bool = True
-    ) -> None:
-        """Add a camera's patches, row by row; `named` False: of a picture that is no camera's (an empty view)."""
-        start = self.num_keys
+    def add_picture(self, camera: str, rows: int, columns: int, height: int, width: int) -> None:
+        """Add a camera's patches, row by row."""
         grid = PatchGrid(rows, columns, height, width)
-        stop = start + grid.num_patches
-        self.spans.append(Span(camera, "image", start, stop, camera if named else None, grid if named else None))
-        self.roles[camera] = role
-
-    def add_growing(self, name: str, count: int, offset: int = 0) -> None:
-        """Add the keys of generated tokens: action query q sees the first q + `offset`."""
-        if count:
-            start = self.num_keys
-            self.spans.append(Span(name, "action", start, start + count, growing=True, growing_offset=offset))
-            self.roles[name] = "action"
+        self.add(camera, "image", grid.num_patches, "image", camera=camera, grid=grid)
 
     def site(
+        self, name: str, queries: tuple[int, int | None], *, layers: tuple[int, ...] = (), variable: str | None = None
+    ) -> RecordedSite:
+        """Return the site with these spans; arguments as in `RecordedSite` and `SiteLayout`."""
+        return RecordedSite(SiteLayout(name, tuple(self.spans), layers=layers), queries, dict(self.roles), variable)
+
+    def layout(
         self,
         name: str,
         queries: tuple[int, int | None],
-        *,
-        layers: tuple[int, ...] = (),
-        heads: int = 0,
-        variable: str | None = None,
-    ) -> RecordedSite:
-        """Return the site with these spans; arguments as in `RecordedSite` and `SiteLayout`."""
-        keys = SiteLayout(name, tuple(self.spans), layers=layers, heads=heads)
-        return RecordedSite(keys, queries, dict(self.roles), variable)
+        blocks: tuple[int, int],
+        rules: Sequence[CallRule],
+        cameras: Sequence[str],
+        fit: PictureFit = "stretch",
+        **others: Any,
+    ) -> PolicyLayout:
+        """Return the layout of a policy with the one site `joint`, whose prompt may be shorter.
+
+        blocks: how many, and heads of each. fit: of all cameras. others: as in `PolicyLayout`.
+        """
+        return PolicyLayout(
+            name=name,
+            sites=(self.site("joint", queries, variable="prompt"),),
+            rules=tuple(rules),
+            num_layers=blocks[0],
+            num_heads=blocks[1],
+            cameras=tuple(CameraPicture(camera, fit) for camera in cameras),
+            **{"family": name, **others},
+        )

@@ -12,14 +12,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from vla_attention.capture.torch_policies.layouts.layout_building import (
-    KeyOrder,
-    find_module,
-    inside,
-    rule_path,
-    square,
-)
-from vla_attention.capture.torch_policies.policy_layout import CallRule, CameraPicture, PolicyLayout, PromptText
+from vla_attention.capture.torch_policies.layouts.layout_building import FoundModule, KeyOrder, square
+from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, PromptText
 from vla_attention.schemas.errors import BadArgument
 
 _CLASSES = ("OpenVLAForActionPrediction",)
@@ -41,16 +35,15 @@ def openvla(
     Raises:
         NotThisPolicy: no OpenVLAForActionPrediction.
     """
-    path, module = find_module(policy, _CLASSES, "openvla")
-    keys = _prefix([camera], prompt_tokens, patches, _picture_size(module), 0, "openvla")
-    keys.add_growing("action_tokens", action_dim - 1)
+    found = FoundModule(policy, _CLASSES, "openvla")
+    keys = _prefix(found, [camera], prompt_tokens, patches, 0, "openvla")
+    keys.add("action_tokens", "action", action_dim - 1, "action", growing=True)
     return _layout(
         "openvla",
-        path,
-        module,
+        found,
         keys,
         (-1, None),
-        [camera],
+        cameras=[camera],
         action_horizon=1,
         action_dim=action_dim,
         autoregressive=True,
@@ -85,38 +78,33 @@ def openvla_oft(
     Raises:
         NotThisPolicy: no OpenVLAForActionPrediction.
     """
-    path, module = find_module(policy, _CLASSES, "openvla_oft")
+    found = FoundModule(policy, _CLASSES, "openvla_oft")
     placeholders = action_dim * chunk
-    keys = _prefix(cameras, prompt_tokens, patches, _picture_size(module), int(proprio), "openvla_oft", diffusion_steps)
+    keys = _prefix(found, cameras, prompt_tokens, patches, int(proprio), "openvla_oft", diffusion_steps)
     keys.add("actions", "action", placeholders, "action")
     keys.add("stop", "text", 1, "template")
     return _layout(
         "openvla_oft",
-        path,
-        module,
+        found,
         keys,
         (-(placeholders + 2), -2),
-        cameras,
+        cameras=cameras,
         num_denoise_steps=max(1, diffusion_steps),
         action_horizon=chunk,
         action_dim=action_dim,
     )
 
 
-def _picture_size(module: Any) -> int:
-    sizes = getattr(module.config, "image_sizes", None) or [224]
-    return int(sizes[0] if isinstance(sizes, list | tuple) else sizes)
-
-
 def _prefix(
-    cameras: Sequence[str], prompt: int, patches: int, size: int, state: int, layout: str, diffusion: int = 0
+    found: FoundModule, cameras: Sequence[str], prompt: int, patches: int, state: int, layout: str, diffusion: int = 0
 ) -> KeyOrder:
     if not cameras or prompt < 1:
         raise BadArgument(f"{layout} needs at least one camera and one prompt token; got {list(cameras)}, {prompt}.")
+    sizes = getattr(found.module.config, "image_sizes", None) or [224]
+    size, side = int(sizes[0] if isinstance(sizes, list | tuple) else sizes), square(patches, "pictures", layout)
     keys = KeyOrder()
     keys.add("bos", "text", 1, "bos")
     for camera in cameras:
-        side = square(patches, "pictures", layout)
         keys.add_picture(camera, side, side, size, size)
     keys.add("state", "state", state, "state")
     keys.add("diffusion_step", "state", int(diffusion > 0), "learned")
@@ -125,30 +113,19 @@ def _prefix(
 
 
 def _layout(
-    name: str,
-    path: str,
-    module: Any,
-    keys: KeyOrder,
-    queries: tuple[int, int | None],
-    cameras: Sequence[str],
-    **fields: Any,
+    name: str, found: FoundModule, keys: KeyOrder, queries: tuple[int, int | None], **others: Any
 ) -> PolicyLayout:
-    llama = inside(path, "language_model.model")
-    site = keys.site("joint", queries, variable="prompt")
-    text = module.config.text_config
+    text = found.module.config.text_config
     # OFT embeds its placeholders and the stop token with the prompt.
     after = [span.name for span in keys.spans if span.name in ("actions", "stop")]
-    return PolicyLayout(
-        name=name,
-        family=name,
-        sites=(site,),
-        rules=(
-            CallRule(rule_path(llama, r"layers\.(?P<block>\d+)\.self_attn"), "joint", tokens="joint"),
-            CallRule(rule_path(path, r"vision_backbone(\..*)?"), None),
-        ),
-        num_layers=text.num_hidden_layers,
-        num_heads=text.num_attention_heads,
-        cameras=tuple(CameraPicture(camera) for camera in cameras),
-        text=PromptText(("bos", "prompt", *after), f"{llama}.embed_tokens"),
-        **fields,
+    return keys.layout(
+        name,
+        queries,
+        (text.num_hidden_layers, text.num_attention_heads),
+        [
+            found.rule(r"language_model\.model\.layers\.(?P<block>\d+)\.self_attn", "joint", tokens="joint"),
+            found.rule(r"vision_backbone(\..*)?"),
+        ],
+        text=PromptText(("bos", "prompt", *after), found.inside("language_model.model.embed_tokens")),
+        **others,
     )

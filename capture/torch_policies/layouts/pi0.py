@@ -6,16 +6,11 @@ layouts are for recording them where they run already: inside openpi's websocket
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
-from vla_attention.capture.torch_policies.layouts.layout_building import (
-    KeyOrder,
-    camera_name,
-    find_module,
-    inside,
-    rule_path,
-)
-from vla_attention.capture.torch_policies.policy_layout import CallRule, CameraPicture, PolicyLayout, PromptText
+from vla_attention.capture.torch_policies.layouts.layout_building import FoundModule, KeyOrder, camera_name
+from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, PromptText
 from vla_attention.schemas.errors import BadArgument
 
 _OPENPI_CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")
@@ -33,7 +28,8 @@ def pi0_pytorch(policy: object, *, cameras: Sequence[str] = (), num_steps: int =
     Raises:
         NotThisPolicy: no such class.
     """
-    path, module = find_module(policy, ("PI0Pytorch", "PI05Pytorch"), "pi0_pytorch")
+    found = FoundModule(policy, ("PI0Pytorch", "PI05Pytorch"), "pi0_pytorch")
+    module = found.module
     config, networks = module.config, module.paligemma_with_expert
     vision, expert = networks.paligemma.config.vision_config, networks.gemma_expert.config
     chunk = getattr(config, "chunk_size", 0) or config.action_horizon
@@ -42,34 +38,25 @@ def pi0_pytorch(policy: object, *, cameras: Sequence[str] = (), num_steps: int =
     five = not hasattr(module, "state_proj")  # pi0.5 has no token of the state
     features = getattr(config, "image_features", None) or {}
     names = list(cameras) or [camera_name(feature) for feature in features] or list(_OPENPI_CAMERAS)
-    side = vision.image_size // vision.patch_size
-    keys = KeyOrder()
-    for camera in names:
-        keys.add_picture(camera, side, side, vision.image_size, vision.image_size)
-    keys.add("prompt", "text", prompt, "instruction")
+    keys = _prefix(names, (vision.image_size,) * 2, vision.patch_size, prompt)
     keys.add("state", "state", int(not five), "state")
     keys.add("actions", "action", chunk, "action")
-    decoder, prefix = "paligemma_with_expert.gemma_expert.model.layers", r"paligemma_with_expert\.paligemma"
-    site = keys.site(
-        "joint",
+    prefix = r"paligemma_with_expert\.paligemma"
+    embedding = found.inside("paligemma_with_expert.paligemma.model.language_model.embed_tokens")
+    return keys.layout(
+        "pi05_pytorch" if five else "pi0_pytorch",
         (-chunk, None),
-        variable="prompt",
-    )
-    embedding = inside(path, "paligemma_with_expert.paligemma.model.language_model.embed_tokens")
-    return PolicyLayout(
-        name="pi05_pytorch" if five else "pi0_pytorch",
+        (expert.num_hidden_layers, expert.num_attention_heads),
+        [
+            found.rule(r"paligemma_with_expert\.gemma_expert\.model\.layers\.(?P<block>\d+)\.self_attn", "joint"),
+            found.rule(rf"{prefix}\.model\.language_model\..*", tokens="joint"),
+            found.rule(rf"{prefix}\..*"),
+        ],
+        names,
+        "pad",
         family="pi0_pytorch",
-        sites=(site,),
-        rules=(
-            CallRule(rule_path(path, decoder.replace(".", r"\.") + r"\.(?P<block>\d+)\.self_attn"), "joint"),
-            CallRule(rule_path(path, rf"{prefix}\.model\.language_model\..*"), None, tokens="joint"),
-            CallRule(rule_path(path, rf"{prefix}\..*"), None),
-        ),
-        num_layers=expert.num_hidden_layers,
-        num_heads=expert.num_attention_heads,
         num_denoise_steps=steps,
         denoise_times=tuple(1.0 - step / steps for step in range(steps)),
-        cameras=tuple(CameraPicture(camera, "pad") for camera in names),
         text=PromptText(("prompt",), embedding, state_between=("State:", ";") if five else None),
         action_horizon=chunk,
         action_dim=getattr(config, "max_action_dim", 0) or config.action_dim,
@@ -87,31 +74,24 @@ def pi0_fast(policy: object) -> PolicyLayout:
     Raises:
         NotThisPolicy: no PI0FastPolicy.
     """
-    path, module = find_module(policy, ("PI0FastPolicy",), "pi0_fast")
-    config = module.config
-    paligemma = module.model.paligemma_with_expert.paligemma
-    vision, text = paligemma.config.vision_config, paligemma.config.text_config
-    height, width = config.image_resolution
-    keys = KeyOrder()
+    found = FoundModule(policy, ("PI0FastPolicy",), "pi0_fast")
+    config, paligemma = found.module.config, found.module.model.paligemma_with_expert.paligemma.config
     cameras = [camera_name(feature) for feature in config.image_features]
-    for camera in cameras:
-        keys.add_picture(camera, height // vision.patch_size, width // vision.patch_size, height, width)
-    keys.add("prompt", "text", config.tokenizer_max_length + 1, "instruction")
-    keys.add_growing("action_tokens", config.max_decoding_steps - 1)
-    decoder = inside(path, "model.paligemma_with_expert.paligemma.model.language_model")
-    site = keys.site("joint", (-1, None), variable="prompt")
-    return PolicyLayout(
-        name="pi0_fast",
-        family="pi0_fast",
-        sites=(site,),
-        rules=(
-            CallRule(rule_path(decoder, r"layers\.(?P<block>\d+)\.self_attn"), "joint", tokens="joint"),
-            CallRule(rule_path(path, r".*vision_tower\..*"), None),
-        ),
-        num_layers=text.num_hidden_layers,
-        num_heads=text.num_attention_heads,
-        cameras=tuple(CameraPicture(camera, "pad") for camera in cameras),
-        text=PromptText(("prompt",), f"{decoder}.embed_tokens", state_between=("State:", ";")),
+    patch, longest = paligemma.vision_config.patch_size, config.tokenizer_max_length + 1
+    keys = _prefix(cameras, tuple(config.image_resolution), patch, longest)
+    keys.add("action_tokens", "action", config.max_decoding_steps - 1, "action", growing=True)
+    decoder = "model.paligemma_with_expert.paligemma.model.language_model"
+    return keys.layout(
+        "pi0_fast",
+        (-1, None),
+        (paligemma.text_config.num_hidden_layers, paligemma.text_config.num_attention_heads),
+        [
+            found.rule(re.escape(decoder) + r"\.layers\.(?P<block>\d+)\.self_attn", "joint", tokens="joint"),
+            found.rule(r".*vision_tower\..*"),
+        ],
+        cameras,
+        "pad",
+        text=PromptText(("prompt",), found.inside(f"{decoder}.embed_tokens"), state_between=("State:", ";")),
         action_horizon=config.n_action_steps,
         action_dim=config.action_feature.shape[0],
         autoregressive=True,
@@ -134,42 +114,39 @@ def pi0_transformers(
     Raises:
         NotThisPolicy: no PI0ForConditionalGeneration.
     """
-    path, module = find_module(policy, ("PI0ForConditionalGeneration",), "pi0_transformers")
+    found = FoundModule(policy, ("PI0ForConditionalGeneration",), "pi0_transformers")
     if not cameras or prompt_tokens < 1:
         raise BadArgument(f"pi0 needs at least one camera and one prompt token; got {list(cameras)}, {prompt_tokens}.")
-    config = module.config
-    vision, dit = config.vlm_config.vision_config, config.dit_config
-    side = vision.image_size // vision.patch_size
-    keys = KeyOrder()
-    for camera in cameras:
-        keys.add_picture(camera, side, side, vision.image_size, vision.image_size)
-    patches = keys.num_keys
-    keys.add("prompt", "text", prompt_tokens, "instruction")
+    config = found.module.config
+    vision, steps = config.vlm_config.vision_config, config.num_inference_steps
+    keys = _prefix(cameras, (vision.image_size,) * 2, vision.patch_size, prompt_tokens)
+    patches = keys.num_keys - prompt_tokens
     keys.add("state", "state", 1, "state")
     keys.add("actions", "action", config.chunk_size, "action")
-    steps = config.num_inference_steps
-    site = keys.site(
-        "joint",
+    return keys.layout(
+        "pi0_transformers",
         (-config.chunk_size, None),
-        variable="prompt",
-    )
-    return PolicyLayout(
-        name="pi0_transformers",
-        family="pi0_transformers",
-        sites=(site,),
-        rules=(
-            CallRule(rule_path(path, r"model\.dit\.layers\.(?P<block>\d+)\.self_attn"), "joint"),
-            CallRule(rule_path(path, r"model\.vlm\.language_model\..*"), None, tokens="joint"),
-            CallRule(rule_path(path, r"model\.vlm\..*"), None),
-        ),
-        num_layers=dit.num_hidden_layers,
-        num_heads=dit.num_attention_heads,
+        (config.dit_config.num_hidden_layers, config.dit_config.num_attention_heads),
+        [
+            found.rule(r"model\.dit\.layers\.(?P<block>\d+)\.self_attn", "joint"),
+            found.rule(r"model\.vlm\.language_model\..*", tokens="joint"),
+            found.rule(r"model\.vlm\..*"),
+        ],
+        cameras,
         num_denoise_steps=steps,
         denoise_times=tuple(1.0 - step / steps for step in range(steps)),
-        cameras=tuple(CameraPicture(camera) for camera in cameras),
         # The model replaces the placeholders for patches by 0 before it embeds the ids: their number tells them.
-        text=PromptText(("prompt",), inside(path, "model.vlm.language_model.embed_tokens"), skip_first=patches),
+        text=PromptText(("prompt",), found.inside("model.vlm.language_model.embed_tokens"), skip_first=patches),
         action_horizon=config.chunk_size,
         action_dim=config.max_action_dim,
         versions={"transformers": ("5.",)},
     )
+
+
+def _prefix(cameras: Sequence[str], size: tuple[int, int], patch: int, prompt: int) -> KeyOrder:
+    """The keys of pictures of (height, width) in pixels, and of the prompt."""
+    keys = KeyOrder()
+    for camera in cameras:
+        keys.add_picture(camera, size[0] // patch, size[1] // patch, *size)
+    keys.add("prompt", "text", prompt, "instruction")
+    return keys

@@ -7,27 +7,19 @@ the prefix only. All of them compute in one module, `vlm_with_expert`, with a so
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from vla_attention.capture.torch_policies.layouts.layout_building import (
+    FoundModule,
     KeyOrder,
     NotThisPolicy,
     camera_name,
-    find_module,
-    inside,
-    rule_path,
     square,
 )
-from vla_attention.capture.torch_policies.policy_layout import (
-    CallRule,
-    CameraPicture,
-    PolicyLayout,
-    PromptText,
-    RecordedSite,
-)
+from vla_attention.capture.torch_policies.policy_layout import CallRule, CameraPicture, PolicyLayout, PromptText
 
 _NAME = "smolvla"
-_SEPARATORS = {"begin": 2, "end": 1}
 
 
 def smolvla(policy: object) -> PolicyLayout:
@@ -38,9 +30,8 @@ def smolvla(policy: object) -> PolicyLayout:
     Raises:
         NotThisPolicy: no SmolVLAPolicy, or one whose calls cannot be told from the prefix's by their numbers.
     """
-    path, module = find_module(policy, ("SmolVLAPolicy",), _NAME)
-    config, model = module.config, module.model.vlm_with_expert
-    prompt = config.tokenizer_max_length
+    found = FoundModule(policy, ("SmolVLAPolicy",), _NAME)
+    config, model = found.module.config, found.module.model.vlm_with_expert
     if config.prefix_length > 0 and config.pad_language_to != "max_length":
         raise NotThisPolicy(
             f"This SmolVLA pads its prefix to {config.prefix_length} keys after prompts of different lengths "
@@ -49,45 +40,44 @@ def smolvla(policy: object) -> PolicyLayout:
         )
     if not config.use_cache:
         raise NotThisPolicy("This SmolVLA has use_cache=False, with which it cannot act; set use_cache=True.")
-    order, cameras = _sequence(config, model), [camera_name(feature) for feature in config.image_features]
-    kinds = list(dict.fromkeys(site for site, _ in order))
-    fewest = _prefix(config, model, cameras, prompt).num_keys - (
-        0 if config.pad_language_to == "max_length" else prompt
-    )
-    most = fewest if config.pad_language_to == "max_length" else fewest + prompt
+    order, cameras = _sequence(model), [camera_name(feature) for feature in config.image_features]
+    most = _prefix(config, model, cameras).num_keys
+    fewest = most if config.pad_language_to == "max_length" else most - config.tokenizer_max_length
     if fewest <= config.chunk_size <= most:
         raise NotThisPolicy(
             f"This SmolVLA's prefix of {fewest} to {most} keys may be as long as its chunk of {config.chunk_size} "
             "actions; then its two passes cannot be told apart."
         )
-    expert = inside(path, "model.vlm_with_expert")
-    both = tuple(_site(kind, config, model, cameras, prompt, expert, order) for kind in kinds)
+    sites = []
+    for kind in dict.fromkeys(site for site, _ in order):
+        keys = _prefix(config, model, cameras)
+        keys.add("actions", "action", config.chunk_size if kind == "self" else 0, "action")
+        blocks = tuple(block for site, block in order if site == kind)
+        sites.append(keys.site(kind, (0, config.chunk_size), layers=blocks, variable="prompt"))
+    expert = found.inside("model.vlm_with_expert")
+    of_expert, tokens = re.escape(expert), "self" if "self" in [site.name for site in sites] else "cross"
     return PolicyLayout(
         name=_NAME,
         family="smolvla",
-        sites=both,
+        sites=tuple(sites),
         rules=(
-            CallRule(rule_path("", _escaped(expert)), None, queries=config.chunk_size, sequence=tuple(order)),
-            CallRule(_escaped(expert), None, tokens="self" if "self" in kinds else "cross"),
-            CallRule(_escaped(expert) + r"\.vlm\..*", None),
+            CallRule(of_expert, None, queries=config.chunk_size, sequence=tuple(order)),
+            CallRule(of_expert, None, tokens=tokens),
+            CallRule(of_expert + r"\.vlm\..*", None),
         ),
         num_layers=max(block for _, block in order) + 1,
         num_heads=model.num_attention_heads,
         num_denoise_steps=config.num_steps,
         denoise_times=tuple(1.0 - step / config.num_steps for step in range(config.num_steps)),
         cameras=tuple(CameraPicture(camera, "pad_left_top") for camera in cameras),
-        text=PromptText(("prompt",), inside(expert, "vlm.model.text_model.embed_tokens")),
+        text=PromptText(("prompt",), f"{expert}.vlm.model.text_model.embed_tokens"),
         action_horizon=config.chunk_size,
         action_dim=config.action_feature.shape[0],
         versions={"lerobot": ("0.4.",)},
     )
 
 
-def _escaped(path: str) -> str:
-    return rule_path(path, "")[:-2]
-
-
-def _sequence(config: Any, model: Any) -> list[tuple[str, int]]:
+def _sequence(model: Any) -> list[tuple[str, int]]:
     """The site and block of each call of a denoise step, in order; the block is the expert's layer."""
     calls = []
     multiple = model.num_vlm_layers // model.num_expert_layers
@@ -100,7 +90,7 @@ def _sequence(config: Any, model: Any) -> list[tuple[str, int]]:
     return calls
 
 
-def _prefix(config: Any, model: Any, cameras: list[str], prompt: int) -> KeyOrder:
+def _prefix(config: Any, model: Any, cameras: list[str]) -> KeyOrder:
     keys = KeyOrder()
     vision = model.config.vision_config
     for feature, camera in zip(config.image_features, cameras, strict=True):
@@ -109,26 +99,11 @@ def _prefix(config: Any, model: Any, cameras: list[str], prompt: int) -> KeyOrde
         patches = (height // vision.patch_size) * (width // vision.patch_size)
         side = square(patches, "pictures", _NAME) // model.config.scale_factor
         if config.add_image_special_tokens:
-            keys.add(f"{camera}_begin", "text", _SEPARATORS["begin"], "template")
+            keys.add(f"{camera}_begin", "text", 2, "template")
         keys.add_picture(camera, side, side, height, width)
         if config.add_image_special_tokens:
-            keys.add(f"{camera}_end", "text", _SEPARATORS["end"], "template")
-    keys.add("prompt", "text", prompt, "instruction")
+            keys.add(f"{camera}_end", "text", 1, "template")
+    keys.add("prompt", "text", config.tokenizer_max_length, "instruction")
     keys.add("state", "state", 1, "state")
     keys.add("prefix_padding", "text", max(0, config.prefix_length - keys.num_keys), "padding")
     return keys
-
-
-def _site(
-    kind: str, config: Any, model: Any, cameras: list[str], prompt: int, expert: str, order: list[tuple[str, int]]
-) -> RecordedSite:
-    keys = _prefix(config, model, cameras, prompt)
-    if kind == "self":
-        keys.add("actions", "action", config.chunk_size, "action")
-    blocks = tuple(block for site, block in order if site == kind)
-    return keys.site(
-        kind,
-        (0, config.chunk_size),
-        layers=blocks,
-        variable="prompt",
-    )

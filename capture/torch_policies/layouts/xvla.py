@@ -10,14 +10,12 @@ from __future__ import annotations
 from typing import Any
 
 from vla_attention.capture.torch_policies.layouts.layout_building import (
+    FoundModule,
     KeyOrder,
     NotThisPolicy,
     camera_name,
-    find_module,
-    inside,
-    rule_path,
 )
-from vla_attention.capture.torch_policies.policy_layout import CallRule, CameraPicture, PolicyLayout, PromptText
+from vla_attention.capture.torch_policies.policy_layout import PolicyLayout, PromptText
 
 _NAME = "xvla"
 
@@ -31,8 +29,8 @@ def xvla(policy: object) -> PolicyLayout:
     Raises:
         NotThisPolicy: no XVLAPolicy, or one with other picture features than means and patches.
     """
-    path, module = find_module(policy, ("XVLAPolicy",), _NAME)
-    config, vision = module.config, module.model.vlm.config.vision_config
+    found = FoundModule(policy, ("XVLAPolicy",), _NAME)
+    config, vision = found.module.config, found.module.model.vlm.config.vision_config
     cameras = [(camera_name(feature), config.image_features[feature].shape) for feature in config.image_features]
     views = max(config.num_image_views or 0, len(cameras))
     keys = KeyOrder()
@@ -47,29 +45,21 @@ def xvla(policy: object) -> PolicyLayout:
         if number == 0:
             keys.add("prompt", "text", config.tokenizer_max_length, "instruction")
     keys.add("soft_prompts", "state", config.len_soft_prompts, "learned")
-    site = keys.site(
-        "joint",
+    return keys.layout(
+        _NAME,
         (0, config.chunk_size),
-        variable="prompt",
-    )
-    return PolicyLayout(
-        name=_NAME,
-        family="xvla",
-        sites=(site,),
-        rules=(
-            CallRule(rule_path(path, r"model\.transformer\.blocks\.(?P<block>\d+)\.attn"), "joint"),
-            CallRule(rule_path(path, r"model\.vlm\..*"), None),
-        ),
-        num_layers=config.depth,
-        num_heads=config.num_heads,
+        (config.depth, config.num_heads),
+        [
+            found.rule(r"model\.transformer\.blocks\.(?P<block>\d+)\.attn", "joint"),
+            found.rule(r"model\.vlm\..*"),
+        ],
+        [name for name, _ in cameras],
+        "pad_left_top" if config.resize_imgs_with_padding else "stretch",
         num_denoise_steps=max(1, config.num_denoising_steps),
         denoise_times=tuple(step / config.num_denoising_steps for step in range(config.num_denoising_steps, 0, -1)),
-        cameras=tuple(
-            CameraPicture(name, "pad_left_top" if config.resize_imgs_with_padding else "stretch") for name, _ in cameras
-        ),
-        text=PromptText(("prompt",), inside(path, "model.vlm.language_model.model.shared")),
+        text=PromptText(("prompt",), found.inside("model.vlm.language_model.model.shared")),
         action_horizon=config.chunk_size,
-        action_dim=module.model.dim_action,
+        action_dim=found.module.model.dim_action,
         versions={"lerobot": ("0.4.",)},
     )
 

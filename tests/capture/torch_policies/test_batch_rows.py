@@ -12,7 +12,7 @@ from torch import nn
 
 import vla_attention as va
 from tests.capture.torch_policies.test_odd_policies import ACTIONS, HEADS, PREFIX, WIDTH, OddPolicy, layout, logits
-from vla_attention.capture.torch_policies.batch_rows import BatchRowsMixed
+from vla_attention.capture.torch_policies.own_setting import BatchRowsMixed
 from vla_attention.capture.torch_policies.record import record
 from vla_attention.capture.torch_policies.session import ContributionsUnknown
 from vla_attention.schemas.errors import Note

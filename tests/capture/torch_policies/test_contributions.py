@@ -108,7 +108,7 @@ def test_rows_of_a_batch_have_gates_of_their_own(tmp_path, name):
         for step in range(2):
             with episodes.replan(env_step=step, active=[True, False, True]):
                 policy.act(batch=3)
-        episodes._episodes.pop(1)  # nothing was recorded of it
+        episodes.pop(1)  # nothing was recorded of it
     for episode, row in zip(stored(tmp_path).episodes, (0, 2), strict=True):
         for gram in episode.read("joint/contribution"):
             close(gram, expected(policy, way, row, batch=3))

@@ -102,12 +102,11 @@ def test_rows_of_some_queries_and_batch_rows():
     with watch_attention(policy, seen):
         policy(hidden, memory, mask)
     call, rows = seen.calls[1], seen.rows[1]
-    for queries in (slice(1, 4), slice(-2, None), [4, 0], torch.tensor([-1, 2])):
-        for batch in (slice(None), slice(1, 2), [2, 0]):
+    for queries in (slice(1, 4), slice(-2, None), slice(None, None, 2)):
+        for batch in (slice(1, 2), slice(None)):
             some = call.rows(queries, batch)
-            places = range(5)[queries] if isinstance(queries, slice) else queries
-            torch.testing.assert_close(some, rows[batch][:, :, list(places)], rtol=1e-6, atol=1e-7)
-            assert call.product_error(some, queries, batch) < 2e-6
+            torch.testing.assert_close(some, rows[batch, :, queries], rtol=1e-6, atol=1e-7)
+        assert call.product_error(some, queries) < 2e-6
         assert torch.equal(
             call.allowed(queries), torch.ones(3, call.allowed().shape[1], len(some[0, 0]), 7, dtype=torch.bool)
         )
@@ -239,7 +238,7 @@ def test_rows_and_results_of_flex_attention(kv_heads, scored, masked, compiled, 
     for (query, key), rows, allowed, call in zip(taken, seen.rows, seen.allowed, seen.calls, strict=True):
         torch.testing.assert_close(rows.double(), reference_rows(query, key, logits), rtol=1e-4, atol=2e-6)
         assert torch.equal(allowed, keep)
-        torch.testing.assert_close(call.rows([4, 1], [1]), rows[[1]][:, :, [4, 1]])
+        torch.testing.assert_close(call.rows(slice(1, 5, 3), slice(1, 2)), rows[1:2, :, 1:5:3])
 
 
 def test_a_change_takes_keys_away_from_flex_attention():

@@ -87,8 +87,6 @@ def test_rows_and_results(data):
         rtol=1e-4 if dtype is torch.float32 else 2e-2,
         atol=1e-6 if dtype is torch.float32 else 2e-2,
     )
-    for wanted in (slice(-1, None), [0]):
-        torch.testing.assert_close(call.rows(wanted), rows[:, :, wanted], rtol=1e-3, atol=1e-5)
 
 
 @pytest.mark.parametrize("options", [{}, {"add_zero_attn": True}, {"add_bias_kv": True}], ids=str)

@@ -59,7 +59,7 @@ def record_call(path, policy, layout, call, **changes):
             fixed_layout(),
             "the",
             "1 x 7: its cache of 7 keys loses its first key at each call",
-            "the caches of site 'joint' lose their first key from token to token",
+            "of a call of site 'joint', its cache of 7 keys loses its first key at each call",
         ),
     ],
 )

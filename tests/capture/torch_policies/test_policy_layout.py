@@ -92,7 +92,9 @@ def test_rules_and_sites_check_themselves():
         CallRule("(", None)
     with pytest.raises(BadArgument, match="does not say which block"):
         CallRule("blocks", "joint")
-
+    for call in (None, (None, 0), ("joint", None), ("joint",)):
+        with pytest.raises(BadArgument, match="in its sequence; expected site and block of each call"):
+            CallRule("blocks", None, sequence=(("joint", 0), call))
     with pytest.raises(BadArgument, match="no role for the spans actions"):
         RecordedSite(KEYS, (0, 1), {"image_front": "image", "prompt": "text"})
 

@@ -294,7 +294,7 @@ def test_wrong_arguments_are_sentences(tmp_path, policy, changes, error, sentenc
 @pytest.mark.parametrize(
     ("inputs", "error", "sentence"),
     [
-        ({"frame": {}}, BadArgument, "replan() has no argument 'frame'. Did you mean 'frames'?"),
+        ({"frame": {}}, UnknownName, "Unknown argument of replan() 'frame'. Did you mean 'frames'?"),
         ({"frames": {"wrist": np.zeros((8, 8, 3), np.uint8)}}, UnknownName, "Unknown camera of frames 'wrist'"),
         ({"frames": {"front": torch.randn(3, 8, 8) * 9}}, BadArgument, "give it before normalising"),
         ({"prompt": ["a"]}, PromptDoesNotFit, "given as 1 pieces, and the layout's prompt has 6 keys"),

@@ -163,21 +163,6 @@ def test_rows_and_results(attend, data):
         assert (rows[~keep.expand(rows.shape)] == 0).all()
 
 
-@pytest.mark.parametrize("attend", SPELLINGS, ids=lambda function: function.__name__)
-def test_some_queries_and_batch_rows(attend):
-    torch.manual_seed(0)
-    policy = Policy(attend, heads=4, kv_heads=2).eval().requires_grad_(False)
-    seen = Seen()
-    with watch_attention(policy, seen):
-        policy(torch.randn(3, 5, 32), torch.randn(3, 7, 32))
-    for call, rows in zip(seen.calls, seen.rows, strict=True):
-        for queries, batch in ((slice(1, 3), slice(None)), ([4, 0], [2, 1]), (slice(-1, None), slice(0, 1))):
-            places = range(5)[queries] if isinstance(queries, slice) else queries
-            some = call.rows(queries, batch)
-            torch.testing.assert_close(some, rows[batch][:, :, list(places)])
-            assert call.product_error(some, queries, batch) < 5e-6
-
-
 def test_values_are_shared_where_they_are():
     torch.manual_seed(0)
     for attend, kv_heads in ((grouped, 2), (grouped_folded, 2), (plain, 4)):
