@@ -63,7 +63,7 @@ def make_policy(name: str, device: str = "cpu", dtype: str = "float32") -> Any:
     from vla_attention.capture.policies.pi import embedded
     from vla_attention.capture.policies.pi.model import PiModel, model_from_state
     from vla_attention.capture.policies.pi.policy import PiPolicy
-    from vla_attention.capture.policies.pi.processing import OpenpiProcessing
+    from vla_attention.capture.policies.pi.processing import openpi_processing
     from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 
     config = sizes(name)
@@ -82,7 +82,7 @@ def make_policy(name: str, device: str = "cpu", dtype: str = "float32") -> Any:
         weights = embedded.random_weights(config, 0)
         model = model_from_state(config, weights, dtype=getattr(torch, dtype), device=device)
     small = embedded.embedded_policy()
-    processing = OpenpiProcessing(config, embedded.builtin_stats(), normalisation="quantile", replan_steps=5)
+    processing = openpi_processing(config, embedded.builtin_stats(), replan_steps=5)
     tokenizer = FullSizeTokenizer(EMBEDDED_TOKENIZER) if name == "full" else small.tokenizer
     return PiPolicy(model, tokenizer, processing, small.source)
 

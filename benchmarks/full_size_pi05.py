@@ -127,8 +127,13 @@ def load_and_run(folder: Path, checkpoint_format: str, dtype: str) -> dict[str, 
 
     loading.PromptTokenizer = FullSizeTokenizer  # type: ignore[misc]
     begun = time.perf_counter()
-    settings = loading.PiSettings(checkpoint_format=checkpoint_format, dtype=dtype)  # type: ignore[arg-type]
-    policy = loading.load_pi_policy(folder, EMBEDDED_TOKENIZER, settings)
+    settings = loading.PiSettings(
+        str(folder),
+        tokenizer=str(EMBEDDED_TOKENIZER),
+        checkpoint_format=checkpoint_format,  # type: ignore[arg-type]
+        dtype=dtype,  # type: ignore[arg-type]
+    )
+    policy = loading.load_pi_policy(settings)
     loaded, peak_loading = time.perf_counter() - begun, peak_memory() / 1e9
     frame = np.random.default_rng(0).integers(0, 255, (256, 256, 3), dtype=np.uint8)
     observation = Observation(

@@ -7,8 +7,10 @@ of a `UserError` as one sentence and exit with code 2; anything else is a defect
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import TypeVar
 
+T = TypeVar("T")
 #: Characters of an error's sentence; what is longer repeats what was given.
 SENTENCE_CHARACTERS = 4000
 #: Characters of one given value or name in a sentence.
@@ -91,6 +93,13 @@ def unknown_name(kind: str, given: str, existing: Iterable[str]) -> UnknownName:
     """Build the error for a name that does not exist: what was given, the nearest name, and what exists."""
     names = list(existing)
     return UnknownName(f"Unknown {kind} '{shortened(given)}'.{did_you_mean(given, names)} Existing: {listing(names)}.")
+
+
+def look_up(kind: str, name: str, existing: Mapping[str, T]) -> T:
+    """Return what a name stands for; `UnknownName` with the names that exist."""
+    if name not in existing:
+        raise unknown_name(kind, name, existing)
+    return existing[name]
 
 
 def plural(count: int, noun: str) -> str:

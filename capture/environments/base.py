@@ -6,13 +6,14 @@ needs a picture about every fifth step, and drawing takes most of the time of a 
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 from vla_attention.capture.environments.episode_protocol import OPENPI, EvaluationProtocol
-from vla_attention.schemas.errors import BadArgument, unknown_name
+from vla_attention.schemas.errors import BadArgument, look_up
 
 # Command lines read suites and settings from here, and print their help without waiting for a library.
 if TYPE_CHECKING:
@@ -60,6 +61,10 @@ class Task:
     instruction: str
     num_initial_states: int
     task_family: str = ""
+
+
+#: Name, instruction and family of a task.
+TaskTexts = tuple[str, str, str]
 
 
 @dataclass(frozen=True)
@@ -189,6 +194,11 @@ class TellsMoments(Protocol):
         """Return what holds after the last step, or after the reset."""
 
 
+def initial_state_seed(scenes: str, index: int) -> int:
+    """Return the seed of one initial state, the same on every machine; scenes: a task, or what the scenes are for."""
+    return int.from_bytes(hashlib.sha256(f"{scenes}/{index}".encode()).digest()[:4], "little")
+
+
 def check_task_id(suite: Suite, task_id: int) -> None:
     """Raise `BadArgument` unless the suite has a task of that number."""
     if not 0 <= task_id < suite.num_tasks:
@@ -206,6 +216,4 @@ def check_initial_state_index(task: Task, index: int) -> None:
 
 def camera_frame(observation: Observation, camera: str) -> NDArray[np.uint8]:
     """Return a camera's picture (height, width, 3); `UnknownName` lists the environment's cameras."""
-    if camera not in observation.images:
-        raise unknown_name("environment camera", camera, observation.images)
-    return observation.images[camera]
+    return look_up("environment camera", camera, observation.images)

@@ -11,6 +11,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
 from vla_attention.capture.environments.base import Suite
@@ -62,10 +63,7 @@ def check_drawing(suite: Suite, libero_assets: Path | None) -> str:
         MissingDependency: something that robosuite or LIBERO imports is not there.
     """
 
-    def draw(environment: Mapping[str, str]) -> str:
-        return _draw_in_a_process(suite, libero_assets, environment)
-
-    return draw_or_say_what_mends(draw, os.environ)
+    return draw_or_say_what_mends(partial(_draw_in_a_process, suite, libero_assets), os.environ)
 
 
 def draw_or_say_what_mends(draw: Draw, environment: Mapping[str, str]) -> str:

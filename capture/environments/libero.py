@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.environments.base import ROBOT, EnvironmentSettings, Task
+from vla_attention.capture.environments.base import EnvironmentSettings, Task
 from vla_attention.capture.environments.libero_installation import find_assets, load_libero, package_folder
 from vla_attention.capture.environments.simulator import SimulatedEnvironment, goal_of
 from vla_attention.capture.foreign_files.checked_files import check_regular
 from vla_attention.schemas.episode_steps import TaskGoal
-from vla_attention.schemas.errors import BadArgument, UserError
+from vla_attention.schemas.errors import BadArgument, UserError, look_up
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 
 
@@ -110,8 +109,7 @@ class LiberoEnvironment(SimulatedEnvironment):
     def _build(self, options: dict[str, Any]) -> Any:
         classes = load_libero(self._assets)
         path = task_file(self.task)
-        with reading_task_file(path):
-            environment = classes[read_task_file(path)["problem_name"]]
+        environment = look_up("problem of LIBERO", str(read_task_file(path).get("problem_name")), classes)
         # The stored state sets the robot's joints, so they need no noise.
         try:
             return self._construct(environment, str(path), initialization_noise=None, **options)
@@ -196,7 +194,7 @@ class LiberoEnvironment(SimulatedEnvironment):
             properties["vis_site_names"].update(before)
         return [all(holds[one] for one in of_task) for of_task in self._conditions_of.values()]
 
-    def _describe_objects(self) -> tuple[tuple[SceneObject, ...], Mapping[str, Sequence[str]]]:
+    def _describe_objects(self) -> tuple[Iterable[SceneObject], Mapping[str, Sequence[str]]]:
         movable, fixed = self._simulator.objects_dict, self._simulator.fixtures_dict
         names = [*movable, *fixed]
         subjects = {parent_of_region(name, names) for name in self._simulator.obj_of_interest}
@@ -204,8 +202,7 @@ class LiberoEnvironment(SimulatedEnvironment):
             *(SceneObject(name, "object", name in subjects) for name in movable),
             *(SceneObject(name, "fixture", name in subjects) for name in fixed),
         ]
-        roots = {name: [thing.root_body] for name, thing in (movable | fixed).items()}
-        return self._with_robot_and_background(described), roots | {ROBOT: self._robot_bodies()}
+        return described, {name: [thing.root_body] for name, thing in (movable | fixed).items()}
 
 
 def task_file(task: Task) -> Path:
@@ -213,28 +210,19 @@ def task_file(task: Task) -> Path:
     return package_folder() / "bddl_files" / task.suite / f"{task.name}.bddl"
 
 
-@contextmanager
-def reading_task_file(path: Path) -> Iterator[None]:
-    """Turn an error of LIBERO's parser, which raises what its own code meets, into `UnusableTask`."""
+def read_task_file(path: Path) -> dict[str, Any]:
+    """Return what LIBERO's parser reads of a task file; `UnusableTask` for one that it must not or cannot read."""
+    from libero.libero.envs.bddl_utils import robosuite_parse_problem
+
+    check_task_file(path)
     try:
-        yield
-    except UserError:
-        raise
-    except Exception as error:
+        parsed: dict[str, Any] = robosuite_parse_problem(str(path))
+    except Exception as error:  # whatever the parser's own code meets
         raise UnusableTask(
             f"The task file '{path}' cannot be read ({type(error).__name__}: {error}); install LIBERO again with "
             "'make setup'."
         ) from error
-
-
-def read_task_file(path: Path) -> dict[str, Any]:
-    """Return what LIBERO's parser reads of a task file; `UnusableTask` for one that it must not read."""
-    from libero.libero.envs.bddl_utils import robosuite_parse_problem
-
-    with reading_task_file(path):
-        check_task_file(path)
-        parsed: dict[str, Any] = robosuite_parse_problem(str(path))
-        return parsed
+    return parsed
 
 
 #: What of a task's file is its scene. The sentence, the goal and the objects of interest are the task's own.

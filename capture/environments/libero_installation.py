@@ -21,8 +21,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from vla_attention.capture.environments.base import Suite, Task
-from vla_attention.capture.environments.robosuite_installation import import_robosuite, readable_device_choice
+from vla_attention.capture.environments.base import Suite, TaskTexts
+from vla_attention.capture.environments.robosuite_installation import (
+    import_robosuite,
+    load_source,
+    readable_device_choice,
+)
 from vla_attention.capture.environments.task_families import sentence_template
 from vla_attention.capture.foreign_files.checked_files import check_folder
 from vla_attention.schemas.errors import INSTALL_LIBERO, MissingDependency, UserError
@@ -61,12 +65,7 @@ def _task_names() -> dict[str, list[str]]:
     # The file holds one dictionary and imports nothing. An import by name would first import the packages above it,
     # which ask questions and load torch.
     path = package_folder() / "benchmark" / "libero_suite_task_map.py"
-    spec = importlib.util.spec_from_file_location("_libero_suite_task_map", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    names: dict[str, list[str]] = module.libero_task_map
+    names: dict[str, list[str]] = load_source("_libero_suite_task_map", path).libero_task_map
     return names
 
 
@@ -78,7 +77,7 @@ def instruction_of(task_name: str) -> str:
     return re.sub(r"^[A-Z_]+SCENE\d+_", "", task_name).replace("_", " ")
 
 
-def list_libero_tasks(suite: Suite) -> tuple[Task, ...]:
+def list_libero_tasks(suite: Suite) -> list[TaskTexts]:
     """Return a suite's tasks in the benchmark's default order."""
     names = _task_names()[suite.name]
     if len(names) != suite.num_tasks:
@@ -86,11 +85,7 @@ def list_libero_tasks(suite: Suite) -> tuple[Task, ...]:
             f"The installed LIBERO has {len(names)} tasks in {suite.name} instead of {suite.num_tasks}; "
             "run 'make setup'."
         )
-    given = [(name, instruction_of(name)) for name in names]
-    return tuple(
-        Task(suite.name, task_id, name, words, suite.initial_states_per_task, sentence_template(words))
-        for task_id, (name, words) in enumerate(given)
-    )
+    return [(name, instruction_of(name), sentence_template(instruction_of(name))) for name in names]
 
 
 def find_assets(configured: Path | None) -> Path:

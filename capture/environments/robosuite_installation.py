@@ -53,6 +53,16 @@ def first_reason(error: BaseException) -> str:
     return f"{' '.join(str(first).split()).rstrip('.')} ({type(first).__name__})"
 
 
+def load_source(name: str, path: str | os.PathLike[str]) -> Any:
+    """Run a file of a package as a module without importing the package around it."""
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 def import_robosuite() -> None:
     """Import robosuite without its log file and advice.
 
@@ -74,12 +84,7 @@ def import_robosuite() -> None:
     # robosuite reads its settings during its import. By default it opens a log file with a fixed name in the common
     # temporary folder. On a shared node that file belongs to its first user, and the import fails for everyone else.
     # The settings module imports nothing, so it can be loaded before the package and changed.
-    location = os.path.join(folder, "macros.py")
-    macros_spec = importlib.util.spec_from_file_location("robosuite.macros", location)
-    assert macros_spec is not None
-    assert macros_spec.loader is not None
-    macros: Any = importlib.util.module_from_spec(macros_spec)
-    macros_spec.loader.exec_module(macros)
+    macros = load_source("robosuite.macros", os.path.join(folder, "macros.py"))
     macros.FILE_LOGGING_LEVEL = None
     macros.CONSOLE_LOGGING_LEVEL = "ERROR"
     sys.modules["robosuite.macros"] = macros

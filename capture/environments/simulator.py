@@ -120,7 +120,11 @@ class SimulatedEnvironment:
         # Freeing an EGL context after EGL's own end prints errors at interpreter exit. atexit calls the functions in
         # reverse order, and `_build` made robosuite register EGL's end, so `close` runs before it.
         atexit.register(self.close)
-        self.objects, self._roots = self._describe_objects()
+        named, roots = self._describe_objects()
+        self.objects = (*named, SceneObject(ROBOT, "robot", False), SceneObject(BACKGROUND, "background", False))
+        robot = self._simulator.robots[0]
+        of_robot = (robot.robot_model.root_body, robot.robot_model.mount.root_body, robot.gripper.root_body)
+        self._roots = {**roots, ROBOT: of_robot}
         self.bodies = (
             HAND,
             *(thing.name for thing in self.objects if thing.name in self._roots and thing.name != ROBOT),
@@ -146,8 +150,6 @@ class SimulatedEnvironment:
 
     def _construct(self, environment_class: Any, *arguments: Any, **options: Any) -> Any:
         """Create an instance of a robosuite environment class whose cameras obey the gate."""
-        from vla_attention.capture.environments.simulator import KeptContext
-
         simulator = environment_class.__new__(environment_class)
         self._gate.attach(simulator)
         self._kept_context = KeptContext(simulator)
@@ -167,11 +169,13 @@ class SimulatedEnvironment:
         self._reset_once()
 
     def _set_initial_state(self, initial_state_index: int) -> None:
-        """Set the state with which the episode begins; called after the simulator's own reset."""
-        raise NotImplementedError
+        """Set the state with which the episode begins, where the simulator's own reset has not done so."""
 
-    def _describe_objects(self) -> tuple[tuple[SceneObject, ...], Mapping[str, Sequence[str]]]:
-        """Return the scene objects, and the root bodies of each by its name: it owns them and all bodies below them."""
+    def _describe_objects(self) -> tuple[Iterable[SceneObject], Mapping[str, Sequence[str]]]:
+        """Return the scene objects but robot and background, and the root bodies of each by its name.
+
+        It owns them and all bodies below them.
+        """
         raise NotImplementedError
 
     def _scene_goals(self) -> Sequence[TaskGoal]:
@@ -344,14 +348,6 @@ class SimulatedEnvironment:
         self._simulator.close()
         self._kept_context.free()
         self._moment = None
-
-    def _robot_bodies(self) -> list[str]:
-        robot = self._simulator.robots[0]
-        return [robot.robot_model.root_body, robot.robot_model.mount.root_body, robot.gripper.root_body]
-
-    def _with_robot_and_background(self, named: Sequence[SceneObject]) -> tuple[SceneObject, ...]:
-        robot, background = SceneObject(ROBOT, "robot", False), SceneObject(BACKGROUND, "background", False)
-        return (*named, robot, background)
 
 
 #: What may differ between resets: places of bodies in their parents, and colours of helper sites, which robosuite hides

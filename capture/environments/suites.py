@@ -11,7 +11,7 @@ from pathlib import Path
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Suite, Task, check_task_id
 from vla_attention.capture.environments.cubes.tasks import list_cube_tasks
 from vla_attention.capture.environments.robosuite_installation import find_robosuite
-from vla_attention.schemas.errors import BadArgument, unknown_name
+from vla_attention.schemas.errors import look_up
 
 #: Every suite. The numbers of steps are openpi's (see `episode_protocol.py`).
 SUITES: tuple[Suite, ...] = (
@@ -35,10 +35,7 @@ STANDARD_SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10"
 
 def find_suite(name: str) -> Suite:
     """Return the suite of that name, or raise `UnknownName` with the names that exist."""
-    for suite in SUITES:
-        if suite.name == name:
-            return suite
-    raise unknown_name("task suite", name, [suite.name for suite in SUITES])
+    return look_up("task suite", name, {suite.name: suite for suite in SUITES})
 
 
 def list_tasks(suite: Suite) -> tuple[Task, ...]:
@@ -46,12 +43,17 @@ def list_tasks(suite: Suite) -> tuple[Task, ...]:
     if suite.kind == "libero":
         from vla_attention.capture.environments.libero_installation import list_libero_tasks
 
-        return list_libero_tasks(suite)
-    if suite.kind == "cubes":
-        return list_cube_tasks(suite)
-    from vla_attention.capture.environments.robosuite_tasks import list_robosuite_tasks
+        texts = list_libero_tasks(suite)
+    elif suite.kind == "cubes":
+        texts = list_cube_tasks(suite)
+    else:
+        from vla_attention.capture.environments.robosuite_tasks import list_robosuite_tasks
 
-    return list_robosuite_tasks(suite)
+        texts = list_robosuite_tasks()
+    return tuple(
+        Task(suite.name, number, name, instruction, suite.initial_states_per_task, family)
+        for number, (name, instruction, family) in enumerate(texts)
+    )
 
 
 def check_installed(suite: Suite, libero_assets: Path | None) -> None:
@@ -73,12 +75,10 @@ def make_environment(suite: Suite, task_id: int, settings: EnvironmentSettings) 
     """Build the simulator of one task, which takes seconds. Close it after use.
 
     Raises:
-        BadArgument: the task does not exist, or the image size is below 1.
+        BadArgument: the task does not exist.
         MissingDependency: the simulator is not installed.
     """
     check_task_id(suite, task_id)
-    if settings.protocol.image_size < 1:
-        raise BadArgument(f"The image size is {settings.protocol.image_size}; it must be at least 1 pixel.")
     tasks = list_tasks(suite)
     task = tasks[task_id]
     if suite.kind == "libero":

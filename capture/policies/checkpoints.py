@@ -44,10 +44,8 @@ class CheckpointMismatch(UserError, ValueError):
 
 def read_json_object(path: Path) -> dict[str, Any]:
     """Read a JSON file that holds an object; anything else is an `UnreadableCheckpoint`."""
-    try:
-        return read_object(path, UnreadableCheckpoint, inside=path.parent)
-    except FileNotFoundError:
-        raise UnreadableCheckpoint(f"There is no '{path}', which the checkpoint needs.") from None
+    check_checkpoint_file(path)
+    return read_object(path, UnreadableCheckpoint, inside=path.parent)
 
 
 def check_checkpoint_file(path: Path) -> int:

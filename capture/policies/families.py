@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 
 from vla_attention.capture.policies.family import PolicyFamily
-from vla_attention.schemas.errors import unknown_name
+from vla_attention.schemas.errors import look_up
 
 #: Modules with a `FAMILY`. `--help` imports them, so they import neither torch nor numpy at the top.
 FAMILY_MODULES = (
@@ -16,7 +16,7 @@ FAMILY_MODULES = (
 
 def policy_families() -> tuple[PolicyFamily, ...]:
     """Return every registered family, in the order of the help text."""
-    return tuple(_load(module) for module in FAMILY_MODULES)
+    return tuple(import_module(module).FAMILY for module in FAMILY_MODULES)
 
 
 def default_family() -> PolicyFamily:
@@ -27,13 +27,4 @@ def default_family() -> PolicyFamily:
 def family_of_kind(kind: str) -> PolicyFamily:
     """Return the family whose policies stores name `kind`; `UnknownName` lists the kinds of all families."""
     kinds = {known: family for family in policy_families() for known in family.kinds or (family.name,)}
-    if kind not in kinds:
-        raise unknown_name("kind of policy", kind, kinds)
-    return kinds[kind]
-
-
-def _load(module: str) -> PolicyFamily:
-    family = import_module(module).FAMILY
-    if not isinstance(family, PolicyFamily):
-        raise TypeError(f"FAMILY of {module} is a {type(family).__name__}, not a PolicyFamily")
-    return family
+    return look_up("kind of policy", kind, kinds)

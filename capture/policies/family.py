@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any, Literal
 
 from vla_attention.capture.environments.episode_protocol import OPENPI, EvaluationProtocol
+from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.options import option, read_options
 
 if TYPE_CHECKING:
@@ -55,6 +56,18 @@ class ModelSettings:
 
     def check_files(self) -> None:
         """Raise what `build` would where a local checkpoint lacks files; loads nothing. Here nothing is known."""
+
+    def refuse_for_untrained(self, *names: str) -> None:
+        """Raise `BadArgument` if options that are for checkpoints were given for a policy that comes along."""
+        defaults = {one.name: one.default for one in fields(self)}
+        given = [f"--{name.replace('_', '-')}" for name in names if getattr(self, name) != defaults[name]]
+        if self.dtype == "bfloat16":
+            given.append("--dtype bfloat16")
+        if given:
+            raise BadArgument(
+                f"Cannot use {listing(given)} with the policy '{self.checkpoint}', which comes with the program, in "
+                "float32; leave out what is for checkpoints only."
+            )
 
     def analysis_arguments(self) -> list[str]:
         """Return further arguments of an analysis that follows the capture."""

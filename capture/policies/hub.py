@@ -84,6 +84,11 @@ def split_hub_name(name: str) -> tuple[str, str | None] | None:
     return None if match is None else (match[1], match[2])
 
 
+def would_be_fetched(name: str) -> bool:
+    """Whether a name is one on the hub rather than a path that exists."""
+    return split_hub_name(name) is not None and not Path(name).expanduser().exists()
+
+
 def local_or_fetched(name: str, patterns: Sequence[str]) -> Path | None:
     """Return a checkpoint: an existing path, or the files of `ORG/NAME` or `ORG/NAME@REVISION`; None for other names.
 

@@ -85,45 +85,30 @@ class ModelSizes(Protocol):
 class Policy(ModelSizes, Protocol):
     """A policy whose attention can be recorded."""
 
-    @property
-    def name(self) -> str:
-        """Short name, for the store and the first lines of a run."""
-
-    @property
-    def model(self) -> nn.Module:
-        """The network. Its modules are looked at when a policy call gives numbers that are not finite."""
+    #: short name, for the store and the first lines of a run
+    name: str
+    #: actions of one chunk
+    action_horizon: int
+    #: the published evaluation of policies of this kind
+    default_protocol: EvaluationProtocol
+    #: actions of a chunk that the published evaluation executes before the next policy call
+    default_replan_steps: int
+    #: whether some keys are made in a pass before the denoise steps, in which their tokens read each other
+    has_prefix: bool
+    #: action queries of every recorded call
+    num_action_queries: int
+    #: the cameras whose pictures reach the model, in key order
+    cameras: tuple[PolicyCameraView, ...]
+    #: whether the model's images have more than whole grey levels, so that stored ones are not exact
+    needs_camera_frames: bool
 
     @property
     def sites(self) -> tuple[SiteLayout, ...]:
         """The sites whose rows can be recorded, with the layout of their keys."""
 
     @property
-    def action_horizon(self) -> int:
-        """Actions of one chunk."""
-
-    @property
-    def default_protocol(self) -> EvaluationProtocol:
-        """The published evaluation of policies of this kind."""
-
-    @property
-    def default_replan_steps(self) -> int:
-        """Actions of a chunk that the published evaluation executes before the next policy call."""
-
-    @property
-    def has_prefix(self) -> bool:
-        """Whether some keys are made in a pass before the denoise steps, in which their tokens read each other."""
-
-    @property
-    def num_action_queries(self) -> int:
-        """Action queries of every recorded call."""
-
-    @property
-    def cameras(self) -> tuple[PolicyCameraView, ...]:
-        """The cameras whose pictures reach the model, in key order."""
-
-    @property
-    def needs_camera_frames(self) -> bool:
-        """Whether the model's images have more than whole grey levels, so that stored ones are not exact."""
+    def model(self) -> nn.Module:
+        """The network. Its modules are looked at when a policy call gives numbers that are not finite."""
 
     def query_pools(self) -> NDArray[np.float64]:
         """Return the weights (pool, action query) of the means that stand for single action steps."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,36 +12,36 @@ from safetensors import safe_open
 from torch import Tensor
 
 from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint, check_checkpoint_file, read_json_object
-from vla_attention.capture.policies.weights import check_floats
+from vla_attention.capture.policies.weights import Shapes, check_floats
 from vla_attention.schemas.errors import listing
 
 
 @dataclass(frozen=True)
 class SafetensorsFile:
-    """An open file: names and shapes are known, numbers are read when they are asked for."""
+    """Open tensors: names and shapes are known, numbers are read when they are asked for.
+
+    held: name -> the library's open file that holds the tensor, and its name there.
+    """
 
     path: Path
-    stored: Any
+    held: Mapping[str, tuple[Any, str]]
 
-    def names(self) -> list[str]:
-        """Return the names of the tensors."""
-        return list(self.stored.keys())
-
-    def shape(self, name: str) -> tuple[int, ...]:
-        """Return the shape of a tensor."""
-        return tuple(self.stored.get_slice(name).get_shape())
+    def shapes(self) -> Shapes:
+        """Return name -> shape."""
+        return {name: tuple(file.get_slice(raw).get_shape()) for name, (file, raw) in self.held.items()}
 
     def read(self, name: str) -> Tensor:
         """Read one tensor."""
+        file, raw = self.held[name]
         try:
-            tensor: Tensor = self.stored.get_tensor(name)
+            tensor: Tensor = file.get_tensor(raw)
         except Exception as error:  # the library's own, and PyTorch's for types and sizes that it does not know
             raise _unreadable(self.path, error) from error
         return tensor
 
-    def check_floats(self, names: Iterable[str]) -> None:
+    def check_floats(self) -> None:
         """Raise `CheckpointMismatch` for tensors that are no weights; see `weights.check_floats`."""
-        check_floats({name: str(self.stored.get_slice(name).get_dtype()) for name in names}, self.path)
+        check_floats({raw: str(file.get_slice(raw).get_dtype()) for file, raw in self.held.values()}, self.path)
 
 
 @contextmanager
@@ -52,24 +52,9 @@ def open_safetensors(path: Path) -> Iterator[SafetensorsFile]:
         opened = safe_open(path, framework="pt")
     except Exception as error:  # the library's own, and PyTorch's for a file that does not fit into memory
         raise _unreadable(path, error) from error
-    with opened as stored:
-        yield SafetensorsFile(path, stored)
-
-
-class _Files:
-    """The tensors of several open files, as `safe_open` gives those of one."""
-
-    def __init__(self, file_of: dict[str, Any]) -> None:
-        self._file_of = file_of
-
-    def keys(self) -> list[str]:
-        return list(self._file_of)
-
-    def get_slice(self, name: str) -> Any:
-        return self._file_of[name].get_slice(name)
-
-    def get_tensor(self, name: str) -> Any:
-        return self._file_of[name].get_tensor(name)
+    with opened as file:
+        names: list[str] = file.keys()
+        yield SafetensorsFile(path, {name: (file, name) for name in names})
 
 
 @contextmanager
@@ -86,15 +71,15 @@ def open_indexed_safetensors(index: Path) -> Iterator[SafetensorsFile]:
         raise UnreadableCheckpoint(f"'{index}' has no weight_map from tensors to files beside it.")
     files = sorted(set(stated.values()))
     with ExitStack() as stack:
-        opened = {file: stack.enter_context(open_safetensors(index.parent / file)) for file in files}
-        held = {name: file for file in files for name in opened[file].names()}
-        wrong = sorted(name for name in {*held, *stated} if held.get(name) != stated.get(name))
+        opened = {file: stack.enter_context(open_safetensors(index.parent / file)).held for file in files}
+        file_of = {name: file for file, held in opened.items() for name in held}
+        wrong = sorted(name for name in {*file_of, *stated} if file_of.get(name) != stated.get(name))
         if wrong:
             raise UnreadableCheckpoint(
                 f"'{index}' and its files disagree on where {listing(wrong)} is: files of two checkpoints, or one is "
                 "missing from the copy."
             )
-        yield SafetensorsFile(index, _Files({name: opened[file].stored for name, file in held.items()}))
+        yield SafetensorsFile(index, {name: place for held in opened.values() for name, place in held.items()})
 
 
 def _unreadable(path: Path, error: Exception) -> UnreadableCheckpoint:

@@ -49,21 +49,9 @@ class SentencepieceModel:
             self._processor.LoadFromSerializedProto(content)
         except (RuntimeError, OSError) as error:
             raise UnreadableCheckpoint(f"'{path}' is not a sentencepiece model, or it is damaged.") from error
-
-    @property
-    def vocab_size(self) -> int:
-        """Number of ids."""
-        return int(self._processor.get_piece_size())
-
-    @property
-    def bos_id(self) -> int:
-        """Id of the token that begins a text; negative if there is none."""
-        return int(self._processor.bos_id())
-
-    @property
-    def eos_id(self) -> int:
-        """Id of the token that ends a text; negative if there is none."""
-        return int(self._processor.eos_id())
+        #: Number of ids, and those of the tokens that begin and end a text; negative if there is none.
+        self.vocab_size = int(self._processor.get_piece_size())
+        self.bos_id, self.eos_id = int(self._processor.bos_id()), int(self._processor.eos_id())
 
     def encode(self, text: str) -> list[Token]:
         """Encode a text, without tokens for its begin and end; offsets count characters."""

@@ -16,7 +16,7 @@ from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.identity import downloads_of
 from vla_attention.capture.rerun.arguments import RerunOutput, RerunSettings
 from vla_attention.capture.rerun.base_store import check_may_change, check_same_policy, open_base
-from vla_attention.capture.rerun.interventions_of_rerun import check_on_store, rerun_interventions
+from vla_attention.capture.rerun.interventions_of_rerun import check_on_store, rerun_interventions, told
 from vla_attention.capture.rerun.rerun_store import Rerun
 from vla_attention.capture.rerun.stored_calls import check_has_inputs
 from vla_attention.capture.store.store_writer import check_target
@@ -50,6 +50,7 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
     if recording.effects is not None:
         refuse_both(interventions)
         refuse_both(base.attributes.interventions)
+    arguments.instructions = told(base, interventions.prompt)
     rerun = _prepare(arguments, recording, base, threads, termination)
     interventions = interventions_for(interventions, rerun.policy)
     rerun.check(settings.check)
@@ -100,7 +101,6 @@ def _prepare(
     say(threads.describe())
     device = load_torch(arguments.device, threads.number)
     family: PolicyFamily = arguments.family
-    arguments.instructions = [episode.attributes.instruction for episode in base.episodes]
     policy = family.read(arguments).build(device)
     identity = policy.identity()
     check_same_policy(base, identity, policy.sites)

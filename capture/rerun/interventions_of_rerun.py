@@ -11,12 +11,12 @@ from msgspec.structs import replace
 from vla_attention.capture.interventions.arguments import read_interventions
 from vla_attention.capture.interventions.changed_inputs import CallContext, object_patches
 from vla_attention.capture.interventions.condition_name import condition_name
-from vla_attention.capture.interventions.prompts import check_synonyms
+from vla_attention.capture.interventions.prompts import changed_instruction, check_synonyms
 from vla_attention.capture.interventions.run_changes import check_stored_replans
 from vla_attention.capture.rerun.base_store import instructions_of
 from vla_attention.schemas.errors import BadArgument, listing, unknown_name
 from vla_attention.schemas.groupings.resolve import EmptyGroup
-from vla_attention.schemas.interventions import ImageChange, Interventions
+from vla_attention.schemas.interventions import ImageChange, Interventions, PromptChange
 from vla_attention.schemas.stores.reader import Store
 
 
@@ -24,6 +24,19 @@ def rerun_interventions(arguments: argparse.Namespace) -> Interventions:
     """Return the interventions of the options, named by `--name` or by what they are."""
     interventions = read_interventions(arguments)
     return replace(interventions, name=arguments.name or condition_name(interventions))
+
+
+def told(base: Store, change: PromptChange | None) -> list[str]:
+    """Return what the policy is told in the stored calls, and in those with another prompt."""
+    known = instructions_of(base)
+    texts = []
+    for attributes in (episode.attributes for episode in base.episodes):
+        place = {"task_id": attributes.task_id, "episode_index": attributes.episode_index}
+        for text in (prompt.instruction_text for prompt in attributes.prompts):
+            texts.append(text)
+            if change is not None:
+                texts.append(changed_instruction(text, change, **place, instructions=known))
+    return list(dict.fromkeys(texts))
 
 
 def check_on_store(interventions: Interventions, base: Store, *, allow_empty: bool) -> list[str]:

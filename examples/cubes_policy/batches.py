@@ -107,7 +107,7 @@ class Batches:
         self._control, self._batch_size, self._seed, self._jitter = control, batch_size, seed, jitter
         self._weights = task_weights(samples.task[chosen])
         self._prompts = Prompts(tokenizer, seen_instructions(instructions, control), config)
-        self._bins = digitise_state(state_statistics.normalise(samples.state, "quantile"))
+        self._bins = digitise_state(state_statistics.normaliser("quantile").normalise(samples.state))
 
     def draw(self, step: int) -> Batch:
         """Return the batch of a step."""

@@ -14,9 +14,9 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.environments.cubes.scene import paste_mark, verb_index
+from vla_attention.capture.environments.cubes.scene import MARK_VERBS, paste_mark
 from vla_attention.capture.environments.cubes.tasks import MARK_INSTRUCTION
-from vla_attention.schemas.errors import BadArgument, UserError, listing
+from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 from vla_attention.schemas.stores.store_place import refuse_in_store
 
 #: What a policy can learn from. `words`: the instruction alone decides. `redundant`: a mark in the picture says the
@@ -163,6 +163,15 @@ def task_weights(task: NDArray[np.integer]) -> NDArray[np.float64]:
 def seen_instructions(instructions: tuple[str, ...], control: Control) -> tuple[str, ...]:
     """Return what the policy reads for each task under a control."""
     return (MARK_INSTRUCTION,) * len(instructions) if control == "mark" else instructions
+
+
+def verb_index(instruction: str) -> int:
+    """Return the index in `MARK_VERBS` of what an instruction of the suite asks for."""
+    words = instruction.split()
+    verb = {"put": "put_on", "push": f"push_{words[-1]}"}.get(words[0], words[0]) if words else ""
+    if verb not in MARK_VERBS:
+        raise unknown_name("verb of the instruction", instruction, MARK_VERBS)
+    return MARK_VERBS.index(verb)
 
 
 def pictures_of(

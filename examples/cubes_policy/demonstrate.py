@@ -32,7 +32,7 @@ from vla_attention.capture.environments.cubes.tasks import COLOURS, CUBE_TASKS, 
 from vla_attention.capture.environments.episode_protocol import CAMERAS, OPENPI, WAIT_STEPS
 from vla_attention.capture.environments.suites import find_suite, list_tasks
 from vla_attention.capture.foreign_files.checked_files import read_object
-from vla_attention.capture.policies.pi.preprocess import libero_state, model_image
+from vla_attention.capture.policies.pi.preprocess import libero_state, resize_with_pad, turn
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stores.store_format import Protocol
@@ -230,7 +230,7 @@ def _describe(environment: CubesEnvironment, observation: Observation, task: int
     cubes[: len(positions)] = positions
     destination = -1 if simulator.destination is None else simulator.destination
     return {
-        "pictures": np.stack([model_image(observation.images[camera], PICTURE_SIZE) for camera in CAMERAS]),
+        "pictures": np.stack([resize_with_pad(turn(observation.images[camera]), PICTURE_SIZE) for camera in CAMERAS]),
         "state": libero_state(observation.eef_pos, observation.eef_quat, observation.gripper_qpos).astype(np.float32),
         "task": np.array(task, dtype=np.int16),
         "episode": np.array(episode, dtype=np.int32),

@@ -89,7 +89,8 @@ def state_statistics(state: np.ndarray) -> Statistics:
     """Return the statistics of the states (sample, 8) by which they are normalised."""
     state = state.astype(np.float64)
     low, high = np.quantile(state, (0.01, 0.99), axis=0)
-    return Statistics(mean=state.mean(axis=0), std=state.std(axis=0), q01=low, q99=high)
+    mean, std = state.mean(axis=0), state.std(axis=0)
+    return Statistics(mean.tolist(), std.tolist(), low.tolist(), high.tolist())
 
 
 class Training:
@@ -197,7 +198,7 @@ def train(
         "instructions": list(instructions),
         "demonstrations": demonstrations.digest,
         "samples": {"training": len(training_part), "held_out": len(held_out)},
-        "state": {name: getattr(statistics, name).tolist() for name in ("mean", "std", "q01", "q99")},
+        "state": {name: getattr(statistics, name) for name in ("mean", "std", "q01", "q99")},
     }
     training = Training(settings, config, number_ids(tokenizer).tolist())
     _begin(training, output, facts, resume=resume)

@@ -93,10 +93,11 @@ def test_a_checkpoint_drives_the_simulator_and_its_store_is_analysed(name, small
 
 
 def test_the_three_formats_of_one_model_have_one_digest(small_tokenizer):
+    from vla_attention.capture.policies.pi.family import PiSettings
     from vla_attention.capture.policies.pi.loading import load_pi_policy
 
     digests = {
-        load_pi_policy(GOLDEN / name, small_tokenizer).identity().digest
+        load_pi_policy(PiSettings(str(GOLDEN / name), tokenizer=str(small_tokenizer))).identity().digest
         for name in CHECKPOINTS
         if name.startswith("pi0_")
     }

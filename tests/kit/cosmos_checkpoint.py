@@ -19,6 +19,7 @@ from vla_attention.capture.policies.cosmos.embedded import BUILTIN_RANGES, rando
 from vla_attention.capture.policies.cosmos.locate import EMBEDDINGS_NAME, STATISTICS_NAME, VAE_NAME
 from vla_attention.capture.policies.cosmos.text import PieceTokenizer, SeededText
 from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
+from vla_attention.schemas.jsonable import to_json
 
 WEIGHTS_NAME = "Cosmos-Policy-Dummy.pt"
 
@@ -42,7 +43,7 @@ def write_dummy_folder(
     folder.mkdir(parents=True, exist_ok=True)
     torch.save(published_state(config, seed, dtype), folder / WEIGHTS_NAME)
     statistics = {
-        **BUILTIN_RANGES,
+        **to_json(BUILTIN_RANGES),
         **{
             f"{kind}_{name}": [0.0] * dim
             for kind, dim in (("actions", 7), ("proprio", 9))

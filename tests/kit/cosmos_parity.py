@@ -22,9 +22,9 @@ from vla_attention.capture.policies.cosmos.config import (
 )
 from vla_attention.capture.policies.cosmos.dit import Attention, Dit
 from vla_attention.capture.policies.cosmos.dit_weights import build_dit, dit_tensors, infer_dit_config
-from vla_attention.capture.policies.cosmos.latents import actions_of_frame, condition_mask, read_value
-from vla_attention.capture.policies.cosmos.model import CallTrace, CosmosModel
-from vla_attention.capture.policies.cosmos.preprocess import compressed_picture, make_ranges
+from vla_attention.capture.policies.cosmos.latents import actions_of_frame, condition_mask
+from vla_attention.capture.policies.cosmos.model import CosmosModel
+from vla_attention.capture.policies.cosmos.preprocess import Ranges, compressed_picture
 from vla_attention.capture.policies.cosmos.sampler import sample, seeded_noise
 from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
 from vla_attention.capture.policies.cosmos.vae import build_encoder
@@ -186,6 +186,23 @@ class ParityReport:
 
 
 @dataclass
+class CallTrace:
+    """Inputs and outputs of each network evaluation."""
+
+    noisy: list[Tensor] = field(default_factory=list)
+    net_input: list[Tensor] = field(default_factory=list)
+    times: list[Tensor] = field(default_factory=list)
+    net_output: list[Tensor] = field(default_factory=list)
+    clean: list[Tensor] = field(default_factory=list)
+
+    def network(self, dit: Dit, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        """Keep what the network gets and gives; a forward hook."""
+        self.net_input.append(inputs[0])
+        self.times.append(inputs[1].to(dit.dtype).float())
+        self.net_output.append(output.float())
+
+
+@dataclass
 class EverythingObserver:
     """Keeps the rows of all queries, and the norms of updates and of each frame's contribution, for all blocks.
 
@@ -214,10 +231,6 @@ class EverythingObserver:
                 self._contributions.setdefault(layer, []).append(parts)
 
         return take
-
-    def takes_updates(self, layer: int) -> bool:
-        """Return True: updates of every block."""
-        return True
 
     def updates(self, layer: int, updates: dict[str, Tensor], gates: dict[str, Tensor], block_input: Tensor) -> None:
         """Keep the norms (batch, token, 4) of updates and input, and (batch, token, frame + 1) of contributions."""
@@ -288,7 +301,7 @@ def _run_policy(case: CosmosCase, device: str) -> ParityReport:
     compare("preprocessed_images", np.stack(pictures), PICTURES)
     if case.facts.get("pillow") != PIL.__version__ and "preprocessed_images" in expected:
         pictures = list(expected["preprocessed_images"])  # so that later stages do not depend on the JPEG decoder
-    statistics = make_ranges(inputs, f"of the case '{case.name}'", config.action_dim, config.proprio_dim)
+    statistics = Ranges(**{name: inputs[name].tolist() for name in Ranges.__struct_fields__})
     proprio = statistics.normalise_proprio(inputs["proprio"])
     compare("proprio_normalized", proprio, OUTPUTS)
     given, count = model.given_latents(pictures, proprio), config.frames.num_conditioned
@@ -308,7 +321,8 @@ def _run_policy(case: CosmosCase, device: str) -> ParityReport:
     actions = actions_of_frame(action_frame, config.chunk_size, config.action_dim).cpu().numpy()
     compare("actions_normalized", actions, ACTIONS)
     compare("actions", statistics.environment_actions(actions), ACTIONS)
-    compare("value", np.asarray(read_value(latents[0, :, config.frames.index("value")])), ACTIONS)
+    value = (latents[0, :, config.frames.index("value")].mean() + 1) / 2
+    compare("value", np.asarray(float(value.clamp(0, 1))), ACTIONS)
     return report
 
 
@@ -323,9 +337,15 @@ def _sample(
 
     def denoise(noisy: Tensor, sigma: float, step: int) -> Tensor:
         observer = observers[step] if has_rows else None
-        return model.denoise(noisy, sigma, given, mask, text, observer, trace)
+        trace.noisy.append(noisy)
+        trace.clean.append(model.denoise(noisy, sigma, given, mask, text, observer))
+        return trace.clean[-1]
 
-    return sample(denoise, noise, model.levels)
+    hook = model.dit.register_forward_hook(trace.network)
+    try:
+        return sample(denoise, noise, model.levels)
+    finally:
+        hook.remove()
 
 
 def _compare_call(

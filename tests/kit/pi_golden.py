@@ -64,7 +64,7 @@ class GoldenCase:
 def load_case(folder: Path) -> GoldenCase:
     case = read_case(folder)
     checkpoint = next(folder / name for name in WEIGHTS if (folder / name).is_dir())
-    model, _ = load_pi_model(checkpoint, config=case.config)
+    model = load_pi_model(checkpoint, case.config)
     return GoldenCase(case, dict(model.state_dict()))
 
 

@@ -148,8 +148,8 @@ def measure(case: Case, case_format: CaseFormat, *, device: str = "cpu") -> Pari
     Cases are made by openpi's JAX model, so its time convention is used for every format.
     """
     folder, checkpoint_format = CHECKPOINT_FOLDERS[case_format]
-    model, _ = load_pi_model(
-        case.folder / folder, checkpoint_format=checkpoint_format, config=case.config, dtype=case.dtype, device=device
+    model = load_pi_model(
+        case.folder / folder, case.config, checkpoint_format=checkpoint_format, dtype=case.dtype, device=device
     )
     collector = AllRows(case.expected["attn"])
     actions = run_case(case, model, collector)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_attention.capture.environments.base import ROBOT, EnvironmentSettings, StepResult, Task
-from vla_attention.capture.environments.cubes.scene import EVALUATION, MARK_VERBS, draw_scene, paste_mark, scene_seed
+from vla_attention.capture.environments.base import EnvironmentSettings, StepResult, Task, initial_state_seed
+from vla_attention.capture.environments.cubes.scene import EVALUATION, MARK_VERBS, draw_scene, paste_mark
 from vla_attention.capture.environments.cubes.tasks import COLOURS, CUBE_TASKS, MARK_ONLY, MARKED, CubeTask
 from vla_attention.capture.environments.episode_protocol import CAMERAS
 from vla_attention.capture.environments.simulator import SimulatedEnvironment, goal_of
@@ -52,24 +52,22 @@ class CubesEnvironment(SimulatedEnvironment):
         return self._construct(CubeTable, self._cube_task, **options)
 
     def _reset_seed(self, initial_state_index: int, seed: int) -> int:
-        return scene_seed(self._purpose, initial_state_index)
+        return initial_state_seed(self._purpose, initial_state_index)
 
     def _reset_simulator(self, initial_state_index: int, seed: int) -> None:
-        self._simulator.scene = draw_scene(scene_seed(self._purpose, initial_state_index), self._cube_task.num_cubes)
+        self._simulator.scene = draw_scene(
+            initial_state_seed(self._purpose, initial_state_index), self._cube_task.num_cubes
+        )
         self._reset_once()
 
-    def _set_initial_state(self, initial_state_index: int) -> None:
-        """Do nothing: the reset has set the state."""
-
-    def _describe_objects(self) -> tuple[tuple[SceneObject, ...], Mapping[str, Sequence[str]]]:
+    def _describe_objects(self) -> tuple[Iterable[SceneObject], Mapping[str, Sequence[str]]]:
         task = self._cube_task
         names = [f"{colour}_cube" for colour in COLOURS[: task.num_cubes]]
         named = {f"{colour}_cube" for colour in (task.target, task.destination) if colour in COLOURS}
         cubes = [SceneObject(name, "object", of_interest=name in named or not named) for name in names]
-        roots: dict[str, Sequence[str]] = {name: (f"{name}_main",) for name in names}
         if self._has_mark:
             cubes.append(SceneObject(MARK, "object", of_interest=True))  # no body: it exists in pictures only
-        return self._with_robot_and_background(cubes), roots | {ROBOT: self._robot_bodies()}
+        return cubes, {name: (f"{name}_main",) for name in names}
 
     def _scene_goals(self) -> Sequence[TaskGoal]:
         sharing = [
@@ -120,14 +118,3 @@ class CubesEnvironment(SimulatedEnvironment):
             )
         self._cube_task = task
         self._simulator.task = task
-
-    @property
-    def named_cube(self) -> str:
-        """Name of the cube that the task asks for in this episode."""
-        return f"{COLOURS[self._simulator.target]}_cube"
-
-    @property
-    def first_touched(self) -> str | None:
-        """Name of the cube that the gripper touched first in this episode; None before."""
-        touched = self._simulator.first_touched
-        return None if touched is None else f"{COLOURS[touched]}_cube"

@@ -6,14 +6,13 @@ control: they need not read.
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.environments.cubes.tasks import COLOURS, Target
-from vla_attention.schemas.errors import BadArgument, unknown_name
+from vla_attention.schemas.errors import BadArgument
 
 #: Half of a cube's edge, in metres.
 HALF_SIZE = 0.022
@@ -41,12 +40,6 @@ class Scene:
 
     positions: NDArray[np.float64]
     yaws: NDArray[np.float64]
-
-
-def scene_seed(purpose: str, index: int) -> int:
-    """Return the seed of a scene, the same on every machine."""
-    digest = hashlib.sha256(f"{purpose}/{index}".encode()).digest()
-    return int.from_bytes(digest[:4], "little")
 
 
 def draw_scene(seed: int, num_cubes: int) -> Scene:
@@ -105,12 +98,3 @@ def paste_mark(picture: NDArray[np.uint8], colour_index: int, verb_index: int) -
     left = (verb_index + 1) * side
     marked[: height // _GRID, left : left + side] = _MARK_RGB[colour_index]
     return marked
-
-
-def verb_index(instruction: str) -> int:
-    """Return the index in `MARK_VERBS` of what an instruction of the suite asks for."""
-    words = instruction.split()
-    verb = {"put": "put_on", "push": f"push_{words[-1]}"}.get(words[0], words[0]) if words else ""
-    if verb not in MARK_VERBS:
-        raise unknown_name("verb of the instruction", instruction, MARK_VERBS)
-    return MARK_VERBS.index(verb)

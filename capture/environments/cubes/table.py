@@ -18,6 +18,8 @@ _TABLE_SIZE = (0.8, 0.8, 0.05)
 _FRICTION = (1.0, 5e-3, 1e-4)
 _RGB = {"red": (0.85, 0.1, 0.1), "green": (0.1, 0.65, 0.15), "blue": (0.1, 0.2, 0.85), "yellow": (0.9, 0.8, 0.1)}
 
+#: Stands for the gripper among the indices of the cubes.
+_GRIPPER = -1
 #: Height in metres over its rest at which a cube counts as lifted, and the way after which it counts as pushed.
 LIFTED, PUSHED = 0.04, 0.05
 
@@ -63,11 +65,9 @@ class CubeTable(SingleArmEnv):  # type: ignore[misc]  # robosuite has no types
         super()._setup_references()
         model = self.sim.model
         self._bodies = [model.body_name2id(cube.root_body) for cube in self._cubes]
-        self._cube_of_geom = {
-            model.geom_name2id(name): index for index, cube in enumerate(self._cubes) for name in cube.contact_geoms
-        }
-        gripper = self.robots[0].gripper
-        self._gripper_geoms = {model.geom_name2id(name) for name in gripper.contact_geoms}
+        of_cubes = {name: index for index, cube in enumerate(self._cubes) for name in cube.contact_geoms}
+        of_gripper = dict.fromkeys(self.robots[0].gripper.contact_geoms, _GRIPPER)
+        self._owners = {model.geom_name2id(name): owner for name, owner in (of_cubes | of_gripper).items()}
 
     def _reset_internal(self) -> None:
         super()._reset_internal()
@@ -101,24 +101,15 @@ class CubeTable(SingleArmEnv):  # type: ignore[misc]  # robosuite has no types
     def _first_but(self, target: int) -> int | None:
         return min(self._touched_first, key=lambda cube: cube == target, default=None)
 
+    def _contacts(self) -> set[frozenset[int | None]]:
+        """What touches what now: pairs of cubes, `_GRIPPER`, and None for everything else."""
+        contacts = self.sim.data.contact[: self.sim.data.ncon]
+        return {frozenset((self._owners.get(one.geom1), self._owners.get(one.geom2))) for one in contacts}
+
     def touched_cubes(self) -> list[int]:
         """Return the cubes that the gripper touches now."""
-        contacts = self.sim.data.contact[: self.sim.data.ncon]
-        pairs = [(contact.geom1, contact.geom2) for contact in contacts]
-        return sorted(
-            {
-                self._cube_of_geom[cube]
-                for one, other in pairs
-                for cube, geom in ((one, other), (other, one))
-                if cube in self._cube_of_geom and geom in self._gripper_geoms
-            }
-        )
-
-    def cubes_touch(self, one: int, other: int) -> bool:
-        """Return whether two cubes touch each other."""
-        owners = self._cube_of_geom
-        contacts = self.sim.data.contact[: self.sim.data.ncon]
-        return any({owners.get(contact.geom1), owners.get(contact.geom2)} == {one, other} for contact in contacts)
+        contacts = self._contacts()
+        return [cube for cube in range(len(self._cubes)) if frozenset((cube, _GRIPPER)) in contacts]
 
     def cube_positions(self) -> NDArray[np.float64]:
         """Return the cubes' centres, (cube, 3) in metres, world frame."""
@@ -150,4 +141,4 @@ class CubeTable(SingleArmEnv):  # type: ignore[misc]  # robosuite has no types
         destination = find_target(task.destination, self._beginning)
         released = target not in self.touched_cubes()
         above = position[2] - self.cube_positions()[destination][2] > HALF_SIZE
-        return bool(released and above and self.cubes_touch(target, destination))
+        return bool(released and above and frozenset((target, destination)) in self._contacts())

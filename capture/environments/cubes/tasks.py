@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from vla_attention.capture.environments.base import Suite, Task
+from vla_attention.capture.environments.base import Suite, TaskTexts
 
 #: The cubes by colour. The last one is in some scenes only, and no instruction names it.
 COLOURS = ("red", "green", "blue", "yellow")
@@ -84,17 +84,8 @@ MARKED, MARK_ONLY = "cubes_marked", "cubes_mark_only"
 MARK_INSTRUCTION = "do what the mark says"
 
 
-def list_cube_tasks(suite: Suite) -> tuple[Task, ...]:
+def list_cube_tasks(suite: Suite) -> list[TaskTexts]:
     """Return the tasks of the suite, or of one of the suites with a mark, in their fixed order."""
-    return tuple(
-        Task(
-            suite.name,
-            task_id,
-            task.name,
-            MARK_INSTRUCTION if suite.name == MARK_ONLY else task.instruction,
-            suite.initial_states_per_task,
-            # What is to be done, also where the mark says it.
-            task.family,
-        )
-        for task_id, task in enumerate(CUBE_TASKS[: suite.num_tasks])
-    )
+    told = {MARK_ONLY: MARK_INSTRUCTION}.get(suite.name)
+    # The family says what is to be done, also where the mark says it.
+    return [(task.name, told or task.instruction, task.family) for task in CUBE_TASKS[: suite.num_tasks]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from vla_attention.schemas.errors import BadArgument, unknown_name
+from vla_attention.schemas.errors import BadArgument, look_up, unknown_name
 
 #: Positions of the text encoder. Positions after the real tokens are exactly 0; the embedding of a real token never is.
 TEXT_LENGTH = 512
@@ -198,6 +198,4 @@ NAMED_CONFIGS: dict[str, CosmosConfig] = {DEFAULT_CONFIG_NAME: CosmosConfig()}
 
 def find_config(name: str) -> CosmosConfig:
     """Return a full-size configuration by the reference's name for it."""
-    if name not in NAMED_CONFIGS:
-        raise unknown_name("Cosmos configuration", name, NAMED_CONFIGS)
-    return NAMED_CONFIGS[name]
+    return look_up("Cosmos configuration", name, NAMED_CONFIGS)

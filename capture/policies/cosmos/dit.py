@@ -25,7 +25,6 @@ class BlockObserver(Protocol):
     `begin_block`: is called before everything else of a block.
     `rows`: returns the function that takes the float32 probabilities (batch, head, query of the frame, key), or None.
     `updates`: takes the block's gated updates, name -> (batch, frame, token, width), after the block.
-    `takes_updates`: whether `updates` is called.
     """
 
     def begin_block(self, layer: int) -> None:
@@ -33,9 +32,6 @@ class BlockObserver(Protocol):
 
     def rows(self, site: str, layer: int, frame: int, attention: Attention, value: Tensor) -> RowSink | None:
         """Return the function that takes the rows of these queries; `value` is (batch, head, key, dim)."""
-
-    def takes_updates(self, layer: int) -> bool:
-        """Return whether `updates` is called for this block."""
 
     def updates(self, layer: int, updates: dict[str, Tensor], gates: dict[str, Tensor], block_input: Tensor) -> None:
         """Take the gated updates of one block; gates are (batch, frame, 1, width)."""
@@ -225,7 +221,7 @@ class Block(nn.Module):
                 update = self.mlp(modulated)
             gates[name], updates[name] = gate, gate * update
             x = x + updates[name]
-        if observer is not None and observer.takes_updates(layer):
+        if observer is not None:
             observer.updates(layer, updates, gates, block_input)
         return x
 

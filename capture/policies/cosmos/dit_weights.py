@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -50,9 +51,8 @@ def dit_tensors(stored: Mapping[str, Any]) -> dict[str, Tensor]:
     return weights
 
 
-def infer_dit_config(weights: Mapping[str, Tensor], base: DitConfig | None = None) -> DitConfig:
+def infer_dit_config(weights: Mapping[str, Tensor], base: DitConfig) -> DitConfig:
     """Return the sizes of the weights. Rotary factors and patch size, which no weight states, are those of `base`."""
-    base = base or DitConfig()
 
     def size(name: str, axis: int, least: int = 1) -> int:
         if name not in weights:
@@ -69,7 +69,8 @@ def infer_dit_config(weights: Mapping[str, Tensor], base: DitConfig | None = Non
     width, features = size(embedder, 0), size(embedder, 1, least=3 * patch)
     blocks = {name.split(".")[1] for name in weights if name.startswith("blocks.")}
     head_dim = size("blocks.0.self_attn.q_norm.weight", 0)
-    return DitConfig(
+    return replace(
+        base,
         width=width,
         # Their numbers are compared with the model's when all names are.
         num_blocks=check_size("The number of blocks of the checkpoint", len(blocks), MAX_BLOCKS),
@@ -79,11 +80,7 @@ def infer_dit_config(weights: Mapping[str, Tensor], base: DitConfig | None = Non
         adaln_dim=size("blocks.0.adaln_modulation_mlp.1.weight", 0),
         in_channels=features // patch - 2,
         out_channels=size("final_layer.linear.weight", 0, least=patch) // patch,
-        patch_size=base.patch_size,
         max_positions=size("pos_embedder.seq", 0),
-        rope_t_extrapolation=base.rope_t_extrapolation,
-        rope_h_extrapolation=base.rope_h_extrapolation,
-        rope_w_extrapolation=base.rope_w_extrapolation,
     )
 
 

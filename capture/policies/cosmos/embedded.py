@@ -8,8 +8,6 @@ rows are neither uniform nor on one key, and depend on pictures, words, noise an
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -18,7 +16,7 @@ from vla_attention.capture.policies.cosmos.config import CosmosConfig, DitConfig
 from vla_attention.capture.policies.cosmos.dit_weights import build_dit, expected_shapes
 from vla_attention.capture.policies.cosmos.model import CosmosModel
 from vla_attention.capture.policies.cosmos.policy import ACTION_FRAME, CosmosPolicy
-from vla_attention.capture.policies.cosmos.preprocess import Ranges, make_ranges
+from vla_attention.capture.policies.cosmos.preprocess import Ranges
 from vla_attention.capture.policies.cosmos.text import PieceTokenizer, SeededText
 from vla_attention.capture.policies.cosmos.vae import build_encoder, expected_vae_shapes
 from vla_attention.capture.policies.identity import PolicySource
@@ -41,21 +39,16 @@ DUMMY_CONFIG = CosmosConfig(
 )
 
 #: Made-up ranges of LIBERO's actions and proprioception (not statistics of any data set).
-BUILTIN_RANGES: Mapping[str, object] = {
-    "actions_min": [-0.6, -0.6, -0.6, -0.12, -0.15, -0.15, -1.0],
-    "actions_max": [0.6, 0.6, 0.6, 0.12, 0.15, 0.15, 1.0],
-    "proprio_min": [0.0, -0.04, -0.4, -0.35, 0.0, -1.0, -1.0, -1.0, -1.0],
-    "proprio_max": [0.04, 0.0, 0.2, 0.35, 1.3, 1.0, 1.0, 1.0, 1.0],
-}
+BUILTIN_RANGES = Ranges(
+    actions_min=[-0.6, -0.6, -0.6, -0.12, -0.15, -0.15, -1.0],
+    actions_max=[0.6, 0.6, 0.6, 0.12, 0.15, 0.15, 1.0],
+    proprio_min=[0.0, -0.04, -0.4, -0.35, 0.0, -1.0, -1.0, -1.0, -1.0],
+    proprio_max=[0.04, 0.0, 0.2, 0.35, 1.3, 1.0, 1.0, 1.0, 1.0],
+)
 
 #: Standard deviation σ of the logits of the first and the last block. Attention then spreads over about exp(-σ²/2) of
 #: the keys.
 _FLATTEST, _SHARPEST = 1.5, 4.0
-
-
-def builtin_ranges() -> Ranges:
-    """Return the made-up ranges as statistics."""
-    return make_ranges(BUILTIN_RANGES, "that come with the program", action_dim=7, proprio_dim=9)
 
 
 def random_dit_weights(config: DitConfig, seed: int) -> dict[str, Tensor]:
@@ -132,7 +125,7 @@ def random_policy(
     return CosmosPolicy(
         build_random_model(config, seed, device),
         text,
-        builtin_ranges(),
+        BUILTIN_RANGES,
         PolicySource(name=name, checkpoint=f"random weights, seed {seed}", checkpoint_format="seeded", untrained=True),
         open_loop_steps=config.chunk_size if open_loop_steps is None else open_loop_steps,
         query_frame=query_frame,

@@ -124,31 +124,10 @@ class CosmosSettings(ModelSettings):
         }
 
     def check_files(self) -> None:
-        """Raise what `build` would where a local checkpoint lacks files; loads nothing."""
-        from pathlib import Path
+        """See `check_cosmos_files`."""
+        from vla_attention.capture.policies.cosmos.loading import check_cosmos_files
 
-        from vla_attention.capture.policies.cosmos.locate import (
-            EMBEDDINGS_NAME,
-            STATISTICS_NAME,
-            find_beside,
-            find_checkpoint,
-            find_vae,
-            find_weights,
-        )
-        from vla_attention.capture.policies.cosmos.preprocess import read_ranges
-        from vla_attention.capture.policies.cosmos.t5_pickle import read_embeddings
-        from vla_attention.capture.policies.cosmos.tensor_files import read_tensors
-        from vla_attention.capture.policies.hub import split_hub_name
-
-        name = self.checkpoint
-        on_hub = split_hub_name(name) is not None and not Path(name).expanduser().exists()
-        if name not in UNTRAINED_POLICIES and not on_hub:
-            folder = find_checkpoint(name)
-            weights = find_weights(folder)
-            read_ranges(find_beside(folder, self.dataset_stats_path, STATISTICS_NAME))
-            read_embeddings(find_beside(folder, self.t5_text_embeddings_path, EMBEDDINGS_NAME))
-            for file in (weights, find_vae(folder, self.vae_path)):
-                read_tensors(file)  # mapped into memory: the numbers are not read
+        check_cosmos_files(self)
 
 
 FAMILY = PolicyFamily(

@@ -1,4 +1,4 @@
-"""Numbers in latent frames: proprioception is written into one frame, actions and the value are read from others.
+"""Numbers in latent frames: proprioception is written into one frame, actions are read from another.
 
 A latent frame is a volume (channel, row, column), read as one long list in that order. The frames are the key axis of
 the site `self`; that of `cross` has the text positions.
@@ -35,12 +35,6 @@ _ROLES = {
 }
 
 
-def patch_grid(config: CosmosConfig) -> PatchGrid:
-    """Return how the tokens of an image frame tile the model's image."""
-    rows, columns = config.dit.grid(config.latent_size, config.latent_size)
-    return PatchGrid(rows, columns, config.image_size, config.image_size)
-
-
 def cameras(config: CosmosConfig) -> tuple[PolicyCameraView, ...]:
     """Return the cameras in key order: wrist, then primary."""
     return tuple(
@@ -52,14 +46,12 @@ def cameras(config: CosmosConfig) -> tuple[PolicyCameraView, ...]:
 
 def self_layout(config: CosmosConfig) -> SiteLayout:
     """Return the key axis of self-attention: one span of kind `latent` per latent frame."""
-    tokens = config.tokens_per_frame
+    rows, columns = config.dit.grid(config.latent_size, config.latent_size)
+    tokens, grid = config.tokens_per_frame, PatchGrid(rows, columns, config.image_size, config.image_size)
     spans = []
     for number, name in enumerate(config.frames.names):
-        start, stop = number * tokens, (number + 1) * tokens
-        if name in CAMERA_OF_FRAME:
-            spans.append(Span(name, "latent", start, stop, camera=name, grid=patch_grid(config)))
-        else:
-            spans.append(Span(name, "latent", start, stop))
+        camera = name if name in CAMERA_OF_FRAME else None
+        spans.append(Span(name, "latent", number * tokens, (number + 1) * tokens, camera, grid if camera else None))
     return SiteLayout(SELF, tuple(spans))
 
 
@@ -86,11 +78,6 @@ def actions_of_frame(frame: Tensor, chunk_size: int, action_dim: int) -> Tensor:
     size = chunk_size * action_dim
     copies = frame.numel() // size
     return frame.reshape(-1)[: copies * size].reshape(copies, chunk_size, action_dim).mean(dim=0)
-
-
-def read_value(frame: Tensor) -> float:
-    """Return the value that the last frame holds: its mean, from -1..1 to 0..1 and cut there."""
-    return float(((frame.mean() + 1) / 2).clamp(0, 1))
 
 
 def action_shares(config: CosmosConfig) -> NDArray[np.float64]:
@@ -121,9 +108,8 @@ def query_pools(shares: NDArray[np.float64]) -> NDArray[np.float64]:
     return pools
 
 
-def condition_mask(config: CosmosConfig, num_given: int | None = None) -> Tensor:
+def condition_mask(config: CosmosConfig) -> Tensor:
     """Return (1, 1, frame, row, column) float32: 1 for the given frames, 0 for the frames that are denoised."""
-    given = config.frames.num_conditioned if num_given is None else num_given
     mask = torch.zeros(1, 1, config.frames.count, config.latent_size, config.latent_size)
-    mask[:, :, :given] = 1.0
+    mask[:, :, : config.frames.num_conditioned] = 1.0
     return mask

@@ -25,7 +25,6 @@ from vla_attention.capture.recording.attention import (
     LogitChange,
     RowCollector,
     RowSink,
-    UpdateSink,
 )
 from vla_attention.capture.recording.contributions import Projection
 
@@ -48,13 +47,6 @@ class CallObserver:
     def _queries(self) -> slice:
         return slice(0, self.tokens_per_frame)
 
-    def _update_sinks(self, layer: int) -> dict[str, UpdateSink]:
-        sinks = {
-            site: recorder.update_sink(layer, self.denoise_step, self._queries)
-            for site, recorder in self.recorders.items()
-        }
-        return {site: sink for site, sink in sinks.items() if sink is not None}
-
     def begin_block(self, layer: int) -> None:
         """Tell the recorders that this block begins."""
         for recorder in self.recorders.values():
@@ -69,15 +61,13 @@ class CallObserver:
             self._seen[site] = value, attention.output_proj.weight
         return recorder.sink(layer, self.denoise_step, self._queries)
 
-    def takes_updates(self, layer: int) -> bool:
-        """Return whether contributions of this block are recorded at any site."""
-        return bool(self._update_sinks(layer))
-
     def updates(self, layer: int, updates: dict[str, Tensor], gates: dict[str, Tensor], block_input: Tensor) -> None:
         """Pass values, projection and update of the recorded queries on to the recorders."""
-        for site, sink in self._update_sinks(layer).items():
-            value, weight = self._seen.pop(site)
-            sink(value, Projection(weight, gates[site][0, self.query_frame]), updates[site][:, self.query_frame])
+        for site, recorder in self.recorders.items():
+            sink = recorder.update_sink(layer, self.denoise_step, self._queries)
+            if sink is not None:
+                value, weight = self._seen.pop(site)
+                sink(value, Projection(weight, gates[site][0, self.query_frame]), updates[site][:, self.query_frame])
 
 
 @dataclass(frozen=True)
@@ -104,29 +94,6 @@ class CallEditor:
 
 
 PROPRIO_FRAME = "proprio"
-
-
-@dataclass
-class CallTrace:
-    """Inputs and outputs of each network evaluation, kept for a comparison with the reference only."""
-
-    noisy: list[Tensor] = field(default_factory=list)
-    net_input: list[Tensor] = field(default_factory=list)
-    times: list[Tensor] = field(default_factory=list)
-    net_output: list[Tensor] = field(default_factory=list)
-    clean: list[Tensor] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class Recorders:
-    """The row collector of each site, and the latent frame whose queries they get. Sampling does not depend on them.
-
-    editors: the editor of each site whose attention changes; for them the queries of that frame are the action queries.
-    """
-
-    rows: Mapping[str, RowCollector] = field(default_factory=dict)
-    query_frame: int = 4
-    editors: Mapping[str, AttentionEditor] = field(default_factory=dict)
 
 
 class CosmosModel(nn.Module):
@@ -179,7 +146,6 @@ class CosmosModel(nn.Module):
         mask: Tensor,
         text: Tensor,
         observer: BlockObserver | None = None,
-        trace: CallTrace | None = None,
         editor: BlockEditor | None = None,
     ) -> Tensor:
         """Return the estimate of the clean latents (float32) from latents with noise `sigma`; given frames are kept."""
@@ -190,23 +156,22 @@ class CosmosModel(nn.Module):
         padding = torch.zeros(len(noisy), 1, size, size, device=noisy.device)
         net_output = self.dit(net_input, times, mask, padding, text, observer, editor).float()
         clean: Tensor = (1 - t) * noisy - t * net_output
-        clean = mask * given + (1 - mask) * clean
-        if trace is not None:
-            trace.noisy.append(noisy)
-            trace.net_input.append(net_input)
-            trace.times.append(times.to(self.dtype).float())
-            trace.net_output.append(net_output)
-            trace.clean.append(clean)
-        return clean
+        return mask * given + (1 - mask) * clean
 
     @torch.no_grad()
     def sample_latents(
-        self, given: Tensor, text: Tensor, seed: int, recorders: Recorders | None = None, trace: CallTrace | None = None
+        self,
+        given: Tensor,
+        text: Tensor,
+        seed: int,
+        query_frame: int,
+        recorders: Mapping[str, RowCollector] | None,
+        editors: Mapping[str, AttentionEditor] | None,
     ) -> Tensor:
-        """Return the clean latent video (1, channel, frame, row, column) float32.
+        """Return the clean latent video (1, channel, frame, row, column) float32; it does not depend on recorders.
 
         given: from `given_latents`. text: (1, position, text width). seed: of the noise, made by numpy's legacy
-        generator.
+        generator. query_frame: whose queries are the action queries. recorders, editors: of sites.
         """
         config = self.config
         noise = torch.from_numpy(seeded_noise(seed, config.latent_shape)).to(self.device)
@@ -214,27 +179,9 @@ class CosmosModel(nn.Module):
         text = text.to(self.device)
 
         def denoise(noisy: Tensor, sigma: float, step: int) -> Tensor:
-            observer, editor = self._observer(recorders, step), self._editor(recorders, step)
-            return self.denoise(noisy, sigma, given, mask, text, observer, trace, editor)
+            call = step, query_frame, config.tokens_per_frame
+            observer = CallObserver(*call, recorders) if recorders else None
+            editor = CallEditor(*call, editors) if editors else None
+            return self.denoise(noisy, sigma, given, mask, text, observer, editor)
 
         return sample(denoise, noise, self.levels)
-
-    def _observer(self, recorders: Recorders | None, step: int) -> CallObserver | None:
-        if recorders is None or not recorders.rows:
-            return None
-        return CallObserver(
-            denoise_step=step,
-            query_frame=recorders.query_frame,
-            tokens_per_frame=self.config.tokens_per_frame,
-            recorders=recorders.rows,
-        )
-
-    def _editor(self, recorders: Recorders | None, step: int) -> CallEditor | None:
-        if recorders is None or not recorders.editors:
-            return None
-        return CallEditor(
-            denoise_step=step,
-            query_frame=recorders.query_frame,
-            tokens_per_frame=self.config.tokens_per_frame,
-            editors=recorders.editors,
-        )

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import Observation
-from vla_attention.capture.policies.cosmos.config import CosmosConfig
 from vla_attention.capture.policies.cosmos.family import COSMOS
 from vla_attention.capture.policies.cosmos.latents import (
     CROSS,
@@ -20,10 +19,9 @@ from vla_attention.capture.policies.cosmos.latents import (
     actions_of_frame,
     cameras,
     query_pools,
-    read_value,
     self_roles,
 )
-from vla_attention.capture.policies.cosmos.model import CosmosModel, Recorders
+from vla_attention.capture.policies.cosmos.model import CosmosModel
 from vla_attention.capture.policies.cosmos.preprocess import Ranges, compressed_picture, proprio_of, upright
 from vla_attention.capture.policies.cosmos.sampler import flow_time
 from vla_attention.capture.policies.cosmos.text import TextSource
@@ -32,17 +30,10 @@ from vla_attention.capture.policies.policy import GivenInputs, PolicyInput, came
 from vla_attention.capture.policies.weights import dtype_name, weights_digest
 from vla_attention.capture.recording.attention import AttentionEditor, RowCollector
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.jsonable import to_json
 from vla_attention.schemas.stores.store_format import PolicyIdentity
 
-ACTION_FRAME, VALUE_FRAME = "action", "value"
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """Result of one policy call: actions (step, dim) in the robot's units, and the expected value, 0..1."""
-
-    actions: NDArray[np.float64]
-    value: float
+ACTION_FRAME = "action"
 
 
 class CosmosPolicy:
@@ -72,6 +63,8 @@ class CosmosPolicy:
                 f"call; expected 1 to {config.chunk_size}."
             )
         self.model = model
+        #: Sizes and conventions.
+        self.config = config
         self.text = text
         self.statistics = statistics
         self.source = source
@@ -90,11 +83,6 @@ class CosmosPolicy:
         #: The model's images are the stored ones.
         self.needs_camera_frames = False
 
-    @property
-    def config(self) -> CosmosConfig:
-        """Sizes and conventions."""
-        return self.model.config
-
     def denoise_times(self) -> NDArray[np.float64]:
         """Return the network's time of each denoise step, (denoise,): 1 = noise, towards 0 = clean."""
         return np.array([flow_time(level) for level in self.model.levels])
@@ -106,17 +94,13 @@ class CosmosPolicy:
         """
         return run_seed
 
-    def action_shares(self) -> NDArray[np.float64]:
-        """Return the shares (query, step, dim) of action numbers in each recorded query of the action frame."""
+    def query_pools(self) -> NDArray[np.float64]:
+        """Return weights (pool, query) that pool the recorded queries by action step and dimension, step-major."""
         if self.query_frame != ACTION_FRAME:
             raise BadArgument(
                 f"Queries of latent frame '{self.query_frame}' do not stand for action steps; use --query-frame action."
             )
-        return action_shares(self.config)
-
-    def query_pools(self) -> NDArray[np.float64]:
-        """Return weights (pool, query) that pool the recorded queries by action step and dimension, step-major."""
-        return query_pools(self.action_shares())
+        return query_pools(action_shares(self.config))
 
     @cached_property
     def _digest(self) -> str:
@@ -128,7 +112,7 @@ class CosmosPolicy:
             "config": json.loads(json.dumps(asdict(self.config))),
             "dtype": dtype_name(self.model.dtype),
             "normalisation": "min-max",
-            "statistics": self.statistics.as_json(),
+            "statistics": to_json(self.statistics),
             "query_frame": self.query_frame,
             "noise": "the same at every replan",
             **self.text.provenance(),
@@ -185,7 +169,13 @@ class CosmosPolicy:
         editors: Mapping[str, AttentionEditor] | None = None,
     ) -> NDArray[np.float64]:
         """Return the action chunk (horizon, 7) for the environment; it does not depend on the recorders."""
-        return self.predict(policy_input, noise_seed, recorders, editors).actions
+        config = self.config
+        given, text = policy_input.tensors["given"], policy_input.tensors["text"]
+        queries = config.frames.index(self.query_frame)
+        clean = self.model.sample_latents(given, text, noise_seed, queries, recorders, editors)[0].cpu()
+        frame = clean[:, config.frames.index(ACTION_FRAME)]
+        actions = actions_of_frame(frame, config.chunk_size, config.action_dim).numpy()
+        return self.statistics.environment_actions(actions)
 
     def action_units(self) -> NDArray[np.float64]:
         """Return how far 1 of the model's normalised actions moves the robot, (action dim,), in the robot's units."""
@@ -193,22 +183,3 @@ class CosmosPolicy:
         low, high = self.statistics.environment_actions(np.stack([np.zeros(size), np.ones(size)]))
         units: NDArray[np.float64] = high - low
         return units
-
-    def predict(
-        self,
-        policy_input: PolicyInput,
-        noise_seed: int,
-        recorders: Mapping[str, RowCollector] | None = None,
-        editors: Mapping[str, AttentionEditor] | None = None,
-    ) -> Prediction:
-        """Return the action chunk and the expected value."""
-        config = self.config
-        wanted = Recorders(recorders or {}, config.frames.index(self.query_frame), editors or {})
-        tensors = policy_input.tensors
-        clean = self.model.sample_latents(tensors["given"], tensors["text"], noise_seed, wanted)[0].cpu()
-        frame = clean[:, config.frames.index(ACTION_FRAME)]
-        actions = actions_of_frame(frame, config.chunk_size, config.action_dim).numpy()
-        return Prediction(
-            actions=self.statistics.environment_actions(actions),
-            value=read_value(clean[:, config.frames.index(VALUE_FRAME)]),
-        )

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -17,6 +16,7 @@ from torch import Tensor
 from vla_attention.capture.foreign_files.checked_files import read_object
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.jsonable import MalformedDocument, from_json
 
 JPEG_QUALITY = 95
 #: Share of the area that the reference crops out of the middle when the policy was trained with image augmentation.
@@ -68,62 +68,29 @@ def pixels(picture: NDArray[np.uint8], dtype: torch.dtype, device: torch.device)
     return raw.to(dtype) / 127.5 - 1.0
 
 
-@dataclass(frozen=True)
-class Ranges:
-    """Ranges of the training data's actions and proprioception, each (dim,) float64."""
+class Ranges(msgspec.Struct, frozen=True):
+    """Ranges of the training data's actions and proprioception, each a number per dimension."""
 
-    actions_min: NDArray[np.float64]
-    actions_max: NDArray[np.float64]
-    proprio_min: NDArray[np.float64]
-    proprio_max: NDArray[np.float64]
+    actions_min: list[float]
+    actions_max: list[float]
+    proprio_min: list[float]
+    proprio_max: list[float]
 
     def normalise_proprio(self, proprio: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return 2 (x - min) / (max - min) - 1 (dim,)."""
-        scaled: NDArray[np.float64] = 2 * (proprio - self.proprio_min) / (self.proprio_max - self.proprio_min) - 1
+        low, high = np.array(self.proprio_min), np.array(self.proprio_max)
+        scaled: NDArray[np.float64] = 2 * (proprio - low) / (high - low) - 1
         return scaled
 
     def environment_actions(self, actions: NDArray[np.floating]) -> NDArray[np.float64]:
         """Return normalised actions (step, dim) in the robot's units: 0.5 (a + 1) (max - min) + min, not cut."""
-        scaled: NDArray[np.float64] = 0.5 * (actions + 1) * (self.actions_max - self.actions_min) + self.actions_min
+        low, high = np.array(self.actions_min), np.array(self.actions_max)
+        scaled: NDArray[np.float64] = 0.5 * (actions + 1) * (high - low) + low
         return scaled
-
-    def as_json(self) -> dict[str, list[float]]:
-        """Return the ranges as plain JSON values."""
-        return {name: [float(x) for x in getattr(self, name)] for name in _FIELDS}
-
-
-_FIELDS = ("actions_min", "actions_max", "proprio_min", "proprio_max")
-
-
-def make_ranges(content: Mapping[str, object], where: str, action_dim: int, proprio_dim: int) -> Ranges:
-    """Check ranges and return them; `UnreadableCheckpoint` names the entry that is missing or of the wrong length.
-
-    where: completes the sentence "The dataset statistics ..." in an error."""
-    arrays = {}
-    for name in _FIELDS:
-        if name not in content:
-            raise UnreadableCheckpoint(f"The dataset statistics {where} have no '{name}'.")
-        try:
-            array = np.asarray(content[name], dtype=np.float64)
-        except (TypeError, ValueError, OverflowError):
-            raise UnreadableCheckpoint(f"'{name}' of the dataset statistics {where} is no list of numbers.") from None
-        dim = action_dim if name.startswith("actions") else proprio_dim
-        if array.shape != (dim,) or not np.isfinite(array).all():
-            raise UnreadableCheckpoint(
-                f"'{name}' of the dataset statistics {where} has shape {array.shape}; expected {dim} finite numbers."
-            )
-        arrays[name] = array
-    if not (arrays["actions_max"] >= arrays["actions_min"]).all():
-        raise UnreadableCheckpoint(f"The dataset statistics {where} have an 'actions_max' below 'actions_min'.")
-    if not (arrays["proprio_max"] > arrays["proprio_min"]).all():
-        raise UnreadableCheckpoint(
-            f"The dataset statistics {where} have a 'proprio_max' that is not above 'proprio_min'."
-        )
-    return Ranges(**arrays)
 
 
 def read_ranges(path: str | Path, action_dim: int = 7, proprio_dim: int = 9) -> Ranges:
-    """Read a file of dataset statistics (JSON)."""
+    """Read a file of dataset statistics (JSON); `UnreadableCheckpoint` names the entry that is missing or wrong."""
     path = Path(path)
     try:
         content = read_object(path, UnreadableCheckpoint)
@@ -132,7 +99,22 @@ def read_ranges(path: str | Path, action_dim: int = 7, proprio_dim: int = 9) -> 
             f"There are no dataset statistics at '{path}'; give --dataset-stats-path (libero_dataset_statistics.json "
             "of the checkpoint)."
         ) from None
-    return make_ranges(content, f"in '{path}'", action_dim, proprio_dim)
+    what = f"the dataset statistics in '{path}'"
+    try:
+        ranges = from_json(Ranges, content, f"{what} at $")
+    except MalformedDocument as error:
+        raise UnreadableCheckpoint(str(error)) from None
+    for name, numbers in msgspec.structs.asdict(ranges).items():
+        dim = action_dim if name.startswith("actions") else proprio_dim
+        if len(numbers) != dim or not np.isfinite(numbers).all():
+            raise UnreadableCheckpoint(
+                f"'{name}' of {what} has {len(numbers)} numbers; expected {dim}, all of them finite."
+            )
+    if np.less(ranges.actions_max, ranges.actions_min).any():
+        raise UnreadableCheckpoint(f"In {what} an 'actions_max' is below 'actions_min'.")
+    if np.less_equal(ranges.proprio_max, ranges.proprio_min).any():
+        raise UnreadableCheckpoint(f"In {what} a 'proprio_max' is not above 'proprio_min'.")
+    return ranges
 
 
 def proprio_of(

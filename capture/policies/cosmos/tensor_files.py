@@ -34,7 +34,7 @@ def read_tensors(path: str | Path) -> dict[str, Any]:
     content: Any
     if path.suffix == ".safetensors":
         with open_safetensors(path) as stored:
-            content = {name: stored.read(name) for name in stored.names()}
+            content = {name: stored.read(name) for name in stored.held}
     else:
         content = load_torch(path, UnreadableCheckpoint, _EXTRA_STATE)
     for wrapper in _WRAPPERS:

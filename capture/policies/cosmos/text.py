@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
@@ -37,7 +38,6 @@ class T5Encoder:
                 f"There is no T5 encoder at '{self.folder}'; give --t5-encoder a folder with config.json, the weights "
                 f"and {T5_TOKENIZER}."
             )
-        self._model: Any = None
 
     def encode(self, ids: list[int], positions: int, width: int) -> Tensor:
         """Return the embedding (1, position, width) bfloat16 of token ids with the end token; other positions are 0."""
@@ -45,7 +45,7 @@ class T5Encoder:
             raise BadArgument(
                 f"The instruction has {len(ids)} tokens, but the policy reads {positions}; shorten the instruction."
             )
-        model = self._load()
+        model = self._model
         if model.config.d_model != width:
             raise UnreadableCheckpoint(
                 f"The T5 encoder at '{self.folder}' gives {model.config.d_model} numbers a position, but the policy "
@@ -57,23 +57,21 @@ class T5Encoder:
         embedding[:, : len(ids)] = hidden.to(torch.bfloat16)
         return embedding
 
-    def _load(self) -> Any:
-        if self._model is None:
-            try:
-                library = import_module("transformers")
-            except ImportError as error:
-                raise MissingDependency(
-                    f"--t5-encoder needs the transformers library ({error}); install it with `pip install "
-                    "transformers`, or precompute the embeddings elsewhere and give --t5-text-embeddings-path."
-                ) from error
-            try:
-                self._model = library.T5EncoderModel.from_pretrained(
-                    str(self.folder), local_files_only=True, dtype=torch.float32
-                ).eval()
-            except Exception as error:  # safetensors and pickle have errors of their own
-                why = first_line(error)
-                raise UnreadableCheckpoint(f"The T5 encoder at '{self.folder}' cannot be loaded ({why}).") from error
-        return self._model
+    @cached_property
+    def _model(self) -> Any:
+        try:
+            library = import_module("transformers")
+        except ImportError as error:
+            raise MissingDependency(
+                f"--t5-encoder needs the transformers library ({error}); install it with `pip install transformers`, "
+                "or precompute the embeddings elsewhere and give --t5-text-embeddings-path."
+            ) from error
+        try:
+            model = library.T5EncoderModel.from_pretrained(str(self.folder), local_files_only=True, dtype=torch.float32)
+        except Exception as error:  # safetensors and pickle have errors of their own
+            why = first_line(error)
+            raise UnreadableCheckpoint(f"The T5 encoder at '{self.folder}' cannot be loaded ({why}).") from error
+        return model.eval()
 
 
 #: T5 ends every text with this token, which has a position and no characters.

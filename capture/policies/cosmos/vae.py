@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib import import_module
 from typing import Any
 
@@ -98,19 +99,13 @@ def expected_vae_shapes(config: VaeConfig) -> Shapes:
     return {name: shape for name, (_, shape) in vae_names(config).items()}
 
 
-def infer_vae_config(state: Mapping[str, Any], base: VaeConfig | None = None) -> VaeConfig:
+def infer_vae_config(state: Mapping[str, Any], base: VaeConfig) -> VaeConfig:
     """Return the sizes of a stored VAE: its own base width, and the rest from `base`, which loading then checks."""
-    base = base or VaeConfig()
-    first, base_dim = state.get("encoder.conv1.weight"), base.base_dim
-    if isinstance(first, Tensor):
-        base_dim = check_size("The width of the image encoder's first layer", first.shape[0] if first.ndim else 0)
-    return VaeConfig(
-        base_dim=base_dim,
-        latent_channels=base.latent_channels,
-        dim_mult=base.dim_mult,
-        num_res_blocks=base.num_res_blocks,
-        temporal_downsample=base.temporal_downsample,
-    )
+    first = state.get("encoder.conv1.weight")
+    if not isinstance(first, Tensor):
+        return base
+    size = check_size("The width of the image encoder's first layer", first.shape[0] if first.ndim else 0)
+    return replace(base, base_dim=size)
 
 
 class CausalEncoder(nn.Module):

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from vla_attention.capture.policies.pi.config import PiConfig
-from vla_attention.capture.policies.pi.flow_time import denoise_times, embed_times
 from vla_attention.capture.policies.pi.gemma import KeysValues, Rotation
 from vla_attention.capture.policies.pi.model import Denoising, PiModel
 from vla_attention.capture.recording.attention import CallKeys, FactorEditor, LogitChange, log_factors
@@ -135,18 +134,12 @@ class _Group:
             slice(len(real), len(real) + config.suffix_len),
             np.concatenate([real, np.arange(config.prefix_len, config.prefix_len + config.suffix_len)]),
         )
-        self.unchanged: dict[int, tuple[KeysValues, ...]] = {}
+        self.unchanged: dict[_Prefix, tuple[KeysValues, ...]] = {}
         positions = torch.tensor([[len(real)]], device=model.device) + torch.arange(
             config.suffix_len, device=model.device
         )
         self.rotation = Rotation.at(positions, config.action_expert.head_dim)
-        self.waves = embed_times(
-            denoise_times(num_steps, config.time_convention),
-            config.action_expert.width,
-            config.time_convention,
-            min_period=config.min_period,
-            max_period=config.max_period,
-        ).to(model.device)
+        self.waves = model.time_waves(num_steps)
 
     def sample(self, calls: Sequence[ModelCall], prefixes: Sequence[_Prefix]) -> Tensor:
         """Make the calls as one batch; returns (call, horizon, action dim)."""
@@ -165,23 +158,16 @@ class _Group:
     def _cache(self, prefixes: Sequence[_Prefix]) -> tuple[KeysValues, ...]:
         """Return the keys and values of the prefix of each call, by block."""
         different = list(dict.fromkeys(prefixes))
-        new = [prefix for prefix in different if prefix.editor is not None or prefix.number not in self.unchanged]
+        new = [prefix for prefix in different if prefix not in self.unchanged]
         blocks = self._encoded(new) if new else ()
-        for place, prefix in enumerate(new):
-            if prefix.editor is None:
-                self.unchanged[prefix.number] = tuple(_one(entry, place) for entry in blocks)
+        caches = {prefix: tuple(_one(entry, place) for entry in blocks) for place, prefix in enumerate(new)}
+        self.unchanged |= {prefix: cache for prefix, cache in caches.items() if prefix.editor is None}
+        caches |= self.unchanged
         if len(different) == 1 and different[0].editor is None:
-            return tuple(_expanded(entry, len(prefixes)) for entry in self.unchanged[different[0].number])
-        known = [prefix for prefix in different if prefix not in new]
-        caches = ([blocks] if blocks else []) + [self.unchanged[prefix.number] for prefix in known]
-        order = {prefix: place for place, prefix in enumerate([*new, *known])}
-        places = torch.tensor([order[prefix] for prefix in prefixes], device=self.model.device)
+            return tuple(_expanded(entry, len(prefixes)) for entry in caches[different[0]])
         return tuple(
-            KeysValues(
-                torch.cat([entry.keys for entry in entries])[places],
-                torch.cat([entry.values for entry in entries])[places],
-            )
-            for entries in zip(*caches, strict=True)
+            KeysValues(torch.cat([entry.keys for entry in entries]), torch.cat([entry.values for entry in entries]))
+            for entries in zip(*(caches[prefix] for prefix in prefixes), strict=True)
         )
 
     def _encoded(self, prefixes: Sequence[_Prefix]) -> tuple[KeysValues, ...]:

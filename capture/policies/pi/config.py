@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from vla_attention.capture.policies.checkpoints import Blocks, Size
 from vla_attention.capture.policies.pi.flow_time import MAX_PERIOD, MIN_PERIOD, TimeConvention
-from vla_attention.schemas.errors import BadArgument, unknown_name
+from vla_attention.schemas.errors import BadArgument, look_up
 
 #: openpi's camera slots, in the order of their keys. The preprocessing assigns cameras to slots.
 CAMERA_SLOTS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")
@@ -63,9 +63,7 @@ GEMMA_VARIANTS: dict[str, GemmaConfig] = {
 
 def find_variant(name: str) -> GemmaConfig:
     """Return the sizes of a Gemma variant by openpi's name for it."""
-    if name not in GEMMA_VARIANTS:
-        raise unknown_name("Gemma variant", name, GEMMA_VARIANTS)
-    return GEMMA_VARIANTS[name]
+    return look_up("Gemma variant", name, GEMMA_VARIANTS)
 
 
 @dataclass(frozen=True)
@@ -121,41 +119,27 @@ class PiConfig:
         """Queries of a denoise step: [state token, pi0 only] and the actions."""
         return self.first_action_query + self.action_horizon
 
-    @property
-    def key_len(self) -> int:
-        """Keys of a denoise step: prefix and suffix."""
-        return self.prefix_len + self.suffix_len
 
-
+_PI05_LIBERO = PiConfig(
+    paligemma=GEMMA_VARIANTS["gemma_2b"],
+    action_expert=GEMMA_VARIANTS["gemma_300m"],
+    siglip=SiglipConfig(),
+    action_horizon=10,
+    max_token_len=200,
+)
+_PI0_LIBERO = dataclasses.replace(_PI05_LIBERO, action_horizon=50, max_token_len=48, pi05=False)
 #: Full-size models by openpi's names for its configurations of LIBERO and DROID.
 NAMED_CONFIGS: dict[str, PiConfig] = {
-    "pi05_libero": PiConfig(
-        paligemma=GEMMA_VARIANTS["gemma_2b"],
-        action_expert=GEMMA_VARIANTS["gemma_300m"],
-        siglip=SiglipConfig(),
-        action_horizon=10,
-        max_token_len=200,
-    ),
-    "pi0_libero": PiConfig(
-        paligemma=GEMMA_VARIANTS["gemma_2b"],
-        action_expert=GEMMA_VARIANTS["gemma_300m"],
-        siglip=SiglipConfig(),
-        action_horizon=50,
-        max_token_len=48,
-        pi05=False,
-    ),
+    "pi05_libero": _PI05_LIBERO,
+    "pi0_libero": _PI0_LIBERO,
+    # The robot of DROID. pi05_droid reads its state in the prompt, which pi05_libero does not.
+    "pi05_droid": dataclasses.replace(_PI05_LIBERO, action_horizon=15, discrete_state_input=True),
+    "pi0_droid": dataclasses.replace(_PI0_LIBERO, action_horizon=10),
+    # The same model; its LoRA arrays are merged when a checkpoint is read.
+    "pi0_libero_low_mem_finetune": _PI0_LIBERO,
 }
-# The robot of DROID. pi05_droid reads its state in the prompt, which pi05_libero does not.
-NAMED_CONFIGS["pi05_droid"] = dataclasses.replace(
-    NAMED_CONFIGS["pi05_libero"], action_horizon=15, discrete_state_input=True
-)
-NAMED_CONFIGS["pi0_droid"] = dataclasses.replace(NAMED_CONFIGS["pi0_libero"], action_horizon=10)
-# The same model; its LoRA arrays are merged when a checkpoint is read.
-NAMED_CONFIGS["pi0_libero_low_mem_finetune"] = NAMED_CONFIGS["pi0_libero"]
 
 
 def find_config(name: str) -> PiConfig:
     """Return a full-size model configuration by openpi's name for it."""
-    if name not in NAMED_CONFIGS:
-        raise unknown_name("pi configuration", name, NAMED_CONFIGS)
-    return NAMED_CONFIGS[name]
+    return look_up("pi configuration", name, NAMED_CONFIGS)

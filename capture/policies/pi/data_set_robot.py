@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Mapping
 
 from vla_attention.capture.policies.pi.config import CAMERA_SLOTS
-from vla_attention.capture.policies.pi.lerobot_config import IMAGES, read_lerobot_config
-from vla_attention.capture.policies.pi.lerobot_pipeline import read_lerobot_pipeline
-from vla_attention.capture.policies.pi.preprocess import NormStats, find_norm_stats
-from vla_attention.capture.policies.robot import Robot, RobotData
+from vla_attention.capture.policies.pi.lerobot_config import LerobotConfig
+from vla_attention.capture.policies.pi.preprocess import NormStats
+from vla_attention.capture.policies.robot import IMAGES, Robot, RobotData
 from vla_attention.schemas.errors import BadArgument
 
 #: Slots of openpi's models -> the columns of its own conversions of LIBERO, DROID and ALOHA, and of LeRobot's.
@@ -37,15 +36,12 @@ _PADDED = 32
 _EMPTY_CAMERA = f"{IMAGES}empty_camera_"
 
 
-def lerobot_robot(folder: Path, data: RobotData) -> Robot:
+def lerobot_robot(stated: LerobotConfig, rename: Mapping[str, str], data: RobotData) -> Robot:
     """Return the robot of a data set for a LeRobot checkpoint, whose config.json lists its features.
 
-    Raises:
-        BadArgument, UnknownName: a camera of the policy has no pictures, or state or actions have other sizes.
-        UnsupportedCheckpoint, UnreadableCheckpoint: see `read_lerobot_config`.
+    rename: columns -> features, of its saved pipeline. Raises `BadArgument` or `UnknownName` where a camera of the
+    policy has no pictures, or state or actions have other sizes.
     """
-    stated = read_lerobot_config(folder)
-    rename = read_lerobot_pipeline(folder, stated).rename
     usual: dict[str, list[str]] = {}
     for column, feature in rename.items():
         usual.setdefault(feature, []).append(column)
@@ -93,9 +89,3 @@ def openpi_robot(data: RobotData, stats: NormStats | None, relative_actions: int
             f"Cannot use --relative-actions {relative}: the state has {state_dim} numbers and an action {action_dim}."
         )
     return Robot(cameras, state, state_dim, actions, action_dim or _PADDED, relative)
-
-
-def asset_name(folder: Path) -> str | None:
-    """Return the name under which an openpi checkpoint keeps its statistics, for instance droid; None for several."""
-    folders = [path.parent for path in find_norm_stats(folder)]
-    return folders[0].relative_to(folder / "assets").as_posix() if len(folders) == 1 else None

@@ -17,7 +17,7 @@ from vla_attention.capture.policies.pi.config import GemmaConfig, PiConfig, Sigl
 from vla_attention.capture.policies.pi.model import PiModel, expected_shapes, model_from_state
 from vla_attention.capture.policies.pi.policy import PiPolicy
 from vla_attention.capture.policies.pi.preprocess import ENVIRONMENT_ACTION_DIM, NormStats, Statistics
-from vla_attention.capture.policies.pi.processing import STATE_DIM, OpenpiProcessing
+from vla_attention.capture.policies.pi.processing import STATE_DIM, openpi_processing
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
 from vla_attention.capture.policies.robot import Robot
 from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
@@ -51,30 +51,28 @@ DUMMY_CONFIG = PiConfig(
 #: Made-up ranges of LIBERO's state and actions (not statistics of any data set): the hand above a table in metres, hand
 #: pointing down (axis-angle around pi), finger joints; pose changes well inside the controller's -1..1, gripper from
 #: open (-1) to closed (1).
-BUILTIN_STATS = {
-    "state": {
-        "q01": [-0.4, -0.35, 0.0, 2.4, -1.5, -1.2, 0.0, -0.04],
-        "q99": [0.2, 0.35, 1.3, 3.7, 1.5, 0.8, 0.04, 0.0],
-    },
-    "actions": {
-        "q01": [-0.6, -0.6, -0.6, -0.12, -0.15, -0.15, -1.0],
-        "q99": [0.6, 0.6, 0.6, 0.12, 0.15, 0.15, 1.0],
-    },
-}
+_STATE_RANGE = ([-0.4, -0.35, 0.0, 2.4, -1.5, -1.2, 0.0, -0.04], [0.2, 0.35, 1.3, 3.7, 1.5, 0.8, 0.04, 0.0])
+_ACTION_RANGE = ([-0.6, -0.6, -0.6, -0.12, -0.15, -0.15, -1.0], [0.6, 0.6, 0.6, 0.12, 0.15, 0.15, 1.0])
 
 #: Standard deviation σ of the logits of the sharpest and the flattest head of a block, for independent keys and
 #: queries. Attention then spreads over about exp(-σ²/2) of the keys.
 _SHARPEST, _FLATTEST = 2.6, 0.8
 
 
-def builtin_stats() -> NormStats:
-    """Return the made-up ranges as statistics; mean and spread are those of an even distribution over the range."""
+def builtin_stats(robot: Robot | None = None) -> NormStats:
+    """Return made-up ranges: those of the simulators' arm, or -1 to 1 for every number of a robot of other sizes.
 
-    def statistics(name: str) -> Statistics:
-        low, high = (np.array(BUILTIN_STATS[name][key]) for key in ("q01", "q99"))
-        return Statistics(mean=(low + high) / 2, std=(high - low) / np.sqrt(12), q01=low, q99=high)
+    Mean and spread are those of an even distribution over the range.
+    """
+    state, actions = _STATE_RANGE, _ACTION_RANGE
+    if robot is not None and (robot.state_dim, robot.action_dim) != (STATE_DIM, ENVIRONMENT_ACTION_DIM):
+        state, actions = (([-1.0] * dim, [1.0] * dim) for dim in (robot.state_dim, robot.action_dim))
 
-    return NormStats(state=statistics("state"), actions=statistics("actions"))
+    def statistics(low: list[float], high: list[float]) -> Statistics:
+        middle, width = (np.array(low) + high) / 2, np.array(high) - low
+        return Statistics(mean=middle.tolist(), std=(width / np.sqrt(12)).tolist(), q01=low, q99=high)
+
+    return NormStats(statistics(*state), statistics(*actions))
 
 
 def random_weights(config: PiConfig, seed: int) -> dict[str, Tensor]:
@@ -122,18 +120,6 @@ def build_random_model(config: PiConfig, seed: int, device: str | torch.device =
     return model_from_state(config, random_weights(config, seed), device=device)
 
 
-def _stats_of(robot: Robot | None) -> NormStats:
-    """Return made-up ranges: those of the simulators' arm, or -1 to 1 for every number of a robot of other sizes."""
-    if robot is None or (robot.state_dim, robot.action_dim) == (STATE_DIM, ENVIRONMENT_ACTION_DIM):
-        return builtin_stats()
-
-    def statistics(dim: int) -> Statistics:
-        ones = np.ones(dim)
-        return Statistics(mean=0 * ones, std=ones * 2 / np.sqrt(12), q01=-ones, q99=ones)
-
-    return NormStats(state=statistics(robot.state_dim), actions=statistics(robot.action_dim))
-
-
 def _random_policy(
     name: str,
     config: PiConfig,
@@ -142,11 +128,10 @@ def _random_policy(
     robot: Robot | None,
     replan_steps: int = OPENPI_REPLAN_STEPS,
 ) -> PiPolicy:
-    stats = _stats_of(robot)
     return PiPolicy(
         build_random_model(config, seed, device),
         PromptTokenizer(EMBEDDED_TOKENIZER),
-        OpenpiProcessing(config, stats, normalisation="quantile", replan_steps=replan_steps, robot=robot),
+        openpi_processing(config, builtin_stats(robot), robot, replan_steps),
         PolicySource(name=name, checkpoint=f"random weights, seed {seed}", checkpoint_format="seeded", untrained=True),
     )
 

@@ -112,17 +112,17 @@ class PiSettings(ModelSettings):
             slots = facts.get("config", {}).get("cameras", ())
             same = {"camera": [f"{name}={sources.get(name, NONE)}" for name in slots]}
         same |= {name: Path(facts[name]) for name in ("model_config", "norm_stats") if name in facts}
-        same |= {name: facts[name] for name in ("asset_id",) if name in facts}
+        same |= {name: facts[name] for name in ("asset_id", "config_name") if name in facts}
         if identity.checkpoint_format == "seeded":
             return {"checkpoint": identity.name, **same}
-        settings = {"checkpoint": identity.checkpoint, "dtype": identity.config["dtype"], **same}
-        if identity.checkpoint_format in ("openpi_torch", "openpi_jax", "lerobot"):
-            settings["checkpoint_format"] = identity.checkpoint_format
         if identity.checkpoint_format.startswith("openpi"):
-            settings["discrete_state_input"] = identity.config["config"].get("discrete_state_input", False)
-        if "config_name" in identity.config:
-            settings["config_name"] = identity.config["config_name"]
-        return settings
+            same["discrete_state_input"] = facts["config"].get("discrete_state_input", False)
+        return {
+            "checkpoint": identity.checkpoint,
+            "checkpoint_format": identity.checkpoint_format,
+            "dtype": facts["dtype"],
+            **same,
+        }
 
 
 FAMILY = PolicyFamily(

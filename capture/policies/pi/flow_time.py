@@ -36,16 +36,17 @@ def embed_times(
     times: np.ndarray,
     width: int,
     convention: TimeConvention = "accumulated",
-    *,
-    min_period: float = MIN_PERIOD,
-    max_period: float = MAX_PERIOD,
+    periods: tuple[float, float] = (MIN_PERIOD, MAX_PERIOD),
 ) -> Tensor:
     """Return [sin, cos] waves of the times (denoise,) as (denoise, width) float32, with geometric periods.
+
+    periods: the shortest and the longest.
 
     Computed on the CPU, because other devices round the periods differently.
     """
     dtype = torch.float64 if convention == "stepped" else torch.float32
     fraction = torch.linspace(0.0, 1.0, width // 2, dtype=dtype)
-    period = min_period * (max_period / min_period) ** fraction
+    shortest, longest = periods
+    period = shortest * (longest / shortest) ** fraction
     angle = torch.from_numpy(times).to(dtype)[:, None] * (1.0 / period * 2.0 * torch.pi)
     return torch.cat([torch.sin(angle), torch.cos(angle)], dim=-1).float()

@@ -177,15 +177,12 @@ def plan_leaves(paths: Iterable[str]) -> tuple[dict[str, LeafPlan], dict[str, tu
     merged = {path for pair in pairs.values() for path in pair}
     found = {path: _plan_leaf(path) for path in known if path not in merged}
     plans = {path: plan for path, plan in found.items() if plan is not None}
-    is_pi = "action_in_proj/kernel" in plans
-    if len(plans) < len(found):
-        unknown = sorted(found.keys() - plans.keys())
-        raise CheckpointMismatch(
-            f"The checkpoint has {len(unknown)} arrays that a pi model does not have: {listing(unknown, 40)}."
-            f"{'' if is_pi else _OTHER_OPENPI_MODEL}"
-        )
-    if not is_pi:
-        raise CheckpointMismatch(f"The checkpoint has no action_in_proj.{_OTHER_OPENPI_MODEL}")
+    unknown, is_pi = sorted(found.keys() - plans.keys()), "action_in_proj/kernel" in plans
+    if unknown or not is_pi:
+        what = "no action_in_proj"
+        if unknown:
+            what = f"{len(unknown)} arrays that a pi model does not have: {listing(unknown, 40)}"
+        raise CheckpointMismatch(f"The checkpoint has {what}.{'' if is_pi else _OTHER_OPENPI_MODEL}")
     return plans, pairs
 
 

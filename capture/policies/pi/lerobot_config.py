@@ -21,6 +21,7 @@ from vla_attention.capture.policies.checkpoints import (
 )
 from vla_attention.capture.policies.pi.flow_time import MAX_PERIOD, MIN_PERIOD
 from vla_attention.capture.policies.pi.sizes import MAX_TOKEN_LEN
+from vla_attention.capture.policies.robot import IMAGES
 from vla_attention.schemas.errors import listing
 
 #: The switches that are refused, with the value that turns each off.
@@ -36,7 +37,6 @@ REFUSED: dict[str, Any] = {
 #: Cameras, with those that are always black. LeRobot's policies have up to five.
 MAX_CAMERAS = 64
 STATE_FEATURE, ACTION_FEATURE = "observation.state", "action"
-IMAGES = "observation.images."
 
 Period = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
 

@@ -17,11 +17,14 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint, UnsupportedCheckpoint, read_typed
+from vla_attention.capture.policies.pi.formats import PREPROCESSOR
 from vla_attention.capture.policies.pi.lerobot_config import ACTION_FEATURE, STATE_FEATURE, LerobotConfig
+from vla_attention.capture.policies.pi.preprocess import Normaliser
+from vla_attention.capture.policies.pi.tokenizer import PromptFormat
 from vla_attention.capture.policies.safetensors_file import open_safetensors
 from vla_attention.schemas.errors import listing
 
-PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor.json", "policy_postprocessor.json"
+POSTPROCESSOR = "policy_postprocessor.json"
 
 _RENAME, _NORMALIZE, _UNNORMALIZE = "rename_observations_processor", "normalizer_processor", "unnormalizer_processor"
 _NEW_LINE, _STATE_PROMPT = "pi0_new_line_processor", "pi05_prepare_state_tokenizer_processor_step"
@@ -63,60 +66,19 @@ class _Pipeline(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True)
-class LerobotNormaliser:
-    """Normalisation of one vector as LeRobot computes it, in float32.
-
-    mode: IDENTITY, MEAN_STD ((x - mean)/(std + eps), inverse x·std + mean) or QUANTILES (2(x - q01)/(q99 - q01) - 1,
-    where a range of 0 counts as eps). statistics: each (dim,) float32.
-    """
-
-    mode: str
-    statistics: Mapping[str, NDArray[np.float32]]
-    eps: float
-
-    def normalise(self, x: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Map (..., dim) to the model's range, without clipping."""
-        x = np.asarray(x, dtype=np.float32)
-        if self.mode == "IDENTITY":
-            return x
-        if self.mode == "MEAN_STD":
-            return (x - self.statistics["mean"]) / (self.statistics["std"] + np.float32(self.eps))
-        return np.float32(2.0) * (x - self.statistics["q01"]) / self._range() - np.float32(1.0)
-
-    def unnormalise(self, x: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Invert `normalise` on (..., dim)."""
-        x = np.asarray(x, dtype=np.float32)
-        if self.mode == "IDENTITY":
-            return x
-        if self.mode == "MEAN_STD":
-            return x * self.statistics["std"] + self.statistics["mean"]
-        return (x + np.float32(1.0)) * self._range() / np.float32(2.0) + self.statistics["q01"]
-
-    def _range(self) -> NDArray[np.float32]:
-        span = self.statistics["q99"] - self.statistics["q01"]
-        return np.where(span == 0, np.float32(self.eps), span)
-
-
-@dataclass(frozen=True)
 class LerobotPipeline:
     """Content of the two saved pipelines: camera names, prompt format, normalisation of state and action."""
 
     rename: dict[str, str]
-    state_in_prompt: bool
-    new_line: bool
+    prompt_format: PromptFormat
     cut_long_prompts: bool
-    state: LerobotNormaliser
-    action: LerobotNormaliser
+    state: Normaliser
+    action: Normaliser
 
 
 def read_lerobot_pipeline(folder: Path, config: LerobotConfig) -> LerobotPipeline:
     """Read both pipelines of a checkpoint folder; an error names an unsupported step or setting."""
     before, after = _steps(folder, PREPROCESSOR, _BEFORE), _steps(folder, POSTPROCESSOR, _AFTER)
-    for steps, name, where in ((before, _RELATIVE, PREPROCESSOR), (after, _ABSOLUTE, POSTPROCESSOR)):
-        if name in steps and steps[name].config.enabled:
-            raise UnsupportedCheckpoint(
-                f"'{folder / where}' has {name} enabled: actions relative to the state are not supported."
-            )
     state_in_prompt, new_line = _STATE_PROMPT in before, _NEW_LINE in before
     if state_in_prompt != config.pi05 or (new_line and config.pi05):
         raise UnsupportedCheckpoint(
@@ -135,10 +97,10 @@ def read_lerobot_pipeline(folder: Path, config: LerobotConfig) -> LerobotPipelin
             raise UnsupportedCheckpoint(
                 f"'{folder / PREPROCESSOR}' tokenizes with {setting} {given!r}; expected {wanted!r}."
             )
+    without_state: PromptFormat = "raw-instruction-newline" if new_line else "raw-instruction"
     return LerobotPipeline(
         rename=before.get(_RENAME, _Step()).config.rename_map or {},
-        state_in_prompt=state_in_prompt,
-        new_line=new_line,
+        prompt_format="task-state-action" if state_in_prompt else without_state,
         cut_long_prompts=tokenizer.truncation,
         state=_normaliser(folder / PREPROCESSOR, before.get(_NORMALIZE), "STATE", STATE_FEATURE, config),
         action=_normaliser(folder / POSTPROCESSOR, after.get(_UNNORMALIZE), "ACTION", ACTION_FEATURE, config),
@@ -159,11 +121,15 @@ def _steps(folder: Path, name: str, known: set[str]) -> dict[str, _Step]:
             raise UnsupportedCheckpoint(f"'{path}' has a step that is not supported: {called!r}.")
         if step.registry_name in by_name and step.registry_name not in _NOTHING:
             raise UnsupportedCheckpoint(f"'{path}' has the step {step.registry_name} twice.")
+        if step.registry_name in (_RELATIVE, _ABSOLUTE) and step.config.enabled:
+            raise UnsupportedCheckpoint(
+                f"'{path}' has {step.registry_name} enabled: actions relative to the state are not supported."
+            )
         by_name[step.registry_name] = step
     return by_name
 
 
-def _normaliser(path: Path, step: _Step | None, kind: str, feature: str, config: LerobotConfig) -> LerobotNormaliser:
+def _normaliser(path: Path, step: _Step | None, kind: str, feature: str, config: LerobotConfig) -> Normaliser:
     if step is None:
         raise UnsupportedCheckpoint(f"'{path}' has no step that says how to normalise {feature}.")
     modes = {**(config.normalization_mapping or {}), **(step.config.norm_map or {})}
@@ -176,7 +142,24 @@ def _normaliser(path: Path, step: _Step | None, kind: str, feature: str, config:
         raise UnsupportedCheckpoint(f"'{path}' normalises {kind} by {mode}; supported are {listing(_NEEDED)}.")
     dim = config.state_dim if kind == "STATE" else config.action_dim
     statistics = _statistics(path.parent, step.state_file or "", feature, _NEEDED[mode], dim)
-    return LerobotNormaliser(mode, statistics, step.config.eps)
+    return lerobot_normaliser(mode, statistics, step.config.eps, dim)
+
+
+def lerobot_normaliser(mode: str, statistics: Mapping[str, NDArray[np.float32]], eps: float, dim: int) -> Normaliser:
+    """Return the normalisation of a vector as LeRobot computes it, in float32.
+
+    mode: IDENTITY, MEAN_STD ((x - mean)/(std + eps), inverse x·std + mean) or QUANTILES (2(x - q01)/(q99 - q01) - 1,
+    where a range of 0 counts as eps). statistics: each (dim,) float32.
+    """
+    if mode == "MEAN_STD":
+        std = statistics["std"]
+        return Normaliser(mode, statistics["mean"], std + np.float32(eps), std)
+    if mode == "QUANTILES":
+        span = statistics["q99"] - statistics["q01"]
+        span = np.where(span == 0, np.float32(eps), span)
+        return Normaliser(mode, statistics["q01"], span, span, is_range=True)
+    one = np.ones(dim, dtype=np.float32)
+    return Normaliser(mode, 0 * one, one, one)
 
 
 def _statistics(
@@ -190,9 +173,10 @@ def _statistics(
         raise UnreadableCheckpoint(f"The statistics of '{feature}' should be in '{path}', which is not there.")
     values: dict[str, NDArray[np.float32]] = {}
     with open_safetensors(path) as stored:
+        shapes = stored.shapes()
         for key in needed:
             name = f"{feature}.{key}"
-            shape = stored.shape(name) if name in stored.names() else "none"
+            shape = shapes.get(name, "none")
             if shape != (dim,):
                 raise UnreadableCheckpoint(
                     f"The statistics '{name}' of '{path}' have shape {shape}; {dim} numbers are needed."

@@ -9,9 +9,9 @@ from pathlib import Path
 import torch
 
 from vla_attention.capture.environments.episode_protocol import CAMERAS
-from vla_attention.capture.policies.checkpoints import UnsupportedCheckpoint
+from vla_attention.capture.policies.checkpoints import UnsupportedCheckpoint, read_json_object
 from vla_attention.capture.policies.family import UNTRAINED, UNTRAINED_TINY
-from vla_attention.capture.policies.hub import downloads, lasting_name
+from vla_attention.capture.policies.hub import downloads, lasting_name, would_be_fetched
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.pi.config import (
     CAMERA_SLOTS,
@@ -22,27 +22,28 @@ from vla_attention.capture.policies.pi.config import (
     find_config,
     find_variant,
 )
-from vla_attention.capture.policies.pi.data_set_robot import asset_name, lerobot_robot, openpi_robot
+from vla_attention.capture.policies.pi.data_set_robot import lerobot_robot, openpi_robot
 from vla_attention.capture.policies.pi.embedded import dummy_policy, embedded_policy
 from vla_attention.capture.policies.pi.family import SHIPPED, PiSettings
 from vla_attention.capture.policies.pi.formats import CheckpointFormat, detect_format
-from vla_attention.capture.policies.pi.lerobot import load_lerobot
+from vla_attention.capture.policies.pi.lerobot import lerobot_arm, lerobot_model, lerobot_processing
 from vla_attention.capture.policies.pi.lerobot_config import read_lerobot_config
 from vla_attention.capture.policies.pi.lerobot_pipeline import read_lerobot_pipeline
-from vla_attention.capture.policies.pi.locate import find_checkpoint, find_tokenizer, would_be_fetched
+from vla_attention.capture.policies.pi.locate import find_checkpoint, find_tokenizer
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.openpi_jax import OpenLeaf, list_leaves, load_openpi_jax
-from vla_attention.capture.policies.pi.openpi_torch import load_openpi_torch, open_tensors
+from vla_attention.capture.policies.pi.openpi_torch import load_safetensors, open_tensors
 from vla_attention.capture.policies.pi.policy import PiPolicy
-from vla_attention.capture.policies.pi.preprocess import RELATIVE_ACTIONS, read_norm_stats
+from vla_attention.capture.policies.pi.preprocess import RELATIVE_ACTIONS, find_norm_stats, read_norm_stats
 from vla_attention.capture.policies.pi.processing import (
     CAMERA_OF_SLOT,
-    OpenpiProcessing,
     Processing,
+    openpi_arm,
+    openpi_processing,
     simulated_arm,
     simulator_cameras,
 )
-from vla_attention.capture.policies.pi.sizes import is_pi05
+from vla_attention.capture.policies.pi.sizes import is_pi05, stated_config
 from vla_attention.capture.policies.pi.stated_sizes import (
     CASE_FILE,
     CONFIG_FILE,
@@ -57,102 +58,20 @@ from vla_attention.schemas.errors import BadArgument, listing
 
 
 def load_pi_model(
-    folder: str | Path,
+    folder: Path,
+    config: PiConfig,
     *,
     checkpoint_format: CheckpointFormat | None = None,
-    config: PiConfig | None = None,
     dtype: torch.dtype = torch.float32,
     device: str | torch.device = "cpu",
-) -> tuple[PiModel, CheckpointFormat]:
-    """Return the model and the format of the folder; `config` overrides the sizes of the checkpoint.
-
-    Of a LeRobot checkpoint only the tensors are read, so that it needs a `config`; see `load_lerobot`.
-    """
-    detected = detect_format(folder, checkpoint_format)
-    if detected != "openpi_jax":
-        return load_openpi_torch(folder, config=config, dtype=dtype, device=device), detected
-    config = config or find_config("pi05_libero" if _is_pi05(Path(folder), detected) else "pi0_libero")
-    return load_openpi_jax(folder, config=config, dtype=dtype, device=device), detected
+) -> PiModel:
+    """Load the model of a checkpoint folder; its tensors must be those of the configuration."""
+    load = load_openpi_jax if detect_format(folder, checkpoint_format) == "openpi_jax" else load_safetensors
+    return load(folder, config, dtype, device)
 
 
 #: The folder of openpi's statistics of DROID, in `assets/`.
 DROID_ASSET = "droid"
-
-
-def load_pi_policy(
-    checkpoint: str | Path,
-    tokenizer: str | Path,
-    settings: PiSettings | None = None,
-    *,
-    config: PiConfig | None = None,
-    device: str | torch.device = "cpu",
-) -> PiPolicy:
-    """Load a policy from a checkpoint folder of any of the three formats and a tokenizer file.
-
-    settings: of which `checkpoint` and `device` are not used. config: the model's configuration, for library callers;
-    the command line names one in `settings`.
-    """
-    folder, settings = Path(checkpoint), settings or PiSettings()
-    data, robot = settings.robot_data, settings.robot
-    chosen_cameras = {} if data is not None else read_camera_choices(settings.camera, CAMERAS)
-    given_dtype = None if settings.dtype is None else DTYPES[settings.dtype]
-    detected = detect_format(folder, settings.checkpoint_format)
-    if config is not None:
-        chosen = ChosenConfig(config, "given")
-    else:
-        chosen = choose_config(folder, detected, settings, of_data_set=bool(data or robot))
-        config = chosen.config
-    norm_stats = None if detected == "lerobot" else read_norm_stats(folder, settings.norm_stats, settings.asset_id)
-    if data is not None and norm_stats is None:
-        robot = lerobot_robot(folder, data)
-    elif data is not None:
-        robot = openpi_robot(data, norm_stats, RELATIVE_ACTIONS if chosen.name in _OF_RELATIVE_ACTIONS else 0)
-    if settings.discrete_state_input and config is not None:
-        _check_state_input(config)
-    # Small files first: if the tokenizer is missing, the minutes for loading the weights are saved.
-    prompt_tokenizer = PromptTokenizer(tokenizer)
-    processing: Processing
-    if norm_stats is None:
-        model, processing = load_lerobot(
-            folder,
-            sizes=config,
-            dtype=given_dtype,
-            device=device,
-            robot=robot,
-            chosen_cameras=chosen_cameras,
-        )
-    else:
-        cameras = None
-        if robot is None:  # before the weights: names may be wrong
-            slots = CAMERA_SLOTS if config is None else config.cameras
-            cameras = simulator_cameras(slots, CAMERA_OF_SLOT, chosen_cameras)
-        dtype = given_dtype or torch.float32
-        model, _ = load_pi_model(folder, checkpoint_format=detected, config=config, dtype=dtype, device=device)
-        if settings.discrete_state_input:
-            _check_state_input(model.config)
-            model.config = dataclasses.replace(model.config, discrete_state_input=True)
-        pi05 = model.config.pi05
-        # openpi's LIBERO configurations: pi0.5 quantiles and plain actions, pi0 z-scores and actions relative to the
-        # state.
-        processing = OpenpiProcessing(
-            model.config,
-            norm_stats,
-            normalisation="quantile" if pi05 else "z-score",
-            relative_actions=not pi05,
-            robot=robot,
-            cameras=cameras,
-        )
-    family = "pi05" if model.config.pi05 else "pi0"
-    source = PolicySource(
-        name=stated_name(folder / CONFIG_FILE) or family if detected == "openpi_torch" else family,
-        checkpoint=str(checkpoint),
-        checkpoint_format=detected,
-        untrained=False,
-        configuration=chosen.source,
-        config_name=chosen.name if chosen.stated else "",
-        options=settings.stored(),
-    )
-    return PiPolicy(model, prompt_tokenizer, processing, source)
 
 
 #: openpi's configurations of pi0 in LIBERO, whose data have actions relative to the state.
@@ -163,19 +82,18 @@ _OF_RELATIVE_ACTIONS = ("pi0_libero", "pi0_libero_low_mem_finetune")
 class ChosenConfig:
     """The configuration that a checkpoint is loaded with.
 
-    config: None if the checkpoint's own files determine it. source: where it is from, in words. name: openpi's for it,
-    empty without one. stated: the user named it; otherwise the checkpoint's files imply the name.
+    config: None for what a LeRobot checkpoint states itself. source: where it is from, in words. name: openpi's for it,
+    empty without one.
     """
 
     config: PiConfig | None
     source: str
     name: str = ""
-    stated: bool = False
 
     @classmethod
-    def named(cls, name: str, why: str = "", *, stated: bool = False) -> ChosenConfig:
+    def named(cls, name: str, why: str = "") -> ChosenConfig:
         """Openpi's configuration of that name."""
-        return cls(find_config(name), f"openpi's {name}{why}", name, stated)
+        return cls(find_config(name), f"openpi's {name}{why}", name)
 
 
 def choose_config(
@@ -189,18 +107,16 @@ def choose_config(
         BadArgument: settings contradict each other or the format.
         UnsupportedCheckpoint: nothing states the configuration.
     """
-    of_config = settings.config_name is not None or settings.discrete_state_input
-    of_statistics = settings.norm_stats is not None or settings.asset_id is not None
     for is_wrong, said in (
         (settings.config_name and settings.model_config, "Give --config-name or --model-config, not both."),
         (settings.norm_stats and settings.asset_id, "Give --norm-stats or --asset-id, not both."),
         (
-            found == "lerobot" and of_config,
+            found == "lerobot" and (settings.config_name or settings.discrete_state_input),
             "A LeRobot checkpoint states its configuration in config.json; leave --config-name and "
             "--discrete-state-input out.",
         ),
         (
-            found == "lerobot" and of_statistics,
+            found == "lerobot" and (settings.norm_stats or settings.asset_id),
             "A LeRobot checkpoint has its statistics in its saved pipelines (policy_preprocessor.json); leave "
             "--norm-stats and --asset-id out.",
         ),
@@ -208,7 +124,7 @@ def choose_config(
         if is_wrong:
             raise BadArgument(said)
     if settings.config_name is not None:
-        return ChosenConfig.named(settings.config_name, stated=True)
+        return ChosenConfig.named(settings.config_name)
     if settings.model_config is not None:
         path = settings.model_config.expanduser()
         return ChosenConfig(read_config(path), str(path))
@@ -217,20 +133,22 @@ def choose_config(
         return ChosenConfig(read_config(beside), f"{CASE_FILE} beside the checkpoint")
     if found == "openpi_torch" and states_sizes(folder / CONFIG_FILE):
         return ChosenConfig(read_config(folder / CONFIG_FILE), CONFIG_FILE)
-    if of_data_set and found != "lerobot" and (settings.asset_id or asset_name(folder)) == DROID_ASSET:
-        name = "pi05_droid" if _is_pi05(folder, found) else "pi0_droid"
-        return ChosenConfig.named(name, f" (its statistics are those of '{DROID_ASSET}')")
+    if found == "lerobot":
+        return ChosenConfig(None, CONFIG_FILE)
+    has_pi05 = _is_pi05(folder, found)  # whatever else it may be comes first
+    kind = "pi05" if has_pi05 else "pi0"
+    of_statistics = [settings.asset_id] if settings.asset_id else list(find_norm_stats(folder))
+    if of_data_set and of_statistics == [DROID_ASSET]:
+        return ChosenConfig.named(f"{kind}_droid", f" (its statistics are those of '{DROID_ASSET}')")
     if found == "openpi_jax":
-        name = "pi05_libero" if _is_pi05(folder, found) else "pi0_libero"
-        return ChosenConfig.named(name, " (not stated by the checkpoint)")
+        return ChosenConfig.named(f"{kind}_libero", " (not stated by the checkpoint)")
     if not (folder / CONFIG_FILE).is_file():
-        _is_pi05(folder, found)  # whatever else it may be comes first
         raise UnsupportedCheckpoint(
             f"'{folder}' has no {CONFIG_FILE}, as openpi's train_pytorch.py leaves it, so that nothing states its "
             f"heads and the actions of a call. Give --config-name NAME (openpi's {listing(NAMED_CONFIGS)}), or "
             f"--model-config FILE, a file like {CASE_FILE} (docs/checkpoints.md)."
         )
-    return ChosenConfig(None, "config.json")
+    return ChosenConfig(stated_config(read_json_object(folder / CONFIG_FILE), pi05=has_pi05), CONFIG_FILE)
 
 
 def _is_pi05(folder: Path, found: CheckpointFormat) -> bool:
@@ -238,12 +156,7 @@ def _is_pi05(folder: Path, found: CheckpointFormat) -> bool:
     if found == "openpi_jax":
         return not any(leaf.path.startswith("state_proj/") for leaf in list_leaves(folder / "params"))
     with open_tensors(folder) as tensors:
-        return is_pi05(tensors.shapes)
-
-
-def _check_state_input(config: PiConfig) -> None:
-    if not config.pi05:
-        raise BadArgument("--discrete-state-input is for pi0.5; a pi0 policy reads its state as a token of its own.")
+        return is_pi05(tensors.held)
 
 
 _UNTRAINED = {UNTRAINED: embedded_policy, UNTRAINED_TINY: dummy_policy}
@@ -254,37 +167,12 @@ def build_pi_policy(settings: PiSettings, device: str) -> PiPolicy:
 
     Raises `BadArgument` if a variant or the number of image tokens contradicts the policy.
     """
-    checkpoint, robot, data = settings.checkpoint, settings.robot, settings.robot_data
+    checkpoint = settings.checkpoint
     named = (settings.paligemma_variant, settings.action_expert_variant)
     variants = [find_variant(name) if name else None for name in named]
-    cameras = {} if data is not None else read_camera_choices(settings.camera, CAMERAS)
-    if cameras and robot is not None:
-        raise BadArgument("Cannot use --camera: the pictures of a data set's store are chosen already; leave it out.")
     if settings.config_name is not None:
         find_config(settings.config_name)  # an unknown name is reported before any download
-    if checkpoint in _UNTRAINED:
-        sizes = (settings.checkpoint_format, settings.config_name, settings.model_config, *settings.stored())
-        if any(sizes) or settings.discrete_state_input or settings.dtype == "bfloat16":
-            raise BadArgument(
-                f"The policy '{checkpoint}' comes with the program, in float32; --checkpoint-format, --config-name, "
-                "--model-config, --discrete-state-input, --norm-stats, --asset-id and --dtype bfloat16 are for "
-                "checkpoints."
-            )
-        if data is not None:
-            robot = openpi_robot(data, None)
-        elif cameras:
-            robot = simulated_arm(simulator_cameras(CAMERA_SLOTS, CAMERA_OF_SLOT, cameras))
-        policy = _UNTRAINED[checkpoint](device=device, robot=robot)
-    else:
-        path = SHIPPED[checkpoint] if checkpoint in SHIPPED else find_checkpoint(checkpoint)
-        detect_format(path, settings.checkpoint_format)  # a folder without a checkpoint is reported first
-        tokenizer_path = find_tokenizer(path, settings.tokenizer)
-        policy = load_pi_policy(path, tokenizer_path, settings, device=device)
-        # Where the package is installed differs between machines; the name of what it ships does not.
-        lasting = checkpoint if checkpoint in SHIPPED else lasting_name(checkpoint, path)
-        policy.source = dataclasses.replace(
-            policy.source, downloads=downloads(path, tokenizer_path), checkpoint=lasting
-        )
+    policy = (_build_untrained if checkpoint in _UNTRAINED else load_pi_policy)(settings, device)
     config = policy.model.config
     for option, given, actual in (
         ("--paligemma-variant", variants[0], config.paligemma),
@@ -303,25 +191,105 @@ def build_pi_policy(settings: PiSettings, device: str) -> PiPolicy:
     return policy
 
 
+def _chosen_cameras(settings: PiSettings) -> dict[str, str]:
+    """Return policy camera -> camera of the simulators, of `--camera`; a data set's columns are chosen elsewhere."""
+    cameras = {} if settings.robot_data is not None else read_camera_choices(settings.camera, CAMERAS)
+    if cameras and settings.robot is not None:
+        raise BadArgument("Cannot use --camera: the pictures of a data set's store are chosen already; leave it out.")
+    return cameras
+
+
+def _build_untrained(settings: PiSettings, device: str) -> PiPolicy:
+    settings.refuse_for_untrained(
+        "checkpoint_format", "config_name", "model_config", "discrete_state_input", "norm_stats", "asset_id"
+    )
+    robot, cameras = settings.robot, _chosen_cameras(settings)
+    if settings.robot_data is not None:
+        robot = openpi_robot(settings.robot_data, None)
+    elif cameras:
+        robot = simulated_arm(simulator_cameras(CAMERA_SLOTS, CAMERA_OF_SLOT, cameras))
+    return _UNTRAINED[settings.checkpoint](device=device, robot=robot)
+
+
+@dataclass(frozen=True)
+class _Planned:
+    """A policy of a checkpoint but for its weights."""
+
+    folder: Path
+    found: CheckpointFormat
+    config: PiConfig
+    dtype: torch.dtype
+    tokenizer: PromptTokenizer
+    processing: Processing
+    source: PolicySource
+
+
+def _plan(settings: PiSettings) -> _Planned:
+    """Read everything of a checkpoint that is small, before the minutes for loading its weights."""
+    name, data, robot, cameras = settings.checkpoint, settings.robot_data, settings.robot, _chosen_cameras(settings)
+    folder = SHIPPED[name] if name in SHIPPED else find_checkpoint(name)
+    found = detect_format(folder, settings.checkpoint_format)
+    chosen = choose_config(folder, found, settings, of_data_set=bool(data or robot))
+    dtype: str = settings.dtype or "float32"
+    if found == "lerobot":
+        stated = read_lerobot_config(folder)
+        pipeline = read_lerobot_pipeline(folder, stated)
+        dtype = settings.dtype or stated.dtype
+        if data is not None:
+            robot = lerobot_robot(stated, pipeline.rename, data)
+        robot = robot or lerobot_arm(stated, pipeline.rename, cameras)
+        config = lerobot_model(stated, _is_pi05(folder, found), chosen.config, robot)
+        processing = lerobot_processing(stated, pipeline, robot)
+    else:
+        assert chosen.config is not None
+        config = chosen.config
+        if settings.discrete_state_input:
+            if not config.pi05:
+                raise BadArgument(
+                    "--discrete-state-input is for pi0.5; a pi0 policy reads its state as a token of its own."
+                )
+            config = dataclasses.replace(config, discrete_state_input=True)
+        stats = read_norm_stats(folder, settings.norm_stats, settings.asset_id)
+        if data is not None:
+            robot = openpi_robot(data, stats, RELATIVE_ACTIONS if chosen.name in _OF_RELATIVE_ACTIONS else 0)
+        processing = openpi_processing(config, stats, robot or openpi_arm(config, cameras))
+    family = "pi05" if config.pi05 else "pi0"
+    tokenizer = find_tokenizer(folder, settings.tokenizer)
+    source = PolicySource(
+        name=stated_name(folder / CONFIG_FILE) or family if found == "openpi_torch" else family,
+        # Where the package is installed differs between machines; the name of what it ships does not.
+        checkpoint=name if name in SHIPPED else lasting_name(name, folder),
+        checkpoint_format=found,
+        untrained=False,
+        configuration=chosen.source,
+        config_name=settings.config_name or "",
+        options=settings.stored(),
+        downloads=downloads(folder, tokenizer),
+    )
+    return _Planned(folder, found, config, DTYPES[dtype], PromptTokenizer(tokenizer), processing, source)
+
+
+def load_pi_policy(settings: PiSettings, device: str | torch.device = "cpu") -> PiPolicy:
+    """Load a policy from a checkpoint of any of the three formats."""
+    planned = _plan(settings)
+    model = load_pi_model(
+        planned.folder, planned.config, checkpoint_format=planned.found, dtype=planned.dtype, device=device
+    )
+    return PiPolicy(model, planned.tokenizer, planned.processing, planned.source)
+
+
 def check_pi_files(settings: PiSettings) -> None:
     """Raise what `build_pi_policy` would for a checkpoint of this machine that lacks a file; reads no weights."""
-    checkpoint = settings.checkpoint
-    if checkpoint in (*SHIPPED, *_UNTRAINED) or would_be_fetched(checkpoint):
+    if settings.checkpoint in (*SHIPPED, *_UNTRAINED) or would_be_fetched(settings.checkpoint):
         return
-    folder = find_checkpoint(checkpoint)
-    found = detect_format(folder, settings.checkpoint_format)
-    choose_config(folder, found, settings)
-    if found == "openpi_jax":
-        for leaf in list_leaves(folder / "params"):
-            OpenLeaf(folder / "params", leaf)
+    planned = _plan(settings)
+    if planned.found == "openpi_jax":
+        params = planned.folder / "params"
+        for leaf in list_leaves(params):
+            OpenLeaf(params, leaf)
     else:
-        with open_tensors(folder):
+        with open_tensors(planned.folder):
             pass
-    if found == "lerobot":
-        read_lerobot_pipeline(folder, read_lerobot_config(folder))
-    else:
-        read_norm_stats(folder, settings.norm_stats, settings.asset_id)
-    find_tokenizer(folder, settings.tokenizer)
 
 
 def _sizes(config: GemmaConfig) -> str:

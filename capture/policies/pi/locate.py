@@ -15,7 +15,6 @@ from vla_attention.capture.policies.hub import (
     in_hub_cache,
     local_or_fetched,
     snapshots_folder,
-    split_hub_name,
 )
 from vla_attention.schemas.errors import BadArgument, listing
 from vla_attention.schemas.safe_text import check_inner_path
@@ -57,17 +56,6 @@ def find_checkpoint(name: str) -> Path:
     return found
 
 
-def would_be_fetched(name: str) -> bool:
-    """Whether `find_checkpoint` would ask the hub for a checkpoint."""
-    return not name.startswith("gs://") and split_hub_name(name) is not None and not Path(name).expanduser().exists()
-
-
-def _in_openpi_cache(url: str) -> Path:
-    inner = url.removeprefix("gs://").rstrip("/")
-    check_inner_path(inner)
-    return openpi_cache() / inner
-
-
 def _where_else(path: Path) -> str:
     """Return where a checkpoint of openpi is whose path leads nowhere: a name alone, or a place in openpi's cache."""
     published = openpi_cache() / OPENPI_CHECKPOINTS
@@ -86,7 +74,9 @@ def openpi_cache() -> Path:
 
 
 def _from_openpi_cache(url: str) -> Path:
-    target = _in_openpi_cache(url)
+    inner = url.removeprefix("gs://")
+    check_inner_path(inner)
+    target = openpi_cache() / inner
     if not target.is_dir():
         raise CheckpointUnavailable(
             f"'{url}' is not in openpi's cache at '{target}'; fetch it where there is a network, with openpi or with "

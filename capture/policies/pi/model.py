@@ -237,6 +237,12 @@ class PiModel(nn.Module):
         among[: self.config.first_action_query, self.config.first_action_query :] = False
         return torch.cat([prefix_valid[:, None].expand(-1, queries, -1), among.expand(batch, -1, -1)], dim=-1)
 
+    def time_waves(self, num_steps: int) -> Tensor:
+        """Return the time embedding of each denoise step, (denoise, width)."""
+        config = self.config
+        times, periods = denoise_times(num_steps, config.time_convention), (config.min_period, config.max_period)
+        return embed_times(times, config.action_expert.width, config.time_convention, periods).to(self.device)
+
     @torch.no_grad()
     def sample_actions(
         self,
@@ -284,15 +290,8 @@ class PiModel(nn.Module):
             recorder.begin_call(denoising.mask[0].any(dim=0), lasting, denoising.pieces)
 
         steps = config.num_denoise_steps if num_steps is None else num_steps
-        all_waves = embed_times(
-            denoise_times(steps, config.time_convention),
-            config.action_expert.width,
-            config.time_convention,
-            min_period=config.min_period,
-            max_period=config.max_period,
-        ).to(noise.device)
         x = noise
-        for step, waves in enumerate(all_waves):
+        for step, waves in enumerate(self.time_waves(steps)):
             x = x + (-1.0 / steps) * self.velocity(x, step, waves, denoising, recorder, editor)
         return x
 

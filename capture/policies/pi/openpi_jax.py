@@ -8,7 +8,7 @@ memory never holds much more than the model itself.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ from vla_attention.capture.foreign_files.checked_files import check_folder
 from vla_attention.capture.policies.checkpoints import UnreadableCheckpoint, read_json_object
 from vla_attention.capture.policies.hub import first_line
 from vla_attention.capture.policies.pi.config import PiConfig
-from vla_attention.capture.policies.pi.formats import detect_format
 from vla_attention.capture.policies.pi.jax_weights import merge_lora, plan_leaves
 from vla_attention.capture.policies.pi.model import PiModel, build_model, expected_shapes, expected_tensors
 from vla_attention.capture.policies.pi.sizes import check_jax_heads
@@ -31,12 +30,10 @@ from vla_attention.schemas.errors import MissingDependency
 
 @dataclass(frozen=True)
 class Leaf:
-    """One array of the checkpoint: its path in the model, its key in the store, and how it is stored."""
+    """One array of the checkpoint: its path in the model, and how tensorstore opens it."""
 
     path: str
-    store_key: str
-    driver: str
-    all_chunks_stored: bool
+    spec: Mapping[str, Any]
 
 
 def list_leaves(params: Path) -> list[Leaf]:
@@ -45,17 +42,24 @@ def list_leaves(params: Path) -> list[Leaf]:
     The saved tree starts with "params", and runs of openpi's training end every path with "value"; both are removed.
     """
     metadata = read_json_object(params / "_METADATA")
-    driver = "zarr3" if metadata.get("use_zarr3") else "zarr"
-    complete = bool(metadata.get("store_array_data_equal_to_fill_value"))
     try:
         keys = [[str(part["key"]) for part in leaf["key_metadata"]] for leaf in metadata["tree_metadata"].values()]
         paths = [parts[1:] if parts[0] == "params" else parts for parts in keys]
     except (KeyError, TypeError, AttributeError, IndexError) as error:
         raise UnreadableCheckpoint(f"'{params / '_METADATA'}' does not describe a tree of arrays.") from error
-    stored = [".".join(parts) for parts in keys]
     if all(path[-1:] == ["value"] for path in paths):
         paths = [path[:-1] for path in paths]
-    return [Leaf("/".join(path), store_key, driver, complete) for path, store_key in zip(paths, stored, strict=True)]
+    base = f"file://{params.resolve()}/"
+    spec = {
+        "driver": "zarr3" if metadata.get("use_zarr3") else "zarr",
+        # If the checkpoint declares that it stores every chunk, a missing chunk is an error, not zeros.
+        "fill_missing_data_reads": not metadata.get("store_array_data_equal_to_fill_value"),
+        "recheck_cached_data": False,
+    }
+    return [
+        Leaf("/".join(path), {**spec, "kvstore": {"driver": "ocdbt", "base": base, "path": f"{'.'.join(parts)}/"}})
+        for path, parts in zip(paths, keys, strict=True)
+    ]
 
 
 class OpenLeaf:
@@ -63,15 +67,10 @@ class OpenLeaf:
 
     def __init__(self, params: Path, leaf: Leaf):
         self._what = f"The array '{leaf.path}' of '{params}' cannot be read: files are missing or damaged"
-        self.path = leaf.path
-        self._spec = {
-            "driver": leaf.driver,
-            "kvstore": {"driver": "ocdbt", "base": f"file://{params.resolve()}/", "path": f"{leaf.store_key}/"},
-            # If the checkpoint declares that it stores every chunk, a missing chunk is an error, not zeros.
-            "fill_missing_data_reads": not leaf.all_chunks_stored,
-        }
+        self._spec = leaf.spec
         array = self._open(cache_bytes=0)
         self.shape: tuple[int, ...] = tuple(array.shape)
+        self.size = math.prod(self.shape)
         chunk = tuple(array.chunk_layout.read_chunk.shape)
         # A chunk is decoded as a whole, however little of it is in the array.
         if any(extent > max(1, size) for extent, size in zip(chunk, self.shape, strict=True)):
@@ -80,11 +79,6 @@ class OpenLeaf:
         #: One chunk often holds all layers; it is kept while its layers are read one by one.
         bytes_of_layer = self.size * array.dtype.numpy_dtype.itemsize / max(1, *self.shape[:1])
         self._cache_bytes = int(1.1 * bytes_of_layer * chunk[0]) if chunk and chunk[0] > 1 else 0
-
-    @property
-    def size(self) -> int:
-        """Number of elements."""
-        return math.prod(self.shape)
 
     def read(self) -> np.ndarray:
         """Return the whole leaf as float32, with the axes of the JAX model."""
@@ -99,9 +93,8 @@ class OpenLeaf:
     def _open(self, cache_bytes: int) -> Any:
         tensorstore = import_tensorstore()
         context = tensorstore.Context({"cache_pool": {"total_bytes_limit": cache_bytes}})
-        spec = {**self._spec, "recheck_cached_data": False}
         try:
-            return tensorstore.open(spec, open=True, read=True, context=context).result()
+            return tensorstore.open(self._spec, open=True, read=True, context=context).result()
         except Exception as error:  # the library raises what the kind of the fault maps to, whatever it is
             raise UnreadableCheckpoint(f"{self._what} ({first_line(error)}).") from error
 
@@ -124,20 +117,12 @@ def import_tensorstore() -> Any:
     return tensorstore
 
 
-def load_openpi_jax(
-    folder: str | Path,
-    *,
-    config: PiConfig,
-    dtype: torch.dtype = torch.float32,
-    device: str | torch.device = "cpu",
-) -> PiModel:
+def load_openpi_jax(folder: Path, config: PiConfig, dtype: torch.dtype, device: str | torch.device) -> PiModel:
     """Load a checkpoint in openpi's JAX format.
 
     Such a checkpoint does not state its configuration. All shapes are checked against the given one; the action horizon
     is in none of them. LoRA arrays are merged into the weights that they adapt.
     """
-    folder = Path(folder)
-    detect_format(folder, "openpi_jax")
     params = folder / "params"
     leaves = list_leaves(params)
     plans, pairs = plan_leaves(leaf.path for leaf in leaves)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,13 +22,18 @@ from vla_attention.capture.policies.pi.flow_time import denoise_times
 from vla_attention.capture.policies.pi.model import PiModel
 from vla_attention.capture.policies.pi.preprocess import libero_state, pad_to
 from vla_attention.capture.policies.pi.processing import Processing, image_tensor
-from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, TokenizedPrompt, check_vocabulary
+from vla_attention.capture.policies.pi.tokenizer import (
+    PromptTokenizer,
+    TokenizedPrompt,
+    check_vocabulary,
+    clean_instruction,
+)
 from vla_attention.capture.policies.policy import CallVariant, GivenInputs, PolicyInput, VariantMemory, camera_frame
 from vla_attention.capture.policies.weights import dtype_name, weights_digest
 from vla_attention.capture.recording.attention import AttentionEditor, BatchCollector, RowCollector
 from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.jsonable import to_json
-from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, roles_from_spans
+from vla_attention.schemas.layout import PatchGrid, Role, SiteLayout, Span, SpanKind, roles_from_spans
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.store_format import PolicyCameraView, PolicyIdentity
 
@@ -37,29 +42,18 @@ PROMPT_SPAN, STATE_SPAN, ACTION_SPAN = "prompt", "state", "actions"
 
 def site_layout(config: PiConfig) -> SiteLayout:
     """Return the key axis of a denoise step: cameras, prompt, state token (pi0 only), actions."""
-    lengths = [(camera, config.siglip.num_tokens) for camera in config.cameras]
-    lengths.append((PROMPT_SPAN, config.max_token_len))
+    parts: list[tuple[str, SpanKind, int]] = [(camera, "image", config.siglip.num_tokens) for camera in config.cameras]
+    parts.append((PROMPT_SPAN, "text", config.max_token_len))
     if not config.pi05:
-        lengths.append((STATE_SPAN, 1))
-    lengths.append((ACTION_SPAN, config.action_horizon))
-    spans: list[Span] = []
-    start = 0
-    for name, length in lengths:
-        stop = start + length
-        if name in config.cameras:
-            spans.append(Span(name, "image", start, stop, camera=name, grid=patch_grid(config)))
-        elif name == PROMPT_SPAN:
-            spans.append(Span(name, "text", start, stop))
-        else:
-            spans.append(Span(name, "state" if name == STATE_SPAN else "action", start, stop))
-        start = stop
+        parts.append((STATE_SPAN, "state", 1))
+    parts.append((ACTION_SPAN, "action", config.action_horizon))
+    siglip, start, spans = config.siglip, 0, []
+    grid = PatchGrid(siglip.grid, siglip.grid, siglip.image_size, siglip.image_size)
+    for name, kind, length in parts:
+        camera = name if kind == "image" else None
+        spans.append(Span(name, kind, start, start + length, camera, grid if camera else None))
+        start += length
     return SiteLayout(name="joint", spans=tuple(spans))
-
-
-def patch_grid(config: PiConfig) -> PatchGrid:
-    """Return how the patches of each camera tile its model image."""
-    siglip = config.siglip
-    return PatchGrid(siglip.grid, siglip.grid, siglip.image_size, siglip.image_size)
 
 
 class PiPolicy:
@@ -86,11 +80,12 @@ class PiPolicy:
         self.num_action_queries = config.action_horizon
         self.default_protocol = processing.protocol
         self.default_replan_steps = processing.default_replan_steps
-        self.cameras = tuple(
+        self.cameras: tuple[PolicyCameraView, ...] = tuple(
             PolicyCameraView(name, source=self.robot.cameras[name], upright=True, mirrored=self.robot.turned)
             for name in config.cameras
             if name in self.robot.cameras
         )
+        self.needs_camera_frames = not processing.whole_grey_levels
         self._warned: set[str] = set()
 
     def query_pools(self) -> NDArray[np.float64]:
@@ -124,16 +119,11 @@ class PiPolicy:
             facts["robot"] = to_json(self.robot)
         return describe_policy(self, self.source, self._digest, facts)
 
-    @property
-    def needs_camera_frames(self) -> bool:
-        """Whether the model's images have more than whole grey levels, so that stored ones are not exact."""
-        return not self.processing.whole_grey_levels
-
     def prepare(self, observation: Observation, instruction: str) -> PolicyInput:
         """Turn an observation and an instruction into the model's input (batch 1)."""
         frames = {camera.name: camera_frame(observation, camera.source) for camera in self.cameras}
         state = libero_state(observation.eef_pos, observation.eef_quat, observation.gripper_qpos)
-        return self._input_of_frames(frames, state, instruction)
+        return self._prepare_frames(frames, state, instruction)
 
     def prepare_robot(
         self, pictures: Mapping[str, NDArray[np.uint8]], state: NDArray[np.float64], instruction: str
@@ -145,53 +135,39 @@ class PiPolicy:
         if state.shape != (self.robot.state_dim,):
             raise BadArgument(f"The state has the shape {state.shape}; expected ({self.robot.state_dim},).")
         frames = {camera.name: pictures[camera.source] for camera in self.cameras}
-        return self._input_of_frames(frames, np.asarray(state, dtype=np.float64), instruction)
+        return self._prepare_frames(frames, np.asarray(state, dtype=np.float64), instruction)
 
-    def _input_of_frames(
+    def _prepare_frames(
         self, frames: Mapping[str, NDArray[np.uint8]], state: NDArray[np.float64], instruction: str
     ) -> PolicyInput:
         """Return the model's input of the cameras' own pictures."""
-        size = self.model.config.siglip.image_size
-        pictures = {camera: self.processing.pictures_of_frame(frame, size) for camera, frame in frames.items()}
-        kept = frames if self.needs_camera_frames else {}
-        return self._input_of(pictures, kept, state, instruction, may_be_empty=False)
+        if not clean_instruction(instruction).strip():
+            raise BadArgument(f"The instruction {instruction!r} is empty: a policy needs at least one word.")
+        prepared = self.prepare_again(GivenInputs({}, frames, state, instruction))
+        return prepared if self.needs_camera_frames else replace(prepared, camera_frames={})
 
     def prepare_again(self, given: GivenInputs) -> PolicyInput:
         """Turn what a call was given into the model's input (batch 1)."""
-        size = self.model.config.siglip.image_size
+        config, device = self.model.config, self.model.device
+        size = config.siglip.image_size
         pictures = {
             camera.name: self.processing.pictures_of_frame(given.camera_frames[camera.name], size)
             if camera.name in given.camera_frames
             else (given.frames[camera.name], image_tensor(given.frames[camera.name]))
             for camera in self.cameras
         }
-        return self._input_of(pictures, given.camera_frames, given.state, given.instruction, may_be_empty=True)
-
-    def _input_of(
-        self,
-        pictures: Mapping[str, tuple[NDArray[np.uint8], Tensor]],
-        camera_frames: Mapping[str, NDArray[np.uint8]],
-        state: NDArray[np.float64],
-        instruction: str,
-        *,
-        may_be_empty: bool,
-    ) -> PolicyInput:
-        """Return the model's input; pictures: slot -> the stored picture and the model's, as in `pictures_of_frame`."""
-        config, device = self.model.config, self.model.device
-        size = config.siglip.image_size
-        normalised = self.processing.normalise_state(state)
+        normalised = self.processing.state.normalise(given.state)
         layout = self.sites[0]
         prompt_span = layout.span(PROMPT_SPAN)
         tokenized = self.tokenizer.tokenize(
-            instruction,
+            given.instruction,
             max_token_len=config.max_token_len,
             first_key=prompt_span.start,
             state=normalised,
             prompt_format=self.processing.prompt_format,
             cut=self.processing.cut_long_prompts,
-            may_be_empty=may_be_empty,
         )
-        self._warn_of_cut(tokenized, instruction)
+        self._warn_of_cut(tokenized, given.instruction)
         roles = {camera: Role.IMAGE if camera in pictures else Role.MASKED_IMAGE for camera in config.cameras}
         # The prompt's own roles replace the placeholder below.
         roles |= {PROMPT_SPAN: Role.TEXT, STATE_SPAN: Role.STATE, ACTION_SPAN: Role.ACTION}
@@ -213,9 +189,9 @@ class PiPolicy:
             frames=frames,
             key_role={layout.name: key_role},
             prompt=tokenized.prompt,
-            state=state,
+            state=given.state,
             tensors=tensors,
-            camera_frames=camera_frames,
+            camera_frames=given.camera_frames,
         )
 
     def _warn_of_cut(self, tokenized: TokenizedPrompt, instruction: str) -> None:
@@ -265,12 +241,11 @@ class PiPolicy:
 
     def act_variants(self, variants: Sequence[CallVariant], num_steps: int, batch: int) -> list[NDArray[np.float64]]:
         """Make variants of one call together; see `VariantPolicy`."""
-        config, site = self.model.config, self.sites[0].name
-        shape = (1, config.action_horizon, config.action_dim)
+        site = self.sites[0].name
         calls = [
             ModelCall(
                 each.policy_input.tensors,
-                torch.from_numpy(initial_noise(each.noise_seed, shape)).to(self.model.device),
+                self._noise([each.noise_seed]),
                 each.editors.get(site),
             )
             for each in variants
@@ -280,6 +255,12 @@ class PiPolicy:
             self.processing.environment_actions(actions, each.policy_input.state)
             for actions, each in zip(sampled, variants, strict=True)
         ]
+
+    def _noise(self, seeds: Sequence[int]) -> Tensor:
+        """Return the noise (call, horizon, action dim) of calls, each from its seed."""
+        shape = (1, self.model.config.action_horizon, self.model.config.action_dim)
+        noise = np.concatenate([initial_noise(seed, shape) for seed in seeds])
+        return torch.from_numpy(noise).to(self.model.device)
 
     def variant_memory(self) -> VariantMemory:
         """Return how much memory variants take, and how much is left for them."""
@@ -306,15 +287,13 @@ class PiPolicy:
     ) -> NDArray[np.float32]:
         """Return the model's actions (batch, horizon, action dim), still normalised."""
         config = self.model.config
-        shape = (1, config.action_horizon, config.action_dim)
-        noise = np.concatenate([initial_noise(seed, shape) for seed in noise_seeds])
         sampled = self.model.sample_actions(
             images={camera: tensors[f"image:{camera}"] for camera in config.cameras},
             image_masks={camera: tensors[f"image_mask:{camera}"] for camera in config.cameras},
             tokens=tensors["tokens"],
             token_mask=tensors["token_mask"],
             state=tensors["state"],
-            noise=torch.from_numpy(noise).to(self.model.device),
+            noise=self._noise(noise_seeds),
             recorder=recorder,
             editor=editor,
         )

@@ -32,12 +32,9 @@ ENVIRONMENT_ACTION_DIM = 7
 RELATIVE_ACTIONS = 6
 
 
-def model_image(frame: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
-    """Return the model's image (size, size, 3) of a raw camera frame (height, width, 3).
-
-    Rotated by 180°, resized by PIL's bilinear filter with the aspect ratio kept, centred on black.
-    """
-    return resize_with_pad(np.ascontiguousarray(frame[::-1, ::-1]), size)
+def turn(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a simulator's picture turned by 180°, as policies of LIBERO see it."""
+    return np.ascontiguousarray(picture[::-1, ::-1])
 
 
 def resize_with_pad(image: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
@@ -74,68 +71,79 @@ def libero_state(
 
 
 @dataclass(frozen=True)
-class Statistics:
-    """Statistics of one vector, each (dim,) float64; the quantiles are absent in some checkpoints."""
+class Normaliser:
+    """Normalisation of one vector: (x - offset) / divisor, and where that is a share of a range, 0..1 becomes -1..1.
 
-    mean: NDArray[np.float64]
-    std: NDArray[np.float64]
-    q01: NDArray[np.float64] | None = None
-    q99: NDArray[np.float64] | None = None
+    mode: its name, for the store. offset, divisor, factor: each (dim,), in the precision of the arithmetic; the factor
+    undoes the divisor.
+    """
 
-    def normalise(self, x: NDArray[np.floating], mode: NormalisationMode) -> NDArray[np.float64]:
-        """Map (..., dim) to the model's range: (x - mean)/(std + eps), or q01..q99 to -1..1 without clipping.
+    mode: str
+    offset: NDArray[np.floating]
+    divisor: NDArray[np.floating]
+    factor: NDArray[np.floating]
+    is_range: bool = False
+
+    def normalise(self, x: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Map (..., dim) to the model's range, without clipping.
 
         Statistics longer than the data are cut to it (older checkpoints hold padded ones).
         """
         dim = x.shape[-1]
-        if mode == "z-score":
-            return (x - self.mean[:dim]) / (self.std[:dim] + NORMALISATION_EPS)
-        low, high = self._quantiles()
-        return (x - low[:dim]) / (high[:dim] - low[:dim] + NORMALISATION_EPS) * 2.0 - 1.0
+        scaled: NDArray[np.floating] = (np.asarray(x, dtype=self.offset.dtype) - self.offset[:dim]) / self.divisor[:dim]
+        return scaled * 2.0 - 1.0 if self.is_range else scaled
 
-    def unnormalise(self, x: NDArray[np.floating], mode: NormalisationMode) -> NDArray[np.float64]:
+    def unnormalise(self, x: NDArray[np.floating]) -> NDArray[np.floating]:
         """Invert `normalise` on (..., dim); dimensions beyond the statistics pass through."""
-        dim = min(x.shape[-1], len(self.mean))
-        known = x[..., :dim]
-        if mode == "z-score":
-            known = known * (self.std[:dim] + NORMALISATION_EPS) + self.mean[:dim]
-        else:
-            low, high = self._quantiles()
-            known = (known + 1.0) / 2.0 * (high[:dim] - low[:dim] + NORMALISATION_EPS) + low[:dim]
-        return np.concatenate([known, x[..., dim:]], axis=-1, dtype=np.float64)
+        x = np.asarray(x, dtype=self.offset.dtype)
+        dim = min(x.shape[-1], len(self.offset))
+        known = (x[..., :dim] + 1.0) / 2.0 if self.is_range else x[..., :dim]
+        return np.concatenate([known * self.factor[:dim] + self.offset[:dim], x[..., dim:]], axis=-1)
 
-    def _quantiles(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+
+class Statistics(msgspec.Struct, frozen=True):
+    """Statistics of one vector, each a number per dimension; the quantiles are absent in some checkpoints."""
+
+    mean: list[float]
+    std: list[float]
+    q01: list[float] | None = None
+    q99: list[float] | None = None
+
+    def check(self, name: str) -> None:
+        """Raise `UnreadableCheckpoint` for unequal lengths, NaN and infinity."""
+        for key, numbers in msgspec.structs.asdict(self).items():
+            if not np.isfinite(numbers or 0).all():
+                raise UnreadableCheckpoint(f"The statistics have NaN or infinity in '{key}' of '{name}'.")
+            if numbers is not None and len(numbers) != len(self.mean):
+                raise UnreadableCheckpoint(f"The statistics '{key}' and 'mean' of '{name}' have unequal lengths.")
+
+    def normaliser(self, mode: NormalisationMode) -> Normaliser:
+        """Return openpi's normalisation: (x - mean)/(std + eps), or q01..q99 to -1..1."""
+        if mode == "z-score":
+            divisor = np.array(self.std) + NORMALISATION_EPS
+            return Normaliser(mode, np.array(self.mean), divisor, divisor)
         if self.q01 is None or self.q99 is None:
             raise UnreadableCheckpoint("The normalisation statistics have no q01 and q99, which quantile mode needs.")
-        return self.q01, self.q99
+        span = np.array(self.q99) - np.array(self.q01) + NORMALISATION_EPS
+        return Normaliser(mode, np.array(self.q01), span, span, is_range=True)
 
 
-@dataclass(frozen=True)
-class NormStats:
+class NormStats(msgspec.Struct, frozen=True):
     """Statistics of state and actions."""
 
     state: Statistics
     actions: Statistics
 
-    def check(
-        self, mode: NormalisationMode, state_dim: int, padded_dim: int, action_dim: int = ENVIRONMENT_ACTION_DIM
-    ) -> None:
-        """Raise `UnreadableCheckpoint` unless they fit the state and the environment's actions in this mode.
+    def check(self, state_dim: int, action_dim: int, padded_dim: int) -> None:
+        """Raise `UnreadableCheckpoint` unless they fit the state and the environment's actions.
 
         Older checkpoints hold statistics padded to the model's `padded_dim`; any other length belongs to another robot.
         """
-        for name, statistics, needed in (
-            ("state", self.state, state_dim),
-            ("actions", self.actions, action_dim),
-        ):
+        for name, statistics, needed in (("state", self.state, state_dim), ("actions", self.actions, action_dim)):
             if len(statistics.mean) not in (needed, padded_dim):
                 raise UnreadableCheckpoint(
                     f"The normalisation statistics of '{name}' have {len(statistics.mean)} numbers; {needed} are "
                     f"needed (or {padded_dim}, padded)."
-                )
-            if mode == "quantile" and (statistics.q01 is None or statistics.q99 is None):
-                raise UnreadableCheckpoint(
-                    f"The normalisation statistics of '{name}' lack q01 and q99 for quantile mode."
                 )
 
 
@@ -144,61 +152,19 @@ def pad_to(x: NDArray[np.floating], dim: int) -> NDArray[np.float64]:
     return np.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, dim - x.shape[-1])])
 
 
-def environment_actions(
-    model_actions: NDArray[np.floating],
-    stats: NormStats,
-    mode: NormalisationMode,
-    *,
-    relative_to: NDArray[np.floating] | None = None,
-    action_dim: int = ENVIRONMENT_ACTION_DIM,
-    num_relative: int = RELATIVE_ACTIONS,
-) -> NDArray[np.float64]:
-    """Return a robot's actions (..., horizon, `action_dim`) of model outputs (..., horizon, action dim of the model).
-
-    `relative_to` (..., state) is the unnormalised state for policies trained on differences to it (openpi's
-    pi0_libero): its first `num_relative` numbers are added; the gripper is absolute.
-    """
-    actions = stats.actions.unnormalise(model_actions, mode)[..., :action_dim]
-    if relative_to is not None:
-        actions[..., :num_relative] += relative_to[..., None, :num_relative]
-    return actions
-
-
-class _Numbers(msgspec.Struct, frozen=True):
-    mean: list[float]
-    std: list[float]
-    q01: list[float] | None = None
-    q99: list[float] | None = None
-
-    def statistics(self, name: str) -> Statistics:
-        """Return them as arrays; raise `UnreadableCheckpoint` for unequal lengths, NaN and infinity."""
-        arrays = {
-            key: np.array(numbers) for key, numbers in msgspec.structs.asdict(self).items() if numbers is not None
-        }
-        for key, array in arrays.items():
-            if not np.isfinite(array).all():
-                raise UnreadableCheckpoint(f"The statistics have NaN or infinity in '{key}' of '{name}'.")
-            if len(array) != len(self.mean):
-                raise UnreadableCheckpoint(f"The statistics '{key}' and 'mean' of '{name}' have unequal lengths.")
-        return Statistics(**arrays)
-
-
-class _Groups(msgspec.Struct, frozen=True):
-    state: _Numbers
-    actions: _Numbers
-
-
 class _File(msgspec.Struct, frozen=True):
-    norm_stats: _Groups
+    norm_stats: NormStats
 
 
 def parse_norm_stats(content: object, where: str) -> NormStats:
     """Build the statistics from the content of openpi's norm_stats.json; `where` names it in errors."""
     try:
-        groups = from_json(_File, content, where).norm_stats
-        return NormStats(groups.state.statistics("state"), groups.actions.statistics("actions"))
+        stats = from_json(_File, content, where).norm_stats
+        stats.state.check("state")
+        stats.actions.check("actions")
     except (MalformedDocument, UnreadableCheckpoint) as error:
         raise UnreadableCheckpoint(f"{where} has no statistics that can be used: {error}") from None
+    return stats
 
 
 def read_norm_stats(checkpoint: str | Path, given: Path | None = None, asset_id: str | None = None) -> NormStats:
@@ -214,7 +180,7 @@ def read_norm_stats(checkpoint: str | Path, given: Path | None = None, asset_id:
     if given is not None:
         return _read_norm_stats(given.expanduser(), inside=None)
     folder = Path(checkpoint)
-    by_name = {path.parent.relative_to(folder / "assets").as_posix(): path for path in find_norm_stats(folder)}
+    by_name = find_norm_stats(folder)
     if not by_name:
         raise CheckpointNotFound(
             f"The checkpoint '{checkpoint}' has no norm_stats.json below '{folder / 'assets'}'; give the one of its "
@@ -242,6 +208,8 @@ def _read_norm_stats(path: Path, inside: Path | None) -> NormStats:
     return parse_norm_stats(content, f"'{path}'")
 
 
-def find_norm_stats(checkpoint: Path) -> list[Path]:
-    """Return the files norm_stats.json below the folder `assets` of a checkpoint, in the order of their paths."""
-    return sorted(path for path in (checkpoint / "assets").glob("**/norm_stats.json") if not path.is_dir())
+def find_norm_stats(checkpoint: Path) -> dict[str, Path]:
+    """Return asset id -> norm_stats.json of the files below the folder `assets` of a checkpoint, in their order."""
+    assets = checkpoint / "assets"
+    files = sorted(path for path in assets.glob("**/norm_stats.json") if not path.is_dir())
+    return {path.parent.relative_to(assets).as_posix(): path for path in files}

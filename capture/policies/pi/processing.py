@@ -6,8 +6,9 @@ different numbers of actions. A `Processing` does this for one policy; `PiPolicy
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,10 +26,10 @@ from vla_attention.capture.policies.pi.preprocess import (
     ENVIRONMENT_ACTION_DIM,
     RELATIVE_ACTIONS,
     NormalisationMode,
+    Normaliser,
     NormStats,
-    environment_actions,
-    model_image,
     resize_with_pad,
+    turn,
 )
 from vla_attention.capture.policies.pi.tokenizer import PromptFormat
 from vla_attention.capture.policies.robot import NONE, Robot
@@ -73,110 +74,92 @@ def simulated_arm(cameras: dict[str, str], relative_actions: int = 0) -> Robot:
     return Robot(cameras, state, STATE_DIM, (), ENVIRONMENT_ACTION_DIM, relative_actions, turned=True)
 
 
-class Processing(Protocol):
-    """Processing of observations and actions outside the model."""
+@dataclass(frozen=True)
+class Processing:
+    """Processing of observations and actions outside the model.
 
-    @property
-    def prompt_format(self) -> PromptFormat:
-        """Format of the prompt, made of instruction and state."""
+    ecosystem, normalisation, image_resize: what it is, for the store. robot: slots of the model without a camera are
+    black and masked. resize: a picture (height, width, 3) uint8 and a size -> the stored picture (size, size, 3) uint8
+    and the model's (1, 3, size, size) in -1..1; whole_grey_levels: the model's is the stored one, without rounding.
+    cut_long_prompts: a prompt with more tokens than slots is cut (with a warning) instead of refused. protocol,
+    default_replan_steps: of the ecosystem's own evaluation.
+    """
 
-    @property
-    def cut_long_prompts(self) -> bool:
-        """Whether a prompt with more tokens than slots is cut (with a warning) or refused."""
-
-    @property
-    def robot(self) -> Robot:
-        """Cameras, state and actions of the robot: slots of the model without a camera are black and masked."""
-
-    @property
-    def protocol(self) -> EvaluationProtocol:
-        """The ecosystem's own evaluation."""
-
-    @property
-    def default_replan_steps(self) -> int:
-        """Actions that the ecosystem's own evaluation executes of each chunk."""
-
-    @property
-    def whole_grey_levels(self) -> bool:
-        """Whether the model's image is the stored one, without rounding."""
+    ecosystem: str
+    robot: Robot
+    state: Normaliser
+    actions: Normaliser
+    normalisation: str
+    resize: Callable[[NDArray[np.uint8], int], tuple[NDArray[np.uint8], Tensor]]
+    image_resize: str
+    whole_grey_levels: bool
+    prompt_format: PromptFormat
+    cut_long_prompts: bool
+    protocol: EvaluationProtocol
+    default_replan_steps: int
 
     def pictures_of_frame(self, frame: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], Tensor]:
-        """Return the model's image of a raw frame: (size, size, 3) uint8 for the store, (1, 3, size, size) in -1..1."""
-
-    def normalise_state(self, state: NDArray[np.float64]) -> NDArray[np.floating]:
-        """Return the state (state,) in the model's range, not padded."""
+        """Return the stored picture and the model's of a raw frame; those of simulators are turned by 180°."""
+        return self.resize(turn(frame) if self.robot.turned else frame, size)
 
     def environment_actions(
         self, model_actions: NDArray[np.floating], state: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the actions (horizon, action dim of the robot) of the model's (horizon, action dim)."""
+        """Return the actions (horizon, action dim of the robot) of the model's (horizon, action dim).
+
+        Undoes the normalisation, and adds the state where actions are differences to it (openpi's pi0_libero).
+        """
+        actions = self.actions.unnormalise(model_actions)[..., : self.robot.action_dim].astype(np.float64)
+        relative = self.robot.relative_actions
+        actions[..., :relative] += state[:relative]
+        return actions
 
     def provenance(self) -> dict[str, Any]:
         """Return plain JSON values that identify the processing."""
-
-
-class OpenpiProcessing:
-    """openpi's client and server transforms: of LIBERO, or of the robot of a data set.
-
-    `cameras`: policy camera -> camera of the simulators, see `simulator_cameras`; None: openpi's of LIBERO.
-    `relative_actions`: the model was trained on differences to the state (openpi's pi0_libero), so the state is added.
-    `robot`: its own number of them replaces `relative_actions`.
-    """
-
-    def __init__(
-        self,
-        config: PiConfig,
-        norm_stats: NormStats,
-        *,
-        normalisation: NormalisationMode,
-        relative_actions: bool = False,
-        replan_steps: int = OPENPI_REPLAN_STEPS,
-        robot: Robot | None = None,
-        cameras: dict[str, str] | None = None,
-    ):
-        if robot is None:
-            seen = cameras or simulator_cameras(config.cameras, CAMERA_OF_SLOT, {})
-            robot = simulated_arm(seen, RELATIVE_ACTIONS if relative_actions else 0)
-        self.robot = robot
-        norm_stats.check(normalisation, self.robot.state_dim, config.action_dim, self.robot.action_dim)
-        self.protocol = OPENPI
-        self.norm_stats = norm_stats
-        self.normalisation = normalisation
-        self.default_replan_steps = replan_steps
-        self.prompt_format: PromptFormat = "task-state-action" if config.discrete_state_input else "instruction-newline"
-        self.cut_long_prompts = True
-        self.whole_grey_levels = True
-
-    def pictures_of_frame(self, frame: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], Tensor]:
-        """Rotate pictures of simulators by 180°, resize with PIL's bilinear filter; uint8 all the way."""
-        image = model_image(frame, size) if self.robot.turned else resize_with_pad(frame, size)
-        return image, image_tensor(image)
-
-    def normalise_state(self, state: NDArray[np.float64]) -> NDArray[np.floating]:
-        """Normalise by the checkpoint's statistics."""
-        return self.norm_stats.state.normalise(state, self.normalisation)
-
-    def environment_actions(
-        self, model_actions: NDArray[np.floating], state: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Undo the normalisation, add the state where actions are relative to it, keep the robot's dimensions."""
-        return environment_actions(
-            model_actions.astype(np.float64),
-            self.norm_stats,
-            self.normalisation,
-            relative_to=state if self.robot.relative_actions else None,
-            action_dim=self.robot.action_dim,
-            num_relative=self.robot.relative_actions,
-        )
-
-    def provenance(self) -> dict[str, Any]:
-        """Return the ecosystem, the normalisation, and whether actions are relative."""
         return {
-            "processing": "openpi",
+            "processing": self.ecosystem,
             "normalisation": self.normalisation,
             "relative_actions": bool(self.robot.relative_actions),
-            "image_resize": "PIL bilinear with antialiasing",
+            "image_resize": self.image_resize,
         }
+
+
+def openpi_arm(config: PiConfig, chosen: Mapping[str, str]) -> Robot:
+    """Return the arm of the simulators, with what `--camera` says; openpi's pi0 of LIBERO has relative actions."""
+    cameras = simulator_cameras(config.cameras, CAMERA_OF_SLOT, chosen)
+    return simulated_arm(cameras, 0 if config.pi05 else RELATIVE_ACTIONS)
+
+
+def openpi_processing(
+    config: PiConfig, stats: NormStats, robot: Robot | None = None, replan_steps: int = OPENPI_REPLAN_STEPS
+) -> Processing:
+    """Return openpi's client and server transforms, of the simulators' arm (None) or another robot.
+
+    As openpi's LIBERO configurations, pi0.5 normalises by quantiles and pi0 by z-scores.
+    """
+    robot = robot or openpi_arm(config, {})
+    stats.check(robot.state_dim, robot.action_dim, config.action_dim)
+    mode: NormalisationMode = "quantile" if config.pi05 else "z-score"
+    return Processing(
+        "openpi",
+        robot,
+        stats.state.normaliser(mode),
+        stats.actions.normaliser(mode),
+        normalisation=mode,
+        resize=openpi_pictures,
+        image_resize="PIL bilinear with antialiasing",
+        whole_grey_levels=True,
+        prompt_format="task-state-action" if config.discrete_state_input else "instruction-newline",
+        cut_long_prompts=True,
+        protocol=OPENPI,
+        default_replan_steps=replan_steps,
+    )
+
+
+def openpi_pictures(picture: NDArray[np.uint8], size: int) -> tuple[NDArray[np.uint8], Tensor]:
+    """Resize with PIL's bilinear filter; uint8 all the way."""
+    image = resize_with_pad(picture, size)
+    return image, image_tensor(image)
 
 
 def image_tensor(image: NDArray[np.uint8]) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any
 
 from vla_attention.capture.policies.checkpoints import MAX_STEPS, CheckpointMismatch, check_size
@@ -28,11 +28,11 @@ OTHER_SIZES = (
 MAX_TOKEN_LEN = {True: 200, False: 48}
 
 
-def is_pi05(shapes: Shapes) -> bool:
+def is_pi05(names: Container[str]) -> bool:
     """Return whether the tensors are pi0.5's; `CheckpointMismatch` if they are neither pi0.5's nor pi0's."""
-    if "time_mlp_in.weight" in shapes:
+    if "time_mlp_in.weight" in names:
         return True
-    if "state_proj.weight" in shapes:
+    if "state_proj.weight" in names:
         return False
     raise CheckpointMismatch(
         "The checkpoint has neither time_mlp_in.weight (pi0.5) nor state_proj.weight (pi0), so it is no pi model."
@@ -68,33 +68,25 @@ def stated_config(stated: Mapping[str, Any], *, pi05: bool, image_size: int = Si
     )
 
 
-#: JAX leaves whose shapes state the heads: the axis of the heads and the axis of their dimension.
-_HEAD_AXES = {
-    "q_einsum": (("num_heads", 1), ("head_dim", 3)),
-    "kv_einsum": (("num_kv_heads", 2), ("head_dim", 4)),
-    "qkv_einsum": (("num_heads", 2), ("num_kv_heads", 2), ("head_dim", 4)),
-    "attn_vec_einsum": (("num_heads", 1), ("head_dim", 2)),
-}
 _HEAD_LEAF = re.compile(r"PaliGemma/llm/layers/attn/(\w+?)(_1)?/w\Z")
 
 
-def check_jax_heads(shapes: Mapping[str, tuple[int, ...]], config: PiConfig) -> None:
-    """Compare the heads that JAX leaves state with a configuration.
+def check_jax_heads(shapes: Shapes, config: PiConfig) -> None:
+    """Compare the heads that JAX leaves state with a configuration; shapes: of the leaves by their paths, layers first.
 
     The model's own tensors join heads and their width, so that their shapes agree for other heads, too.
-
-    Args:
-        shapes: shapes of the leaves by their paths, layers first.
-        config: the configuration that the model is built with.
     """
     for path, shape in shapes.items():
-        match = _HEAD_LEAF.match(path)
-        if match is None or match[1] not in _HEAD_AXES or len(shape) <= max(a for _, a in _HEAD_AXES[match[1]]):
-            continue  # an array with another number of axes is reported with the shapes
-        part = config.action_expert if match[2] else config.paligemma
-        for name, axis in _HEAD_AXES[match[1]]:
-            if shape[axis] != getattr(part, name):
+        if match := _HEAD_LEAF.match(path):
+            part = config.action_expert if match[2] else config.paligemma
+            expected = {
+                "q_einsum": (part.num_heads, part.width, part.head_dim),
+                "kv_einsum": (2, part.num_kv_heads, part.width, part.head_dim),
+                "qkv_einsum": (3, part.num_kv_heads, part.width, part.head_dim),
+                "attn_vec_einsum": (part.num_heads, part.head_dim, part.width),
+            }[match[1]]
+            if shape[1:] != expected:
                 raise CheckpointMismatch(
-                    f"The checkpoint's {path} has {name} {shape[axis]}, and the configuration {getattr(part, name)}; "
+                    f"The checkpoint's {path} has the heads of {shape[1:]}, and the configuration those of {expected}; "
                     "choose the checkpoint's own with --config-name NAME, or state its sizes with --model-config PATH."
                 )

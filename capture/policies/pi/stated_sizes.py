@@ -27,7 +27,7 @@ class _Sizes(msgspec.Struct, frozen=True):
     action_dim: Size
     action_horizon: Steps
     max_token_len: Steps
-    num_steps: Steps
+    num_denoise_steps: Steps = msgspec.field(name="num_steps")
     discrete_state_input: bool = False
 
 
@@ -49,20 +49,8 @@ def read_config(path: Path) -> PiConfig:
     case = read_typed(path, _Case)
     for camera in case.layout.image_keys:
         check_name("camera", camera)
-    given = case.config
-    return PiConfig(
-        paligemma=given.paligemma,
-        action_expert=given.action_expert,
-        siglip=given.siglip,
-        vocab_size=given.vocab_size,
-        action_dim=given.action_dim,
-        action_horizon=given.action_horizon,
-        max_token_len=given.max_token_len,
-        num_denoise_steps=given.num_steps,
-        pi05=case.model == "pi05",
-        discrete_state_input=given.discrete_state_input,
-        cameras=case.layout.image_keys,
-    )
+    sizes = msgspec.structs.asdict(case.config)
+    return PiConfig(**sizes, pi05=case.model == "pi05", cameras=case.layout.image_keys)
 
 
 def states_sizes(path: Path) -> bool:

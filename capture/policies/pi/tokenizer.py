@@ -97,7 +97,6 @@ class PromptTokenizer:
         state: NDArray[np.floating] | None = None,
         prompt_format: PromptFormat | None = None,
         cut: bool = False,
-        may_be_empty: bool = False,
     ) -> TokenizedPrompt:
         """Tokenize an instruction, and the state if the format contains it.
 
@@ -108,10 +107,7 @@ class PromptTokenizer:
             state: (state,) normalised, unpadded.
             prompt_format: None takes openpi's, with the state if there is one.
             cut: cut a longer prompt as the reference implementations do, instead of refusing it as a `BadArgument`.
-            may_be_empty: accept an instruction without words, instead of refusing it as a `BadArgument`.
         """
-        if not may_be_empty and not clean_instruction(instruction).strip():
-            raise BadArgument(f"The instruction {instruction!r} is empty: a policy needs at least one word.")
         if prompt_format is None:
             prompt_format = "instruction-newline" if state is None else "task-state-action"
         sections = _sections(instruction, state, prompt_format)

@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from vla_attention.analyze.core.camera_maps import enlarge
-from vla_attention.capture.environments.coverage import patch_coverage
+from vla_attention.capture.environments.coverage import camera_coverage
 from vla_attention.capture.policies.cosmos.preprocess import crop_and_enlarge, visible_area
+from vla_attention.schemas.layout import PatchGrid
 
 
 @pytest.mark.parametrize("flip_columns", [True, False])
@@ -22,9 +23,10 @@ def test_patches_line_up_with_what_a_cropping_policy_stores(flip_columns: bool) 
     turned = segmentation[::-1, :: -1 if flip_columns else 1]
     picture = np.where(turned[..., None] == 1, 255, 0).astype(np.uint8).repeat(3, axis=-1)
     frame = crop_and_enlarge(picture)
-    share = patch_coverage(
-        segmentation, 2, patches, patches, flip_rows=True, flip_columns=flip_columns, visible=visible_area()
-    )[:, 1]
+    grids = [PatchGrid(patches, patches, size, size)]
+    share = camera_coverage(segmentation, 2, grids, flip_rows=True, flip_columns=flip_columns, visible=visible_area())[
+        :, 1
+    ]
     seen = (frame[..., 0] / 255.0).reshape(patches, size // patches, patches, size // patches).mean(axis=(1, 3))
     assert 0.05 < seen.mean() < 0.5
     # The crop starts at a whole pixel: a border may be off by one pixel of fourteen; a shifted patch would differ by 1.

@@ -10,9 +10,9 @@ import pytest
 
 pytest.importorskip("robosuite")
 
-from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Observation
+from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Observation, initial_state_seed
 from vla_attention.capture.environments.episode_protocol import CAMERAS, OPENPI, WAIT_ACTION
-from vla_attention.capture.environments.robosuite_tasks import BUILTIN_TASKS, initial_state_seed
+from vla_attention.capture.environments.robosuite_tasks import BUILTIN_TASKS
 from vla_attention.capture.environments.suites import find_suite, make_environment
 
 SUITE = find_suite("robosuite")

@@ -12,7 +12,6 @@ from vla_attention.capture.environments.libero_installation import (
     ASSETS_VARIABLE,
     find_assets,
     instruction_of,
-    list_libero_tasks,
 )
 from vla_attention.capture.environments.suites import SUITES, find_suite, list_tasks
 from vla_attention.schemas.errors import MissingDependency
@@ -54,7 +53,7 @@ def test_every_suite_lists_its_tasks() -> None:
     for suite in SUITES:
         tasks = list_tasks(suite)
         assert [task.task_id for task in tasks] == list(range(suite.num_tasks))
-    first = list_libero_tasks(find_suite("libero_spatial"))[0]
+    first = list_tasks(find_suite("libero_spatial"))[0]
     assert first.instruction == "pick up the black bowl between the plate and the ramekin and place it on the plate"
 
 

@@ -126,7 +126,7 @@ def test_an_expert_reaches_its_own_goal_and_no_other_of_its_kind(cubes, number):
     assert held <= {goal.task_id for goal in cubes.goals if meant(cubes, goal.task_id) == simulator.target}
     touched = [moment.touched for moment in told if moment.touched.any()]
     assert np.flatnonzero(touched[0]).tolist() == [1 + simulator.target]
-    assert cubes.first_touched == cubes.bodies[1 + simulator.target]
+    assert simulator.first_touched == simulator.target
 
 
 def meant(cubes: CubesEnvironment, number: int) -> int:

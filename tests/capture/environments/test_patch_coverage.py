@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from vla_attention.capture.environments.coverage import overlap_lengths, patch_coverage
+from vla_attention.capture.environments.coverage import camera_coverage, overlap_lengths
 from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.layout import PatchGrid
 
 STRAIGHT = {"flip_rows": False, "flip_columns": False}
 TURNED = {"flip_rows": True, "flip_columns": True}
@@ -18,6 +19,11 @@ pictures = arrays.arrays(
     np.int32, st.tuples(st.integers(1, 13), st.integers(1, 13)), elements=st.integers(0, NUM_OBJECTS - 1)
 )
 grids = st.tuples(st.integers(1, 9), st.integers(1, 9))
+
+
+def patch_coverage(segmentation, num_objects, rows, columns, **options):
+    """The coverage of one grid over the whole picture."""
+    return camera_coverage(segmentation, num_objects, [PatchGrid(rows, columns, 8, 8)], **options)
 
 
 def fine_grained(segmentation: np.ndarray, grid_rows: int, grid_columns: int) -> np.ndarray:

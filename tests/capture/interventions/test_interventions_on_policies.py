@@ -21,7 +21,7 @@ from vla_attention.capture.interventions.resolution import (
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, build_random_model, builtin_stats, dummy_policy
 from vla_attention.capture.policies.pi.policy import PiPolicy
-from vla_attention.capture.policies.pi.processing import OpenpiProcessing
+from vla_attention.capture.policies.pi.processing import openpi_processing
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer
 from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.schemas.errors import BadArgument
@@ -36,7 +36,7 @@ def dummy_pi0() -> PiPolicy:
     return PiPolicy(
         build_random_model(config, 0),
         PromptTokenizer(EMBEDDED_TOKENIZER),
-        OpenpiProcessing(config, builtin_stats(), normalisation="z-score", relative_actions=True),
+        openpi_processing(config, builtin_stats()),
         PolicySource("dummy-pi0", "random weights, seed 0", "seeded", untrained=True),
     )
 

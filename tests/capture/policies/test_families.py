@@ -11,6 +11,9 @@ from vla_attention.capture.__main__ import main
 from vla_attention.capture.engine import simulator_process
 from vla_attention.capture.environments.base import Observation, StepResult
 from vla_attention.capture.policies import families
+from vla_attention.capture.policies.cosmos.family import CosmosSettings
+from vla_attention.capture.policies.pi.family import PiSettings
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 
 
@@ -74,3 +77,15 @@ def test_a_third_family_captures_and_is_analysed(tmp_path, capfd):
     assert "made again without any change: bit-equal" in capfd.readouterr().out
     assert main(["rerun", str(store)]) == 2
     assert "its policy has the action_horizon 3, and this one has 4" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (PiSettings("untrained-tiny", config_name="pi05_libero", dtype="bfloat16"), "--config-name, --dtype bfloat16"),
+        (CosmosSettings("untrained-tiny", vae_path="x.pth"), "--vae-path"),
+    ],
+)
+def test_options_of_checkpoints_are_refused_for_policies_that_come_along(settings, said):
+    with pytest.raises(BadArgument, match=f"Cannot use {said} with the policy 'untrained-tiny'"):
+        settings.build("cpu")

@@ -19,6 +19,7 @@ from vla_attention.capture.recording.recorder import AttentionRecorder, Recordin
 
 GPU = torch.device("meta")
 CONFIG = DUMMY_CONFIG
+KEYS = CONFIG.prefix_len + CONFIG.suffix_len
 
 
 class Transfers(TorchDispatchMode):
@@ -43,10 +44,10 @@ class Transfers(TorchDispatchMode):
 
 def recorder_of(queries: str) -> AttentionRecorder:
     plan = RecordingPlan((0, 1, 2), (0, 1, 2), (5, 0), queries, "joint")
-    parts = np.zeros((CONFIG.key_len, 3), dtype=bool)
+    parts = np.zeros((KEYS, 3), dtype=bool)
     parts[:4, 0], parts[4::2, 1], parts[5::2, 2] = True, True, True
     pools = np.eye(4)[:2] if queries == "steps" else None
-    return AttentionRecorder(plan, CONFIG.key_len, parts, pools)
+    return AttentionRecorder(plan, KEYS, parts, pools)
 
 
 def fake_call(recorder: AttentionRecorder, dtype: torch.dtype) -> tuple[list[str], list[str], list[torch.Tensor]]:
@@ -62,7 +63,7 @@ def fake_call(recorder: AttentionRecorder, dtype: torch.dtype) -> tuple[list[str
         denoising = Denoising(
             torch.empty(1, CONFIG.action_dim, device=GPU),
             Rotation.at(torch.zeros(1, CONFIG.suffix_len, dtype=torch.int64, device=GPU), expert.head_dim),
-            torch.ones(1, CONFIG.suffix_len, CONFIG.key_len, dtype=torch.bool, device=GPU),
+            torch.ones(1, CONFIG.suffix_len, KEYS, dtype=torch.bool, device=GPU),
             tuple(KeysValues(keys(), keys()) for _ in range(expert.depth)),
             None,
         )
@@ -84,7 +85,7 @@ def test_nothing_waits_for_the_gpu_in_the_denoise_steps(queries, dtype):
     assert after == []
     assert {tensor.device for tensor in recorded} == {GPU}
     length = {"mean": 1, "steps": 2, "all": 4}[queries]
-    assert [tuple(tensor.shape) for tensor in recorded] == [(9, 2, length, CONFIG.key_len), (9, 4, 4)]
+    assert [tuple(tensor.shape) for tensor in recorded] == [(9, 2, length, KEYS), (9, 4, 4)]
 
 
 def whole_call(recorder: AttentionRecorder, masks: torch.device) -> tuple[list[str], list[int]]:

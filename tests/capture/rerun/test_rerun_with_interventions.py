@@ -9,6 +9,8 @@ import pytest
 
 from tests.capture.rerun.test_rerun import refused
 from vla_attention.capture.__main__ import main
+from vla_attention.capture.policies.cosmos.family import CosmosSettings
+from vla_attention.schemas.errors import BadArgument
 from vla_attention.schemas.interventions import KeyKnockout, NoiseChange
 from vla_attention.schemas.layout import Role
 from vla_attention.schemas.stores.reader import Store, open_store
@@ -96,6 +98,18 @@ def test_prompts_of_another_task_shuffled_and_with_synonyms(pi_store, tmp_path):
     assert prompt_of(f"synonyms:{tmp_path / 'words.json'}") == {"lift the crimson cube"}
     [order] = prompt_of("shuffled")
     assert sorted(order.split()) == ["cube", "lift", "red", "the"]
+
+
+def test_a_changed_prompt_is_known_before_the_model_is_loaded(cosmos_store, monkeypatch, capsys):
+    """Cosmos refuses a sentence without an embedding before it loads its weights, if it is told of it."""
+
+    def build(settings, device):
+        raise BadArgument(f"told: {settings.instructions}")
+
+    monkeypatch.setattr(CosmosSettings, "build", build)
+    said = refused(capsys, "rerun", cosmos_store, "--prompt", "text:fly to the moon")
+    stored = ("lift the red cube", "fly to the moon", "stack the red cube on top of the green cube")
+    assert f"told: {stored}" in said
 
 
 @pytest.mark.thorough

@@ -86,7 +86,7 @@ def test_prompts_of_a_batch_are_those_of_the_policy(demonstrations, tokenizer):
         expected = tokenizer.tokenize(
             INSTRUCTIONS[samples.task[sample]],
             max_token_len=32,
-            state=statistics.normalise(samples.state[sample].astype(np.float64), "quantile"),
+            state=statistics.normaliser("quantile").normalise(samples.state[sample].astype(np.float64)),
         )
         length = made.tokens.shape[1]
         np.testing.assert_array_equal(made.tokens[row], expected.ids[:length])

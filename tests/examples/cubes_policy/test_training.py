@@ -161,7 +161,7 @@ def test_an_exported_policy_runs_like_any_checkpoint(demonstrations, whole, tmp_
     facts = json.loads((folder / "settings.json").read_text())["state"]
     low, high = np.array(facts["q01"]), np.array(facts["q99"])
     np.testing.assert_allclose(
-        policy.processing.normalise_state(sample), (sample - low) / (high - low) * 2 - 1, rtol=1e-4
+        policy.processing.state.normalise(sample), (sample - low) / (high - low) * 2 - 1, rtol=1e-4
     )
     actions = np.random.default_rng(0).uniform(-1, 1, (10, 8))
     np.testing.assert_allclose(policy.processing.environment_actions(actions, sample), actions[:, :7], atol=1e-6)

@@ -13,7 +13,7 @@ pytest.importorskip("robosuite")
 from examples.cubes_policy.experts import expert_action, read_state
 from vla_attention.capture.environments.base import EnvironmentSettings, Observation
 from vla_attention.capture.environments.cubes.environment import CubesEnvironment
-from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS, CubeTask, Target, Verb
+from vla_attention.capture.environments.cubes.tasks import COLOURS, CUBE_TASKS, CubeTask, Target, Verb
 from vla_attention.capture.environments.episode_protocol import CAMERAS, OPENPI, WAIT_ACTION, WAIT_STEPS
 from vla_attention.capture.environments.suites import find_suite, list_tasks
 
@@ -96,7 +96,7 @@ def test_experts_solve_the_tasks_and_nothing_else_does(environment: CubesEnviron
                 break
         else:
             raise AssertionError(f"the expert did not solve {task.name} from initial state {index}")
-        assert environment.first_touched == environment.named_cube
+        assert simulator.first_touched == simulator.target
 
 
 def test_touching_another_cube_first_is_no_success(environment: CubesEnvironment) -> None:
@@ -106,9 +106,9 @@ def test_touching_another_cube_first_is_no_success(environment: CubesEnvironment
     for _ in range(SUITE.max_steps):
         wrong = expert_action("touch", read_state(simulator), 1, None)
         assert not environment.step(wrong, observe=False).success
-        if environment.first_touched:
+        if environment.simulator.first_touched is not None:
             break
-    assert environment.first_touched == "green_cube"
+    assert COLOURS[environment.simulator.first_touched] == "green"
     for _ in range(60):
         right = expert_action("touch", read_state(simulator), simulator.target, None)
         assert not environment.step(right, observe=False).success

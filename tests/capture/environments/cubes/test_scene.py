@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from vla_attention.capture.environments.base import initial_state_seed
 from vla_attention.capture.environments.cubes import scene
 from vla_attention.capture.environments.cubes.scene import (
     draw_scene,
     find_target,
     paste_mark,
-    scene_seed,
 )
-from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS, NUM_BASE_TASKS, list_cube_tasks
-from vla_attention.capture.environments.suites import find_suite
+from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS, NUM_BASE_TASKS
+from vla_attention.capture.environments.suites import find_suite, list_tasks
 
 SUITE, HARDER = find_suite("cubes"), find_suite("cubes_harder")
 
@@ -38,8 +38,8 @@ def test_cubes_are_apart_within_reach_and_the_outermost_ones_stand_out(num_cubes
 def test_a_seed_gives_the_same_scene_again_and_demonstrations_have_seeds_of_their_own() -> None:
     one, again = draw_scene(5, 3), draw_scene(5, 3)
     np.testing.assert_array_equal(one.positions, again.positions)
-    evaluation = {scene_seed(scene.EVALUATION, index) for index in range(SUITE.initial_states_per_task)}
-    training = {scene_seed(scene.TRAINING, index) for index in range(20_000)}
+    evaluation = {initial_state_seed(scene.EVALUATION, index) for index in range(SUITE.initial_states_per_task)}
+    training = {initial_state_seed(scene.TRAINING, index) for index in range(20_000)}
     assert len(evaluation) == SUITE.initial_states_per_task
     assert not evaluation & training
 
@@ -52,9 +52,9 @@ def test_left_is_the_robots_left() -> None:
 
 
 def test_tasks_have_names_and_instructions_that_tell_them_apart() -> None:
-    tasks = list_cube_tasks(HARDER)
+    tasks = list_tasks(HARDER)
     assert len(tasks) == HARDER.num_tasks == len(CUBE_TASKS)
-    assert list_cube_tasks(SUITE) == tuple(replace(task, suite=SUITE.name) for task in tasks[: SUITE.num_tasks])
+    assert list_tasks(SUITE) == tuple(replace(task, suite=SUITE.name) for task in tasks[: SUITE.num_tasks])
     assert len({task.name for task in tasks}) == len(tasks)
     base = tasks[:NUM_BASE_TASKS]
     assert len({task.instruction for task in base}) == NUM_BASE_TASKS

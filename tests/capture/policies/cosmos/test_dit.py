@@ -56,7 +56,7 @@ def test_the_published_checkpoint_loads_strictly(manifest):
     assert len(stored) == 574
     weights = dit_tensors(stored)
     assert len(stored) - len(weights) == 4
-    config = infer_dit_config(weights)
+    config = infer_dit_config(weights, DitConfig())
     assert config == DitConfig()
     with torch.device("meta"):
         model = Dit(config)
@@ -67,7 +67,7 @@ def test_the_published_checkpoint_loads_strictly(manifest):
 def test_the_published_image_encoder_has_our_names_and_shapes(manifest):
     pytest.importorskip("diffusers")
     stored = {name: torch.empty(shape, device="meta") for name, shape in manifest["vae"].items()}
-    config = infer_vae_config(stored)
+    config = infer_vae_config(stored, VaeConfig())
     assert config == VaeConfig()
     found = {name: tuple(tensor.shape) for name, tensor in stored.items()}
     assert len(found) == 194

@@ -14,7 +14,7 @@ from vla_attention.capture.policies.cosmos.config import LIBERO_FRAMES, CosmosCo
 from vla_attention.capture.policies.cosmos.embedded import DUMMY_CONFIG, EMBEDDED_CONFIG, random_policy
 from vla_attention.capture.policies.cosmos.family import CosmosSettings
 from vla_attention.capture.policies.cosmos.latents import cross_layout, self_layout
-from vla_attention.capture.policies.cosmos.loading import build_cosmos_policy, select_call
+from vla_attention.capture.policies.cosmos.loading import build_cosmos_policy, check_call_length
 from vla_attention.capture.recording.recorder import AttentionRecorder, RecordingPlan
 from vla_attention.schemas.errors import BadArgument, UnknownName
 from vla_attention.schemas.layout import Role, camera_grids
@@ -30,13 +30,10 @@ def recorders_for(policy, queries="mean"):
 
 
 def test_actions_are_bit_equal_with_and_without_recording(dummy, prepared):
-    plain = dummy.predict(prepared, 195)
-    recorded = dummy.predict(prepared, 195, recorders_for(dummy))
-    with_contributions = dummy.predict(prepared, 195, recorders_of(dummy, prepared))
-    assert np.array_equal(plain.actions, with_contributions.actions)
-    assert np.array_equal(plain.actions, recorded.actions)
-    assert plain.value == recorded.value
-    assert plain.actions.shape == (16, 7)
+    plain = dummy.act(prepared, 195)
+    assert np.array_equal(plain, dummy.act(prepared, 195, recorders_of(dummy, prepared)))
+    assert np.array_equal(plain, dummy.act(prepared, 195, recorders_for(dummy)))
+    assert plain.shape == (16, 7)
 
 
 def test_queries_are_pooled_by_action_step(dummy, prepared):
@@ -69,8 +66,8 @@ def test_another_query_frame_has_other_rows(dummy, prepared):
     assert np.array_equal(other.act(prepared, 195, theirs), actions)
     assert not np.array_equal(ours["self"].finish().rows, theirs["self"].finish().rows)
     with pytest.raises(BadArgument, match="latent frame 'primary' do not stand for action steps"):
-        other.action_shares()
-    assert dummy.action_shares().shape == (16, 16, 7)
+        other.query_pools()
+    assert dummy.query_pools().shape == (16 * 7, 16)
 
 
 def test_the_published_layout():
@@ -134,10 +131,10 @@ def test_frames_are_found_by_name_and_number():
 
 def test_a_call_that_never_was_is_an_error():
     config = CosmosConfig()
-    assert select_call(config, 1764, "last") == 4
-    assert select_call(config, None, "first") == 0
+    check_call_length(config, 1764)
+    check_call_length(config, None)
     with pytest.raises(BadArgument, match="No call has --prefer-S 1000: all 5 calls of this policy have S = 1764"):
-        select_call(config, 1000, "last")
+        check_call_length(config, 1000)
 
 
 def test_denoise_times_and_noise_seeds(dummy):

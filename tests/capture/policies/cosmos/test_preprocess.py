@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from vla_attention.capture.policies.cosmos.config import VaeConfig
-from vla_attention.capture.policies.cosmos.embedded import builtin_ranges, random_vae_weights
+from vla_attention.capture.policies.cosmos.embedded import BUILTIN_RANGES, random_vae_weights
 from vla_attention.capture.policies.cosmos.preprocess import (
     crop_and_enlarge,
     crop_size,
@@ -33,7 +33,7 @@ def test_the_middle_is_cut_out_and_enlarged():
 
 
 def test_ranges_are_applied_and_undone():
-    statistics = builtin_ranges()
+    statistics = BUILTIN_RANGES
     assert statistics.normalise_proprio(statistics.proprio_min).tolist() == [-1.0] * 9
     assert statistics.normalise_proprio(statistics.proprio_max).tolist() == [1.0] * 9
     beyond = statistics.environment_actions(np.full((2, 7), 1.5))

@@ -10,10 +10,10 @@ import pytest
 
 from tests.kit.pi_golden import GOLDEN
 from tests.kit.small_tokenizer import train_small_tokenizer
+from vla_attention.capture.policies.checkpoints import CheckpointMismatch
 from vla_attention.capture.policies.pi.config import find_config
 from vla_attention.capture.policies.pi.data_set_robot import openpi_robot
 from vla_attention.capture.policies.pi.family import PiSettings
-from vla_attention.capture.policies.pi.lerobot import lerobot_image
 from vla_attention.capture.policies.pi.loading import choose_config, load_pi_policy
 from vla_attention.capture.policies.pi.preprocess import read_norm_stats
 from vla_attention.capture.policies.pi.stated_sizes import read_config
@@ -72,9 +72,10 @@ def test_openpi_s_configuration_of_droid_is_known_by_its_statistics(tmp_path, ca
     (folder / "config.json").write_text(json.dumps({"action_dim": 32, "action_horizon": 15}))
     chosen = choose_config(folder, "openpi_torch", PiSettings(), of_data_set=True)
     assert chosen.config == find_config(name)
-    assert (chosen.name, chosen.stated) == (name, False)
+    assert chosen.name == name
     assert name in chosen.source
-    assert choose_config(folder, "openpi_torch", PiSettings()).config is None
+    with pytest.raises(CheckpointMismatch, match="does not state its attention heads"):
+        choose_config(folder, "openpi_torch", PiSettings())
 
 
 def test_actions_of_a_robot_are_unnormalised_and_made_absolute(tmp_path, tokenizer):
@@ -84,7 +85,10 @@ def test_actions_of_a_robot_are_unnormalised_and_made_absolute(tmp_path, tokeniz
         chosen_cameras={"left_wrist_0_rgb": "none"}, relative_actions=6,
     )  # fmt: skip
     config = read_config(GOLDEN / "pi05_batch2" / "case.json")
-    policy = load_pi_policy(folder, tokenizer, PiSettings(robot_data=data), config=config)
+    settings = PiSettings(
+        str(folder), tokenizer=str(tokenizer), robot_data=data, model_config=GOLDEN / "pi05_batch2" / "case.json"
+    )
+    policy = load_pi_policy(settings)
     assert policy.robot.cameras == {"base_0_rgb": "observation.images.cam_high"}
     state = np.linspace(-0.5, 0.5, 14)
     model = np.random.default_rng(1).uniform(-1, 1, (config.action_horizon, config.action_dim))
@@ -99,12 +103,6 @@ def test_actions_of_a_robot_are_unnormalised_and_made_absolute(tmp_path, tokeniz
     assert policy.act(prepared, 0).shape == (config.action_horizon, 14)
     with pytest.raises(BadArgument, match=r"shape \(8,\); expected \(14,\)"):
         policy.prepare_robot({"observation.images.cam_high": picture}, state[:8], "fold the towel")
-
-
-def test_pictures_of_data_sets_are_not_turned():
-    picture = np.random.default_rng(0).integers(0, 255, (40, 60, 3)).astype(np.uint8)
-    turned = lerobot_image(np.ascontiguousarray(picture[::-1, ::-1]), 28)
-    assert np.array_equal(lerobot_image(picture, 28, turned=False), turned)
 
 
 @pytest.mark.parametrize(

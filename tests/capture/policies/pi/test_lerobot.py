@@ -16,9 +16,9 @@ from vla_attention.capture.policies.checkpoints import CheckpointMismatch, Unrea
 from vla_attention.capture.policies.pi.family import PiSettings
 from vla_attention.capture.policies.pi.lerobot import lerobot_image
 from vla_attention.capture.policies.pi.lerobot_config import read_lerobot_config
-from vla_attention.capture.policies.pi.lerobot_pipeline import LerobotNormaliser, read_lerobot_pipeline
+from vla_attention.capture.policies.pi.lerobot_pipeline import lerobot_normaliser, read_lerobot_pipeline
 from vla_attention.capture.policies.pi.loading import load_pi_policy
-from vla_attention.capture.policies.pi.preprocess import libero_state
+from vla_attention.capture.policies.pi.preprocess import libero_state, turn
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, digitise_state
 from vla_attention.capture.policies.policy import Policy
 from vla_attention.schemas.errors import BadArgument, UserError
@@ -65,7 +65,7 @@ def expected():
 
 def normaliser(mode, feature):
     statistics = {name: np.float32(values) for name, values in CASE["stats"][feature].items()}
-    return LerobotNormaliser(mode, statistics, 1e-8)
+    return lerobot_normaliser(mode, statistics, 1e-8, 0)
 
 
 def state_of(inputs):
@@ -74,7 +74,7 @@ def state_of(inputs):
 
 
 def test_images(inputs, expected):
-    got = lerobot_image(inputs["agentview_image"][0], 224)
+    got = lerobot_image(turn(inputs["agentview_image"][0]), 224)
     assert got.dtype == torch.float32
     assert np.abs(got.numpy() - expected["image_slot0"]).max() <= 2 / 255
     # in fact it is the same arithmetic
@@ -87,7 +87,7 @@ def test_images_that_are_not_square_are_padded_and_those_of_the_right_size_kept(
     assert (wide[:, :, :12] == -1).all()
     assert (wide[:, :, 37:] == -1).all()
     same = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
-    np.testing.assert_allclose((lerobot_image(same, 4)[0].permute(1, 2, 0) + 1) * 127.5, same[::-1, ::-1], atol=1e-4)
+    np.testing.assert_allclose((lerobot_image(same, 4)[0].permute(1, 2, 0) + 1) * 127.5, same, atol=1e-4)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -127,9 +127,9 @@ def test_pi0_prompt(tokenizer_path):
 
 def test_ranges_of_zero_count_as_eps():
     statistics = {"q01": np.float32([1, 0]), "q99": np.float32([1, 2])}
-    got = LerobotNormaliser("QUANTILES", statistics, 1e-8).normalise(np.array([1.0, 1.0]))
+    got = lerobot_normaliser("QUANTILES", statistics, 1e-8, 2).normalise(np.array([1.0, 1.0]))
     assert got.tolist() == [-1.0, 0.0]
-    np.testing.assert_array_equal(LerobotNormaliser("IDENTITY", {}, 1e-8).normalise(np.ones(2)), np.ones(2))
+    np.testing.assert_array_equal(lerobot_normaliser("IDENTITY", {}, 1e-8, 2).normalise(np.ones(2)), np.ones(2))
 
 
 # --- the whole policy
@@ -139,8 +139,12 @@ def typed(policy) -> Policy:
     return policy
 
 
+def load(checkpoint, tokenizer, **settings):
+    return load_pi_policy(PiSettings(str(checkpoint), tokenizer=str(tokenizer), **settings))
+
+
 def test_the_files_decide_everything(checkpoint, tokenizer_path):
-    policy = typed(load_pi_policy(checkpoint, tokenizer_path))
+    policy = typed(load(checkpoint, tokenizer_path))
     pi05 = policy.name == "pi05"
     config = policy.model.config
     assert config.cameras == ("image", "image2", "empty_camera_0")
@@ -173,7 +177,7 @@ def test_the_files_decide_everything(checkpoint, tokenizer_path):
 
 def test_the_cameras_own_pictures_give_the_same_input_again(checkpoint, tokenizer_path):
     """Pictures that were rounded for the store would not: the model's image was resized in floating point."""
-    policy = load_pi_policy(checkpoint, tokenizer_path)
+    policy = load(checkpoint, tokenizer_path)
     observation = make_observation(0)
     prepared = policy.prepare(observation, INSTRUCTION)
     assert policy.needs_camera_frames
@@ -196,23 +200,23 @@ def test_renamed_cameras_and_empty_cameras_that_only_a_number_states(checkpoint,
 
     edit(checkpoint / "config.json", change)
     with pytest.raises(BadArgument, match=r"None of the policy's cameras top, wrist.*agentview, .*--camera"):
-        load_pi_policy(checkpoint, tokenizer_path)
+        load(checkpoint, tokenizer_path)
     names = {"observation.images.image": "observation.images.wrist"}
     step = {"registry_name": "rename_observations_processor", "config": {"rename_map": names}}
     edit(checkpoint / "policy_preprocessor.json", lambda content: content["steps"].__setitem__(0, step))
-    policy = load_pi_policy(checkpoint, tokenizer_path)
+    policy = load(checkpoint, tokenizer_path)
     assert policy.model.config.cameras == ("wrist", "top", "empty_camera_0")
     assert [camera.source for camera in policy.cameras] == ["agentview"]
 
 
 def test_weights_without_prefix_and_without_embed_tokens(checkpoint, tokenizer_path):
-    whole = load_pi_policy(checkpoint, tokenizer_path).identity().digest
+    whole = load(checkpoint, tokenizer_path).identity().digest
     tensors = load_file(checkpoint / "model.safetensors")
     table = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
     older = {name.removeprefix("model."): tensor for name, tensor in tensors.items()}
     older["paligemma_with_expert.paligemma.lm_head.weight"] = older.pop(table)
     save_file(older, checkpoint / "model.safetensors")
-    assert load_pi_policy(checkpoint, tokenizer_path).identity().digest == whole
+    assert load(checkpoint, tokenizer_path).identity().digest == whole
 
 
 # --- refusals
@@ -234,7 +238,7 @@ def test_unsupported_features_are_refused_by_name(checkpoint, tokenizer_path, ch
         for name in ("policy_preprocessor.json", "policy_postprocessor.json"):
             edit(checkpoint / name, lambda c: [s["config"].update(norm_map={"ACTION": "IDENTITY"}) for s in c["steps"]])
     with pytest.raises((UnsupportedCheckpoint, CheckpointMismatch), match=expected) as caught:
-        load_pi_policy(checkpoint, tokenizer_path)
+        load(checkpoint, tokenizer_path)
     assert isinstance(caught.value, UserError)
     assert "\n" not in str(caught.value)
 
@@ -280,15 +284,19 @@ def test_the_type_must_be_that_of_the_tensors(checkpoint, tokenizer_path):
     other = GOLDEN / ("pi0_batch2" if pi05 else "pi05_batch2") / "checkpoint_lerobot" / "model.safetensors"
     shutil.copy(other, checkpoint / "model.safetensors")
     with pytest.raises(CheckpointMismatch, match="its tensors are those of pi0"):
-        load_pi_policy(checkpoint, tokenizer_path)
+        load(checkpoint, tokenizer_path)
 
 
 def test_sizes_that_only_a_case_file_states(checkpoint, tokenizer_path, tmp_path):
     (tmp_path / "case.json").rename(tmp_path / "sizes.json")
     with pytest.raises(CheckpointMismatch, match=r"instead of .*--model-config PATH .*case\.json beside"):
-        load_pi_policy(checkpoint, tokenizer_path)
-    options = PiSettings(model_config=tmp_path / "sizes.json")
-    assert load_pi_policy(checkpoint, tokenizer_path, options).identity().config["configuration"].endswith("sizes.json")
-    contradiction = PiSettings(config_name="pi05_libero", model_config=tmp_path / "sizes.json")
+        load(checkpoint, tokenizer_path)
+    assert (
+        load(checkpoint, tokenizer_path, model_config=tmp_path / "sizes.json")
+        .identity()
+        .config["configuration"]
+        .endswith("sizes.json")
+    )
+    contradiction = {"config_name": "pi05_libero", "model_config": tmp_path / "sizes.json"}
     with pytest.raises(BadArgument):
-        load_pi_policy(checkpoint, tokenizer_path, contradiction)
+        load(checkpoint, tokenizer_path, **contradiction)

@@ -82,10 +82,10 @@ def test_recorder_is_told_which_queries_are_actions(golden_case):
     model = model_of(one)
     one.sample(model, keep)
     plan = RecordingPlan(layers=(1, 0), denoise_steps=(0, 2), heads=(5, 2), queries="all", site="joint")
-    recorder = AttentionRecorder(plan, config.key_len)
+    recorder = AttentionRecorder(plan, config.prefix_len + config.suffix_len)
     one.sample(model, recorder)
     got = recorder.finish()
-    assert got.rows.shape == (2, 2, 2, config.action_horizon, config.key_len)
+    assert got.rows.shape == (2, 2, 2, config.action_horizon, config.prefix_len + config.suffix_len)
     everything = keep.stacked()
     for i, layer in enumerate(plan.layers):
         for j, step in enumerate(plan.denoise_steps):

@@ -14,8 +14,9 @@ from tests.kit.policy_inputs import KeepAll
 from vla_attention.capture.policies.checkpoints import CheckpointMismatch, UnreadableCheckpoint
 from vla_attention.capture.policies.pi.config import NAMED_CONFIGS, SiglipConfig, find_config, find_variant
 from vla_attention.capture.policies.pi.jax_weights import plan_leaves
+from vla_attention.capture.policies.pi.loading import load_pi_model
 from vla_attention.capture.policies.pi.model import PiModel, expected_shapes
-from vla_attention.capture.policies.pi.openpi_torch import load_openpi_torch, model_names
+from vla_attention.capture.policies.pi.openpi_torch import model_names
 from vla_attention.capture.policies.pi.sizes import stated_config
 from vla_attention.capture.policies.weights import check_shapes
 from vla_attention.schemas.errors import BadArgument, UserError
@@ -40,7 +41,7 @@ def rewrite(folder, change):
 
 
 def test_jax_leaves_convert_to_the_same_model(pi05_case):
-    loaded = load_openpi_torch(STORED, config=pi05_case.config).state_dict()
+    loaded = load_pi_model(STORED, pi05_case.config).state_dict()
     converted = from_jax_flat(pi05_case.leaves, pi05_case.config)
     assert loaded.keys() == converted.keys()
     for name, tensor in converted.items():
@@ -49,7 +50,7 @@ def test_jax_leaves_convert_to_the_same_model(pi05_case):
 
 def test_loaded_model_meets_the_reference(pi05_case):
     keep = KeepAll()
-    pi05_case.sample(load_openpi_torch(STORED, config=pi05_case.config), keep)
+    pi05_case.sample(load_pi_model(STORED, pi05_case.config), keep)
     np.testing.assert_allclose(keep.stacked(), pi05_case.expected["attn"], rtol=0, atol=5e-5)
 
 
@@ -58,7 +59,7 @@ def test_embed_tokens_wins_over_the_tied_name(checkpoint, pi05_case):
         tensors[TABLE] = torch.full_like(tensors[TIED], 7.0)
 
     rewrite(checkpoint, add_table)
-    assert (load_openpi_torch(checkpoint, config=pi05_case.config).state_dict()[TABLE] == 7).all()
+    assert (load_pi_model(checkpoint, pi05_case.config).state_dict()[TABLE] == 7).all()
 
 
 #: The rows of gemma_2b's projections (8 query heads and one key head of 256) as other heads.
@@ -107,7 +108,7 @@ def test_every_difference_is_listed_in_one_error(checkpoint, pi05_case):
 
     rewrite(checkpoint, damage)
     with pytest.raises(CheckpointMismatch) as caught:
-        load_openpi_torch(checkpoint, config=pi05_case.config)
+        load_pi_model(checkpoint, pi05_case.config)
     text = str(caught.value)
     assert "1 missing: time_mlp_out.bias" in text
     assert "1 extra: state_proj.weight" in text
@@ -121,7 +122,7 @@ def test_truncated_safetensors(checkpoint, pi05_case, kept):
     content = file.read_bytes()
     file.write_bytes(content[: int(len(content) * kept)])
     with pytest.raises(UnreadableCheckpoint, match="damaged or its copy incomplete"):
-        load_openpi_torch(checkpoint, config=pi05_case.config)
+        load_pi_model(checkpoint, pi05_case.config)
 
 
 def test_sizes_that_do_not_fit_are_refused():
@@ -130,9 +131,9 @@ def test_sizes_that_do_not_fit_are_refused():
         dataclasses.replace(full, action_expert=find_variant("dummy"))
     with pytest.raises(BadArgument, match="whole number"):
         dataclasses.replace(full, siglip=SiglipConfig(image_size=225))
-    assert (full.prefix_len, full.suffix_len, full.key_len) == (968, 10, 978)
+    assert (full.prefix_len, full.suffix_len) == (968, 10)
     pi0 = find_config("pi0_libero")
-    assert (pi0.prefix_len, pi0.suffix_len, pi0.key_len, pi0.first_action_query) == (816, 51, 867, 1)
+    assert (pi0.prefix_len, pi0.suffix_len, pi0.first_action_query) == (816, 51, 1)
 
 
 @pytest.mark.parametrize("name", ["pi05_libero", "pi0_libero"])

@@ -14,10 +14,11 @@ from vla_attention.capture.policies.checkpoints import CheckpointNotFound
 from vla_attention.capture.policies.identity import PolicySource
 from vla_attention.capture.policies.pi.config import find_config
 from vla_attention.capture.policies.pi.embedded import DUMMY_CONFIG, build_random_model, builtin_stats
+from vla_attention.capture.policies.pi.family import PiSettings
 from vla_attention.capture.policies.pi.loading import load_pi_policy
 from vla_attention.capture.policies.pi.policy import PiPolicy, site_layout
-from vla_attention.capture.policies.pi.preprocess import model_image
-from vla_attention.capture.policies.pi.processing import OpenpiProcessing
+from vla_attention.capture.policies.pi.preprocess import resize_with_pad, turn
+from vla_attention.capture.policies.pi.processing import openpi_processing
 from vla_attention.capture.policies.pi.tokenizer import PromptTokenizer, check_vocabulary
 from vla_attention.capture.policies.sentencepiece_model import EMBEDDED_TOKENIZER
 from vla_attention.capture.policies.weights import weights_digest
@@ -45,7 +46,7 @@ def dummy_pi0():
     return PiPolicy(
         build_random_model(config, 0),
         PromptTokenizer(EMBEDDED_TOKENIZER),
-        OpenpiProcessing(config, builtin_stats(), normalisation="z-score", relative_actions=True),
+        openpi_processing(config, builtin_stats()),
         PolicySource("dummy-pi0", "random weights, seed 0", "seeded", untrained=True),
     )
 
@@ -82,7 +83,7 @@ def test_frames_are_the_rotated_pictures_of_the_real_cameras(policy, observation
     for camera in policy.cameras:
         assert camera.upright
         assert camera.mirrored
-        expected = model_image(observation.images[camera.source], size)
+        expected = resize_with_pad(turn(observation.images[camera.source]), size)
         np.testing.assert_array_equal(given.frames[camera.name], expected)
         tensor = given.tensors[f"image:{camera.name}"]
         np.testing.assert_allclose((tensor[0].permute(1, 2, 0).numpy() + 1) * 127.5, expected, atol=1e-4)
@@ -106,8 +107,9 @@ def test_a_changed_picture_and_no_words_reach_the_model(policy, observation):
     assert changed.prompt.instruction_text == ""
     assert Role.INSTRUCTION not in changed.key_role["joint"]
     assert np.isfinite(policy.act(changed, 3)).all()
-    with pytest.raises(BadArgument, match="a policy needs at least one word"):
-        policy.prepare(observation, "")
+    for empty in ("", "__"):
+        with pytest.raises(BadArgument, match="is empty: a policy needs at least one word"):
+            policy.prepare(observation, empty)
 
 
 def test_roles_agree_with_the_keys_that_get_attention(policy, observation):
@@ -202,14 +204,15 @@ def test_policy_from_a_checkpoint_folder(tmp_path, observation):
     config = dataclasses.replace(DUMMY_CONFIG, discrete_state_input=False)
     model = build_random_model(config, 4)
     save_file(dict(model.state_dict()), tmp_path / "model.safetensors")
-    (tmp_path / "config.json").write_text(json.dumps({"action_dim": 32, "action_horizon": 4}))
+    sizes = {**dataclasses.asdict(config), "num_steps": config.num_denoise_steps}
+    (tmp_path / "config.json").write_text(json.dumps({"model": "pi05", "config": sizes}))
     stats = tmp_path / "assets" / "physical-intelligence" / "libero" / "norm_stats.json"
     stats.parent.mkdir(parents=True)
     stats.write_text((GOLDEN / "libero_preproc" / "norm_stats.json").read_text())
-    policy = load_pi_policy(tmp_path, EMBEDDED_TOKENIZER, config=config)
+    policy = load_pi_policy(PiSettings(str(tmp_path), tokenizer=str(EMBEDDED_TOKENIZER)))
     assert policy.identity().digest == weights_digest(model)
     assert policy.identity().untrained is False
     assert policy.name == "pi05"
     assert np.isfinite(policy.act(policy.prepare(observation, INSTRUCTION), 0)).all()
     with pytest.raises(CheckpointNotFound):
-        load_pi_policy(tmp_path, tmp_path / "none.model", config=config)
+        load_pi_policy(PiSettings(str(tmp_path), tokenizer=str(tmp_path / "none.model")))

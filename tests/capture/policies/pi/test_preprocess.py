@@ -8,18 +8,19 @@ from PIL import Image
 
 from tests.kit.pi_golden import GOLDEN
 from vla_attention.capture.policies.checkpoints import CheckpointNotFound, UnreadableCheckpoint
+from vla_attention.capture.policies.pi.config import find_config
 from vla_attention.capture.policies.pi.preprocess import (
     NormStats,
     Statistics,
     axis_angle,
-    environment_actions,
     libero_state,
-    model_image,
     pad_to,
     parse_norm_stats,
     read_norm_stats,
     resize_with_pad,
+    turn,
 )
+from vla_attention.capture.policies.pi.processing import openpi_processing, simulated_arm
 from vla_attention.capture.policies.pi.tokenizer import digitise_state
 from vla_attention.schemas.errors import UserError
 
@@ -45,7 +46,7 @@ def stats():
 @pytest.mark.parametrize(("camera", "name"), [("agentview_image", "base"), ("robot0_eye_in_hand_image", "wrist")])
 def test_images_are_rotated_and_resized_within_one_grey_level(inputs, expected, camera, name):
     for frame, wanted in zip(inputs[camera], expected[name], strict=True):
-        got = model_image(frame, 224)
+        got = resize_with_pad(turn(frame), 224)
         assert got.dtype == np.uint8
         assert np.abs(got.astype(int) - wanted.astype(int)).max() <= 1
 
@@ -59,34 +60,42 @@ def test_states(inputs, expected, stats):
     state = states(inputs)
     np.testing.assert_allclose(state, expected["state8"], rtol=0, atol=1e-6)
     for mode, name in MODES.items():
-        got = pad_to(stats.state.normalise(state, mode), 32)
+        got = pad_to(stats.state.normaliser(mode).normalise(state), 32)
         np.testing.assert_allclose(got, expected[f"{name}_state32"], rtol=0, atol=1e-6)
 
 
 def test_digitised_states(inputs, expected, stats):
-    digits = digitise_state(stats.state.normalise(states(inputs), "quantile"))
+    digits = digitise_state(stats.state.normaliser("quantile").normalise(states(inputs)))
     np.testing.assert_array_equal(digits, expected["digitized"])
     assert (digits == -1).any()
     assert (digits == 255).any()
 
 
+def processing(stats, pi05, relative=0):
+    cameras = {"base_0_rgb": "agentview"}
+    config = find_config("pi05_libero" if pi05 else "pi0_libero")
+    return openpi_processing(config, stats, simulated_arm(cameras, relative))
+
+
 @pytest.mark.parametrize("mode", MODES)
 def test_actions(inputs, expected, stats, mode):
-    got = environment_actions(inputs["model_actions"], stats, mode)
-    assert got.shape == (3, 10, 7)
+    made = processing(stats, mode == "quantile")
+    got = [made.environment_actions(*given) for given in zip(inputs["model_actions"], states(inputs), strict=True)]
+    assert np.shape(got) == (3, 10, 7)
     np.testing.assert_allclose(got, expected[f"{MODES[mode]}_actions7"], rtol=0, atol=1e-6)
 
 
 def test_actions_relative_to_the_state(inputs, expected, stats):
-    got = environment_actions(inputs["model_actions"], stats, "z-score", relative_to=states(inputs))
+    made = processing(stats, False, relative=6)
+    got = [made.environment_actions(*given) for given in zip(inputs["model_actions"], states(inputs), strict=True)]
     np.testing.assert_allclose(got, expected["z_actions7_extra_delta"], rtol=0, atol=1e-6)
 
 
 def test_longer_statistics_are_cut_and_longer_data_passes_through():
-    long = Statistics(mean=np.arange(32.0), std=np.ones(32))
-    assert long.normalise(np.arange(8.0), "z-score").tolist() == [0.0] * 8
-    short = Statistics(mean=np.zeros(2), std=np.ones(2), q01=np.zeros(2), q99=np.ones(2))
-    assert short.unnormalise(np.full((1, 4), 5.0), "quantile")[0, 2:].tolist() == [5.0, 5.0]
+    long = Statistics(mean=np.arange(32.0), std=np.ones(32)).normaliser("z-score")
+    assert long.normalise(np.arange(8.0)).tolist() == [0.0] * 8
+    short = Statistics(mean=np.zeros(2), std=np.ones(2), q01=np.zeros(2), q99=np.ones(2)).normaliser("quantile")
+    assert short.unnormalise(np.full((1, 4), 5.0))[0, 2:].tolist() == [5.0, 5.0]
 
 
 def test_axis_angle_of_special_orientations():
@@ -131,19 +140,19 @@ def test_statistics_come_from_the_checkpoint_s_assets(tmp_path, stats):
         np.testing.assert_array_equal(read_norm_stats(tmp_path, **right).actions.q99, stats.actions.q99)
 
 
-def numbers(dim, **more):
-    return Statistics(mean=np.zeros(dim), std=np.ones(dim), **more)
+def numbers(dim):
+    return Statistics(mean=np.zeros(dim), std=np.ones(dim))
 
 
 def test_statistics_must_be_those_of_state_and_actions(stats):
-    stats.check("quantile", 8, 32)
-    NormStats(numbers(32), numbers(32)).check("z-score", 8, 32)
+    stats.check(8, 7, 32)
+    NormStats(numbers(32), numbers(32)).check(8, 7, 32)
     for state, actions, message in (
         (7, 7, "'state' have 7 numbers; 8 are needed"),
         (14, 7, "'state' have 14 numbers; 8 are needed"),
         (8, 8, r"'actions' have 8 numbers; 7 are needed \(or 32, padded\)"),
     ):
         with pytest.raises(UnreadableCheckpoint, match=message):
-            NormStats(numbers(state), numbers(actions)).check("z-score", 8, 32)
-    with pytest.raises(UnreadableCheckpoint, match="'state' lack q01"):
-        NormStats(numbers(8), numbers(7)).check("quantile", 8, 32)
+            NormStats(numbers(state), numbers(actions)).check(8, 7, 32)
+    with pytest.raises(UnreadableCheckpoint, match="no q01 and q99"):
+        numbers(8).normaliser("quantile")

@@ -146,9 +146,3 @@ def test_a_prompt_that_does_not_fit_is_refused_not_cut(tokenizer):
     assert tokenizer.tokenize("open the door", max_token_len=fits).mask.all()
     with pytest.raises(BadArgument, match=rf"'open the door' has {fits} tokens, but the model has room for {fits - 1}"):
         tokenizer.tokenize("open the door", max_token_len=fits - 1)
-
-
-@pytest.mark.parametrize("instruction", ["", "__"])
-def test_an_empty_instruction_is_refused(tokenizer, instruction):
-    with pytest.raises(BadArgument, match="is empty"):
-        tokenizer.tokenize(instruction, max_token_len=48)
