@@ -127,7 +127,7 @@ def _finding(question: Question, words: pl.DataFrame, by: Collection[str], named
     said = [
         f"{which}: {', '.join(_named(row) for row in part.head(_MOST_NAMED).iter_rows(named=True))}"
         + (f" and {part.height - _MOST_NAMED} more" if part.height > _MOST_NAMED else "")
-        for which, part in (("More than its share of attention goes to", more), ("less to", less))
+        for which, part in (("more than its share of attention goes to", more), ("less than its share goes to", less))
         if part.height
     ]
     tested = words["lift_q"].len() - words["lift_q"].null_count()
@@ -139,7 +139,9 @@ def _finding(question: Question, words: pl.DataFrame, by: Collection[str], named
         return Finding(verdict, "Which words are read?", {"tested": tested}, f"{few}{limit}", effects)
     top = (more if more.height else less).row(0, named=True)
     numbers = {"word": top["item"], "estimate": top["lift"], "low": top["lift_low"], "high": top["lift_high"]}
-    return Finding(f"{'; '.join(said)}.", "Which words are read?", {**numbers, "q": top["lift_q"]}, limit, effects)
+    sentence = "; ".join(said)
+    sentence = f"{sentence[0].upper()}{sentence[1:]}."
+    return Finding(sentence, "Which words are read?", {**numbers, "q": top["lift_q"]}, limit, effects)
 
 
 def _named(row: dict[str, object]) -> str:

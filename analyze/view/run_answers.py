@@ -31,7 +31,7 @@ def runs_answer(
         "runs": [
             {"name": store.path.name if counts[store.path.name] == 1 else str(store.path)}
             | _run_answer(store, known)
-            | ({"path": str(store.path)} if with_paths else {})
+            | ({"path": str(store.path), "notes": list(store.notes)} if with_paths else {})
             for store in stores
         ]
     }

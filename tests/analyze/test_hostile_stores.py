@@ -124,7 +124,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "effects of data": ("STORE", "--output", "OUT"),
     "overlay": ("STORE", "OTHER", "--output", "OUT"),
     "report": ("STORE", "--output", "OUT", "--num-episodes", "1", "--task", "0", "--layers", "0"),
-    "view": ("STORE", "--output", "OUT"),
+    "view": ("STORE", "--site", "OUT"),
     "store copy": ("copy", "STORE", "OUT/copy.zarr", "--without", "frames"),
     "store verify": ("verify", "STORE"),
 }

@@ -86,7 +86,9 @@ def test_a_site_has_the_servers_answers(store, tmp_path, capsys, heads):
         for address, content in answers.items():
             assert ask(running, address).body == content, address
         live, copy = json.loads(ask(running, "runs.json").body), json.loads((folder / "runs.json").read_bytes())
-    assert live["runs"][0].pop("path") == str(store)  # elsewhere nobody needs it
+    # Elsewhere nobody needs to know where it was.
+    assert (live["runs"][0].pop("path"), live["runs"][0].pop("notes")) == (str(store), [])
+    assert str(store).encode() not in b"".join(answers.values())
     assert copy == live | {"copy": {"heads": heads}}
     kinds = {re.sub(r"\d+|mean", "N", address.split("/", 3)[-1]) for address in answers}
     assert {"about.json", "joint/rows/N.npy", "joint/groups/denoise-N.json", "joint/grid/N.json"} <= kinds

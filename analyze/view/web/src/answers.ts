@@ -38,6 +38,7 @@ export interface Run {
   readonly untrained: boolean;
   readonly rerun: boolean;
   readonly changed: readonly string[];
+  readonly notes?: readonly string[];
   readonly sites: readonly SiteAxes[];
   readonly episodes: readonly EpisodeLine[];
 }

@@ -185,7 +185,7 @@ export function EpisodePage() {
         <p class={`verdict ${kindOf(episode)}`} role="status">{episode.verdict}</p>
       </header>
       {episode.told_other ? <p class="banner" role="alert">The policy was told '{episode.told}'; the task is '{episode.instruction}'.</p> : null}
-      {run.value.changed.map((line) => <p class="banner" key={line}>{line}</p>)}
+      {episode.told_other ? null : run.value.changed.map((line) => <p class="banner" key={line}>{line}</p>)}
       <div class="top"><Title /><Controls /></div>
       {more.value ? <Drawer /> : null}
       {part("beside") ? <><SideBySide /><Legend /><div class="columns"><div class="main"><Timeline /></div><aside><Actions /><Ratio /></aside></div></> : (

@@ -9,8 +9,14 @@ const chosen = signal<string | null>(null);
 
 const targets = computed(() => {
   const known = (layout.value?.targets ?? []).map((one, i) => ({ ...one, path: `grid/${i}.json` }));
-  const own = picked.value.selector;
-  return own ? [...known, { name: own, selector: own, path: `grid.json?${new URLSearchParams({ selector: own })}` }] : known;
+  const asked = (name: string, selector: string) => ({ name, selector, path: `grid.json?${new URLSearchParams({ selector })}` });
+  const { cells, selector } = picked.value;
+  const keys = Object.entries(cells).flatMap(([camera, some]) => {
+    const how = layout.value?.cameras[camera];
+    return (how?.keys ?? []).filter((_, i) => some.includes(how!.cells[i]!));
+  });
+  const patches = keys.map((key) => `keys:${key}-${key}`).join(" | ");
+  return [...known, ...(patches ? [asked("the clicked patches", patches)] : []), ...(selector ? [asked(selector, selector)] : [])];
 });
 const target = computed(() => targets.value.find(({ selector }) => selector === chosen.value) ?? targets.value[0] ?? null);
 

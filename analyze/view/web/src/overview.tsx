@@ -111,6 +111,7 @@ export function Overview() {
           {shownRun.rerun ? "policy calls of another run, made again" : known ? `${solved} of ${known} episodes solved` : "outcomes not known"}
         </p>
         {shownRun.changed.map((line) => <p class="banner" key={line}>{line}</p>)}
+        {shownRun.notes?.map((line) => <p class="soft" key={line}>{line}</p>)}
       </header>
       <Findings />
       <div class="filters" role="search">
@@ -120,7 +121,7 @@ export function Overview() {
         <input type="search" aria-label="Find episodes" placeholder="find: red, failed, not solved …" value={part("find")} onInput={(event) => setPart({ find: event.currentTarget.value })} />
         <span class="soft" role="status">{listed.value.length} of {shownRun.episodes.length} episodes</span>
       </div>
-      <div class={tasks.value.every(({ lines }) => lines.length <= 3) ? "tasks few" : "tasks"}>
+      <div class={`tasks of-${Math.max(0, ...tasks.value.map(({ lines }) => lines.length))}`}>
         {tasks.value.map(({ task, instruction, lines }) => (
         <section class="task" key={`${task} ${instruction}`}>
           <h2><span class="soft">task {task}</span> {instruction}</h2>
