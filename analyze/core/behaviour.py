@@ -137,9 +137,11 @@ def verdict(store: Store, attributes: EpisodeAttributes) -> Verdict:
     if attributes.success:
         return Verdict(f"{begin}, done after {attributes.num_steps} steps.")
     row = row_of(store.suite, attributes, told, steps, _same(store))
+    if row["how"] == TOLD_SO:
+        task = visible(attributes.instruction)
+        return Verdict(f"Failed the task '{task}': told '{visible(told)}', did that (step {row['did_at']}).")
     did, touched = f"'{row['did']}' (step {row['did_at']})", f"{row['touched']} first (step {row['touched_at']})"
     came_to = {
-        TOLD_SO: f"did so (step {row['did_at']}), which is not the task '{visible(attributes.instruction)}'",
         OTHER_GOAL: f"did {did}",
         OTHER_TOUCH: f"touched {touched}",
         UNFINISHED: f"touched {touched}, did not finish",

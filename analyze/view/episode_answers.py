@@ -109,7 +109,11 @@ class ShownEpisode:
             for body, at in zip(steps.bodies, steps.first_touch, strict=True):
                 if at is not None:
                     found.append((at, "touch", f"touches {body.replace('_', ' ')}", body))
-            found += [(goal.first_held, "goal", goal.instruction, "") for goal in steps.goals if goal.first_held]
+            found += [
+                (goal.first_held, "goal", f"fulfils '{goal.instruction}'", "")
+                for goal in steps.goals
+                if goal.first_held
+            ]
             closes = _closings(self.episode.read(EXECUTED)[:, GRIPPER])
             found += [(at, "gripper", "gripper closes", "") for at in closes]
         outcome = attributes.success if self.store.attributes.rerun_of is None else None
@@ -267,10 +271,10 @@ class ShownEpisode:
 
     def grid(self, site: str, selector: str) -> dict[str, Any]:
         """`grid.json`: mass and lift of a selector's keys in every head, (replan, layer, head)."""
-        question = self.question(site, groups=(f"group={selector}",))
+        question = self.question(site, groups=(f"own={selector}",))
         levels = levels_of(question, heads=True)
         frame = pl.concat(means(one, ("replan", "layer", "head")) for one in levels.measured)
-        frame = frame.filter(pl.col("group") == "group", pl.col("layer") != LAYERS_AVG)
+        frame = frame.filter(pl.col("group") == "own", pl.col("layer") != LAYERS_AVG)
         shape = (self.episode.attributes.num_replans, len(question.selection.layers), len(question.selection.heads))
         return {
             "layers": list(question.selection.layer_labels),
@@ -280,7 +284,7 @@ class ShownEpisode:
 
     def keys(self, site: str, selector: str) -> dict[str, Any]:
         """`keys.json`: the keys that a selector takes with their weights, once where they never change, by replan."""
-        question = self.question(site, groups=(f"group={selector}",))
+        question = self.question(site, groups=(f"own={selector}",))
         check_names(question.grouping, question.vocabulary)
         weights = resolve_episode(question.grouping, question.selected[0]).weights[..., 0]
         if (weights == weights[:1]).all():

@@ -8,6 +8,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -59,20 +60,17 @@ def write_site(folder: Path, stores: Sequence[ServedStore], heads: bool) -> str:
     runs = _runs(stores, heads)
     places = [(number, store, episode.name) for number, store in enumerate(stores) for episode in store.store.episodes]
     size = 0
-    with writing("site", folder, instead="another --site"), progress_bar(len(places), "episodes") as advance:
-        folder.mkdir(parents=True, exist_ok=True)
-        shutil.rmtree(folder / "runs", ignore_errors=True)  # of an earlier site
+    with _made_beside(folder) as new, progress_bar(len(places), "episodes") as advance:
         for name in PAGE_FILES:
-            write_text(folder / name, (page / name).read_text(encoding="utf-8"))
+            write_text(new / name, (page / name).read_text(encoding="utf-8"))
         for number, store in enumerate(stores):
-            size += _write(folder / f"runs/{number}/numbers.json.gz", _packed(json.dumps(_numbers(store)).encode()))
+            size += _write(new / f"runs/{number}/numbers.json.gz", _packed(json.dumps(_numbers(store)).encode()))
         answers = Answers()
         for number, store, episode in places:
             for path, content in _compressed(answers.of_episode(store, episode, heads)):
-                size += _write(folder / f"runs/{number}/{episode}/{path}", content)
+                size += _write(new / f"runs/{number}/{episode}/{path}", content)
             advance(1)
-        # Last: a folder with it is a whole site.
-        write_text(folder / RUNS, json.dumps(runs) + "\n")
+        write_text(new / RUNS, json.dumps(runs) + "\n")
     return (
         f"{folder}: {format_bytes(size)}, a page for any web server, for instance `python -m http.server -d {folder}`."
     )
@@ -106,6 +104,24 @@ def write_page_file(path: Path, store: ServedStore, episode: str, heads: bool) -
     with writing("page", path, instead="another --file"):
         write_text(path, text)
     return f"{path}: {format_bytes(len(text.encode()))}, opens in a browser from disk."
+
+
+@contextmanager
+def _made_beside(folder: Path) -> Iterator[Path]:
+    """A new folder that takes the place of another one, an earlier site, when it is whole."""
+    new, old = (folder.absolute().with_name(f".{folder.absolute().name}.{what}") for what in ("new", "old"))
+    with writing("site", folder, instead="another --site"):
+        for left in (new, old):
+            shutil.rmtree(left, ignore_errors=True)
+        new.mkdir(parents=True)
+        try:
+            yield new
+            if folder.exists():
+                folder.rename(old)
+            new.rename(folder)
+        finally:
+            for left in (new, old):
+                shutil.rmtree(left, ignore_errors=True)
 
 
 def _runs(stores: Sequence[ServedStore], heads: bool) -> dict[str, Any]:

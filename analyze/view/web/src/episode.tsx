@@ -5,9 +5,9 @@ import { Actions } from "./actions";
 import { kindOf } from "./overview";
 import { HeadGrid } from "./heads";
 import { OwnGroup, Ratio } from "./numbers";
-import { Legend, Pictures } from "./pictures";
+import { Legend, levels, Pictures } from "./pictures";
 import {
-  about, axes, beside, besideReplan, denoise, episodeName, groups, head, layer, layerPlace, main, onlyEpisode, part, replan, rows, run, runNumber, runs,
+  about, axes, beside, besideReplan, closeEpisode, denoise, episodeName, groups, head, layer, layerPlace, main, onlyEpisode, part, replan, rows, run, runNumber, runs,
   setPart, site,
 } from "./state";
 import { shown } from "./sums";
@@ -43,7 +43,7 @@ function Controls() {
       <Choose name="head" title="head" known={runs.value.value?.copy?.heads === false ? [] : (axes.value?.heads ?? [])} value={head.value} />
       <Choose name="denoise" title="denoise step" known={axes.value?.denoise_steps ?? []} value={denoise.value} />
       <ChooseBeside />
-      <button aria-expanded={more.value} onClick={() => (more.value = !more.value)}>more</button>
+      <button aria-expanded={more.value} onClick={() => (more.value = !more.value)}>share</button>
     </div>
   );
 }
@@ -58,9 +58,9 @@ function ChooseBeside() {
   );
   known.sort((a, b) => Number(b.line.name === episode.name) - Number(a.line.name === episode.name));
   return known.length ? (
-    <label>beside{" "}
+    <label>compare with{" "}
       <select value={part("beside")} onChange={(event) => setPart({ beside: event.currentTarget.value })}>
-        <option value="">-</option>
+        <option value="">nothing</option>
         {known.map(({ line, run: i, title }) => <option value={`${i}:${line.name}`}>{title}</option>)}
       </select>
     </label>
@@ -83,6 +83,8 @@ function SideBySide() {
       {sides.map(({ scene, at, episode }, i) => (
         <div key={i}>
           <p class={`verdict ${kindOf(episode)}`}>{episode.verdict}</p>
+          {i && episode.told_other ? <p class="banner">The policy was told '{episode.told}'; the task is '{episode.instruction}'.</p> : null}
+          {i ? runs.value.value?.runs[scene.run.value]?.changed.map((line) => <p class="banner" key={line}>{line}</p>) : null}
           <Pictures scene={scene} at={at} />
           <p class="soft">{scene.run.value === runNumber.value ? "" : `${runs.value.value?.runs[scene.run.value]?.name}: `}step {episode.starts[at]} of {episode.end}; {ratioOf(scene.groups.value.value, at)}</p>
         </div>
@@ -134,7 +136,12 @@ function picturesAsSvg(): { text: string; width: number; height: number } {
     return image + new XMLSerializer().serializeToString(copy);
   });
   const width = Math.max(1, x - GAP);
-  return { text: `<svg xmlns="http://www.w3.org/2000/svg" width="${width}" height="${height}">${parts.join("")}</svg>`, width, height };
+  const episode = about.value.value!;
+  const chosen = [["layer", layer.value], ["head", head.value], ["denoise step", denoise.value]].map(([name, one]) => `${name} ${one}`).join(", ");
+  const lines = [episode.verdict, `step ${episode.starts[replan.value]} of ${episode.end}; ${chosen}; lines: ${levels.value.join(" and ")} times an even spread; dashed: named or touched`];
+  const texts = lines.map((line, i) => `<text x="0" y="${height + 18 + 18 * i}" font-family="sans-serif" font-size="13">${line.replaceAll("&", "&amp;").replaceAll("<", "&lt;")}</text>`);
+  height += 46;
+  return { text: `<svg xmlns="http://www.w3.org/2000/svg" width="${width}" height="${height}"><rect width="100%" height="100%" fill="#fff"/>${parts.join("")}${texts.join("")}</svg>`, width, height };
 }
 
 async function savePictures(kind: "png" | "svg"): Promise<void> {
@@ -167,7 +174,7 @@ function Drawer() {
         <button onClick={() => void savePictures("svg")}>Save SVG</button>{" "}
         <button onClick={() => copy("command", command)}>Copy command</button> <span role="status">{copied}</span>
       </p>
-      <p><code>{command}</code> <span class="soft">draws the same; with --video gif instead of --replans a film.</span></p>
+      <p><code>{command}</code> <span class="soft">draws this episode in a terminal; with --video gif instead of --replans a film.</span></p>
       <p class="soft">Keys: ← → call, space plays, [ ] layer, , . head, - + denoise step, Esc overview.</p>
     </section>
   );
@@ -175,7 +182,9 @@ function Drawer() {
 
 export function EpisodePage() {
   const { value: episode, error } = about.value;
-  const back = onlyEpisode.value ? null : <button class="back" onClick={() => setPart({ episode: "" })}>← episodes</button>;
+  const back = onlyEpisode.value ? null : <button class="back" onClick={closeEpisode}>← episodes</button>;
+  const isListed = run.value?.episodes.some(({ name }) => name === episodeName.value) ?? true;
+  if (!isListed) return <div class="episode">{back}<p class="error" role="alert">{run.value!.name} has no episode '{episodeName.value}'.</p></div>;
   if (error) return <div class="episode">{back}<p class="error" role="alert">{error}</p></div>;
   if (!episode || !run.value) return <div class="episode">{back}<p class="soft">Reading {part("episode")} …</p></div>;
   return (

@@ -45,7 +45,7 @@ export function HeadGrid() {
       <label>Which head looks at{" "}
         <select value={target.value?.selector} onChange={(event) => (chosen.value = event.currentTarget.value)}>
           {targets.value.map(({ name, selector }) => <option value={selector}>{name}</option>)}
-        </select>?
+        </select>{" "}in this call?
       </label>
       {lifts.value.error ? <p class="soft">{lifts.value.error}</p> : null}
       {grid && numbers ? (
@@ -59,7 +59,7 @@ export function HeadGrid() {
                   {line.map((one, j) => (
                     <td key={j}>
                       <button
-                        aria-pressed={layer.value === numbers.layers[i] && head.value === numbers.heads[j]} aria-label={`layer ${numbers.layers[i]}, head ${numbers.heads[j]}: ${shown(one)} times even`}
+                        disabled={!has} aria-pressed={layer.value === numbers.layers[i] && head.value === numbers.heads[j]} aria-label={`layer ${numbers.layers[i]}, head ${numbers.heads[j]}: ${shown(one)} times even`}
                         title={`layer ${numbers.layers[i]}, head ${numbers.heads[j]}: ${shown(one)} times even`} class={place?.[0] === i && place[1] === j ? "best" : ""}
                         style={{ "--strength": Math.min(1, Math.max(0, (one ?? 0) / highest)).toFixed(3) }} onClick={() => toggle(numbers.layers[i]!, numbers.heads[j]!)}
                       />
@@ -69,7 +69,7 @@ export function HeadGrid() {
               ))}
             </tbody>
           </table>
-          <p class="soft">rows: layers; columns: heads; dark: {shown(highest)} times even. {has ? "A click shows that head alone." : ""}</p>
+          <p class="soft">rows: layers; columns: heads; strongest: {shown(highest)} times even. {has ? "A click shows that head alone." : ""}</p>
         </>
       ) : null}
     </section>

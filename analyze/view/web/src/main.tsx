@@ -5,7 +5,7 @@ import { render } from "preact";
 import "./page.css";
 import { EpisodePage } from "./episode";
 import { Overview } from "./overview";
-import { axes, beside, denoise, effects, episodeName, head, layer, main, playing, replan, runs, setPart } from "./state";
+import { axes, beside, closeEpisode, denoise, effects, episodeName, head, layer, main, numReplans, playing, replan, runs, setPart } from "./state";
 
 function App() {
   if (runs.value.error) return <p class="error" role="alert">{runs.value.error}</p>;
@@ -24,7 +24,7 @@ addEventListener("keydown", (event) => {
   if (event.ctrlKey || event.metaKey || event.altKey || on.matches("input:not([type=range]), select, textarea") || !episodeName.value) return;
   const acts: Record<string, () => void> = {
     ArrowLeft: () => setPart({ replan: Math.max(0, replan.value - 1) }),
-    ArrowRight: () => setPart({ replan: replan.value + 1 }),
+    ArrowRight: () => setPart({ replan: Math.min(numReplans.value - 1, replan.value + 1) }),
     "[": () => setPart({ layer: next(axes.value?.layers, layer.value, -1) }),
     "]": () => setPart({ layer: next(axes.value?.layers, layer.value, 1) }),
     ",": () => setPart({ head: next(axes.value?.heads, head.value, -1) }),
@@ -32,7 +32,7 @@ addEventListener("keydown", (event) => {
     "-": () => setPart({ denoise: next(axes.value?.denoise_steps, denoise.value, -1) }),
     "+": () => setPart({ denoise: next(axes.value?.denoise_steps, denoise.value, 1) }),
     " ": () => (playing.value = !playing.value),
-    Escape: () => setPart({ episode: "" }),
+    Escape: closeEpisode,
   };
   const act = acts[event.key];
   if (!act || (event.key === " " && on.matches("button")) || (event.key.startsWith("Arrow") && on.matches("input[type=range]"))) return;

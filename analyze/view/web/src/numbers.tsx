@@ -1,7 +1,8 @@
 /** Numbers of this replan: the ratio, the parts of the attention, and the own group of clicked patches and words. */
 import { useState } from "preact/hooks";
 
-import { groups, layerPlace, layout, masses, massesAt, pick, picked, pickedKeys, replan, typed, uniformAt, words } from "./state";
+import { Hint } from "./hint";
+import { groups, layer, layerPlace, layout, masses, massesAt, pick, picked, pickedKeys, replan, runs, typed, uniformAt, words } from "./state";
 import { type Keys } from "./state";
 import { percent, range, shown, sumOf } from "./sums";
 
@@ -15,9 +16,9 @@ export function Ratio() {
     <section class="ratio" aria-label="Attention in this call">
       {numbers.sides ? (
         <p>
-          <b class="figure" data-number="ratio" data-value={at(numbers.ratio)}>{shown(at(numbers.ratio))}</b> pictures / text{" "}
+          <b class="figure" data-number="ratio" data-value={at(numbers.ratio)}>{shown(at(numbers.ratio))}</b> pictures / text{layer.value === "mean" ? ` (geometric mean of ${numbers.layers.length - 1} layers)` : ""}{" "}
           <span class="soft">an even spread gives <span data-number="uniform" data-value={at(numbers.uniform_ratio)}>{shown(at(numbers.uniform_ratio))}</span>: this is <span data-number="lift" data-value={at(numbers.ratio_lift)}>{shown(at(numbers.ratio_lift))}</span> times that</span>
-          <span class="hint" title="Where the attention of the action queries went. It does not show what the policy used, and not why it acted: the effect of a word does.">?</span>
+          <Hint text="Where the attention of the action queries went. It does not show what the policy used, and not why it acted: the effect of a word does. Of several layers the ratio is the geometric mean of theirs, not the quotient of the mean parts below." />
         </p>
       ) : null}
       <div class="bar" role="img" aria-label={parts.map(({ name, fraction }) => `${name} ${percent(fraction)}`).join(", ")}>
@@ -44,6 +45,7 @@ function Side({ name, keys }: { name: string; keys: Keys }) {
 
 /** Patches and words that were clicked, what they get, and their ratio. */
 export function OwnGroup() {
+  const isCopy = runs.value.value?.copy !== undefined;
   const [text, setText] = useState(picked.value.selector);
   const { seen, read } = pickedKeys(replan.value);
   const [mass, even] = [massesAt(replan.value), uniformAt(replan.value)];
@@ -54,19 +56,19 @@ export function OwnGroup() {
   return (
     <section class="own" aria-label="Own group">
       <h2>Own group</h2>
-      {any || picked.value.selector ? null : <p class="soft">Click patches in the pictures and words in the title, or type a <span title="camera:NAME, object:NAME, word:bowl, role:image, patch:CAMERA[r0:r1,c0:c1], joined by | & -">selector</span>.</p>}
+      {any || picked.value.selector ? null : <p class="soft">Click patches in the pictures and words in the title, or type a selector.<Hint text="camera:NAME, object:NAME, word:bowl, role:image, patch:CAMERA[r0:r1,c0:c1], joined by |, & and -" /></p>}
       {any ? (
         <table class="numbers">
           <thead><tr><td /><th>keys</th><th>attention</th><th>times even</th></tr></thead>
           <tbody><Side name="patches" keys={seen} /><Side name="words" keys={read} /></tbody>
         </table>
       ) : null}
-      {ratio ? <p><b class="figure" data-number="own-ratio">{shown(ratio[0])}</b> patches / words <span class="soft">an even spread gives {shown(ratio[1])}: this is {shown(ratio[0]! / ratio[1]!)} times that</span></p> : null}
+      {ratio ? <p><b class="figure" data-number="own-ratio">{shown(ratio[0])}</b> patches / words (of the sums) <span class="soft">an even spread gives {shown(ratio[1])}: this is {shown(ratio[0]! / ratio[1]!)} times that</span></p> : null}
       {seen.size && !read.size && words.value.length ? <p><button onClick={() => pick({ words: allWords })}>Ratio to the whole instruction</button></p> : null}
       {read.size && !seen.size && Object.keys(whole).length ? <p><button onClick={() => pick({ cells: whole })}>Ratio of all pictures to these words</button></p> : null}
       <form onSubmit={(event) => { event.preventDefault(); pick({ selector: text.trim() }); }}>
-        <input aria-label="Selector" placeholder="object:red_cube | patch:…" value={text} onInput={(event) => setText(event.currentTarget.value)} />
-        <button>Add</button>
+        <input aria-label="Selector" disabled={isCopy} placeholder={isCopy ? "a typed selector needs vla-attention view" : "object:red_cube | patch:…"} value={text} onInput={(event) => setText(event.currentTarget.value)} />
+        <button disabled={isCopy}>Add</button>
         {any || picked.value.selector ? <button type="button" onClick={() => { setText(""); pick({ cells: {}, words: [], selector: "" }); }}>Clear</button> : null}
       </form>
       {typed.value.error ? <p class="error" role="alert">{typed.value.error}</p> : null}

@@ -9,8 +9,8 @@ const FAILED = ["failed", "fails", "failure", "unsolved", "unsuccessful"];
 
 /** Whether an episode fits all words of a search; "failed", "not solved" and "solved" are outcomes. */
 export function fits(line: EpisodeLine, search: string): boolean {
-  const text = search.toLowerCase().replace(/\bnot (solved|successful)\b/g, "failed");
-  const known = [line.name, line.instruction, line.told, line.verdict, line.failed].join(" ").toLowerCase();
+  const text = search.toLowerCase().replace(/\btask (?=\d)/g, "task").replace(/\bnot (solved|successful)\b/g, "failed");
+  const known = [`task${line.task}`, line.name, line.instruction, line.told, line.verdict, line.failed].join(" ").toLowerCase();
   return text.split(/\s+/).filter(Boolean).every((word) => {
     if (FAILED.includes(word)) return line.outcome === false;
     if (["solved", "successful", "success"].includes(word)) return line.outcome === true;
@@ -63,7 +63,7 @@ function Card({ line }: { line: EpisodeLine }) {
       <span class="about">
         <b>{line.outcome === true ? "✓" : line.outcome === false ? "✗" : "·"} {line.episode}</b>
         {line.num_steps ? <span>{line.num_steps} steps</span> : null}
-        {numbers?.ratio != null ? <span class="soft" title={`ratio ${runNumbers.value?.ratio ?? ""}, and times what even attention gives`}>{shown(numbers.ratio)} (×{shown(numbers.lift)})</span> : null}
+        {numbers?.ratio != null ? <span class="soft" title={`ratio ${runNumbers.value?.ratio ?? ""}, and times what even attention gives`}>ratio {shown(numbers.ratio)} ({shown(numbers.lift)} × even)</span> : null}
       </span>
     </button>
   );

@@ -2,6 +2,7 @@
 import { computed, signal } from "@preact/signals";
 
 import { address, type CameraLayout } from "./answers";
+import { Hint } from "./hint";
 import {
   about, covered, evenOf, layout, main, massesAt, massesOf, numReplans, pick, picked, type Scene, setPart, toggled, uniformAt,
 } from "./state";
@@ -77,12 +78,21 @@ function Picture(one: At) {
   const { scene, camera, how, at } = one;
   const here = pointed.value?.camera === camera && pointed.value.scene === scene ? pointed.value.cell : null;
   const toggle = (cell: number): void => pick({ cells: { ...picked.value.cells, [camera]: toggled(picked.value.cells[camera] ?? [], cell) } });
+  const byKey = (event: KeyboardEvent): void => {
+    const step = { ArrowLeft: -1, ArrowRight: 1, ArrowUp: -how.columns, ArrowDown: how.columns }[event.key];
+    if (step !== undefined) pointed.value = { scene, camera, cell: here === null ? 0 : (here + step + how.rows * how.columns) % (how.rows * how.columns) };
+    else if (event.key === "Enter" && here !== null && scene === main) toggle(here);
+    else return;
+    event.preventDefault();
+    event.stopPropagation();
+  };
   return (
     <figure class="picture">
       <div class="stack" data-camera={camera}>
         {how.stored ? <img src={address.picture(scene.run.value, scene.name.value, camera, at)} alt={`${camera} at call ${at}`} width={how.width} height={how.height} /> : <div class="grey" />}
         <svg
-          viewBox={`0 0 ${how.columns} ${how.rows}`} preserveAspectRatio="none" aria-hidden="true"
+          viewBox={`0 0 ${how.columns} ${how.rows}`} preserveAspectRatio="none" role="img" tabIndex={0} aria-label={`${camera}: arrow keys go from patch to patch, Enter picks one`}
+          onKeyDown={(event) => byKey(event)}
           onMouseMove={(event) => (pointed.value = { scene, camera, cell: cellAt(event, how) })}
           onMouseLeave={() => (pointed.value = null)}
           onClick={(event) => scene === main && toggle(cellAt(event, how))}
@@ -93,7 +103,7 @@ function Picture(one: At) {
       </div>
       <figcaption>
         <b>{camera}</b>
-        {how.mirrored || !how.upright ? <span class="hint" title={`The policy sees it ${[how.mirrored && "mirrored", !how.upright && "upside down"].filter(Boolean).join(" and ")}; here it is as a person sees the scene.`}>?</span> : null}
+        {how.mirrored || !how.upright ? <Hint text={`The policy sees it ${[how.mirrored && "mirrored", !how.upright && "upside down"].filter(Boolean).join(" and ")}; here it is as a person sees the scene.`} /> : null}
         {how.stored ? null : " no pictures were stored: attention alone"}
         <span class="soft">{here !== null ? ` ${aboutCell(one, here)}` : how.note ? ` ${how.note}` : ""}</span>
       </figcaption>
@@ -120,9 +130,9 @@ export function Pictures({ scene, at }: { scene: Scene; at: number }) {
 export function Legend() {
   return (
     <p class="legend soft">
-      <svg viewBox="0 0 24 8" class="sample first"><path class="casing" d="M2 4H22" /><path class="line" d="M2 4H22" /></svg>{FIRST} times the attention of an even spread
-      {levels.value[1] ? <><svg viewBox="0 0 24 8" class="sample second"><path class="casing" d="M2 4H22" /><path class="line" d="M2 4H22" /></svg>{levels.value[1]} times</> : null}
-      {about.value.value?.objects.length && covered.value.value ? <><svg viewBox="0 0 24 8" class="sample"><path class="object named" d="M2 4H22" /></svg>named in the task <svg viewBox="0 0 24 8" class="sample"><path class="object touched" d="M2 4H22" /></svg>touched</> : null}
+      <span><svg viewBox="0 0 24 8" class="sample first"><path class="casing" d="M2 4H22" /><path class="line" d="M2 4H22" /></svg>{FIRST} times an even spread</span>
+      {levels.value[1] ? <span><svg viewBox="0 0 24 8" class="sample second"><path class="casing" d="M2 4H22" /><path class="line" d="M2 4H22" /></svg>{levels.value[1]} times</span> : null}
+      {about.value.value?.objects.length && covered.value.value ? <><span><svg viewBox="0 0 24 8" class="sample"><path class="object named" d="M2 4H22" /></svg>named in the task</span> <span><svg viewBox="0 0 24 8" class="sample"><path class="object touched" d="M2 4H22" /></svg>touched</span></> : null}
     </p>
   );
 }

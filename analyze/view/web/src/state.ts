@@ -76,7 +76,7 @@ export function openEpisode(episode: string, run = Number(part("run"))): void {
 }
 
 export const runs = answered(() => readRuns());
-export const runNumber = computed(() => Math.min(Number(part("run")) || 0, Math.max(0, (runs.value.value?.runs.length ?? 1) - 1)));
+export const runNumber = computed(() => Math.max(0, Math.min(Math.trunc(Number(part("run"))) || 0, (runs.value.value?.runs.length ?? 1) - 1)));
 export const run = computed(() => runs.value.value?.runs[runNumber.value] ?? null);
 /** A page of one episode has no list. */
 export const onlyEpisode = computed(() => (runs.value.value?.copy && runs.value.value.runs.length === 1 && run.value?.episodes.length === 1 ? run.value.episodes[0]!.name : ""));
@@ -170,7 +170,19 @@ export const { about, layout, rows, groups, covered, masses } = main;
 export const massesAt = (at: number): Float64Array | null => massesOf(main, at);
 export const uniformAt = (at: number): Float64Array | null => evenOf(main, at);
 export const numReplans = computed(() => about.value.value?.starts.length ?? 0);
-export const replan = computed(() => Math.max(0, Math.min(Number(part("replan")) || 0, numReplans.value - 1)));
+export const replan = computed(() => Math.max(0, Math.min(Math.trunc(Number(part("replan"))) || 0, numReplans.value - 1)));
+
+// What a link names and does not exist is put right in the link, too.
+effect(() => {
+  if (numReplans.value && part("replan") !== String(replan.value)) setPart({ replan: replan.value });
+  if (axes.value) for (const [name, known] of [["layer", layer], ["head", head], ["denoise", denoise]] as const) if (part(name) !== String(known.value)) setPart({ [name]: known.value });
+  if (runs.value.value && part("run") !== String(runNumber.value)) setPart({ run: runNumber.value });
+});
+
+/** Shows the overview. */
+export function closeEpisode(): void {
+  setPart({ episode: "", replan: 0, layer: "mean", head: "mean", denoise: "mean", group: "", beside: "" });
+}
 
 /** The episode beside it, in the link as RUN:EPISODE; shown at the call whose step is nearest. */
 const besideParts = computed(() => part("beside").split(":"));

@@ -54,7 +54,7 @@ function Plot({ curves, title }: { curves: Curves; title: string }) {
     const axis = { stroke: css.color, grid: { stroke: css.borderTopColor, width: 1 }, ticks: { show: false } };
     const made = new uPlot(
       {
-        width: place.clientWidth, height: 130, cursor: { drag: { x: false, y: false }, y: false }, legend: { live: true },
+        width: place.clientWidth, height: 130, cursor: { drag: { x: false, y: false }, y: false }, legend: { live: false },
         scales: { x: { time: false, range: [0, end] } },
         axes: [{ ...axis, size: 28, label: undefined }, { ...axis, size: 46 }],
         series: [{ label: "step" }, ...curves.curves.map(({ name }, i) => ({ label: name, stroke: COLOURS[i % COLOURS.length]!, width: 1.5, points: { show: false }, dash: i >= COLOURS.length ? [4, 3] : undefined }))],
@@ -109,7 +109,7 @@ export function Timeline() {
           playing.value = !playing.value;
         }}>{playing.value ? "❚❚" : "▶"}</button>
         <input type="range" aria-label="Replan" min="0" max={last} value={replan.value} onInput={(event) => setPart({ replan: event.currentTarget.value })} />
-        <output>step {episode.starts[replan.value]} of {episode.end}, call {replan.value} of {last}</output>
+        <output>step {episode.starts[replan.value]} of {episode.end}, call {replan.value + 1} of {last + 1}</output>
       </div>
       <ol class="events">
         {events.value.map((event) => (

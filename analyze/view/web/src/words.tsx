@@ -67,6 +67,7 @@ export function Title() {
           >{text}</button>
         )) : episode.told}
       </h1>
+      {shades.value.length && shades.value.every(({ none }) => none) ? <span class="soft">no word moves the action more than another noise seed does</span> : null}
       {effects.value.error ? <span class="soft">{effects.value.error}</span> : null}
     </div>
   );
@@ -78,9 +79,9 @@ export function ChooseShade() {
   return (
     <label>words by{" "}
       <select value={shade.value} onChange={(event) => setPart({ words: event.currentTarget.value })}>
-        <option value="effect">effect, this call</option>
-        <option value="effects">effect, whole episode</option>
-        <option value="attention">attention per token</option>
+        <option value="effect">what decides, this call</option>
+        <option value="effects">what decides, whole episode</option>
+        <option value="attention">what is read (per token)</option>
       </select>
     </label>
   );
@@ -101,7 +102,7 @@ export function AboutWords() {
           return (
             <tr key={i}>
               <th>{text}</th><td>{percent(mass && sumOf(mass, once(keys)))}</td><td>{shown(liftOf(keys, replan.value))} times even</td>
-              <td>{effect ? `${shown(effect.effect[replan.value])}; over the episode ${shown(effect.mean)} (another noise seed ${shown(effect.noise)})` : "not recorded"}</td>
+              <td>{effect ? `${shown(effect.effect[replan.value])} (another noise seed ${shown(noiseAt(replan.value))}); over the episode ${shown(effect.mean)} (${shown(effect.noise)})` : "not recorded"}</td>
             </tr>
           );
         })}
