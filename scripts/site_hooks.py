@@ -152,8 +152,10 @@ def printed_help(program: str, command: str) -> str:
         run = ["-c", start]
     else:
         run = ["-m", MODULES[program]]
+    # With what the package needs, which the environment that builds the site lacks.
+    own = ROOT / ".venv/bin/python"
     done = subprocess.run(
-        [sys.executable, *run, *command.split(), "--help-all"],
+        [str(own) if own.exists() else sys.executable, *run, *command.split(), "--help-all"],
         cwd=ROOT,
         env={**os.environ, "COLUMNS": _COLUMNS, "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"},
         capture_output=True,
