@@ -5,7 +5,7 @@ runs/0/numbers.json                         of a run: what is computed meanwhile
 runs/0/EPISODE/about.json                   what happened, and what every key is
 runs/0/EPISODE/effects.json                 how the action changes without a word, an object, a picture
 runs/0/EPISODE/actions/NUMBER.npy           the actions of the calls of one effect
-runs/0/EPISODE/pictures/CAMERA/REPLAN.png
+runs/0/EPISODE/pictures/CAMERA/REPLAN.png   film.gif: all of them, with the attention on them
 runs/0/EPISODE/SITE/objects.json            which cells of the pictures objects cover
 runs/0/EPISODE/SITE/rows/LAYER.npy          rows of a layer, or of the mean of all; heads/LAYER.npy: of every head
 runs/0/EPISODE/SITE/uniform/LAYER.npy       what uniform attention gives in their place
@@ -49,7 +49,7 @@ class Answers:
     """The answers about some stores; asked by several threads at once."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._lock, self._drawing = threading.Lock(), threading.Lock()
         self._open: OrderedDict[tuple[str, str, str], ShownEpisode] = OrderedDict()
         self._units: dict[tuple[str, int], ActionSpread] = {}
         self._lines: dict[tuple[str, str], dict[str, Any]] = {}
@@ -80,6 +80,9 @@ class Answers:
                 return _json(shown.effects(self._units_of(shown.store)))
             case ["actions", file]:
                 return npy(shown.changed_actions(_number(file, ".npy"))), NPY
+            case ["film.gif"]:
+                with self._drawing:
+                    return shown.film(), "image/gif"
             case ["pictures", camera, file]:
                 return shown.picture(camera, _number(file, ".png")), PNG
             case [site, *of_site] if site in [known.name for known in shown.store.attributes.sites]:

@@ -8,14 +8,17 @@ from __future__ import annotations
 import io
 import math
 import re
+import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from vla_attention.analyze.ask import answer_to
 from vla_attention.analyze.core.action_changes import GRIPPER, ActionSpread
 from vla_attention.analyze.core.camera_maps import PictureMap, map_note, seen_cameras, stored_picture, upright, view_of
 from vla_attention.analyze.core.levels import levels_of
@@ -173,6 +176,15 @@ class ShownEpisode:
         file = io.BytesIO()
         Image.fromarray(np.ascontiguousarray(picture)).save(file, "PNG", compress_level=1)
         return file.getvalue()
+
+    def film(self) -> bytes:
+        """The pictures with the attention on them as a GIF, as `vla-attention overlay --video gif` makes it."""
+        only, number = replace(self.store, episodes=(self.episode,)), self.episode.attributes.episode_index
+        result = answer_to("overlay", [only], AnalysisSettings(), {"episode": number, "video": "gif"})
+        ((name, write),) = result.files.items()
+        with tempfile.TemporaryDirectory() as folder:
+            write(Path(folder) / name)
+            return (Path(folder) / name).read_bytes()
 
     @property
     def _site_names(self) -> list[str]:

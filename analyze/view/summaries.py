@@ -17,16 +17,13 @@ from typing import Any
 
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store
-from vla_attention.schemas.stores.store_format import parse_episode_name
 
 _MODULE = "vla_attention.analyze.view.summary_process"
 
 
 def empty_row(name: str) -> dict[str, Any]:
-    """The entry of an episode of which nothing but the name is known."""
-    task, episode = parse_episode_name(name)
-    unknown = dict.fromkeys(("instruction", "success", "replans", "ratio", "lift"))
-    return {"name": name, "task": task, "episode": episode, **unknown}
+    """The entry of an episode that was not measured yet."""
+    return {"name": name, "ratio": None, "lift": None}
 
 
 class Summary:
@@ -35,9 +32,7 @@ class Summary:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._rows: dict[str, dict[str, Any]] = {}
-        self._about: dict[str, Any] = dict.fromkeys(
-            ("site", "grouping", "ratio", "effect_units", "findings", "leaves", "failed")
-        )
+        self._about: dict[str, Any] = dict.fromkeys(("ratio", "findings", "leaves", "failed"))
         self._complete = False
         self._process: subprocess.Popen[str] | None = None
         self._reader: threading.Thread | None = None
@@ -55,7 +50,7 @@ class Summary:
             names = [episode.name for episode in store.episodes]
             self._rows = {name: self._rows.get(name) or empty_row(name) for name in names}
             self._complete = False
-            self._about |= {"failed": None, "effect_units": None}
+            self._about["failed"] = None
         # The module is found as this process found it.
         variables = {**os.environ, "PYTHONPATH": os.pathsep.join(path or os.curdir for path in sys.path)}
         command = [sys.executable, "-m", _MODULE, str(store.path)]

@@ -19,15 +19,13 @@ import polars as pl
 
 from vla_attention.analyze.ask import answer_to
 from vla_attention.analyze.core.about import sides
-from vla_attention.analyze.core.action_changes import units_of_recorded
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.measures.frames import LAYERS_AVG
-from vla_attention.analyze.measures.question import Question, ask
+from vla_attention.analyze.measures.question import ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
-from vla_attention.analyze.view.summaries import empty_row
 from vla_attention.schemas.errors import UserError
 from vla_attention.schemas.stores.reader import Store, StoredEpisode, open_store
-from vla_attention.schemas.stores.store_format import episode_name
+from vla_attention.schemas.stores.store_format import episode_name, parse_episode_name
 
 #: Whose answers are the findings of the run, in this order.
 _QUESTIONS = ("language", "failures", "objects")
@@ -57,10 +55,6 @@ def summary_parts(store: Store) -> Iterator[dict[str, Any]]:
     """
     failed = None
     batches = [store.episodes[at : at + _AT_ONCE] for at in range(0, len(store.episodes), _AT_ONCE)]
-    for batch in batches:
-        yield {"episodes": [_described(episode) for episode in batch]}
-    if store.attributes.recording.effects is not None:
-        yield {"effect_units": _effect_units(store)}
     for batch in batches:
         try:
             yield _measured(store, batch)
@@ -97,26 +91,6 @@ def _findings(store: Store) -> dict[str, Any]:
     return {"findings": list(found.values()), "leaves": leaves}
 
 
-def _effect_units(store: Store) -> dict[str, Any]:
-    """`spread`: by dimension of the action, None for those that are not compared; or `failed`, why there is none."""
-    try:
-        units = units_of_recorded(store)
-    except UserError as error:
-        return {"failed": str(error)}
-    spread = zip(units.spread, units.used, strict=True)
-    return {"spread": [float(deviation) if used else None for deviation, used in spread]}
-
-
-def _described(episode: StoredEpisode) -> dict[str, Any]:
-    row = empty_row(episode.name)
-    try:
-        attributes = episode.attributes
-    except UserError:
-        return row
-    known = {"instruction": attributes.instruction, "success": attributes.success, "replans": attributes.num_replans}
-    return row | known
-
-
 def _measured(store: Store, batch: Sequence[StoredEpisode]) -> dict[str, Any]:
     """The entries of some episodes with their ratios over all layers and their lifts."""
     question = ask([replace(store, episodes=tuple(batch))], AnalysisSettings())
@@ -124,19 +98,11 @@ def _measured(store: Store, batch: Sequence[StoredEpisode]) -> dict[str, Any]:
     by_episode = {(row["task_id"], row["episode_index"]): row for row in cells.iter_rows(named=True)}
     rows = []
     for episode in batch:
-        row = _described(episode)
-        numbers = by_episode[row["task"], row["episode"]]
-        rows.append(row | {"ratio": _finite(numbers.get("geometric_mean")), "lift": _finite(numbers.get("ratio_lift"))})
-    return {"episodes": rows, **_about(question)}
-
-
-def _about(question: Question) -> dict[str, Any]:
+        numbers = by_episode[parse_episode_name(episode.name)]
+        lift = _finite(numbers.get("ratio_lift"))
+        rows.append({"name": episode.name, "ratio": _finite(numbers.get("geometric_mean")), "lift": lift})
     has_ratio = question.grouping.ratio is not None
-    return {
-        "site": question.site,
-        "grouping": question.grouping.name,
-        "ratio": " / ".join(map(_joined, sides(question.grouping))) if has_ratio else None,
-    }
+    return {"episodes": rows, "ratio": " / ".join(map(_joined, sides(question.grouping))) if has_ratio else None}
 
 
 def _joined(names: Sequence[str]) -> str:

@@ -129,6 +129,13 @@ def test_maps_of_the_page_are_those_of_overlay(server, places, name):
                 np.testing.assert_array_equal(shown, picture)
 
 
+def test_the_film_has_every_call(server):
+    about = read(server, "joint", "about.json")
+    reply = ask(server, f"runs/0/{about['name']}/film.gif")
+    assert (reply.status, reply.headers["content-type"]) == (200, "image/gif")
+    assert Image.open(io.BytesIO(reply.body)).n_frames == about["num_replans"]
+
+
 def test_heads_of_a_selector(server, places):
     given = read(server, "joint", f"joint/grid.json?selector={quote('role:instruction')}")
     result = va.open(places["joint"]).analyze(groups={"words": "role:instruction"}, by=("layer", "head"), tasks=0)

@@ -2,6 +2,7 @@
 import { signal } from "@preact/signals";
 
 import { Actions } from "./actions";
+import { address } from "./answers";
 import { kindOf } from "./overview";
 import { HeadGrid } from "./heads";
 import { OwnGroup, Ratio } from "./numbers";
@@ -172,9 +173,10 @@ function Drawer() {
         <button onClick={() => copy("link", location.href)}>Copy link</button>{" "}
         <button onClick={() => void savePictures("png")}>Save PNG</button>{" "}
         <button onClick={() => void savePictures("svg")}>Save SVG</button>{" "}
+        {runs.value.value?.copy ? null : <><a class="button" href={`${address.episode(runNumber.value, episodeName.value)}/film.gif`} download={`${episodeName.value}.gif`}>Save GIF</a>{" "}</>}
         <button onClick={() => copy("command", command)}>Copy command</button> <span role="status">{copied}</span>
       </p>
-      <p><code>{command}</code> <span class="soft">draws this episode in a terminal; with --video gif instead of --replans a film.</span></p>
+      <p><code>{command}</code> <span class="soft">draws this episode in a terminal.</span></p>
       <p class="soft">Keys: ← → call, space plays, [ ] layer, , . head, - + denoise step, Esc overview.</p>
     </section>
   );

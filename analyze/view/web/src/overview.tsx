@@ -35,8 +35,10 @@ const medians = computed(() => {
 
 const listed = computed(() => {
   const chip = chips[part("show")] ?? chips.all!;
-  return (run.value?.episodes ?? []).filter((line) => chip.holds(line, medians.value.get(line.task)!) && fits(line, part("find")));
+  return (run.value?.episodes ?? []).filter((line) => (part("task") === "" || part("task") === String(line.task)) && chip.holds(line, medians.value.get(line.task)!) && fits(line, part("find")));
 });
+
+const ids = computed(() => [...new Set(run.value?.episodes.map(({ task }) => task))]);
 
 const tasks = computed(() => {
   const of = new Map<string, EpisodeLine[]>();
@@ -101,7 +103,7 @@ export function Overview() {
         {(runs.value.value?.runs.length ?? 0) > 1 ? (
           <nav>
             {runs.value.value!.runs.map(({ name }, i) => (
-              <button aria-pressed={i === runNumber.value} onClick={() => setPart({ run: i, show: "all", find: "" })}>{name}</button>
+              <button aria-pressed={i === runNumber.value} onClick={() => setPart({ run: i, show: "all", find: "", task: "" })}>{name}</button>
             ))}
           </nav>
         ) : null}
@@ -118,6 +120,12 @@ export function Overview() {
         {used.map(([name, { name: text }]) => (
           <button class="chip" aria-pressed={part("show") === name} onClick={() => setPart({ show: name })}>{text}</button>
         ))}
+        {ids.value.length > 1 ? (
+          <select aria-label="Task" value={part("task")} onChange={(event) => setPart({ task: event.currentTarget.value })}>
+            <option value="">all tasks</option>
+            {ids.value.map((task) => <option value={String(task)}>task {task}</option>)}
+          </select>
+        ) : null}
         <input type="search" aria-label="Find episodes" placeholder="find: red, failed, not solved …" value={part("find")} onInput={(event) => setPart({ find: event.currentTarget.value })} />
         <span class="soft" role="status">{listed.value.length} of {shownRun.episodes.length} episodes</span>
       </div>
@@ -131,7 +139,7 @@ export function Overview() {
       </div>
       {!shownRun.episodes.length ? <p>The run has no episodes yet. Load the page again when it has.</p> : null}
       {shownRun.episodes.length && !listed.value.length ? (
-        <p>No episode fits. <button onClick={() => setPart({ show: "all", find: "" })}>Show all</button></p>
+        <p>No episode fits. <button onClick={() => setPart({ show: "all", find: "", task: "" })}>Show all</button></p>
       ) : null}
     </div>
   );
