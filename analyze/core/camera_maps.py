@@ -17,7 +17,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.measures.frames import Axis, long_table
-from vla_attention.analyze.measures.masses import uniform_keys
+from vla_attention.analyze.measures.masses import mean_of_layers, uniform_keys
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.measures.selected import SelectedEpisode, positions_by_task
 from vla_attention.analyze.stores.rows import layer_rows
@@ -252,8 +252,7 @@ def episode_maps(question: Question, item: SelectedEpisode, cameras: Sequence[st
     parts = [part.rows.mean(axis=1, dtype=np.float64) for part in rows if part.layer in selection.once]
     mean = sum(parts, np.zeros(())) / len(parts)  # (replan, key)
     image = mean * (tokens.static_roles == int(Role.IMAGE))
-    uniform = uniform_keys(item, selection).mean(axis=(2, 3))
-    uniform = (uniform[:, list(selection.once)] if uniform.shape[1] > 1 else uniform).mean(axis=1)
+    uniform = mean_of_layers(uniform_keys(item, selection).mean(axis=(2, 3)), selection)
     # As much mass as the valid keys have, shared out as uniform attention does.
     uniform = uniform * ((mean * item.valid).sum(axis=1) / (uniform * item.valid).sum(axis=1))[:, None]
     whole = image.sum(axis=1)

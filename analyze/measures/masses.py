@@ -54,6 +54,12 @@ def uniform_keys(item: SelectedEpisode, selection: Selection) -> Array:
     return stacked.reshape(replans, len(selection.layers) if layers > 1 else 1, -1, *rest)
 
 
+def mean_of_layers(values: Array, selection: Selection) -> Array:
+    """Mean over the layers (axis 1); a block that two layer numbers name counts once, an axis of length 1 is all."""
+    mean: Array = (values[:, list(selection.once)] if values.shape[1] > 1 else values).mean(axis=1)
+    return mean
+
+
 def uniform_masses(uniform: Array, weights: NDArray[np.float32]) -> Array:
     """What uniform attention gives groups: (replan or 1, layer, denoise, head, group).
 

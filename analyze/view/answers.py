@@ -24,10 +24,12 @@ from itertools import product
 from typing import Any, TypeAlias
 
 from vla_attention.analyze.core.action_changes import ActionSpread, units_of_recorded
+from vla_attention.analyze.core.camera_maps import seen_cameras
 from vla_attention.analyze.view.episode_answers import MEAN, ShownEpisode, npy
-from vla_attention.analyze.view.run_answers import runs_answer
+from vla_attention.analyze.view.paths import RUNS
+from vla_attention.analyze.view.run_answers import KnownLines, runs_answer
 from vla_attention.analyze.view.served_stores import ServedStore
-from vla_attention.schemas.errors import BadArgument
+from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stores.reader import Store
 
 JSON, PNG, NPY = "application/json", "image/png", "application/octet-stream"
@@ -35,10 +37,6 @@ JSON, PNG, NPY = "application/json", "image/png", "application/octet-stream"
 Content: TypeAlias = tuple[bytes, str]
 #: Episodes that stay open: what was read of one is used again for its other answers.
 _OPEN = 8
-
-
-#: Conditions whose actions a copy of the page has: those that it draws.
-_DRAWN = "without"
 
 
 class NoAnswer(LookupError):
@@ -52,7 +50,7 @@ class Answers:
         self._lock, self._drawing = threading.Lock(), threading.Lock()
         self._open: OrderedDict[tuple[str, str, str], ShownEpisode] = OrderedDict()
         self._units: dict[tuple[str, int], ActionSpread] = {}
-        self._lines: dict[tuple[str, str], dict[str, Any]] = {}
+        self._lines: KnownLines = {}
 
     def answer(
         self, stores: Sequence[ServedStore], names: Sequence[str], query: Mapping[str, Sequence[str]]
@@ -63,7 +61,7 @@ class Answers:
             NoAnswer: nothing has this address.
             UserError: what it names does not exist, or cannot be read.
         """
-        if list(names) == ["runs.json"]:
+        if list(names) == [RUNS]:
             return _json(runs_answer([one.store for one in stores], True, self._lines))
         try:
             _, number, episode, *rest = names
@@ -89,38 +87,17 @@ class Answers:
                 return _of_site(shown, site, of_site, query)
         raise NoAnswer
 
-    def of_episode(self, served: ServedStore, name: str, heads: bool) -> Iterator[tuple[str, bytes]]:
-        """All that a copy of the page has of an episode: addresses below it, and answers.
+    def copied(self, served: ServedStore, name: str, heads: bool) -> Iterator[tuple[str, bytes]]:
+        """All that a copy of the page has of an episode: addresses below it, and what `answer` says there.
 
-        heads: with the rows of every head, which is most of it.
+        An error is its sentence, as the server sends it. heads: with the rows of every head, which is most of it.
         """
-        shown = self._shown(served.store, name)
-        about = shown.about()
-        yield "about.json", _json(about)[0]
-        for camera in {camera for site in about["sites"].values() for camera in site["cameras"]}:
-            for replan in range(about["num_replans"]) if shown.episode.has(f"frames/{camera}") else ():
-                yield f"pictures/{camera}/{replan}.png", shown.picture(camera, replan)
-        if about["effects"]:
-            effects = shown.effects(self._units_of(served.store))
-            yield "effects.json", _json(effects)[0]
-            for number in {one["number"] for one in (effects or {})["items"] if one["kind"] == _DRAWN}:
-                yield f"actions/{number}.npy", npy(shown.changed_actions(number))
-        recording = served.store.attributes
-        for site in about["sites"]:
-            axes = recording.recording_of(site)
-            for layer in [*map(str, axes.layer_labels), MEAN]:
-                yield f"{site}/rows/{layer}.npy", npy(shown.rows(site, layer))
-                yield f"{site}/uniform/{layer}.npy", npy(shown.uniform(site, layer))
-                if heads:
-                    yield f"{site}/heads/{layer}.npy", npy(shown.rows(site, layer, heads=True))
-            yield f"{site}/objects.json", _json(shown.covered(site))[0]
-            for number, target in enumerate(about["sites"][site]["targets"]):
-                yield f"{site}/grid/{number}.json", _json(shown.grid(site, target["selector"]))[0]
-            steps = ["", *(f"denoise-{step}" for step in axes.denoise_steps)]
-            of_heads = ["", *(f"head-{head}" for head in axes.heads if heads)]
-            for step, head in product(steps, of_heads):
-                chosen = ".".join(filter(None, (step, head))) or "all"
-                yield f"{site}/groups/{chosen}.json", _json(shown.groups(site, chosen))[0]
+        for address in _addresses(self._shown(served.store, name), heads):
+            try:
+                content, _ = self.answer([served], ("runs", "0", name, *address.split("/")), {})
+            except UserError as error:
+                content, _ = error_answer(error)
+            yield address, content
 
     def _shown(self, store: Store, name: str) -> ShownEpisode:
         """An episode that stays open for its other answers, unless the store was captured anew."""
@@ -144,6 +121,33 @@ class Answers:
         return self._units[key]
 
 
+def _addresses(shown: ShownEpisode, heads: bool) -> Iterator[str]:
+    root, episode = shown.store.attributes, shown.episode
+    yield "about.json"
+    try:
+        cameras = dict.fromkeys(camera for site in root.sites for camera in seen_cameras(shown.item(site.name)))
+    except UserError:  # about.json says it
+        return
+    for camera in cameras:
+        for replan in range(episode.attributes.num_replans) if episode.has(f"frames/{camera}") else ():
+            yield f"pictures/{camera}/{replan}.png"
+    if episode.attributes.effects is not None:
+        yield "effects.json"
+        yield from (f"actions/{number}.npy" for number in shown.drawn_effects)
+    for site in root.sites:
+        axes = root.recording_of(site.name)
+        for layer in (*axes.layer_labels, MEAN):
+            yield from (
+                f"{site.name}/{kind}/{layer}.npy" for kind in ("rows", "uniform", *(["heads"] if heads else []))
+            )
+        yield f"{site.name}/objects.json"
+        yield from (f"{site.name}/grid/{number}.json" for number in range(len(shown.targets(site.name))))
+        steps = ["", *(f"denoise-{step}" for step in axes.denoise_steps)]
+        of_heads = ["", *(f"head-{head}" for head in axes.heads if heads)]
+        for chosen in product(steps, of_heads):
+            yield f"{site.name}/groups/{'.'.join(filter(None, chosen)) or 'all'}.json"
+
+
 def _of_site(shown: ShownEpisode, site: str, names: Sequence[str], query: Mapping[str, Sequence[str]]) -> Content:
     match names:
         case ["objects.json"]:
@@ -163,6 +167,11 @@ def _of_site(shown: ShownEpisode, site: str, names: Sequence[str], query: Mappin
         case ["keys.json"]:
             return _json(shown.keys(site, _selector(query)))
     raise NoAnswer
+
+
+def error_answer(sentence: object) -> Content:
+    """What is said where there is no answer."""
+    return _json({"error": str(sentence)})
 
 
 def _json(document: Any) -> Content:

@@ -23,9 +23,9 @@ from vla_attention.analyze.core.action_changes import GRIPPER, ActionSpread
 from vla_attention.analyze.core.camera_maps import PictureMap, map_note, seen_cameras, stored_picture, upright, view_of
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.core.measure import means
-from vla_attention.analyze.core.recorded_effects import NAMES, recorded_effects
+from vla_attention.analyze.core.recorded_effects import NAMES, described, recorded_effects
 from vla_attention.analyze.measures.frames import LAYERS_AVG
-from vla_attention.analyze.measures.masses import uniform_keys
+from vla_attention.analyze.measures.masses import mean_of_layers, uniform_keys
 from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, check_replan, resolve_episode
@@ -38,7 +38,6 @@ from vla_attention.schemas.episode_steps import EXECUTED, HAND, POSES
 from vla_attention.schemas.episode_steps import GRIPPER as FINGERS
 from vla_attention.schemas.errors import BadArgument, unknown_name
 from vla_attention.schemas.groupings.resolve import check_names
-from vla_attention.schemas.layout import Role
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 
@@ -68,6 +67,11 @@ class ShownEpisode:
         """The rows of the mean of all layers by site, for which every layer is read."""
         return {}
 
+    @cached_property
+    def covered_cells(self) -> dict[str, dict[str, Any]]:
+        """What `covered` gave by site: heads and pictures ask for it, too."""
+        return {}
+
     def question(self, site: str, **settings: Any) -> Question:
         """A question about this episode alone, as the commands ask it."""
         asked = AnalysisSettings(site=site, **settings)
@@ -87,7 +91,8 @@ class ShownEpisode:
         attributes = self.episode.attributes
         env_step = self.episode.read("env_step").astype(np.int64)
         starts, end = item.timing(env_step)
-        return episode_line(self.store, self.episode) | {
+        line = episode_line(self.store, self.episode)
+        return line | {
             "env_step": env_step.tolist(),
             "starts": starts.tolist(),
             "end": end,
@@ -97,14 +102,14 @@ class ShownEpisode:
                 for thing in attributes.objects
                 if thing.kind == "object"
             ],
-            "events": self._events(starts),
+            "events": self._events(starts, line["outcome"]),
             "courses": self._courses(),
             "actions": _numbers(self.episode.read("actions")) if self.episode.has("actions") else None,
             "effects": attributes.effects is not None,
             "sites": {site.name: self._site(site.name) for site in self.store.attributes.sites},
         }
 
-    def _events(self, starts: NDArray[np.int64]) -> list[dict[str, Any]]:
+    def _events(self, starts: NDArray[np.int64], outcome: bool | None) -> list[dict[str, Any]]:
         """Touches, reached goals and closings of the gripper, in the order of their steps; then the end."""
         attributes = self.episode.attributes
         found: list[tuple[int, str, str, str]] = []
@@ -119,7 +124,6 @@ class ShownEpisode:
             ]
             closes = _closings(self.episode.read(EXECUTED)[:, GRIPPER])
             found += [(at, "gripper", "gripper closes", "") for at in closes]
-        outcome = attributes.success if self.store.attributes.rerun_of is None else None
         ends = {True: "solved", False: "not solved", None: "end"}[outcome]
         found = [*sorted(found), (attributes.num_steps, "end", ends, "")]
         replans = np.searchsorted(starts, [max(at - 1, 0) for at, *_ in found], side="right") - 1
@@ -144,14 +148,8 @@ class ShownEpisode:
 
     def _site(self, site: str) -> dict[str, Any]:
         item = self.item(site)
-        tokens, prompts = item.tokens, item.tokens.prompts
+        tokens = item.tokens
         return {
-            "spans": [
-                {"name": span.name, "kind": span.kind, "start": span.start, "stop": span.stop}
-                for span in tokens.layout.spans
-            ],
-            "roles": [[Role(code).label for code in line] for line in tokens.static_roles.tolist()],
-            "valid": item.valid.astype(int).tolist(),
             "cameras": {camera: _camera(item, camera) for camera in seen_cameras(item)},
             "targets": self.targets(site),
             "prompts": [
@@ -159,7 +157,7 @@ class ShownEpisode:
                     "text": visible(prompt.text),
                     "words": [{"text": visible(word.text), "keys": list(word.keys)} for word in words],
                 }
-                for prompt, words in zip(prompts, tokens.words, strict=True)
+                for prompt, words in zip(tokens.prompts, tokens.words, strict=True)
             ],
         }
 
@@ -192,6 +190,8 @@ class ShownEpisode:
 
     def covered(self, site: str) -> dict[str, Any]:
         """`objects.json`: camera -> object -> at each replan the cells of the map that it covers."""
+        if site in self.covered_cells:
+            return self.covered_cells[site]
         item = self.item(site)
         found = {}
         for camera, coverage in (item.tokens.coverage or {}).items():
@@ -203,6 +203,7 @@ class ShownEpisode:
                 if thing.kind == "object"
             }
             found[camera] = {name: of_replans for name, of_replans in shown.items() if any(of_replans)}
+        self.covered_cells[site] = found
         return found
 
     def rows(self, site: str, layer: str, heads: bool = False) -> Array:
@@ -228,8 +229,7 @@ class ShownEpisode:
         """What uniform attention gives in the place of `rows`, (replan or 1, denoise or 1, key)."""
         selection = self._selection(site, layer)
         uniform = uniform_keys(self.item(site), selection)[:, :, :, 0]
-        found: Array = (uniform[:, list(selection.once)] if uniform.shape[1] > 1 else uniform).mean(axis=1)
-        return found
+        return mean_of_layers(uniform, selection)
 
     def _selection(self, site: str, layer: str) -> Selection:
         root = self.store.attributes
@@ -329,6 +329,13 @@ class ShownEpisode:
                 | {name: mean[name] for name in ("noise", "lift", "keys")}
             )
         return {"items": items, "notes": list(found.notes), "used": units.used.tolist()}
+
+    @property
+    def drawn_effects(self) -> list[int]:
+        """The conditions whose actions the page draws: the calls without an item."""
+        effects = self.episode.attributes.effects
+        conditions = effects.conditions if effects is not None and self.episode.has(CHANGE) else ()
+        return [i for i, one in enumerate(conditions) if described(one, {})["kind"] == "without"]
 
     def changed_actions(self, number: int) -> Array:
         """The actions of a condition's calls, (replan, step, dimension); NaN where it was not tried."""

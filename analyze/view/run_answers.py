@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 from vla_attention.analyze.core.behaviour import verdict
 from vla_attention.analyze.stores.contents import read_one_by_one
@@ -14,16 +14,17 @@ from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import parse_episode_name
 
+#: Lines of episodes by their store's place and run, and their name.
+KnownLines: TypeAlias = dict[tuple[str, str, str], dict[str, Any]]
 
-def runs_answer(
-    stores: Sequence[Store], with_paths: bool = False, known: dict[tuple[str, str], dict[str, Any]] | None = None
-) -> dict[str, Any]:
+
+def runs_answer(stores: Sequence[Store], with_paths: bool = False, known: KnownLines | None = None) -> dict[str, Any]:
     """`runs.json`: the runs of the page, each with a line for every episode.
 
     Args:
         stores: of the runs.
         with_paths: also where the stores are on this machine, for commands to copy; sites of others do not say it.
-        known: lines of episodes by store's run and name, which are not made again; new ones are added.
+        known: lines of episodes that could be read, which are not made again; new ones are added.
     """
     known = {} if known is None else known
     counts = Counter(store.path.name for store in stores)
@@ -37,18 +38,19 @@ def runs_answer(
     }
 
 
-def _run_answer(store: Store, known: dict[tuple[str, str], dict[str, Any]]) -> dict[str, Any]:
-    root = store.attributes
-    new = [episode for episode in store.episodes if (str(store.path) + store.run, episode.name) not in known]
-    for episode in read_one_by_one(new):
-        known[str(store.path) + store.run, episode.name] = episode_line(store, episode)
+def _run_answer(store: Store, known: KnownLines) -> dict[str, Any]:
+    root, place = store.attributes, (str(store.path), store.run)
+    lines = {name: known[*place, name] for name in (one.name for one in store.episodes) if (*place, name) in known}
+    for episode in read_one_by_one(one for one in store.episodes if one.name not in lines):
+        lines[episode.name] = episode_line(store, episode)
+        if "failed" not in lines[episode.name]:
+            known[*place, episode.name] = lines[episode.name]
     return {
         "policy": visible(root.policy.name),
         "suite": root.protocol.suite,
         "untrained": root.policy.untrained,
         "rerun": root.rerun_of is not None,
         "changed": list(change_notes([store])),
-        "cameras": {view.name: {"upright": view.upright, "mirrored": view.mirrored} for view in root.policy.cameras},
         "sites": [
             {
                 "name": site.name,
@@ -59,7 +61,7 @@ def _run_answer(store: Store, known: dict[tuple[str, str], dict[str, Any]]) -> d
             }
             for site in root.sites
         ],
-        "episodes": [known[str(store.path) + store.run, episode.name] for episode in store.episodes],
+        "episodes": [lines[episode.name] for episode in store.episodes],
     }
 
 

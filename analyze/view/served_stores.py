@@ -1,4 +1,4 @@
-"""The stores of a page: their episodes, their summaries, and the bytes of their files."""
+"""The stores of a page: their episodes and their summaries."""
 
 from __future__ import annotations
 

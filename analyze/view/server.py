@@ -1,4 +1,4 @@
-"""The viewer's web server: on the loopback only, for who has the link, and for files of the stores only.
+"""The viewer's web server: on the loopback only, for who has the link, and with the page and its answers only.
 
 The link's secret part keeps out other users and programs of this machine, the check of the host keeps out sites that
 a browser has open (the host of a proxy is allowed by its name), and the content security policy keeps the page from
@@ -7,14 +7,13 @@ asking for anything elsewhere, whatever a store holds.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 
-from vla_attention.analyze.view.answers import Answers, NoAnswer
+from vla_attention.analyze.view.answers import Answers, NoAnswer, error_answer
 from vla_attention.analyze.view.kept_token import kept_token, new_token
 from vla_attention.analyze.view.paths import (
     PAGE_FILES,
@@ -30,7 +29,6 @@ from vla_attention.schemas.errors import BadArgument, UserError
 from vla_attention.schemas.stores.remote_source import RemoteFailure
 
 LOOPBACK = "127.0.0.1"
-_JSON = "application/json"
 CONTENT_SECURITY_POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -129,15 +127,11 @@ class ViewerServer(ThreadingHTTPServer):
         except NoAnswer:
             return _NOTHING
         except RemoteFailure as error:
-            return Answer(HTTPStatus.BAD_GATEWAY, _said(error), _JSON)
+            return Answer(HTTPStatus.BAD_GATEWAY, *error_answer(error))
         except UserError as error:
-            return Answer(HTTPStatus.UNPROCESSABLE_ENTITY, _said(error), _JSON)
+            return Answer(HTTPStatus.UNPROCESSABLE_ENTITY, *error_answer(error))
         except OSError as error:  # the store was moved, or changes
-            return Answer(HTTPStatus.UNPROCESSABLE_ENTITY, _said(error.strerror or error), _JSON)
-
-
-def _said(sentence: object) -> bytes:
-    return json.dumps({"error": str(sentence)}).encode()
+            return Answer(HTTPStatus.UNPROCESSABLE_ENTITY, *error_answer(error.strerror or error))
 
 
 def _allowed_host(given: str) -> str:

@@ -29,6 +29,8 @@ _POLICY = (
     "default-src 'none'; script-src 'sha256-{script}'; style-src 'sha256-{style}'; img-src data: blob:; "
     "base-uri 'none'; form-action 'none'"
 )
+#: In a site's folder: one that is being written.
+_NEW = ".new"
 
 
 def check_site(folder: Path) -> None:
@@ -38,19 +40,18 @@ def check_site(folder: Path) -> None:
         raise BadArgument(f"Cannot write a site into {folder}: it is a store, or named like one; give another folder.")
     if folder.exists() and not folder.is_dir():
         raise BadArgument(f"Cannot write a site into {folder}: it is a file; give a folder.")
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / RUNS).is_file():
+    if folder.is_dir() and any(one.name != _NEW for one in folder.iterdir()) and not (folder / RUNS).is_file():
         raise BadArgument(f"Cannot write a site into {folder}: it holds other files; give an empty or a new folder.")
 
 
 def site_size(stores: Sequence[ServedStore], heads: bool) -> int:
-    """About how many bytes a site has: those of the first episode of each store, for all of its replans."""
+    """About how many bytes a site has: those of the first readable episode of each store, for all of its replans."""
     size = 0.0
-    for store in stores:
-        replans = [episode.attributes.num_replans for episode in store.store.episodes]
-        if replans and replans[0]:
-            first = store.store.episodes[0].name
-            written = sum(len(content) for _, content in _compressed(Answers().of_episode(store, first, heads)))
-            size += written * sum(replans) / replans[0]
+    for store, run in zip(stores, _runs(stores, heads)["runs"], strict=True):
+        lines = [line for line in run["episodes"] if line.get("num_replans")]
+        if lines:
+            written = sum(len(content) for _, content in _compressed(Answers().copied(store, lines[0]["name"], heads)))
+            size += written * sum(line["num_replans"] for line in lines) / lines[0]["num_replans"]
     return round(size)
 
 
@@ -60,14 +61,16 @@ def write_site(folder: Path, stores: Sequence[ServedStore], heads: bool) -> str:
     runs = _runs(stores, heads)
     places = [(number, store, episode.name) for number, store in enumerate(stores) for episode in store.store.episodes]
     size = 0
-    with _made_beside(folder) as new, progress_bar(len(places), "episodes") as advance:
+    with _replaced(folder) as new, progress_bar(len(places), "episodes") as advance:
         for name in PAGE_FILES:
             write_text(new / name, (page / name).read_text(encoding="utf-8"))
         for number, store in enumerate(stores):
-            size += _write(new / f"runs/{number}/numbers.json.gz", _packed(json.dumps(_numbers(store)).encode()))
+            size += _write(
+                new / f"runs/{number}/numbers.json.gz", _packed(json.dumps(store.summary.document()).encode())
+            )
         answers = Answers()
         for number, store, episode in places:
-            for path, content in _compressed(answers.of_episode(store, episode, heads)):
+            for path, content in _compressed(answers.copied(store, episode, heads)):
                 size += _write(new / f"runs/{number}/{episode}/{path}", content)
             advance(1)
         write_text(new / RUNS, json.dumps(runs) + "\n")
@@ -81,9 +84,12 @@ def write_page_file(path: Path, store: ServedStore, episode: str, heads: bool) -
     page = files("vla_attention.analyze.view") / "bundle"
     runs = _runs([store], heads)
     runs["runs"][0]["episodes"] = [line for line in runs["runs"][0]["episodes"] if line["name"] == episode]
-    content = {"runs.json": json.dumps(runs).encode(), "runs/0/numbers.json": json.dumps(_numbers(store)).encode()}
+    content = {
+        "runs.json": json.dumps(runs).encode(),
+        "runs/0/numbers.json": json.dumps(store.summary.document()).encode(),
+    }
     within = {name: base64.b64encode(_packed(one)).decode() for name, one in content.items()}
-    for address, one in _compressed(Answers().of_episode(store, episode, heads)):
+    for address, one in _compressed(Answers().copied(store, episode, heads)):
         within[f"runs/0/{episode}/{address.removesuffix('.gz')}"] = base64.b64encode(one).decode()
     script, style = ((page / name).read_text(encoding="utf-8") for name in ("main.js", "main.css"))
     script = script.replace("</script", "<\\/script")
@@ -92,44 +98,42 @@ def write_page_file(path: Path, store: ServedStore, episode: str, heads: bool) -
         for name, text in (("script", script), ("style", style))
     }
     data = json.dumps(within).replace("<", "\\u003c")
-    text = (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY.format(**hashes)}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<meta name="color-scheme" content="light dark">\n<title>Attention</title>\n'
-        f"<style>{style}</style>\n</head>\n<body>\n"
-        f'<main id="page"></main>\n<script type="application/json" id="answers">{data}</script>\n'
-        f'<script type="module">{script}</script>\n</body>\n</html>\n'
-    )
+    policy = f'<meta http-equiv="Content-Security-Policy" content="{_POLICY.format(**hashes)}">'
+    parts = {
+        '<link rel="stylesheet" href="main.css">': f"<style>{style}</style>",
+        '<script type="module" src="main.js"></script>': "",
+        '<link rel="icon" href="data:,">': policy,
+        "</body>": f'<script type="application/json" id="answers">{data}</script>\n'
+        f'<script type="module">{script}</script>\n</body>',
+    }
+    text = (page / "index.html").read_text(encoding="utf-8")
+    for mark, part in parts.items():
+        before, _, after = text.partition(mark)
+        text = f"{before}{part}{after}"
     with writing("page", path, instead="another --file"):
         write_text(path, text)
     return f"{path}: {format_bytes(len(text.encode()))}, opens in a browser from disk."
 
 
 @contextmanager
-def _made_beside(folder: Path) -> Iterator[Path]:
-    """A new folder that takes the place of another one, an earlier site, when it is whole."""
-    new, old = (folder.absolute().with_name(f".{folder.absolute().name}.{what}") for what in ("new", "old"))
+def _replaced(folder: Path) -> Iterator[Path]:
+    """A folder inside of a site's, whose content takes the place of the earlier one when it is whole."""
+    new = folder / _NEW
     with writing("site", folder, instead="another --site"):
-        for left in (new, old):
-            shutil.rmtree(left, ignore_errors=True)
+        shutil.rmtree(new, ignore_errors=True)
         new.mkdir(parents=True)
         try:
             yield new
-            if folder.exists():
-                folder.rename(old)
-            new.rename(folder)
+            (folder / RUNS).unlink(missing_ok=True)
+            shutil.rmtree(folder / "runs", ignore_errors=True)
+            for entry in sorted(new.iterdir(), key=lambda one: one.name == RUNS):  # last: who has it is whole
+                entry.replace(folder / entry.name)
         finally:
-            for left in (new, old):
-                shutil.rmtree(left, ignore_errors=True)
+            shutil.rmtree(new, ignore_errors=True)
 
 
 def _runs(stores: Sequence[ServedStore], heads: bool) -> dict[str, Any]:
     return runs_answer([store.store for store in stores]) | {"copy": {"heads": heads}}
-
-
-def _numbers(store: ServedStore) -> dict[str, Any]:
-    return store.summary.document()
 
 
 def _packed(content: bytes) -> bytes:

@@ -48,9 +48,8 @@ def main(place: str) -> int:
 
 
 def summary_parts(store: Store) -> Iterator[dict[str, Any]]:
-    """The summary of a store in parts: entries of episodes, then of these with their numbers, and what is said of all.
+    """The summary of a store in parts: entries of episodes with their numbers, then what is said of all.
 
-    Before the numbers come the units of effects, if the store recorded some: the page shows no effect without them.
     An episode that cannot be read, or whose ratio is not defined, has no numbers; the first such sentence is `failed`.
     """
     failed = None

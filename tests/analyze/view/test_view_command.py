@@ -87,6 +87,20 @@ def test_a_site_has_the_servers_answers(store, tmp_path, capsys, heads):
     assert not any(path.is_symlink() for path in folder.rglob("*"))
 
 
+def test_a_site_of_a_store_with_a_damaged_episode_says_so(store, tmp_path, capsys):
+    damaged = shutil.copytree(store, tmp_path / "a.zarr")
+    (damaged / "episodes/task000_episode000/joint/key_role/c.0.0").unlink()
+    assert main(["view", str(damaged), "--site", str(tmp_path / "site")]) == 0
+    assert "Not every episode" in capsys.readouterr().err
+    answers = answers_in(tmp_path / "site")
+    with served(damaged) as running:
+        reply = ask(running, "runs/0/task000_episode000/about.json")
+    assert reply.status == 422
+    assert answers["runs/0/task000_episode000/about.json"] == reply.body
+    assert sum(address.startswith("runs/0/task000_episode000/") for address in answers) == 1
+    assert not (tmp_path / "site/.new").exists()
+
+
 def test_one_episode_is_one_file(store, tmp_path, capsys):
     path = tmp_path / "one.html"
     assert main(["view", str(store), "--file", str(path), "--task", "1", "--episode", "1"]) == 0

@@ -88,9 +88,6 @@ export interface Word {
 }
 
 export interface SiteLayout {
-  readonly spans: readonly { name: string; kind: string; start: number; stop: number }[];
-  readonly roles: readonly (readonly string[])[];
-  readonly valid: readonly (readonly number[])[];
   readonly cameras: Readonly<Record<string, CameraLayout>>;
   readonly prompts: readonly { text: string; words: readonly Word[] }[];
   /** What heads may look at. */
@@ -223,7 +220,11 @@ function once<T>(address: string, read: (bytes: ArrayBuffer) => T): Promise<T> {
 }
 
 export function readJson<T>(address: string): Promise<T> {
-  return once(address, (bytes) => JSON.parse(new TextDecoder().decode(bytes)) as T);
+  return once(address, (bytes) => {
+    const document = JSON.parse(new TextDecoder().decode(bytes)) as T & { error?: string };
+    if (document?.error !== undefined) throw new Error(document.error); // a copy has the sentences of errors, too
+    return document;
+  });
 }
 
 /** Asks anew each time. */
@@ -257,6 +258,7 @@ const pictures = new Map<string, string>();
 /** A `.npy` file of version 1, little-endian float32 in C order. */
 export function parseNpy(bytes: ArrayBuffer): NumberArray {
   const view = new DataView(bytes);
+  if (view.getUint8(0) !== 0x93) throw new Error((JSON.parse(new TextDecoder().decode(bytes)) as { error: string }).error);
   const length = view.getUint16(8, true);
   const header = new TextDecoder("latin1").decode(new Uint8Array(bytes, 10, length));
   const shape = /'shape': \(([^)]*)\)/.exec(header)?.[1];

@@ -1,5 +1,5 @@
 /** The page: the overview of a run, or one of its episodes. */
-import { effect } from "@preact/signals";
+import { computed, effect } from "@preact/signals";
 import { render } from "preact";
 
 import "./page.css";
@@ -42,8 +42,7 @@ addEventListener("keydown", (event) => {
 
 const page = document.getElementById("page")!;
 render(<App />, page);
-// For who waits until all is drawn.
-effect(() => {
-  const ready = !runs.value.pending && (episodeName.value === "" || (main.ready.value && beside.ready.value && !effects.value.pending));
-  requestAnimationFrame(() => (page.dataset.ready = ready ? "1" : ""));
-});
+// For who waits until all is drawn: taken back at once, given when the browser has drawn.
+const ready = computed(() => !runs.value.pending && (episodeName.value === "" || (main.ready.value && beside.ready.value && !effects.value.pending)));
+const mark = (): void => void (page.dataset.ready = ready.peek() ? "1" : "");
+effect(() => void (ready.value ? requestAnimationFrame(mark) : mark()));
