@@ -30,6 +30,7 @@ from vla_attention.analyze.measures.question import Question, ask
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.measures.selected import SelectedEpisode, check_replan, resolve_episode
 from vla_attention.analyze.stores.rows import layer_rows
+from vla_attention.analyze.stores.run_notes import same_words, told_instruction
 from vla_attention.analyze.stores.selection import Selection, select
 from vla_attention.analyze.view.run_answers import episode_line
 from vla_attention.schemas.cached_property import cached_property
@@ -38,6 +39,7 @@ from vla_attention.schemas.episode_steps import EXECUTED, HAND, POSES
 from vla_attention.schemas.episode_steps import GRIPPER as FINGERS
 from vla_attention.schemas.errors import BadArgument, unknown_name
 from vla_attention.schemas.groupings.resolve import check_names
+from vla_attention.schemas.groupings.words import has_phrase, split_words
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 
@@ -85,6 +87,17 @@ class ShownEpisode:
         """The episode with the tokens of a site."""
         return self.question(site).selected[0]
 
+    @cached_property
+    def named(self) -> set[str]:
+        """The objects that the policy was told of: the task's, or of another sentence those whose name stands in it."""
+        attributes = self.episode.attributes
+        told = told_instruction(self.store, attributes)
+        if same_words(told, attributes.instruction):
+            return {thing.name for thing in attributes.objects if thing.of_interest}
+        words = [told[start:stop].casefold() for start, stop in split_words(told)]
+        names = [thing.name for thing in attributes.objects if thing.kind == "object"]
+        return {name for name in names if has_phrase(words, re.sub(r"_\d+$", "", name))}
+
     def about(self) -> dict[str, Any]:
         """`about.json`: what happened, and what every key is."""
         item = self.item(self.store.attributes.sites[0].name)
@@ -98,7 +111,7 @@ class ShownEpisode:
             "end": end,
             "prompt_index": self.episode.read("prompt_index").tolist(),
             "objects": [
-                {"name": thing.name, "shown": visible(thing.name.replace("_", " ")), "named": thing.of_interest}
+                {"name": thing.name, "shown": visible(thing.name.replace("_", " ")), "named": thing.name in self.named}
                 for thing in attributes.objects
                 if thing.kind == "object"
             ],
@@ -265,12 +278,14 @@ class ShownEpisode:
         }
 
     def targets(self, site: str) -> list[dict[str, str]]:
-        """What heads may look at: name and selector; objects that the task names first, then pictures and words."""
+        """What heads may look at: name and selector; named objects first, then pictures and words."""
         item = self.item(site)
         seen = {name for things in self.covered(site).values() for name in things}
-        things = sorted((one for one in item.tokens.objects if one.name in seen), key=lambda one: not one.of_interest)
+        things = sorted(
+            (one for one in item.tokens.objects if one.name in seen), key=lambda one: one.name not in self.named
+        )
         found = [
-            (visible(one.name.replace("_", " ")) + " (named)" * one.of_interest, f"object:{_quoted(one.name)}")
+            (visible(one.name.replace("_", " ")) + " (named)" * (one.name in self.named), f"object:{_quoted(one.name)}")
             for one in things
         ]
         if seen_cameras(item):
@@ -332,10 +347,10 @@ class ShownEpisode:
 
     @property
     def drawn_effects(self) -> list[int]:
-        """The conditions whose actions the page draws: the calls without an item."""
+        """The conditions whose actions the page draws: the calls without an item, or with another."""
         effects = self.episode.attributes.effects
         conditions = effects.conditions if effects is not None and self.episode.has(CHANGE) else ()
-        return [i for i, one in enumerate(conditions) if described(one, {})["kind"] == "without"]
+        return [i for i, one in enumerate(conditions) if described(one, {})["kind"] in ("without", "prompt", "image")]
 
     def changed_actions(self, number: int) -> Array:
         """The actions of a condition's calls, (replan, step, dimension); NaN where it was not tried."""

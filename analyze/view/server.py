@@ -129,7 +129,8 @@ class ViewerServer(ThreadingHTTPServer):
         except RemoteFailure as error:
             return Answer(HTTPStatus.BAD_GATEWAY, *error_answer(error))
         except UserError as error:
-            return Answer(HTTPStatus.UNPROCESSABLE_ENTITY, *error_answer(error))
+            # A browser logs every other status as an error; a wrong selector is the user's, and the page says it.
+            return Answer(HTTPStatus.OK if asked.query else HTTPStatus.UNPROCESSABLE_ENTITY, *error_answer(error))
         except OSError as error:  # the store was moved, or changes
             return Answer(HTTPStatus.UNPROCESSABLE_ENTITY, *error_answer(error.strerror or error))
 

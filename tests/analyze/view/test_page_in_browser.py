@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+import json
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,6 +17,7 @@ from PIL import Image
 
 import vla_attention as va
 from tests.kit.browser import Watched, needs_chromium, watched_page
+from tests.kit.golden_stores import golden_store
 from tests.kit.http_ranges import serve
 from tests.kit.stores import StoreSpec, rerun_source, write_store
 from tests.kit.viewer import ask, served
@@ -95,7 +98,60 @@ def test_clicked_patches_and_words_are_a_group_and_its_ratio(view, server, store
     view.page.locator(".own form button").first.click()
     view.page.wait_for_selector('[role="alert"]')
     assert "no instruction has the word 'nothing'" in view.page.inner_text('[role="alert"]')
-    view.complaints.clear()  # the browser reports every answer of 422
+
+
+def test_back_undoes_what_a_person_takes_for_a_step(view, server):
+    view.open(server.link)
+    view.page.locator(".card").first.click()
+    view.wait_for_link("episode=task000_episode000")
+    view.page.keyboard.press("ArrowRight")
+    view.wait_for_link("replan=1")
+    view.page.locator(".word").nth(1).click()
+    view.wait_for_link("group=words")
+    view.page.keyboard.press("ArrowRight")
+    view.wait_for_link("replan=2")
+    view.page.select_option(".controls label:has-text('compare') select", "0:task000_episode001")
+    view.wait_for_link("beside=0")
+    for there, gone in (("replan=2", "beside"), ("replan=1", "group"), (server.token, "episode")):
+        view.page.go_back()
+        view.wait_for_link(there)
+        assert gone not in view.page.url
+    view.page.go_forward()
+    view.wait_for_link("replan=1")
+
+
+def test_an_item_of_the_effects_is_taken_away_by_a_click_or_a_key(browser):
+    with served(golden_store("effects")) as running, watched_page(browser) as watched:
+        watched.open(f"{running.link}{FIRST}")
+        items = json.loads(ask(running, "runs/0/task000_episode000/effects.json").body)["items"]
+        watched.page.locator(".effects > button").click()
+        rows = watched.page.locator(".effects tbody tr")
+        shown = [float(text) for text in watched.page.locator(".effects td:nth-child(3)").all_inner_texts()]
+        assert shown == sorted(shown, reverse=True)
+        tried = {one["item"] for one in items if one["kind"] in ("without", "noise")}
+        assert rows.count() == len(tried)
+        assert watched.page.locator(".actions .chunk.without").count() == 0
+        for item in tried - {"another noise seed"}:
+            (button,) = rows.locator("button").filter(has_text=re.compile(f"^{re.escape(item)}$")).all()
+            button.focus()
+            watched.page.keyboard.press("Enter")
+            watched.page.wait_for_selector(".actions .chunk.without")
+            assert f"without {item}" in watched.page.inner_text(".actions")
+        word = watched.page.locator(".word").first
+        word.click()
+        watched.wait_for_link("group=words")
+        assert f"without '{word.inner_text()}'" in watched.page.inner_text(".actions")
+
+
+def test_both_episodes_have_heads_and_the_own_group(view, server, store):
+    view.open(f"{server.link}{FIRST}&beside=0:task000_episode001&replan=1&group=words:0")
+    view.page.wait_for_function("document.querySelectorAll('.grids table').length === 2")
+    shown = view.page.locator('[data-number="own-words"]').evaluate_all("all => all.map((one) => +one.dataset.value)")
+    about = json.loads(ask(server, "runs/0/task000_episode000/about.json").body)
+    word = about["sites"]["joint"]["prompts"][0]["words"][0]["text"]
+    result = va.open(store).analyze(groups={"word": f"word:{word}"}, tasks=0)["replans_groups"]
+    cells = result.filter(group="word", replan=1, layer="layers_avg").sort("episode_index")
+    assert shown == pytest.approx(cells["mass"].to_list(), rel=1e-5)
 
 
 def test_the_overview_finds_episodes(view, server, store):

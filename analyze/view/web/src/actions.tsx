@@ -1,16 +1,14 @@
-/** The actions of this call, and beside them those of the call without the word that is picked. */
+/** The actions of this call, and beside them those of the call without what was taken away. */
 import { address, type Grid, type NumberArray, readArray } from "./answers";
-import { about, answered, beside, besideReplan, episodeName, part, picked, replan, runNumber, words } from "./state";
-import { effectOfWord } from "./words";
+import { described } from "./effects";
+import { about, answered, beside, besideReplan, episodeName, part, replan, runNumber, taken } from "./state";
 import { range } from "./sums";
 
 const NAMES = ["x", "y", "z", "turn x", "turn y", "turn z", "gripper"];
 
-const changed = answered<NumberArray>(() => {
-  const word = words.value[picked.value.words.at(-1) ?? -1];
-  const effect = word ? effectOfWord(word.text) : null;
-  return effect ? readArray(`${address.episode(runNumber.value, episodeName.value)}/actions/${effect.number}.npy`) : null;
-});
+const changed = answered<NumberArray>(() =>
+  taken.value && readArray(`${address.episode(runNumber.value, episodeName.value)}/actions/${taken.value.number}.npy`),
+);
 
 function chunkAt({ shape, data }: NumberArray, at: number): number[][] {
   const [steps, size] = [shape[1]!, shape[2]!];
@@ -26,16 +24,15 @@ export function Actions() {
   const chunk: Grid | undefined = about.value.value?.actions?.[replan.value];
   if (!chunk?.length) return null;
   const size = chunk[0]!.length;
-  const word = words.value[picked.value.words.at(-1) ?? -1]?.text;
   const besides = part("beside") ? beside.about.value.value?.actions?.[besideReplan.value] : undefined;
   const other: Grid | null = besides ?? (changed.value.value ? chunkAt(changed.value.value, replan.value) : null);
-  const whose = besides ? "the episode beside it" : `without '${word}'`;
+  const whose = besides ? "the episode beside it" : taken.value && described(taken.value);
   const all = [...chunk.flat(), ...(other ?? []).flat()].filter((one): one is number => typeof one === "number" && Number.isFinite(one));
   const most = Math.max(1e-6, ...all.map(Math.abs));
   return (
     <section class="actions" aria-label="Actions of this call">
       <h2>Actions of this call</h2>
-      <p class="soft">{chunk.length} steps, scale ±{Number(most.toPrecision(2))}{other ? <>; <span class="without">dashed: {whose}</span></> : word && about.value.value?.effects ? `; no call without '${word}' was recorded` : ""}</p>
+      <p class="soft">{chunk.length} steps, scale ±{Number(most.toPrecision(2))}{other ? <>; <span class="without">dashed: {whose}</span></> : part("without") && about.value.value?.effects ? `; no call without ${part("without")} was recorded` : ""}</p>
       <div class="small-plots">
         {range(size).map((i) => (
           <figure key={i}>

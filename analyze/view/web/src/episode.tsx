@@ -3,13 +3,14 @@ import { signal } from "@preact/signals";
 
 import { Actions } from "./actions";
 import { address } from "./answers";
-import { kindOf } from "./overview";
+import { EffectTable } from "./effects";
 import { HeadGrid } from "./heads";
 import { OwnGroup, Ratio } from "./numbers";
+import { kindOf } from "./overview";
 import { Legend, levels, Pictures } from "./pictures";
 import {
-  about, axes, beside, besideReplan, closeEpisode, denoise, episodeName, groups, head, layer, layerPlace, main, onlyEpisode, part, replan, rows, run, runNumber, runs,
-  setPart, site,
+  about, axes, beside, closeEpisode, denoise, episodeName, groups, head, layer, layerPlace, main, nameOf, onlyEpisode, part, replan, rows, run, runNumber, runs, setPart,
+  sides, site, step,
 } from "./state";
 import { shown } from "./sums";
 import { Timeline } from "./timeline";
@@ -28,10 +29,12 @@ function Choose({ name, title, known, value }: { name: "layer" | "head" | "denoi
   );
 }
 
+const options = signal(false);
+
 function Controls() {
   const sites = run.value?.sites ?? [];
   return (
-    <div class={more.value ? "controls open" : "controls"}>
+    <div class={options.value ? "controls open" : "controls"}>
       <ChooseShade />
       {sites.length > 1 ? (
         <label>site{" "}
@@ -44,6 +47,7 @@ function Controls() {
       <Choose name="head" title="head" known={runs.value.value?.copy?.heads === false ? [] : (axes.value?.heads ?? [])} value={head.value} />
       <Choose name="denoise" title="denoise step" known={axes.value?.denoise_steps ?? []} value={denoise.value} />
       <ChooseBeside />
+      <button class="options" aria-expanded={options.value} onClick={() => (options.value = !options.value)}>options</button>
       <button aria-expanded={more.value} onClick={() => (more.value = !more.value)}>share</button>
     </div>
   );
@@ -60,7 +64,7 @@ function ChooseBeside() {
   known.sort((a, b) => Number(b.line.name === episode.name) - Number(a.line.name === episode.name));
   return known.length ? (
     <label>compare with{" "}
-      <select value={part("beside")} onChange={(event) => setPart({ beside: event.currentTarget.value })}>
+      <select value={part("beside")} onChange={(event) => step({ beside: event.currentTarget.value })}>
         <option value="">nothing</option>
         {known.map(({ line, run: i, title }) => <option value={`${i}:${line.name}`}>{title}</option>)}
       </select>
@@ -72,24 +76,24 @@ function ChooseBeside() {
 function SideBySide() {
   const other = beside.about.value;
   if (other.error) return <p class="error" role="alert">{other.error}</p>;
-  if (!other.value || !about.value.value) return <p class="soft">Reading …</p>;
+  if (!other.value) return <p class="soft">Reading …</p>;
   const ratioOf = (numbers: typeof groups.value.value, at: number): string =>
     numbers?.ratio ? `ratio ${shown(numbers.ratio[at]?.[layerPlace(numbers)])}, ${shown(numbers.ratio_lift?.[at]?.[layerPlace(numbers)])} times even` : "";
-  const sides = [
-    { scene: main, at: replan.value, episode: about.value.value },
-    { scene: beside, at: besideReplan.value, episode: other.value },
-  ];
   return (
     <div class="beside">
-      {sides.map(({ scene, at, episode }, i) => (
-        <div key={i}>
-          <p class={`verdict ${kindOf(episode)}`}>{episode.verdict}</p>
-          {i && episode.told_other ? <p class="banner">The policy was told '{episode.told}'; the task is '{episode.instruction}'.</p> : null}
-          {i ? runs.value.value?.runs[scene.run.value]?.changed.map((line) => <p class="banner" key={line}>{line}</p>) : null}
-          <Pictures scene={scene} at={at} />
-          <p class="soft">{scene.run.value === runNumber.value ? "" : `${runs.value.value?.runs[scene.run.value]?.name}: `}step {episode.starts[at]} of {episode.end}; {ratioOf(scene.groups.value.value, at)}</p>
-        </div>
-      ))}
+      {sides.value.map((side, i) => {
+        const { scene, at } = side;
+        const episode = scene.about.value.value!;
+        return (
+          <div key={i}>
+            <p class={`verdict ${kindOf(episode)}`}>{episode.verdict}</p>
+            {i && episode.told_other ? <p class="banner">The policy was told '{episode.told}'; the task is '{episode.instruction}'.</p> : null}
+            {i ? runs.value.value?.runs[scene.run.value]?.changed.map((line) => <p class="banner" key={line}>{line}</p>) : null}
+            <Pictures scene={scene} at={at} />
+            <p class="soft">{nameOf(side)}: step {episode.starts[at]} of {episode.end}; {ratioOf(scene.groups.value.value, at)}</p>
+          </div>
+        );
+      })}
     </div>
   );
 }
@@ -189,6 +193,7 @@ export function EpisodePage() {
   if (!isListed) return <div class="episode">{back}<p class="error" role="alert">{run.value!.name} has no episode '{episodeName.value}'.</p></div>;
   if (error) return <div class="episode">{back}<p class="error" role="alert">{error}</p></div>;
   if (!episode || !run.value) return <div class="episode">{back}<p class="soft">Reading {part("episode")} …</p></div>;
+  const isBeside = part("beside") !== "";
   return (
     <div class="episode">
       <header>
@@ -199,18 +204,18 @@ export function EpisodePage() {
       {episode.told_other ? null : run.value.changed.map((line) => <p class="banner" key={line}>{line}</p>)}
       <div class="top"><Title /><Controls /></div>
       {more.value ? <Drawer /> : null}
-      {part("beside") ? <><SideBySide /><Legend /><div class="columns"><div class="main"><Timeline /></div><aside><Actions /><Ratio /></aside></div></> : (
-        <div class="columns">
-          <div class="main"><Pictures scene={main} at={replan.value} /><Legend /><Timeline /></div>
-          <aside>
-            <AboutWords />
-            <Ratio />
-            <HeadGrid />
-            <OwnGroup />
-            <Actions />
-          </aside>
-        </div>
-      )}
+      {isBeside ? <><SideBySide /><Legend /></> : null}
+      <div class="columns">
+        <div class="main">{isBeside ? null : <><Pictures scene={main} at={replan.value} /><Legend /></>}<Timeline /></div>
+        <aside>
+          <AboutWords />
+          <Ratio />
+          {isBeside ? null : <EffectTable />}
+          <Actions />
+          <HeadGrid />
+          <OwnGroup />
+        </aside>
+      </div>
       {rows.value.error ? <p class="error" role="alert">{rows.value.error}</p> : null}
     </div>
   );

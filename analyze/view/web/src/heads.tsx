@@ -2,76 +2,90 @@
 import { computed, signal } from "@preact/signals";
 
 import { address, type HeadLifts, readJson } from "./answers";
-import { about, answered, episodeName, head, layer, layout, picked, replan, runNumber, runs, setPart, site } from "./state";
+import { answered, cellsOf, head, layer, main, beside, nameOf, picked, runs, type Scene, setPart, type Side, sides, site } from "./state";
 import { shown } from "./sums";
 
-const chosen = signal<string | null>(null);
+interface Target {
+  readonly id: string;
+  readonly name: string;
+  readonly path: string;
+}
 
-const targets = computed(() => {
-  const known = (layout.value?.targets ?? []).map((one, i) => ({ ...one, path: `grid/${i}.json` }));
-  const asked = (name: string, selector: string) => ({ name, selector, path: `grid.json?${new URLSearchParams({ selector })}` });
-  const { cells, selector } = picked.value;
-  const keys = Object.entries(cells).flatMap(([camera, some]) => {
-    const how = layout.value?.cameras[camera];
-    return (how?.keys ?? []).filter((_, i) => some.includes(how!.cells[i]!));
-  });
+const asked = (selector: string): string => `grid.json?${new URLSearchParams({ selector })}`;
+
+/** What heads of an episode may look at; `id` is the same in the one beside it. */
+function targetsOf(scene: Scene): readonly Target[] {
+  const known = (scene.layout.value?.targets ?? []).map(({ name, selector }, i) => ({ id: selector, name, path: `grid/${i}.json` }));
+  const keys = Object.entries(scene.layout.value?.cameras ?? {}).flatMap(([camera, how]) => how.keys.filter((_, i) => cellsOf(scene, camera).includes(how.cells[i]!)));
   const patches = keys.map((key) => `keys:${key}-${key}`).join(" | ");
-  return [...known, ...(patches ? [asked("the clicked patches", patches)] : []), ...(selector ? [asked(selector, selector)] : [])];
-});
-const target = computed(() => targets.value.find(({ selector }) => selector === chosen.value) ?? targets.value[0] ?? null);
+  const { selector } = picked.value;
+  return [...known, ...(patches ? [{ id: "patches", name: "the clicked patches", path: asked(patches) }] : []), ...(selector ? [{ id: selector, name: selector, path: asked(selector) }] : [])];
+}
 
-const lifts = answered<HeadLifts>(() => {
-  const wanted = target.value;
-  if (!wanted || about.value.value?.name !== episodeName.value) return null;
-  return readJson<HeadLifts>(`${address.episode(runNumber.value, episodeName.value)}/${site.value}/${wanted.path}`);
-});
+const chosen = signal<string | null>(null);
+const target = computed(() => targetsOf(main).find(({ id }) => id === chosen.value) ?? targetsOf(main)[0] ?? null);
 
-export function HeadGrid() {
-  const numbers = lifts.value.value;
-  const grid = numbers?.lift[replan.value];
-  if (!targets.value.length) return null;
-  const known = (grid ?? []).flat().filter((one): one is number => one !== null);
-  const highest = Math.max(4, ...known);
-  const best = Math.max(...known);
-  const place = grid?.flatMap((line, i) => line.flatMap((one, j) => (one === best ? [[i, j] as const] : [])))[0];
+const liftsOf = (scene: Scene) => answered<HeadLifts>(() => {
+  const id = target.value?.id;
+  if (id === undefined || scene.about.value.value?.name !== scene.name.value) return null;
+  const path = targetsOf(scene).find((one) => one.id === id)?.path ?? asked(id);
+  return readJson<HeadLifts>(`${address.episode(scene.run.value, scene.name.value)}/${site.value}/${path}`);
+});
+const lifts = new Map([main, beside].map((scene) => [scene, liftsOf(scene)]));
+
+const known = ({ scene, at }: Side): number[] => (lifts.get(scene)!.value.value?.lift[at] ?? []).flat().filter((one): one is number => one !== null);
+
+function Grid({ side, highest }: { side: Side; highest: number }) {
+  const { value: numbers, error } = lifts.get(side.scene)!.value;
+  const grid = numbers?.lift[side.at];
+  if (error) return <p class="soft">{nameOf(side)} {error}</p>;
+  if (!grid || !numbers) return null;
+  const best = Math.max(...known(side));
+  const place = grid.flatMap((line, i) => line.flatMap((one, j) => (one === best ? [[i, j] as const] : [])))[0];
   const has = runs.value.value?.copy?.heads !== false;
   const toggle = (own: number, ofHead: number): void => {
-    if (!has) return;
     const same = layer.value === own && head.value === ofHead;
     setPart({ layer: same ? "mean" : own, head: same ? "mean" : ofHead });
   };
   return (
+    <div>
+      <p>{nameOf(side) ? `${nameOf(side)}: ` : ""}{place ? `most: layer ${numbers.layers[place[0]]}, head ${numbers.heads[place[1]]}, ${shown(best)} times even` : "none, it is out of sight in this call"}</p>
+      <table>
+        <tbody>
+          {grid.map((line, i) => (
+            <tr key={i}>
+              <th scope="row">{numbers.layers[i]}</th>
+              {line.map((one, j) => {
+                const about = `layer ${numbers.layers[i]}, head ${numbers.heads[j]}: ${shown(one)} times even`;
+                return (
+                  <td key={j}>
+                    <button
+                      disabled={!has} aria-pressed={layer.value === numbers.layers[i] && head.value === numbers.heads[j]} aria-label={about} title={about} class={place?.[0] === i && place[1] === j ? "best" : ""}
+                      style={{ "--strength": Math.min(1, Math.max(0, (one ?? 0) / highest)).toFixed(3) }} onClick={() => toggle(numbers.layers[i]!, numbers.heads[j]!)}
+                    />
+                  </td>
+                );
+              })}
+            </tr>
+          ))}
+        </tbody>
+      </table>
+    </div>
+  );
+}
+
+export function HeadGrid() {
+  if (!target.value) return null;
+  const highest = Math.max(4, ...sides.value.flatMap(known));
+  return (
     <section class="heads" aria-label="Heads">
       <label>Which head looks at{" "}
-        <select value={target.value?.selector} onChange={(event) => (chosen.value = event.currentTarget.value)}>
-          {targets.value.map(({ name, selector }) => <option value={selector}>{name}</option>)}
+        <select value={target.value.id} onChange={(event) => (chosen.value = event.currentTarget.value)}>
+          {targetsOf(main).map(({ id, name }) => <option value={id}>{name}</option>)}
         </select>{" "}in this call?
       </label>
-      {lifts.value.error ? <p class="soft">{lifts.value.error}</p> : null}
-      {grid && numbers ? (
-        <>
-          {place ? <p>Most: layer {numbers.layers[place[0]]}, head {numbers.heads[place[1]]}, {shown(best)} times even.</p> : <p>None: it is out of sight in this call.</p>}
-          <table>
-            <tbody>
-              {grid.map((line, i) => (
-                <tr key={i}>
-                  <th scope="row">{numbers.layers[i]}</th>
-                  {line.map((one, j) => (
-                    <td key={j}>
-                      <button
-                        disabled={!has} aria-pressed={layer.value === numbers.layers[i] && head.value === numbers.heads[j]} aria-label={`layer ${numbers.layers[i]}, head ${numbers.heads[j]}: ${shown(one)} times even`}
-                        title={`layer ${numbers.layers[i]}, head ${numbers.heads[j]}: ${shown(one)} times even`} class={place?.[0] === i && place[1] === j ? "best" : ""}
-                        style={{ "--strength": Math.min(1, Math.max(0, (one ?? 0) / highest)).toFixed(3) }} onClick={() => toggle(numbers.layers[i]!, numbers.heads[j]!)}
-                      />
-                    </td>
-                  ))}
-                </tr>
-              ))}
-            </tbody>
-          </table>
-          <p class="soft">rows: layers; columns: heads; strongest: {shown(highest)} times even. {has ? "A click shows that head alone." : ""}</p>
-        </>
-      ) : null}
+      <div class="grids">{sides.value.map((side) => <Grid key={nameOf(side)} side={side} highest={highest} />)}</div>
+      <p class="soft">rows: layers; columns: heads; strongest: {shown(highest)} times even. {runs.value.value?.copy?.heads === false ? "" : "A click shows that head alone."}</p>
     </section>
   );
 }

@@ -4,7 +4,7 @@ import { computed, signal } from "@preact/signals";
 import { address, type CameraLayout } from "./answers";
 import { Hint } from "./hint";
 import {
-  about, covered, evenOf, layout, main, massesAt, massesOf, numReplans, pick, picked, type Scene, setPart, toggled, uniformAt,
+  about, cellsOf, covered, evenOf, groupOf, hasCells, layout, main, massesAt, massesOf, numReplans, picked, type Scene, setPart, toggled, uniformAt,
 } from "./state";
 import { cellLifts, cellSums, outline, percent, shown } from "./sums";
 
@@ -36,7 +36,7 @@ interface At {
 function Lines({ scene, camera, how, at }: At) {
   const [mass, even] = [massesOf(scene, at), evenOf(scene, at)];
   const lifts = mass && even ? cellLifts(mass, even, how) : null;
-  const own = scene === main ? (picked.value.cells[camera] ?? []) : [];
+  const own = cellsOf(scene, camera);
   const things = scene.covered.value.value?.[camera] ?? {};
   const episode = scene.about.value.value;
   const touched = new Set(episode?.events.map(({ thing }) => thing));
@@ -73,15 +73,17 @@ function aboutCell({ scene, camera, how, at }: At, cell: number): string {
   return `${where}: ${percent(sums[cell])} of all attention, ${percent(sums[cell]! / ofPicture)} of this picture's, ${shown(cellLifts(mass, even, how)[cell])} times even${things.length ? `, ${things.join(", ")}` : ""}`;
 }
 
-/** One camera at a replan. Clicks on the main episode's pick patches. */
+/** One camera at a replan. Clicks pick patches, in both episodes the same ones. */
 function Picture(one: At) {
   const { scene, camera, how, at } = one;
   const here = pointed.value?.camera === camera && pointed.value.scene === scene ? pointed.value.cell : null;
-  const toggle = (cell: number): void => pick({ cells: { ...picked.value.cells, [camera]: toggled(picked.value.cells[camera] ?? [], cell) } });
+  const toggle = (cell: number): void => {
+    if (hasCells(scene, camera)) setPart({ group: groupOf({ cells: { ...picked.value.cells, [camera]: toggled(cellsOf(scene, camera), cell) } }) });
+  };
   const byKey = (event: KeyboardEvent): void => {
     const step = { ArrowLeft: -1, ArrowRight: 1, ArrowUp: -how.columns, ArrowDown: how.columns }[event.key];
     if (step !== undefined) pointed.value = { scene, camera, cell: here === null ? 0 : (here + step + how.rows * how.columns) % (how.rows * how.columns) };
-    else if (event.key === "Enter" && here !== null && scene === main) toggle(here);
+    else if (event.key === "Enter" && here !== null) toggle(here);
     else return;
     event.preventDefault();
     event.stopPropagation();
@@ -95,7 +97,7 @@ function Picture(one: At) {
           onKeyDown={(event) => byKey(event)}
           onMouseMove={(event) => (pointed.value = { scene, camera, cell: cellAt(event, how) })}
           onMouseLeave={() => (pointed.value = null)}
-          onClick={(event) => scene === main && toggle(cellAt(event, how))}
+          onClick={(event) => toggle(cellAt(event, how))}
         >
           <Lines {...one} />
           {here === null ? null : <rect class="pointed" x={here % how.columns} y={Math.floor(here / how.columns)} width="1" height="1" />}
@@ -132,7 +134,7 @@ export function Legend() {
     <p class="legend soft">
       <span><svg viewBox="0 0 24 8" class="sample first"><path class="casing" d="M2 4H22" /><path class="line" d="M2 4H22" /></svg>{FIRST} times an even spread</span>
       {levels.value[1] ? <span><svg viewBox="0 0 24 8" class="sample second"><path class="casing" d="M2 4H22" /><path class="line" d="M2 4H22" /></svg>{levels.value[1]} times</span> : null}
-      {about.value.value?.objects.length && covered.value.value ? <><span><svg viewBox="0 0 24 8" class="sample"><path class="object named" d="M2 4H22" /></svg>named in the task</span> <span><svg viewBox="0 0 24 8" class="sample"><path class="object touched" d="M2 4H22" /></svg>touched</span></> : null}
+      {about.value.value?.objects.length && covered.value.value ? <><span><svg viewBox="0 0 24 8" class="sample"><path class="object named" d="M2 4H22" /></svg>named in the sentence</span> <span><svg viewBox="0 0 24 8" class="sample"><path class="object touched" d="M2 4H22" /></svg>touched</span></> : null}
     </p>
   );
 }

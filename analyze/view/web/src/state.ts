@@ -37,7 +37,7 @@ export function answered<T>(ask: () => Promise<T> | null): ReadonlySignal<Answer
 /** The parts of the link, as texts; what is not in it has its default. */
 const DEFAULTS = {
   run: "0", episode: "", replan: "0", site: "", layer: "mean", head: "mean", denoise: "mean", words: "", beside: "", group: "",
-  find: "", task: "", show: "all", curve: "ratio",
+  without: "", find: "", task: "", show: "all", curve: "ratio",
 } as const;
 export type Part = keyof typeof DEFAULTS;
 
@@ -69,10 +69,23 @@ export function setPart(changes: Partial<Record<Part, string | number>>): void {
   });
 }
 
-/** Shows an episode from its beginning, or the overview (an empty name); the browser's Back returns from it. */
-export function openEpisode(episode: string, run = Number(part("run"))): void {
+/** The same for what a person thinks of as a step: the browser's Back undoes it. */
+export function step(changes: Partial<Record<Part, string | number>>): void {
+  if (Object.entries(changes).every(([name, value]) => part(name as Part) === String(value))) return;
   history.pushState(null, "", location.href);
-  setPart({ run, episode, replan: 0, group: "", head: "mean", layer: "mean" });
+  setPart(changes);
+}
+
+const CLOSED = { episode: "", replan: 0, layer: "mean", head: "mean", denoise: "mean", group: "", without: "", beside: "" };
+
+/** Shows an episode from its beginning. */
+export function openEpisode(episode: string): void {
+  step({ ...CLOSED, episode });
+}
+
+/** Shows the overview. */
+export function closeEpisode(): void {
+  step(CLOSED);
 }
 
 export const runs = answered(() => readRuns());
@@ -112,6 +125,26 @@ export const head = choice("head", () => axes.value?.heads ?? []);
 export const denoise = choice("denoise", () => axes.value?.denoise_steps ?? []);
 const position = (known: readonly number[] | undefined, chosen: Choice): Choice => (chosen === "mean" ? chosen : (known ?? []).indexOf(chosen));
 
+/** What was clicked or typed: cells of cameras, words (positions), selectors. In the link as CAMERA:1.2.3;words:0.2;=selector */
+export interface Picked {
+  readonly cells: Readonly<Record<string, readonly number[]>>;
+  readonly words: readonly number[];
+  readonly selector: string;
+}
+
+export const picked = computed<Picked>(() => {
+  const cells: Record<string, number[]> = {};
+  let chosen: number[] = [];
+  let selector = "";
+  for (const text of part("group").split(";").filter(Boolean)) {
+    const at = text.lastIndexOf(":");
+    if (text.startsWith("=")) selector = text.slice(1);
+    else if (text.startsWith("words:")) chosen = text.slice(6).split(".").map(Number);
+    else cells[text.slice(0, at)] = text.slice(at + 1).split(".").map(Number);
+  }
+  return { cells, words: chosen, selector };
+});
+
 /** An episode with what was read of it, for the chosen site, layer, head and denoise step. */
 export interface Scene {
   readonly name: ReadonlySignal<string>;
@@ -125,6 +158,8 @@ export interface Scene {
   readonly masses: ReadonlySignal<Float64Array[] | null>;
   /** The same of uniform attention, of every replan or once. */
   readonly even: ReadonlySignal<Float64Array[] | null>;
+  /** The keys of the typed selector by replan, or why there are none. */
+  readonly typed: ReadonlySignal<Answer<{ keys: [number, number][][] }>>;
   /** Whether all of it is there. */
   readonly ready: ReadonlySignal<boolean>;
 }
@@ -144,6 +179,10 @@ function sceneOf(ofRun: ReadonlySignal<number>, name: ReadonlySignal<string>): S
     return readAt(ofSite(`groups/${parts.map(([of, one]) => `${of}-${one}`).join(".") || "all"}.json`));
   });
   const covered = answered<Covered>(() => readAt(ofSite("objects.json")));
+  const typed = answered<{ keys: [number, number][][] }>(() => {
+    const { selector } = picked.value;
+    return selector ? readAt(ofSite(`keys.json?${new URLSearchParams({ selector })}`)) : null;
+  });
   return {
     name,
     run: ofRun,
@@ -151,7 +190,8 @@ function sceneOf(ofRun: ReadonlySignal<number>, name: ReadonlySignal<string>): S
     rows,
     groups,
     covered,
-    ready: computed(() => ![about, rows, uniform, groups, covered].some(({ value }) => value.pending)),
+    typed,
+    ready: computed(() => ![about, rows, uniform, groups, covered, typed].some(({ value }) => value.pending)),
     layout: computed(() => about.value.value?.sites[site.value] ?? null),
     masses: computed(() => rows.value.value && keyMasses(rows.value.value, steps.value, position(axes.value?.heads, head.value))),
     even: computed(() => uniform.value.value && keyMasses(uniform.value.value, steps.value, "mean")),
@@ -179,11 +219,6 @@ effect(() => {
   if (runs.value.value && part("run") !== String(runNumber.value)) setPart({ run: runNumber.value });
 });
 
-/** Shows the overview. */
-export function closeEpisode(): void {
-  setPart({ episode: "", replan: 0, layer: "mean", head: "mean", denoise: "mean", group: "", beside: "" });
-}
-
 /** The episode beside it, in the link as RUN:EPISODE; shown at the call whose step is nearest. */
 const besideParts = computed(() => part("beside").split(":"));
 export const beside = sceneOf(computed(() => Number(besideParts.value[0]) || 0), computed(() => besideParts.value[1] ?? ""));
@@ -195,10 +230,24 @@ export const besideReplan = computed(() => {
 
 export const effects = answered<Effects | null>(() => (about.value.value?.effects ? readJson<Effects | null>(`${address.episode(runNumber.value, episodeName.value)}/effects.json`) : null));
 
-export const words = computed<readonly Word[]>(() => {
-  const prompts = layout.value?.prompts ?? [];
-  return prompts[about.value.value?.prompt_index[replan.value] ?? 0]?.words ?? [];
-});
+/** What is on the screen: the episode, and the one beside it. */
+export interface Side {
+  readonly scene: Scene;
+  readonly at: number;
+}
+export const sides = computed<readonly Side[]>(() => [{ scene: main, at: replan.value }, ...(beside.about.value.value ? [{ scene: beside, at: besideReplan.value }] : [])]);
+
+/** As "told.zarr, episode 3"; empty where one episode is shown alone. */
+export function nameOf({ scene }: Side): string {
+  const other = scene.run.value === runNumber.value ? "" : `${runs.value.value?.runs[scene.run.value]?.name}, `;
+  return sides.value.length > 1 ? `${other}episode ${scene.about.value.value?.episode}` : "";
+}
+
+export function wordsOf({ scene, at }: Side): readonly Word[] {
+  const prompts = scene.layout.value?.prompts ?? [];
+  return prompts[scene.about.value.value?.prompt_index[at] ?? 0]?.words ?? [];
+}
+export const words = computed(() => wordsOf({ scene: main, at: replan.value }));
 
 /** Events with the leaving of solved episodes, which is computed from all of them. */
 export const events = computed<readonly EpisodeEvent[]>(() => {
@@ -211,64 +260,63 @@ export const events = computed<readonly EpisodeEvent[]>(() => {
   return [...episode.events, own].sort((a, b) => a.step - b.step);
 });
 
-/** The effect of a word: when nobody reads it, or where that was not tried, when the action queries do not. */
-export function effectOf(item: string): Effect | null {
-  const own = effects.value.value?.items.filter((one) => one.kind === "without" && one.item === item) ?? [];
-  return own.find(({ reader }) => reader === "total") ?? own.find(({ reader }) => reader === "direct") ?? null;
-}
-
-/** What was clicked or typed: cells of cameras, words (positions), selectors. In the link as CAMERA:1.2.3;words:0.2;=selector */
-export interface Picked {
-  readonly cells: Readonly<Record<string, readonly number[]>>;
-  readonly words: readonly number[];
-  readonly selector: string;
-}
-
-export const picked = computed<Picked>(() => {
-  const cells: Record<string, number[]> = {};
-  let chosen: number[] = [];
-  let selector = "";
-  for (const text of part("group").split(";").filter(Boolean)) {
-    const at = text.lastIndexOf(":");
-    if (text.startsWith("=")) selector = text.slice(1);
-    else if (text.startsWith("words:")) chosen = text.slice(6).split(".").map(Number);
-    else cells[text.slice(0, at)] = text.slice(at + 1).split(".").map(Number);
+/** What was taken away or exchanged, by name: read by nobody, or where that was not tried, not by the action queries. */
+const tried = computed(() => {
+  const found = new Map<string, Effect>();
+  for (const reader of [null, "direct", "total"]) {
+    for (const one of effects.value.value?.items ?? []) if (one.reader === reader && ["without", "prompt", "image"].includes(one.kind)) found.set(one.item, one);
   }
-  return { cells, words: chosen, selector };
+  return found;
 });
 
-export function pick(changes: Partial<Picked>): void {
+/** The largest effect over the episode first. */
+export const ranked = computed(() => [...tried.value.values()].sort((a, b) => (b.mean ?? 0) - (a.mean ?? 0)));
+
+export function effectOf(item: string): Effect | null {
+  return tried.value.get(item) ?? tried.value.get(item.toLowerCase()) ?? null;
+}
+
+/** How words are called among what is taken away. */
+export const wordItem = (text: string): string => `'${text}'`;
+
+/** What is taken away: the changed actions are drawn beside the executed ones. */
+export const taken = computed<Effect | null>(() => effectOf(part("without")));
+
+/** The link's text of what is picked. */
+export function groupOf(changes: Partial<Picked>): string {
   const { cells, words: chosen, selector } = { ...picked.peek(), ...changes };
   const parts = Object.entries(cells).filter(([, some]) => some.length).map(([camera, some]) => `${camera}:${some.join(".")}`);
   if (chosen.length) parts.push(`words:${chosen.join(".")}`);
   if (selector) parts.push(`=${selector.replaceAll(";", " ")}`);
-  setPart({ group: parts.join(";") });
+  return parts.join(";");
 }
 
 export function toggled(all: readonly number[], one: number): number[] {
   return all.includes(one) ? all.filter((other) => other !== one) : [...all, one].sort((a, b) => a - b);
 }
 
-/** The keys of a typed selector by replan, or why there are none. */
-export const typed = answered<{ keys: [number, number][][] }>(() => {
-  const { selector } = picked.value;
-  return selector && about.value.value ? readJson(`${address.episode(runNumber.value, episodeName.value)}/${site.value}/keys.json?${new URLSearchParams({ selector })}`) : null;
-});
-
 export type Keys = Map<number, number>;
 
-/** The keys of the picked cells and of a typed selector (`seen`), and of the picked words (`read`), at a replan. */
-export function pickedKeys(at: number): { seen: Keys; read: Keys } {
+/** Whether an episode's map of a camera has the main one's cells. */
+export function hasCells(scene: Scene, camera: string): boolean {
+  const [own, how] = [layout.value?.cameras[camera], scene.layout.value?.cameras[camera]];
+  return own?.rows === how?.rows && own?.columns === how?.columns;
+}
+
+/** The picked cells of a camera; in the episode beside it the same. */
+export const cellsOf = (scene: Scene, camera: string): readonly number[] => (hasCells(scene, camera) ? (picked.value.cells[camera] ?? []) : []);
+
+/** The keys of the picked cells and of a typed selector (`seen`), and of the words at the picked places (`read`). */
+export function pickedKeys({ scene, at }: Side): { seen: Keys; read: Keys } {
   const seen: Keys = new Map();
-  for (const [camera, cells] of Object.entries(picked.value.cells)) {
-    const how = layout.value?.cameras[camera];
-    const wanted = new Set(cells);
-    how?.keys.forEach((key, i) => wanted.has(how.cells[i]!) && seen.set(key, Math.min(1, (seen.get(key) ?? 0) + (how.shares?.[i] ?? 1))));
+  for (const [camera, how] of Object.entries(scene.layout.value?.cameras ?? {})) {
+    const wanted = new Set(cellsOf(scene, camera));
+    how.keys.forEach((key, i) => wanted.has(how.cells[i]!) && seen.set(key, Math.min(1, (seen.get(key) ?? 0) + (how.shares?.[i] ?? 1))));
   }
-  const ofReplans = typed.value.value?.keys ?? [];
+  const ofReplans = scene.typed.value.value?.keys ?? [];
   for (const [key, weight] of ofReplans[at] ?? ofReplans[0] ?? []) seen.set(key, weight);
   const read: Keys = new Map();
-  for (const place of picked.value.words) for (const key of words.value[place]?.keys ?? []) read.set(key, 1);
+  for (const place of picked.value.words) for (const key of wordsOf({ scene, at })[place]?.keys ?? []) read.set(key, 1);
   return { seen, read };
 }
 

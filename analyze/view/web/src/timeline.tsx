@@ -5,7 +5,7 @@ import uPlot from "uplot";
 import "uplot/dist/uPlot.min.css";
 
 import type { Grid } from "./answers";
-import { about, events, groups, layerPlace, layout, massesAt, numReplans, part, pickedKeys, playing, replan, setPart } from "./state";
+import { about, events, groups, layerPlace, layout, main, massesAt, numReplans, part, pickedKeys, playing, replan, setPart } from "./state";
 import { range, sumOf } from "./sums";
 
 interface Curve {
@@ -29,7 +29,7 @@ function kinds(): Record<string, { title: string; of: () => Curves | null }> {
   const found: Record<string, { title: string; of: () => Curves | null }> = {};
   if (numbers?.ratio) found.ratio = { title: "ratio of pictures to text", of: () => atReplans([{ name: "ratio", values: column(numbers.ratio) }, { name: "of even attention", values: column(numbers.uniform_ratio) }]) };
   if (numbers) found.masses = { title: "parts of the attention", of: () => atReplans(Object.entries(numbers.groups).map(([name, { fraction }]) => ({ name, values: column(fraction) })).filter(({ values }) => values.some((one) => (one ?? 0) > 0.005))) };
-  if (part("group")) found.group = { title: "own group", of: () => atReplans(["seen", "read"].map((side) => ({ name: side === "seen" ? "patches" : "words", values: range(numReplans.value).map((at) => (massesAt(at) ? sumOf(massesAt(at)!, pickedKeys(at)[side as "seen" | "read"]) : null)) })).filter(({ values }) => values.some(Boolean))) };
+  if (part("group")) found.group = { title: "own group", of: () => atReplans(["seen", "read"].map((side) => ({ name: side === "seen" ? "patches" : "words", values: range(numReplans.value).map((at) => (massesAt(at) ? sumOf(massesAt(at)!, pickedKeys({ scene: main, at })[side as "seen" | "read"]) : null)) })).filter(({ values }) => values.some(Boolean))) };
   if (courses) {
     const steps = range(courses.gap.length);
     found.hand = { title: "hand and gripper (cm)", of: () => ({ steps, curves: [{ name: "height of the hand", values: (courses.places[courses.hand] ?? []).map(([, , z]) => (z == null ? null : 100 * z)) }, { name: "gap between the fingers", values: courses.gap.map((one) => (one === null ? null : 100 * one)) }] }) };

@@ -1,8 +1,8 @@
 /** The instruction as a title: its words shaded by attention or by effect, and what is known of the picked one. */
 import { computed } from "@preact/signals";
 
-import type { Effect } from "./answers";
-import { about, effectOf, effects, massesAt, part, pick, picked, replan, setPart, toggled, uniformAt, words } from "./state";
+import { noiseAt } from "./effects";
+import { about, effectOf, effects, groupOf, massesAt, part, picked, replan, setPart, step, toggled, uniformAt, wordItem, words } from "./state";
 import { percent, shown, sumOf } from "./sums";
 
 /** attention, effect (of this replan), effects (over the episode); the effect where it was recorded. */
@@ -21,15 +21,6 @@ function liftOf(keys: readonly number[], at: number): number {
   return mass && even ? sumOf(mass, once(keys)) / sumOf(even, once(keys)) : NaN;
 }
 
-export function effectOfWord(text: string): Effect | null {
-  return effectOf(`'${text}'`) ?? effectOf(`'${text.toLowerCase()}'`);
-}
-
-/** Another noise seed's effect at a replan. */
-function noiseAt(at: number): number {
-  return effects.value.value?.items.find(({ kind }) => kind === "noise")?.effect[at] ?? NaN;
-}
-
 interface Shaded {
   readonly strength: number;
   /** Not more than another noise seed. */
@@ -40,7 +31,7 @@ interface Shaded {
 const shades = computed<readonly Shaded[]>(() => {
   const [at, whole] = [replan.value, shade.value === "effects"];
   const values = words.value.map(({ text, keys }) => {
-    const effect = effectOfWord(text);
+    const effect = effectOf(wordItem(text));
     return { lift: liftOf(keys, at), effect: (whole ? effect?.mean : effect?.effect[at]) ?? NaN, noise: (whole ? effect?.noise : noiseAt(at)) ?? NaN };
   });
   const of = (one: (typeof values)[0]): number => (shade.value === "attention" ? one.lift : one.effect);
@@ -53,6 +44,13 @@ const shades = computed<readonly Shaded[]>(() => {
   });
 });
 
+/** Puts a word into the own group and takes it away, or undoes both. */
+function toggle(place: number): void {
+  const chosen = toggled(picked.value.words, place);
+  const last = chosen.includes(place) ? place : chosen.at(-1);
+  step({ group: groupOf({ words: chosen }), without: last === undefined ? "" : wordItem(words.value[last]!.text) });
+}
+
 export function Title() {
   const episode = about.value.value;
   if (!episode) return null;
@@ -63,7 +61,7 @@ export function Title() {
         {words.value.length ? words.value.map(({ text }, i) => (
           <button
             key={i} class={`word${shades.value[i]!.none ? " none" : ""}`} aria-pressed={chosen.includes(i)} title={shades.value[i]!.title}
-            style={{ "--strength": shades.value[i]!.strength.toFixed(3) }} onClick={() => pick({ words: toggled(chosen, i) })}
+            style={{ "--strength": shades.value[i]!.strength.toFixed(3) }} onClick={() => toggle(i)}
           >{text}</button>
         )) : episode.told}
       </h1>
@@ -87,24 +85,18 @@ export function ChooseShade() {
   );
 }
 
-/** What is known of the picked words. */
+/** What the picked words get. */
 export function AboutWords() {
   const chosen = picked.value.words.filter((i) => words.value[i]);
+  const mass = massesAt(replan.value);
   if (!chosen.length) return null;
   return (
     <table class="numbers">
-      <thead><tr><th>word</th><th>attention</th><th>per token</th><th>without it the action moves</th></tr></thead>
+      <thead><tr><th>word</th><th>attention</th><th>per token</th></tr></thead>
       <tbody>
         {chosen.map((i) => {
           const { text, keys } = words.value[i]!;
-          const effect = effectOfWord(text);
-          const mass = massesAt(replan.value);
-          return (
-            <tr key={i}>
-              <th>{text}</th><td>{percent(mass && sumOf(mass, once(keys)))}</td><td>{shown(liftOf(keys, replan.value))} times even</td>
-              <td>{effect ? `${shown(effect.effect[replan.value])} (another noise seed ${shown(noiseAt(replan.value))}); over the episode ${shown(effect.mean)} (${shown(effect.noise)})` : "not recorded"}</td>
-            </tr>
-          );
+          return <tr key={i}><th>{text}</th><td>{percent(mass && sumOf(mass, once(keys)))}</td><td>{shown(liftOf(keys, replan.value))} times even</td></tr>;
         })}
       </tbody>
     </table>
