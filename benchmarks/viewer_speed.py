@@ -85,7 +85,7 @@ def measure(store: Path, rounds: int) -> None:
         measured("the mean of all layers", lambda _: get(f"{own}/joint/rows/mean.npy"), rounds)
         measured("every head of a layer", lambda n: get(f"{own}/joint/heads/{n % 18}.npy"), rounds)
         measured("a picture", lambda n: get(f"{own}/pictures/base_0_rgb/{n % REPLANS}.png"), 4 * rounds)
-        measured("ratio and masses", lambda _: get(f"{own}/joint/groups/all.json"), rounds)
+        measured("ratio and masses", lambda _: get(f"{own}/joint/groups/mean/mean.json"), rounds)
         measured("all heads on an object", lambda _: get(f"{own}/joint/grid/0.json"), rounds)
         with watched_page(browser) as watched:
             watched.open(f"{server.link}#episode=task000_episode000&layer=3")

@@ -9,7 +9,7 @@ runs/0/EPISODE/pictures/CAMERA/REPLAN.png   film.gif: all of them, with the atte
 runs/0/EPISODE/SITE/objects.json            which cells of the pictures objects cover
 runs/0/EPISODE/SITE/rows/LAYER.npy          rows of a layer, or of the mean of all; heads/LAYER.npy: of every head
 runs/0/EPISODE/SITE/uniform/LAYER.npy       what uniform attention gives in their place
-runs/0/EPISODE/SITE/groups/all.json         ratio and masses of the grouping `default`; groups/denoise-0.head-3.json
+runs/0/EPISODE/SITE/groups/DENOISE/HEAD.json    ratio and masses of the grouping `default`; `mean`: of all
 runs/0/EPISODE/SITE/grid/NUMBER.json        mass and lift in every head of one of the site's `targets`
 runs/0/EPISODE/SITE/grid.json?selector=     the same of a selector; keys.json?selector= has its keys
 """
@@ -26,7 +26,7 @@ from typing import Any, TypeAlias
 from vla_attention.analyze.core.action_changes import ActionSpread, units_of_recorded
 from vla_attention.analyze.core.camera_maps import seen_cameras
 from vla_attention.analyze.view.episode_answers import MEAN, ShownEpisode, npy
-from vla_attention.analyze.view.paths import RUNS
+from vla_attention.analyze.view.paths import RUNS, NothingThere
 from vla_attention.analyze.view.run_answers import KnownLines, runs_answer
 from vla_attention.analyze.view.served_stores import ServedStore
 from vla_attention.schemas.errors import BadArgument, UserError
@@ -37,10 +37,6 @@ JSON, PNG, NPY = "application/json", "image/png", "application/octet-stream"
 Content: TypeAlias = tuple[bytes, str]
 #: Episodes that stay open: what was read of one is used again for its other answers.
 _OPEN = 8
-
-
-class NoAnswer(LookupError):
-    """An address that names no answer."""
 
 
 class Answers:
@@ -58,11 +54,11 @@ class Answers:
         """The answer at an address; names: its parts.
 
         Raises:
-            NoAnswer: nothing has this address.
+            NothingThere: nothing has this address.
             UserError: what it names does not exist, or cannot be read.
         """
         if list(names) == [RUNS]:
-            return _json(runs_answer([one.store for one in stores], True, self._lines))
+            return _json(runs_answer([one.store for one in stores], self._lines, with_paths=True))
         try:
             _, number, episode, *rest = names
             served = stores[int(number)]
@@ -70,7 +66,7 @@ class Answers:
                 return _json(served.summary.document())
             shown = self._shown(served.store, episode)
         except (ValueError, IndexError):
-            raise NoAnswer from None
+            raise NothingThere from None
         match rest:
             case ["about.json"]:
                 return _json(shown.about())
@@ -85,7 +81,7 @@ class Answers:
                 return shown.picture(camera, _number(file, ".png")), PNG
             case [site, *of_site] if site in [known.name for known in shown.store.attributes.sites]:
                 return _of_site(shown, site, of_site, query)
-        raise NoAnswer
+        raise NothingThere
 
     def copied(self, served: ServedStore, name: str, heads: bool) -> Iterator[tuple[str, bytes]]:
         """All that a copy of the page has of an episode: addresses below it, and what `answer` says there.
@@ -106,7 +102,7 @@ class Answers:
             if key not in self._open:
                 episode = next((episode for episode in store.episodes if episode.name == name), None)
                 if episode is None:
-                    raise NoAnswer
+                    raise NothingThere
                 self._open[key] = ShownEpisode(store, episode)
                 while len(self._open) > _OPEN:
                     self._open.popitem(last=False)
@@ -142,10 +138,8 @@ def _addresses(shown: ShownEpisode, heads: bool) -> Iterator[str]:
             )
         yield f"{site.name}/objects.json"
         yield from (f"{site.name}/grid/{number}.json" for number in range(len(shown.targets(site.name))))
-        steps = ["", *(f"denoise-{step}" for step in axes.denoise_steps)]
-        of_heads = ["", *(f"head-{head}" for head in axes.heads if heads)]
-        for chosen in product(steps, of_heads):
-            yield f"{site.name}/groups/{'.'.join(filter(None, chosen)) or 'all'}.json"
+        for step, head in product((MEAN, *axes.denoise_steps), (MEAN, *(axes.heads if heads else ()))):
+            yield f"{site.name}/groups/{step}/{head}.json"
 
 
 def _of_site(shown: ShownEpisode, site: str, names: Sequence[str], query: Mapping[str, Sequence[str]]) -> Content:
@@ -156,8 +150,8 @@ def _of_site(shown: ShownEpisode, site: str, names: Sequence[str], query: Mappin
             return npy(shown.rows(site, file.removesuffix(".npy"), heads=kind == "heads")), NPY
         case ["uniform", file] if file.endswith(".npy"):
             return npy(shown.uniform(site, file.removesuffix(".npy"))), NPY
-        case ["groups", file] if file.endswith(".json"):
-            return _json(shown.groups(site, file.removesuffix(".json")))
+        case ["groups", denoise, file] if file.endswith(".json"):
+            return _json(shown.groups(site, denoise, file.removesuffix(".json")))
         case ["grid", file]:
             targets, number = shown.targets(site), _number(file, ".json")
             if number < len(targets):
@@ -166,7 +160,7 @@ def _of_site(shown: ShownEpisode, site: str, names: Sequence[str], query: Mappin
             return _json(shown.grid(site, _selector(query)))
         case ["keys.json"]:
             return _json(shown.keys(site, _selector(query)))
-    raise NoAnswer
+    raise NothingThere
 
 
 def error_answer(sentence: object) -> Content:
@@ -181,7 +175,7 @@ def _json(document: Any) -> Content:
 def _number(file: str, ending: str) -> int:
     stem = file.removesuffix(ending)
     if stem == file or not stem.isdecimal() or len(stem) > 9:
-        raise NoAnswer
+        raise NothingThere
     return int(stem)
 
 

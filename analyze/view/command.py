@@ -64,7 +64,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve the page until Ctrl-C, or write it."""
-    from contextlib import ExitStack
+    from contextlib import ExitStack, closing
 
     from vla_attention.analyze.view.served_stores import ServedStore
     from vla_attention.analyze.view.static_site import check_site
@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.file is not None and (len(places) > 1 or arguments.site is not None):
         raise BadArgument("--file writes one episode of one store, and nothing else; leave out the other ones.")
     with ExitStack() as stack:
-        stores = [ServedStore(open_store(place), stack.enter_context(Summary())) for place in places]
+        stores = [ServedStore(open_store(place), stack.enter_context(closing(Summary()))) for place in places]
         for store in stores:
             store.summary.begin(store.store)
         if arguments.site is None and arguments.file is None:
@@ -90,6 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _write(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None:
     import warnings
+    from dataclasses import replace
 
     from vla_attention.analyze.view.static_site import site_size, write_page_file, write_site
     from vla_attention.schemas.command_line import format_bytes
@@ -100,19 +101,18 @@ def _write(arguments: argparse.Namespace, stores: Sequence[ServedStore]) -> None
         print(f"About {about} for {sum(len(store.store.episodes) for store in stores)} episodes.", flush=True)
     for store in stores:
         if failed := store.summary.wait():
-            warnings.warn(f"Not every episode of {store.place} has numbers: {failed}", Note, stacklevel=2)
+            warnings.warn(f"Not every episode of {store.store.path} has numbers: {failed}", Note, stacklevel=2)
     if arguments.site is not None:
         print(write_site(arguments.site, stores, arguments.heads))
         return
-    numbers = {episode.name: parse_episode_name(episode.name) for episode in stores[0].store.episodes}
-    fitting = [
-        name
-        for name, (task, episode) in numbers.items()
-        if arguments.task in (None, task) and arguments.episode in (None, episode)
-    ]
-    if not fitting:
-        raise BadArgument(f"{stores[0].place} has no such episode (--task, --episode); it has {listing(numbers, 20)}.")
-    print(write_page_file(arguments.file, stores[0], fitting[0], arguments.heads))
+    first, wanted = stores[0], (arguments.task, arguments.episode)
+    episodes = {one.name: one for one in first.store.episodes}
+    for name, episode in episodes.items():
+        if all(given in (None, own) for given, own in zip(wanted, parse_episode_name(name), strict=True)):
+            only = replace(first, store=replace(first.store, episodes=(episode,)))
+            print(write_page_file(arguments.file, only, arguments.heads))
+            return
+    raise BadArgument(f"{first.store.path} has no such episode (--task, --episode); it has {listing(episodes, 20)}.")
 
 
 def _notes(stores: Sequence[Store]) -> tuple[str, ...]:

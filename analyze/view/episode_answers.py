@@ -10,7 +10,7 @@ import math
 import re
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -58,30 +58,21 @@ class ShownEpisode:
 
     store: Store
     episode: StoredEpisode
-
-    @cached_property
-    def questions(self) -> dict[AnalysisSettings, Question]:
-        """The questions about the episode that were asked last."""
-        return {}
-
-    @cached_property
-    def mean_rows(self) -> dict[str, Array]:
-        """The rows of the mean of all layers by site, for which every layer is read."""
-        return {}
-
-    @cached_property
-    def covered_cells(self) -> dict[str, dict[str, Any]]:
-        """What `covered` gave by site: heads and pictures ask for it, too."""
-        return {}
+    #: The questions about the episode that were asked last.
+    _questions: dict[AnalysisSettings, Question] = field(default_factory=dict)
+    #: By site the rows of the mean of all layers, for which every layer is read.
+    _mean_rows: dict[str, Array] = field(default_factory=dict)
+    #: By site what `covered` gave: heads and pictures ask for it, too.
+    _covered: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def question(self, site: str, **settings: Any) -> Question:
         """A question about this episode alone, as the commands ask it."""
         asked = AnalysisSettings(site=site, **settings)
-        if asked not in self.questions:
-            if len(self.questions) > 50:
-                self.questions.clear()
-            self.questions[asked] = ask([replace(self.store, episodes=(self.episode,))], asked)
-        return self.questions[asked]
+        if asked not in self._questions:
+            if len(self._questions) > 50:
+                self._questions.clear()
+            self._questions[asked] = ask([replace(self.store, episodes=(self.episode,))], asked)
+        return self._questions[asked]
 
     def item(self, site: str) -> SelectedEpisode:
         """The episode with the tokens of a site."""
@@ -135,8 +126,8 @@ class ShownEpisode:
                 for goal in steps.goals
                 if goal.first_held
             ]
-            closes = _closings(self.episode.read(EXECUTED)[:, GRIPPER])
-            found += [(at, "gripper", "gripper closes", "") for at in closes]
+            executed = self.episode.read(EXECUTED)
+            found += [(at, "gripper", "gripper closes", "") for at in _closings(executed[:, GRIPPER])]
         ends = {True: "solved", False: "not solved", None: "end"}[outcome]
         found = [*sorted(found), (attributes.num_steps, "end", ends, "")]
         replans = np.searchsorted(starts, [max(at - 1, 0) for at, *_ in found], side="right") - 1
@@ -203,8 +194,8 @@ class ShownEpisode:
 
     def covered(self, site: str) -> dict[str, Any]:
         """`objects.json`: camera -> object -> at each replan the cells of the map that it covers."""
-        if site in self.covered_cells:
-            return self.covered_cells[site]
+        if site in self._covered:
+            return self._covered[site]
         item = self.item(site)
         found = {}
         for camera, coverage in (item.tokens.coverage or {}).items():
@@ -216,7 +207,7 @@ class ShownEpisode:
                 if thing.kind == "object"
             }
             found[camera] = {name: of_replans for name, of_replans in shown.items() if any(of_replans)}
-        self.covered_cells[site] = found
+        self._covered[site] = found
         return found
 
     def rows(self, site: str, layer: str, heads: bool = False) -> Array:
@@ -224,8 +215,8 @@ class ShownEpisode:
 
         heads: each head's, (replan, denoise, head, key).
         """
-        if layer == MEAN and not heads and site in self.mean_rows:
-            return self.mean_rows[site]
+        if layer == MEAN and not heads and site in self._mean_rows:
+            return self._mean_rows[site]
         selection = replace(self._selection(site, layer), per_head=heads)
         parts: list[Array] = [np.zeros(())] * len(selection.denoise)
         for part in layer_rows(self.store.attributes, self.episode, selection, site):
@@ -235,14 +226,13 @@ class ShownEpisode:
         if heads:
             return rows
         if layer == MEAN:
-            self.mean_rows[site] = rows[:, :, 0]
+            self._mean_rows[site] = rows[:, :, 0]
         return rows[:, :, 0]
 
     def uniform(self, site: str, layer: str) -> Array:
         """What uniform attention gives in the place of `rows`, (replan or 1, denoise or 1, key)."""
         selection = self._selection(site, layer)
-        uniform = uniform_keys(self.item(site), selection)[:, :, :, 0]
-        return mean_of_layers(uniform, selection)
+        return mean_of_layers(uniform_keys(self.item(site), selection)[:, :, :, 0], selection)
 
     def _selection(self, site: str, layer: str) -> Selection:
         root = self.store.attributes
@@ -252,12 +242,15 @@ class ShownEpisode:
             raise BadArgument(f"There is no layer '{layer}'; expected its number, or {MEAN}.")
         return select(root, [int(layer)], site=site)
 
-    def groups(self, site: str, name: str) -> dict[str, Any]:
-        """`groups/NAME.json`: the numbers of `vla-attention analyze`, by replan and layer, the mean of all layers last.
+    def groups(self, site: str, denoise: str, head: str) -> dict[str, Any]:
+        """`groups/DENOISE/HEAD.json`: the numbers of `vla-attention analyze`, by replan and layer.
 
-        name: `all`, or a denoise step, a head or both, as in `denoise-0.head-3`.
+        The last layer is the mean of all; so is that of denoise steps and heads.
         """
-        question = self.question(site, **_chosen(name))
+        if head != MEAN and not head.isdecimal():
+            raise BadArgument(f"There is no head '{head}'; expected its number, or {MEAN}.")
+        steps, heads = (None if one == MEAN else (one,) for one in (denoise, head))
+        question = self.question(site, denoise=steps, heads=heads and (int(head),))
         levels = levels_of(question)
         replans = levels.replans().collect()
         groups = levels.groups("replan", "layer").collect()
@@ -326,24 +319,18 @@ class ShownEpisode:
         found = recorded_effects(self.question(self._site_names[0]), spread=units)
         if found is None:
             return None
-        rows = found.rows().collect()
-        of_episode = {row["condition"]: row for row in found.episodes().iter_rows(named=True)}
+        rows, replans = found.rows().collect(), range(self.episode.attributes.num_replans)
         stored = self.episode.attributes.effects
         assert stored is not None
         numbers = {visible(condition.name): i for i, condition in enumerate(stored.conditions)}
         items = []
-        for names, part in rows.group_by(*NAMES, maintain_order=True):
-            named = dict(zip(NAMES, names, strict=True))
-            by_replan: list[float | None] = [None] * self.episode.attributes.num_replans
-            for replan, effect in part.select("replan", "effect").iter_rows():
-                by_replan[replan] = effect
-            mean = of_episode[named["condition"]]
+        for mean in found.episodes().iter_rows(named=True):
+            effects = dict(rows.filter(condition=mean["condition"]).select("replan", "effect").iter_rows())
             items.append(
-                named
-                | {"number": numbers[named["condition"]], "effect": by_replan, "mean": mean["effect"]}
-                | {name: mean[name] for name in ("noise", "lift", "keys")}
+                {name: mean[name] for name in (*NAMES, "noise", "lift")}
+                | {"number": numbers[mean["condition"]], "mean": mean["effect"], "effect": [*map(effects.get, replans)]}
             )
-        return {"items": items, "notes": list(found.notes), "used": units.used.tolist()}
+        return {"items": items, "notes": list(found.notes)}
 
     @property
     def drawn_effects(self) -> list[int]:
@@ -358,8 +345,8 @@ class ShownEpisode:
         changed = np.full_like(actions, np.nan)
         if effects is None or not 0 <= number < len(effects.conditions) or not self.episode.has(CHANGE):
             raise BadArgument(f"There is no effect {number} in episode {self.episode.name}.")
-        entries = [i for i, condition in enumerate(effects.condition) if condition == number]
-        replans = [effects.replan[i] for i in entries]
+        entries = np.array(effects.condition) == number
+        replans = np.array(effects.replan)[entries]
         change = self.episode.read(CHANGE)[entries].astype(np.float64) * np.array(effects.units)
         changed[replans] = actions[replans] + change
         return changed
@@ -367,20 +354,7 @@ class ShownEpisode:
 
 def _quoted(name: str) -> str:
     """A name as selectors have it; names that need quotes have one kind of them at most (`check_name`)."""
-    if re.fullmatch(r"\w+", name):
-        return name
     return f"'{name}'" if '"' in name else f'"{name}"'
-
-
-def _chosen(name: str) -> dict[str, Any]:
-    """`denoise-0.head-3` as settings of a question."""
-    if name == "all":
-        return {}
-    parts = dict(part.partition("-")[::2] for part in name.split("."))
-    if not set(parts) <= {"denoise", "head"} or not all(value.isdecimal() for value in parts.values()):
-        raise BadArgument(f"There are no groups of '{name}'; expected all, or as in denoise-0.head-3.")
-    denoise = {"denoise": (parts["denoise"],)} if "denoise" in parts else {}
-    return denoise | ({"heads": (int(parts["head"]),)} if "head" in parts else {})
 
 
 def _camera(item: SelectedEpisode, camera: str) -> dict[str, Any]:
@@ -391,8 +365,8 @@ def _camera(item: SelectedEpisode, camera: str) -> dict[str, Any]:
     """
     picture, view = PictureMap.of(item.tokens.layout, camera), view_of(item, camera)
     maps = upright(np.moveaxis(picture.spread(np.eye(len(picture.keys))), 0, -1), view)  # (row, column, patch)
-    cells, patches = np.nonzero(maps.reshape(-1, len(picture.keys)))
-    shares = maps.reshape(-1, len(picture.keys))[cells, patches]
+    maps = maps.reshape(-1, len(picture.keys))
+    cells, patches = np.nonzero(maps)
     return {
         "rows": picture.rows,
         "columns": picture.columns,
@@ -400,7 +374,7 @@ def _camera(item: SelectedEpisode, camera: str) -> dict[str, Any]:
         "width": picture.grids[0].image_width,
         "keys": picture.keys[patches].tolist(),
         "cells": cells.tolist(),
-        "shares": None if picture.cells_are_patches else shares.tolist(),
+        "shares": None if picture.cells_are_patches else maps[cells, patches].tolist(),
         "upright": view.upright,
         "mirrored": view.mirrored,
         "stored": item.episode.has(f"frames/{camera}"),
@@ -418,11 +392,10 @@ def _closings(commands: Array) -> list[int]:
     ]
 
 
-def _by_layer(frame: pl.DataFrame, column: str, layers: Sequence[str]) -> list[list[float | None]]:
+def _by_layer(frame: pl.DataFrame, column: str, layers: Sequence[str]) -> Any:
     """A column of a table of replans and layers as (replan, layer), null where there is no number."""
     values = frame.select(pl.col(column).cast(pl.Float64)).to_series().to_numpy().reshape(-1, len(layers))
-    found: list[list[float | None]] = _numbers(values, exact=True)
-    return found
+    return _numbers(values, exact=True)
 
 
 def _numbers(values: Array, exact: bool = False) -> Any:

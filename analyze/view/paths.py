@@ -1,11 +1,11 @@
-"""What a request may name: the page's own files, and answers. No I/O here."""
+"""What a request may name: the page's own files, and answers, see `answers`. No I/O here."""
 
 from __future__ import annotations
 
 import hmac
 import re
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
 from urllib.parse import parse_qs, unquote_to_bytes
 
 from vla_attention.schemas.errors import BadArgument
@@ -18,32 +18,20 @@ PAGE_FILES = {
     "main.css": "text/css; charset=utf-8",
     "licenses.txt": "text/plain; charset=utf-8",
 }
+BUNDLE = files("vla_attention.analyze.view") / "bundle"
 #: What the page asks for first.
 RUNS = "runs.json"
-_LOOPBACK = frozenset({"127.0.0.1", "localhost", "[::1]"})
+#: A site elsewhere can let its own name mean 127.0.0.1 (DNS rebinding); the browser then sends that name.
+LOOPBACK_NAMES = frozenset({"127.0.0.1", "localhost", "[::1]"})
 _HOST = re.compile(r"([0-9a-z_](?:[0-9a-z_.-]{0,252})|\[[0-9a-f:.]{2,45}\])(?::[0-9]{1,5})?")
 
 
 class NothingThere(LookupError):
-    """A path that names nothing that is served."""
+    """An address that names nothing that is served."""
 
 
 class WrongToken(PermissionError):
     """A path that does not begin with the secret part of the link."""
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """What a request names.
-
-    Attributes:
-        page: a file of the page.
-        answer: the parts of an answer's address, see `answers`; query: what is asked there.
-    """
-
-    page: str = ""
-    answer: tuple[str, ...] = ()
-    query: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
 
 def name_of_host(host: str) -> str | None:
@@ -52,17 +40,10 @@ def name_of_host(host: str) -> str | None:
     return match and match[1]
 
 
-def is_allowed(host: str, allowed: Collection[str] = ()) -> bool:
-    """Whether the host that a request names is this machine's loopback, or one of the allowed (`name_of_host`).
+def wanted(target: str, token: str) -> tuple[list[str], Mapping[str, Sequence[str]]]:
+    """The parts of an address, and what is asked there, of a request's target (`/TOKEN/PATH?QUERY`).
 
-    A site elsewhere can let its own name mean 127.0.0.1 (DNS rebinding); the browser then sends that name.
-    """
-    name = name_of_host(host)
-    return name is not None and (name in _LOOPBACK or name in allowed)
-
-
-def wanted(target: str, token: str) -> Wanted:
-    """What the target of a request (`/TOKEN/PATH`) names; a proxy may have a path of its own before the token.
+    A proxy may have a path of its own before the token.
 
     Every part of the path is decoded once, and by itself: a slash, a backslash or a control character that appears then
     is refused, as is `..`.
@@ -81,14 +62,10 @@ def wanted(target: str, token: str) -> Wanted:
         raise WrongToken
     if not parts:  # the link without its last slash; relative addresses of the page would miss the token
         raise NothingThere
-    if parts == [""]:
-        return Wanted(page="index.html")
-    names = [_decoded(part) for part in parts]
-    if len(names) == 1 and names[0] in PAGE_FILES:
-        return Wanted(page=names[0])
-    if names[0] not in ("runs", RUNS):
+    names = ["index.html"] if parts == [""] else [_decoded(part) for part in parts]
+    if names[0] not in ("runs", RUNS) and (len(names) > 1 or names[0] not in PAGE_FILES):
         raise NothingThere
-    return Wanted(answer=tuple(names), query=parse_qs(asked, keep_blank_values=True))
+    return names, parse_qs(asked, keep_blank_values=True)
 
 
 def _decoded(part: str) -> str:

@@ -14,19 +14,18 @@ from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 from vla_attention.schemas.stores.store_format import parse_episode_name
 
-#: Lines of episodes by their store's place and run, and their name.
-KnownLines: TypeAlias = dict[tuple[str, str, str], dict[str, Any]]
+#: Lines of episodes by their store's place and run, and by their name.
+KnownLines: TypeAlias = dict[tuple[str, str], dict[str, dict[str, Any]]]
 
 
-def runs_answer(stores: Sequence[Store], with_paths: bool = False, known: KnownLines | None = None) -> dict[str, Any]:
+def runs_answer(stores: Sequence[Store], known: KnownLines, with_paths: bool = False) -> dict[str, Any]:
     """`runs.json`: the runs of the page, each with a line for every episode.
 
     Args:
         stores: of the runs.
+        known: lines that are not made again where the episode could be read; new ones are added.
         with_paths: also where the stores are on this machine, for commands to copy; sites of others do not say it.
-        known: lines of episodes that could be read, which are not made again; new ones are added.
     """
-    known = {} if known is None else known
     counts = Counter(store.path.name for store in stores)
     return {
         "runs": [
@@ -39,12 +38,9 @@ def runs_answer(stores: Sequence[Store], with_paths: bool = False, known: KnownL
 
 
 def _run_answer(store: Store, known: KnownLines) -> dict[str, Any]:
-    root, place = store.attributes, (str(store.path), store.run)
-    lines = {name: known[*place, name] for name in (one.name for one in store.episodes) if (*place, name) in known}
-    for episode in read_one_by_one(one for one in store.episodes if one.name not in lines):
+    root, lines = store.attributes, known.setdefault((str(store.path), store.run), {})
+    for episode in read_one_by_one(one for one in store.episodes if "failed" in lines.get(one.name, {"failed"})):
         lines[episode.name] = episode_line(store, episode)
-        if "failed" not in lines[episode.name]:
-            known[*place, episode.name] = lines[episode.name]
     return {
         "policy": visible(root.policy.name),
         "suite": root.protocol.suite,

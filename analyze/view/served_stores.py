@@ -10,7 +10,6 @@ from vla_attention.analyze.view.summaries import Summary
 from vla_attention.schemas.stores.reader import Store, open_store
 from vla_attention.schemas.stores.root import episode_folders
 from vla_attention.schemas.stores.store_format import StoreError
-from vla_attention.schemas.stores.store_url import StorePlace
 
 
 @dataclass
@@ -26,21 +25,17 @@ class ServedStore:
     summary: Summary
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
-    @property
-    def place(self) -> StorePlace:
-        """Where it is."""
-        return self.store.path
-
     def refresh(self) -> None:
         """List the episodes of a store of this machine anew: a capture may add some while the page is open."""
-        if not isinstance(self.place, Path):
+        place = self.store.path
+        if not isinstance(place, Path):
             return
         with self._lock:
             try:
-                names = {folder.name for folder in episode_folders(self.place)}
+                names = {folder.name for folder in episode_folders(place)}
                 if names == {one.name for one in self.store.episodes}:
                     return
-                self.store = open_store(self.place)
+                self.store = open_store(place)
             except StoreError:  # moved away, or being replaced; the page says so when it reads
                 return
             self.summary.begin(self.store)

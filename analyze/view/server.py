@@ -11,16 +11,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from importlib.resources import files
 
-from vla_attention.analyze.view.answers import Answers, NoAnswer, error_answer
+from vla_attention.analyze.view.answers import Answers, error_answer
 from vla_attention.analyze.view.kept_token import kept_token, new_token
 from vla_attention.analyze.view.paths import (
+    BUNDLE,
+    LOOPBACK_NAMES,
     PAGE_FILES,
     RUNS,
     NothingThere,
     WrongToken,
-    is_allowed,
     name_of_host,
     wanted,
 )
@@ -42,6 +42,10 @@ _HEADERS = {
     # A store may be captured anew under its name, and the link be used by the next server on this port.
     "Cache-Control": "no-store",
 }
+_OTHER_HOST = (
+    "The page of vla-attention view is asked for as {0}, a host that it does not know. If that is the proxy through "
+    "which you reach this machine (JupyterHub, Open OnDemand), start it again with --allow-host {0}."
+)
 #: Seconds after which a connection on which nothing is said is closed.
 _SILENT_S = 60
 
@@ -54,9 +58,6 @@ class Answer:
     content: bytes
     kind: str = "text/plain; charset=utf-8"
     headers: Mapping[str, str] = field(default_factory=dict)
-
-
-_NOTHING = Answer(HTTPStatus.NOT_FOUND, b"There is nothing here.\n")
 
 
 class ViewerServer(ThreadingHTTPServer):
@@ -80,10 +81,9 @@ class ViewerServer(ThreadingHTTPServer):
     ) -> None:
         if not 0 <= port < 2**16:
             raise BadArgument(f"Cannot use --port {port}; expected a number from 1 to 65535, or 0 for any free port.")
-        self.allowed = frozenset(map(_allowed_host, allow_hosts))
+        self.allowed = LOOPBACK_NAMES.union(map(_allowed_host, allow_hosts))
         self.stores = tuple(stores)
-        folder = files("vla_attention.analyze.view") / "bundle"
-        self.page = {name: (folder / name).read_bytes() for name in PAGE_FILES}
+        self.page = {name: (BUNDLE / name).read_bytes() for name in PAGE_FILES}
         self._answers = Answers()
         try:
             super().__init__((LOOPBACK, port), _Handler)
@@ -91,8 +91,7 @@ class ViewerServer(ThreadingHTTPServer):
             reason = error.strerror or error
             raise BadArgument(f"Cannot use --port {port}: {reason}. Leave it out for any free port.") from None
         # Only who has the port writes its token.
-        places = [store.place for store in self.stores]
-        kept = kept_token(places, self.port) if keep_link else None
+        kept = kept_token([one.store.path for one in self.stores], self.port) if keep_link else None
         self.keeps_link = kept is not None
         self.token = kept or new_token()
 
@@ -112,25 +111,22 @@ class ViewerServer(ThreadingHTTPServer):
     def answer(self, target: str) -> Answer:
         """The answer to a request that was let in: `target` as it stands in the request."""
         try:
-            asked = wanted(target, self.token)
+            names, query = wanted(target, self.token)
+            if names[0] in self.page:
+                return Answer(200, self.page[names[0]], PAGE_FILES[names[0]])
+            if names == [RUNS]:
+                for store in self.stores:
+                    store.refresh()
+            return Answer(200, *self._answers.answer(self.stores, names, query))
         except WrongToken:
             return Answer(403, b"This is the page of vla-attention view: open the whole link that it printed.\n")
         except NothingThere:
-            return _NOTHING
-        if asked.page:
-            return Answer(200, self.page[asked.page], PAGE_FILES[asked.page])
-        if asked.answer == (RUNS,):
-            for store in self.stores:
-                store.refresh()
-        try:
-            return Answer(200, *self._answers.answer(self.stores, asked.answer, asked.query))
-        except NoAnswer:
-            return _NOTHING
+            return Answer(HTTPStatus.NOT_FOUND, b"There is nothing here.\n")
         except RemoteFailure as error:
             return Answer(HTTPStatus.BAD_GATEWAY, *error_answer(error))
         except UserError as error:
             # A browser logs every other status as an error; a wrong selector is the user's, and the page says it.
-            return Answer(HTTPStatus.OK if asked.query else HTTPStatus.UNPROCESSABLE_ENTITY, *error_answer(error))
+            return Answer(HTTPStatus.OK if query else HTTPStatus.UNPROCESSABLE_ENTITY, *error_answer(error))
         except OSError as error:  # the store was moved, or changes
             return Answer(HTTPStatus.UNPROCESSABLE_ENTITY, *error_answer(error.strerror or error))
 
@@ -145,13 +141,6 @@ def _allowed_host(given: str) -> str:
     return name
 
 
-def _other_host(name: str) -> str:
-    return (
-        f"The page of vla-attention view is asked for as {name}, a host that it does not know. If that is the proxy "
-        f"through which you reach this machine (JupyterHub, Open OnDemand), start it again with --allow-host {name}."
-    )
-
-
 class _Handler(BaseHTTPRequestHandler):
     """One connection."""
 
@@ -162,29 +151,23 @@ class _Handler(BaseHTTPRequestHandler):
     disable_nagle_algorithm = True
 
     def do_GET(self) -> None:
-        """Answer with the bytes."""
-        self._answer()
-
-    def do_HEAD(self) -> None:
-        """Answer without the bytes."""
-        self._answer()
-
-    def _answer(self) -> None:
+        """Answer, with the bytes unless it is HEAD that asks."""
         hosts = self.headers.get_all("Host", [])
-        if len(hosts) != 1 or not is_allowed(hosts[0].strip(), self.server.allowed):
-            name = name_of_host(hosts[0].strip()) if len(hosts) == 1 else None
-            self.send_error(403, name and _other_host(name))
+        name = name_of_host(hosts[0].strip()) if len(hosts) == 1 else None
+        if name not in self.server.allowed:
+            self.send_error(403, name and _OTHER_HOST.format(name))
             return
         if "Content-Length" in self.headers or "Transfer-Encoding" in self.headers:
             self.send_error(400)
             return
         self._send(self.server.answer(self.path))
 
+    do_HEAD = do_GET
+
     def _send(self, answer: Answer) -> None:
         self.send_response_only(answer.status)
-        length = str(len(answer.content))
-        headers = {"Content-Type": answer.kind, "Content-Length": length, **_HEADERS, **answer.headers}
-        for name, value in headers.items():
+        own = {"Content-Type": answer.kind, "Content-Length": str(len(answer.content))}
+        for name, value in {**own, **_HEADERS, **answer.headers}.items():
             self.send_header(name, value)
         if self.close_connection:
             self.send_header("Connection", "close")

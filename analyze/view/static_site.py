@@ -9,13 +9,12 @@ import json
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from vla_attention.analyze.render.files import write_text, writing
 from vla_attention.analyze.view.answers import Answers
-from vla_attention.analyze.view.paths import PAGE_FILES, RUNS
+from vla_attention.analyze.view.paths import BUNDLE, PAGE_FILES, RUNS
 from vla_attention.analyze.view.run_answers import runs_answer
 from vla_attention.analyze.view.served_stores import ServedStore
 from vla_attention.schemas.command_line import format_bytes
@@ -56,42 +55,30 @@ def site_size(stores: Sequence[ServedStore], heads: bool) -> int:
 
 
 def write_site(folder: Path, stores: Sequence[ServedStore], heads: bool) -> str:
-    """Write the page and all answers, compressed; the summaries are complete. Returns what was written, in words."""
-    page = files("vla_attention.analyze.view") / "bundle"
-    runs = _runs(stores, heads)
-    places = [(number, store, episode.name) for number, store in enumerate(stores) for episode in store.store.episodes]
+    """Write the page and all answers; returns what was written, in words."""
     size = 0
-    with _replaced(folder) as new, progress_bar(len(places), "episodes") as advance:
+    with _replaced(folder) as new:
         for name in PAGE_FILES:
-            write_text(new / name, (page / name).read_text(encoding="utf-8"))
-        for number, store in enumerate(stores):
-            size += _write(
-                new / f"runs/{number}/numbers.json.gz", _packed(json.dumps(store.summary.document()).encode())
-            )
-        answers = Answers()
-        for number, store, episode in places:
-            for path, content in _compressed(answers.copied(store, episode, heads)):
-                size += _write(new / f"runs/{number}/{episode}/{path}", content)
-            advance(1)
-        write_text(new / RUNS, json.dumps(runs) + "\n")
+            write_text(new / name, (BUNDLE / name).read_text(encoding="utf-8"))
+        for path, content in _contents(stores, heads):
+            (new / path).parent.mkdir(parents=True, exist_ok=True)
+            size += (new / path).write_bytes(content)
+        write_text(new / RUNS, json.dumps(_runs(stores, heads)) + "\n")
     return (
         f"{folder}: {format_bytes(size)}, a page for any web server, for instance `python -m http.server -d {folder}`."
     )
 
 
-def write_page_file(path: Path, store: ServedStore, episode: str, heads: bool) -> str:
-    """Write one episode as one HTML file; returns what was written, in words."""
-    page = files("vla_attention.analyze.view") / "bundle"
-    runs = _runs([store], heads)
-    runs["runs"][0]["episodes"] = [line for line in runs["runs"][0]["episodes"] if line["name"] == episode]
-    content = {
-        "runs.json": json.dumps(runs).encode(),
-        "runs/0/numbers.json": json.dumps(store.summary.document()).encode(),
+def write_page_file(path: Path, store: ServedStore, heads: bool) -> str:
+    """Write a store of one episode as one HTML file; returns what was written, in words."""
+    runs = _packed(json.dumps(_runs([store], heads)).encode())
+    within = {
+        address.removesuffix(".gz"): base64.b64encode(content).decode()
+        for address, content in ((RUNS, runs), *_contents([store], heads))
     }
-    within = {name: base64.b64encode(_packed(one)).decode() for name, one in content.items()}
-    for address, one in _compressed(Answers().copied(store, episode, heads)):
-        within[f"runs/0/{episode}/{address.removesuffix('.gz')}"] = base64.b64encode(one).decode()
-    script, style = ((page / name).read_text(encoding="utf-8") for name in ("main.js", "main.css"))
+    index, script, style = (
+        (BUNDLE / name).read_text(encoding="utf-8") for name in ("index.html", "main.js", "main.css")
+    )
     script = script.replace("</script", "<\\/script")
     hashes = {
         name: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
@@ -106,13 +93,11 @@ def write_page_file(path: Path, store: ServedStore, episode: str, heads: bool) -
         "</body>": f'<script type="application/json" id="answers">{data}</script>\n'
         f'<script type="module">{script}</script>\n</body>',
     }
-    text = (page / "index.html").read_text(encoding="utf-8")
     for mark, part in parts.items():
-        before, _, after = text.partition(mark)
-        text = f"{before}{part}{after}"
+        index = index.replace(mark, part, 1)
     with writing("page", path, instead="another --file"):
-        write_text(path, text)
-    return f"{path}: {format_bytes(len(text.encode()))}, opens in a browser from disk."
+        write_text(path, index)
+    return f"{path}: {format_bytes(len(index.encode()))}, opens in a browser from disk."
 
 
 @contextmanager
@@ -133,7 +118,19 @@ def _replaced(folder: Path) -> Iterator[Path]:
 
 
 def _runs(stores: Sequence[ServedStore], heads: bool) -> dict[str, Any]:
-    return runs_answer([store.store for store in stores]) | {"copy": {"heads": heads}}
+    return runs_answer([store.store for store in stores], {}) | {"copy": {"heads": heads}}
+
+
+def _contents(stores: Sequence[ServedStore], heads: bool) -> Iterator[tuple[str, bytes]]:
+    """All answers but the first by their addresses, compressed; the summaries are complete."""
+    answers = Answers()
+    with progress_bar(sum(len(store.store.episodes) for store in stores), "episodes") as advance:
+        for number, store in enumerate(stores):
+            yield f"runs/{number}/numbers.json.gz", _packed(json.dumps(store.summary.document()).encode())
+            for episode in store.store.episodes:
+                for path, content in _compressed(answers.copied(store, episode.name, heads)):
+                    yield f"runs/{number}/{episode.name}/{path}", content
+                advance(1)
 
 
 def _packed(content: bytes) -> bytes:
@@ -143,8 +140,3 @@ def _packed(content: bytes) -> bytes:
 def _compressed(answers: Iterator[tuple[str, bytes]]) -> Iterator[tuple[str, bytes]]:
     for path, content in answers:
         yield (path, content) if path.endswith(".png") else (f"{path}.gz", _packed(content))
-
-
-def _write(path: Path, content: bytes) -> int:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path.write_bytes(content)

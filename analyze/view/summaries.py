@@ -21,13 +21,8 @@ from vla_attention.schemas.stores.reader import Store
 _MODULE = "vla_attention.analyze.view.summary_process"
 
 
-def empty_row(name: str) -> dict[str, Any]:
-    """The entry of an episode that was not measured yet."""
-    return {"name": name, "ratio": None, "lift": None}
-
-
 class Summary:
-    """The summary of one store, as far as it is computed. A context manager: at its end the process has ended."""
+    """The summary of one store, as far as it is computed; `close` ends the process that computes it."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -37,18 +32,12 @@ class Summary:
         self._process: subprocess.Popen[str] | None = None
         self._reader: threading.Thread | None = None
 
-    def __enter__(self) -> Summary:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end()
-
     def begin(self, store: Store) -> None:
         """Compute the summary of a store's episodes in the background; of another state of it, if one is under way."""
-        self._end()
+        self.close()
         with self._lock:
-            names = [episode.name for episode in store.episodes]
-            self._rows = {name: self._rows.get(name) or empty_row(name) for name in names}
+            empty = {one.name: {"name": one.name, "ratio": None, "lift": None} for one in store.episodes}
+            self._rows = {name: self._rows.get(name, row) for name, row in empty.items()}
             self._complete = False
             self._about["failed"] = None
         # The module is found as this process found it.
@@ -60,7 +49,6 @@ class Summary:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 stdin=subprocess.DEVNULL,
-                text=True,
                 encoding="utf-8",
                 env=variables,
                 start_new_session=True,  # Ctrl-C is for the server, which then ends this process
@@ -80,9 +68,8 @@ class Summary:
         """Wait until everything is computed; returns why an episode has no numbers, None where all of them have."""
         if self._reader is not None:
             self._reader.join()
-        with self._lock:
-            failed: str | None = self._about["failed"]
-            return failed
+        failed: str | None = self.document()["failed"]
+        return failed
 
     def _read(self, process: subprocess.Popen[str]) -> None:
         assert process.stdout is not None
@@ -107,7 +94,8 @@ class Summary:
             self._about["failed"] = self._about["failed"] or visible(sentence)
             self._complete = True
 
-    def _end(self) -> None:
+    def close(self) -> None:
+        """End the process."""
         process, self._process = self._process, None
         if process is not None:
             with suppress(OSError):

@@ -50,23 +50,22 @@ def main(place: str) -> int:
 def summary_parts(store: Store) -> Iterator[dict[str, Any]]:
     """The summary of a store in parts: entries of episodes with their numbers, then what is said of all.
 
-    An episode that cannot be read, or whose ratio is not defined, has no numbers; the first such sentence is `failed`.
+    An episode that cannot be read, or whose ratio is not defined, has no numbers, and `failed` is why.
     """
-    failed = None
-    batches = [store.episodes[at : at + _AT_ONCE] for at in range(0, len(store.episodes), _AT_ONCE)]
-    for batch in batches:
-        try:
-            yield _measured(store, batch)
-            continue
-        except UserError:
-            pass
-        for episode in batch:  # one of them is the reason
-            try:
-                yield _measured(store, [episode])
-            except UserError as error:
-                failed = failed or str(error)
-                yield {"failed": failed}
+    for at in range(0, len(store.episodes), _AT_ONCE):
+        yield from _entries(store, store.episodes[at : at + _AT_ONCE])
     yield _findings(store)
+
+
+def _entries(store: Store, batch: Sequence[StoredEpisode]) -> Iterator[dict[str, Any]]:
+    try:
+        yield _measured(store, batch)
+    except UserError as error:
+        if len(batch) == 1:
+            yield {"failed": str(error)}
+        else:  # one of them is the reason
+            for episode in batch:
+                yield from _entries(store, [episode])
 
 
 def _findings(store: Store) -> dict[str, Any]:

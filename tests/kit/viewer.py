@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from vla_attention.schemas.stores.reader import open_store
 def served(*places: str | Path, summaries: bool = False, allow_hosts: Sequence[str] = ()) -> Iterator[ViewerServer]:
     """Serve stores until the end of the block; summaries: compute them, too. allow_hosts: as `--allow-host`."""
     with ExitStack() as stack:
-        stores = [ServedStore(open_store(place), stack.enter_context(Summary())) for place in places]
+        stores = [ServedStore(open_store(place), stack.enter_context(closing(Summary()))) for place in places]
         for store in stores if summaries else ():
             store.summary.begin(store.store)
         server = stack.enter_context(ViewerServer(stores, allow_hosts=allow_hosts))

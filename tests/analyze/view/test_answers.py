@@ -77,7 +77,7 @@ def numbers(values: Any) -> np.ndarray:
 def test_ratios_and_masses(server, places, name, site, asked):
     run = va.open(places[name])
     last = run.attributes.recording.denoise_steps[-1]
-    given = read(server, name, f"{site}/groups/{f'denoise-{last}.head-0' if asked else 'all'}.json")
+    given = read(server, name, f"{site}/groups/{f'{last}/0' if asked else 'mean/mean'}.json")
     result = run.analyze(site=site, grouping="default", **asked)
     about = read(server, name, "about.json")
     episode = {"task_id": about["task"], "episode_index": about["episode"]}
@@ -95,7 +95,7 @@ def test_ratios_and_masses(server, places, name, site, asked):
 @pytest.mark.parametrize(("name", "site"), SITES)
 def test_sums_of_rows_are_the_masses(server, name, site):
     about = read(server, name, "about.json")
-    groups = read(server, name, f"{site}/groups/all.json")
+    groups = read(server, name, f"{site}/groups/mean/mean.json")
     camera_keys = [key for camera in about["sites"][site]["cameras"].values() for key in camera["keys"]]
     for at, layer in enumerate(groups["layers"]):
         rows, heads = (read(server, name, f"{site}/{kind}/{layer}.npy") for kind in ("rows", "heads"))
@@ -191,7 +191,7 @@ def test_effects_are_those_of_the_command(server, places):
 
 def test_a_copy_has_the_actions_of_all_that_is_taken_away_or_exchanged(server, places):
     given = read(server, "effects", "effects.json")["items"]
-    (effects,) = [one for one in server.stores if one.place == places["effects"]]
+    (effects,) = [one for one in server.stores if one.store.path == places["effects"]]
     copied = {address for address, _ in Answers().copied(effects, "task000_episode000", heads=False)}
     numbers = {one["number"] for one in given if one["kind"] in ("without", "prompt", "image")}
     assert numbers

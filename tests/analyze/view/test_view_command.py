@@ -82,7 +82,7 @@ def test_a_site_has_the_servers_answers(store, tmp_path, capsys, heads):
     assert str(store).encode() not in b"".join(answers.values())
     assert copy == live | {"copy": {"heads": heads}}
     kinds = {re.sub(r"\d+|mean", "N", address.split("/", 3)[-1]) for address in answers}
-    assert {"about.json", "joint/rows/N.npy", "joint/groups/denoise-N.json", "joint/grid/N.json"} <= kinds
+    assert {"about.json", "joint/rows/N.npy", "joint/groups/N/N.json", "joint/grid/N.json"} <= kinds
     assert ("joint/heads/N.npy" in kinds) == heads
     assert not any(path.is_symlink() for path in folder.rglob("*"))
 
@@ -112,7 +112,7 @@ def test_one_episode_is_one_file(store, tmp_path, capsys):
     (entry,) = json.loads(within["runs.json"])["runs"]
     assert [line["name"] for line in entry["episodes"]] == ["task001_episode001"]
     with served(store) as running:
-        for name in ("about.json", "joint/rows/mean.npy", "joint/groups/all.json"):
+        for name in ("about.json", "joint/rows/mean.npy", "joint/groups/mean/mean.json"):
             address = f"runs/0/task001_episode001/{name}"
             assert within[address] == ask(running, address).body
     assert main(["view", str(store), "--file", str(path), "--task", "7"]) == 2

@@ -174,10 +174,7 @@ function sceneOf(ofRun: ReadonlySignal<number>, name: ReadonlySignal<string>): S
   const rows = answered<NumberArray>(() => arrayAt(ofSite(`${head.value === "mean" ? "rows" : "heads"}/${layer.value}.npy`)));
   const uniform = answered<NumberArray>(() => arrayAt(ofSite(`uniform/${layer.value}.npy`)));
   const steps = computed(() => position(axes.value?.denoise_steps, denoise.value));
-  const groups = answered<Groups>(() => {
-    const parts = Object.entries({ denoise: denoise.value, head: head.value }).filter(([, one]) => one !== "mean");
-    return readAt(ofSite(`groups/${parts.map(([of, one]) => `${of}-${one}`).join(".") || "all"}.json`));
-  });
+  const groups = answered<Groups>(() => readAt(ofSite(`groups/${denoise.value}/${head.value}.json`)));
   const covered = answered<Covered>(() => readAt(ofSite("objects.json")));
   const typed = answered<{ keys: [number, number][][] }>(() => {
     const { selector } = picked.value;
