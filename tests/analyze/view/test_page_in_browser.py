@@ -126,8 +126,10 @@ def test_an_item_of_the_effects_is_taken_away_by_a_click_or_a_key(browser):
         items = json.loads(ask(running, "runs/0/task000_episode000/effects.json").body)["items"]
         watched.page.locator(".effects > button").click()
         rows = watched.page.locator(".effects tbody tr")
-        shown = [float(text) for text in watched.page.locator(".effects td:nth-child(3)").all_inner_texts()]
-        assert shown == sorted(shown, reverse=True)
+        for words, column in (("whole episode", 3), ("now", 2)):  # ranked as the words are shaded
+            watched.page.locator(".shades").get_by_text(words).click()
+            texts = watched.page.locator(f".effects td:nth-child({column})").all_inner_texts()
+            assert [float(text) for text in texts] == sorted(map(float, texts), reverse=True)
         tried = {one["item"] for one in items if one["kind"] in ("without", "noise")}
         assert rows.count() == len(tried)
         assert watched.page.locator(".actions .chunk.without").count() == 0

@@ -3,13 +3,8 @@ import { signal } from "@preact/signals";
 
 import type { Effect } from "./answers";
 import { Hint } from "./hint";
-import { effects, part, ranked, replan, step, taken } from "./state";
+import { effects, part, ranked, replan, seed, step, taken } from "./state";
 import { shown } from "./sums";
-
-const noise = (): Effect | undefined => effects.value.value?.items.find(({ kind }) => kind === "noise");
-
-/** Another noise seed's effect at a replan. */
-export const noiseAt = (at: number): number => noise()?.effect[at] ?? NaN;
 
 const nameOf = ({ item, item_kind: kind }: Effect): string => (kind === "object" ? item.replaceAll("_", " ") : item);
 
@@ -21,10 +16,9 @@ const all = signal(false);
 
 /** All that was tried, the largest effect first, and another noise seed in its place. A click takes it away: `Actions`. */
 export function EffectTable() {
-  if (!ranked.value.length) return null;
-  const seed = noise();
-  const place = seed ? ranked.value.filter(({ mean }) => (mean ?? 0) > seed.mean!).length : 0;
-  const rows = seed ? [...ranked.value.slice(0, place), seed, ...ranked.value.slice(place)] : ranked.value;
+  const rows = ranked.value;
+  if (!rows.length) return null;
+  const place = seed.value ? rows.indexOf(seed.value) : rows.length;
   return (
     <section class="effects" aria-label="Effects">
       <h2>What moves the action<Hint text="How far the action moves when nobody reads it any more (where that was not tried: when the action queries do not), or with the other word or picture; in standard deviations of the run's actions. What stands below another noise seed does not count. Effects do not add up." /></h2>
@@ -32,8 +26,8 @@ export function EffectTable() {
         <thead><tr><th>taken away or exchanged</th><th>this call (SD)</th><th>episode (SD)</th><th>calls</th></tr></thead>
         <tbody>
           {rows.map((one, i) => all.value || i < FIRST_ROWS || one === taken.value ? (
-            <tr key={one.number} class={seed && i >= place ? "soft" : ""}>
-              <th>{one === seed ? nameOf(one) : <button aria-pressed={taken.value === one} onClick={() => step({ without: taken.value === one ? "" : one.item })}>{nameOf(one)}</button>}</th>
+            <tr key={one.number} class={i < place ? "" : "soft"}>
+              <th>{one === seed.value ? nameOf(one) : <button aria-pressed={taken.value === one} onClick={() => step({ without: taken.value === one ? "" : one.item })}>{nameOf(one)}</button>}</th>
               <td data-number={`effect-${one.item}`} data-value={one.effect[replan.value]}>{shown(one.effect[replan.value])}</td><td>{shown(one.mean)}</td><td>{one.effect.filter((value) => value !== null).length}</td>
             </tr>
           ) : null)}

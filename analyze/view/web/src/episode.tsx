@@ -9,7 +9,7 @@ import { OwnGroup, Ratio } from "./numbers";
 import { kindOf } from "./overview";
 import { Legend, levels, Pictures } from "./pictures";
 import {
-  about, axes, beside, closeEpisode, denoise, episodeName, groups, head, layer, layerPlace, main, nameOf, onlyEpisode, part, replan, rows, run, runNumber, runs, setPart,
+  about, axes, beside, closeEpisode, denoise, episodeName, groups, head, layer, layerPlace, main, nameOf, onlyEpisode, part, replan, rows, run, runNumber, runs, type Scene, setPart,
   sides, site, step,
 } from "./state";
 import { shown } from "./sums";
@@ -72,6 +72,13 @@ function ChooseBeside() {
   ) : null;
 }
 
+/** What was changed in an episode; the words that it was told say most. */
+function Banners({ scene }: { scene: Scene }) {
+  const episode = scene.about.value.value!;
+  if (episode.told_other) return <p class="banner" role="alert">The policy was told '{episode.told}'; the task is '{episode.instruction}'.</p>;
+  return <>{runs.value.value?.runs[scene.run.value]?.changed.map((line) => <p class="banner" key={line}>{line}</p>)}</>;
+}
+
 /** Two episodes at the same step: pictures with the same lines, what they came to, and their ratios. */
 function SideBySide() {
   const other = beside.about.value;
@@ -87,8 +94,7 @@ function SideBySide() {
         return (
           <div key={i}>
             <p class={`verdict ${kindOf(episode)}`}>{episode.verdict}</p>
-            {i && episode.told_other ? <p class="banner">The policy was told '{episode.told}'; the task is '{episode.instruction}'.</p> : null}
-            {i ? runs.value.value?.runs[scene.run.value]?.changed.map((line) => <p class="banner" key={line}>{line}</p>) : null}
+            <Banners scene={scene} />
             <Pictures scene={scene} at={at} />
             <p class="soft">{nameOf(side)}: step {episode.starts[at]} of {episode.end}; {ratioOf(scene.groups.value.value, at)}</p>
           </div>
@@ -198,10 +204,9 @@ export function EpisodePage() {
     <div class="episode">
       <header>
         {back}
-        <p class={`verdict ${kindOf(episode)}`} role="status">{episode.verdict}</p>
+        {isBeside ? null : <p class={`verdict ${kindOf(episode)}`} role="status">{episode.verdict}</p>}
       </header>
-      {episode.told_other ? <p class="banner" role="alert">The policy was told '{episode.told}'; the task is '{episode.instruction}'.</p> : null}
-      {episode.told_other ? null : run.value.changed.map((line) => <p class="banner" key={line}>{line}</p>)}
+      {isBeside ? null : <Banners scene={main} />}
       <div class="top"><Title /><Controls /></div>
       {more.value ? <Drawer /> : null}
       {isBeside ? <><SideBySide /><Legend /></> : null}

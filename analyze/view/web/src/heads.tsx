@@ -85,7 +85,7 @@ export function HeadGrid() {
         </select>{" "}in this call?
       </label>
       <div class="grids">{sides.value.map((side) => <Grid key={nameOf(side)} side={side} highest={highest} />)}</div>
-      <p class="soft">rows: layers; columns: heads; strongest: {shown(highest)} times even. {runs.value.value?.copy?.heads === false ? "" : "A click shows that head alone."}</p>
+      <p class="soft">rows: layers; columns: heads; full colour: {shown(highest)} times even. {runs.value.value?.copy?.heads === false ? "" : "A click shows that head alone."}</p>
     </section>
   );
 }

@@ -15,7 +15,7 @@ export function Ratio() {
     <section class="ratio" aria-label="Attention in this call">
       {numbers.sides ? (
         <p>
-          {nameOf(sides.value[0]!)}{" "}
+          {nameOf(sides.value[0]!) ? `${nameOf(sides.value[0]!)}: ` : ""}
           <b class="figure" data-number="ratio" data-value={at(numbers.ratio)}>{shown(at(numbers.ratio))}</b> pictures / text{layer.value === "mean" ? ` (geometric mean of ${numbers.layers.length - 1} layers)` : ""}{" "}
           <span class="soft">an even spread gives <span data-number="uniform" data-value={at(numbers.uniform_ratio)}>{shown(at(numbers.uniform_ratio))}</span>: this is <span data-number="lift" data-value={at(numbers.ratio_lift)}>{shown(at(numbers.ratio_lift))}</span> times that</span>
           <Hint text="Where the attention of the action queries went. It does not show what the policy used, and not why it acted: the effect of a word does. Of several layers the ratio is the geometric mean of theirs, not the quotient of the mean parts below." />

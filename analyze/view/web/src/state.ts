@@ -266,8 +266,24 @@ const tried = computed(() => {
   return found;
 });
 
-/** The largest effect over the episode first. */
-export const ranked = computed(() => [...tried.value.values()].sort((a, b) => (b.mean ?? 0) - (a.mean ?? 0)));
+/** What words are shaded by: attention, effect (of this replan), effects (over the episode); the effect where it was recorded. */
+export const shade = computed<"attention" | "effect" | "effects">(() => {
+  const given = part("words");
+  if (given === "attention" || !effects.value.value?.items.length) return "attention";
+  return given === "effects" ? "effects" : "effect";
+});
+
+/** How far the action moves: at this replan, or over the episode where that is what words are shaded by. */
+export const sizeOf = (effect: Effect | null | undefined): number => (shade.value === "effects" ? effect?.mean : effect?.effect[replan.value]) ?? NaN;
+
+/** Another noise seed, which no item is. */
+export const seed = computed(() => effects.value.value?.items.find(({ kind }) => kind === "noise"));
+
+/** All of them and the noise, the largest effect first. */
+export const ranked = computed(() => {
+  const known = [...tried.value.values(), ...(seed.value ? [seed.value] : [])];
+  return tried.value.size ? known.sort((a, b) => (sizeOf(b) || 0) - (sizeOf(a) || 0)) : [];
+});
 
 export function effectOf(item: string): Effect | null {
   return tried.value.get(item) ?? tried.value.get(item.toLowerCase()) ?? null;

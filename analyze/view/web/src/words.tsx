@@ -1,17 +1,8 @@
 /** The instruction as a title: its words shaded by attention or by effect, and what is known of the picked one. */
 import { computed } from "@preact/signals";
 
-import { noiseAt } from "./effects";
-import { about, effectOf, effects, groupOf, massesAt, part, picked, replan, setPart, step, toggled, uniformAt, wordItem, words } from "./state";
+import { about, effectOf, effects, groupOf, massesAt, picked, replan, seed, setPart, shade, sizeOf, step, toggled, uniformAt, wordItem, words } from "./state";
 import { percent, shown, sumOf } from "./sums";
-
-/** attention, effect (of this replan), effects (over the episode); the effect where it was recorded. */
-type Shade = "attention" | "effect" | "effects";
-export const shade = computed<Shade>(() => {
-  const given = part("words");
-  if (given === "attention" || !effects.value.value?.items.length) return "attention";
-  return given === "effects" ? "effects" : "effect";
-});
 
 const once = (keys: readonly number[]): [number, number][] => keys.map((key) => [key, 1]);
 
@@ -29,10 +20,9 @@ interface Shaded {
 }
 
 const shades = computed<readonly Shaded[]>(() => {
-  const [at, whole] = [replan.value, shade.value === "effects"];
   const values = words.value.map(({ text, keys }) => {
     const effect = effectOf(wordItem(text));
-    return { lift: liftOf(keys, at), effect: (whole ? effect?.mean : effect?.effect[at]) ?? NaN, noise: (whole ? effect?.noise : noiseAt(at)) ?? NaN };
+    return { lift: liftOf(keys, replan.value), effect: sizeOf(effect), noise: sizeOf(seed.value) };
   });
   const of = (one: (typeof values)[0]): number => (shade.value === "attention" ? one.lift : one.effect);
   const highest = Math.max(shade.value === "attention" ? 4 : 0, ...values.map(of).filter(Number.isFinite));
@@ -71,17 +61,15 @@ export function Title() {
   );
 }
 
+const SHADES = { effect: "effect now", effects: "effect, whole episode", attention: "attention" } as const;
+
 /** What the words are shaded by. */
 export function ChooseShade() {
   if (!effects.value.value?.items.length) return <span class="soft">words shaded by attention per token</span>;
   return (
-    <label>words by{" "}
-      <select value={shade.value} onChange={(event) => setPart({ words: event.currentTarget.value })}>
-        <option value="effect">what decides, this call</option>
-        <option value="effects">what decides, whole episode</option>
-        <option value="attention">what is read (per token)</option>
-      </select>
-    </label>
+    <span class="shades" role="group" aria-label="Words shaded by">words by{" "}
+      {Object.entries(SHADES).map(([name, title]) => <button key={name} class="chip" aria-pressed={shade.value === name} onClick={() => setPart({ words: name })}>{title}</button>)}
+    </span>
   );
 }
 
