@@ -33,7 +33,7 @@ class Screenshot:
 
 SCREENSHOTS = {
     "viewer_overview": Screenshot({}),
-    "viewer_episode": Screenshot({**FIRST, "group": "words:2"}),
+    "viewer_episode": Screenshot({**FIRST, "group": "words:2", "without": "'red'"}),
     "viewer_compare": Screenshot({**FIRST, "beside": "0:task003_episode001"}),
     "viewer_phone": Screenshot(
         FIRST, width=390, height=844, options={"color_scheme": "dark", "has_touch": True, "device_scale_factor": 2}
