@@ -24,7 +24,8 @@ class TaskGoal(Document, frozen=True):
     """The goal of a task that shares the scene.
 
     `conditions`: what holds when it is reached, each as the simulator's words; a goal whose conditions are among
-    another's is contained in it. `first_held`: the moment at which it first held; None: never.
+    another's is contained in it. `first_held`: the moment at which it first held; None: never. `things`: the objects
+    of the scene that the task names as its subject; none where that is not known.
     """
 
     task_id: int
@@ -32,6 +33,7 @@ class TaskGoal(Document, frozen=True):
     instruction: str
     conditions: tuple[str, ...]
     first_held: int | None
+    things: tuple[str, ...] = ()
 
 
 class EpisodeSteps(Document, frozen=True):

@@ -15,6 +15,7 @@ from vla_attention.analyze.commands.effects import word_effects
 from vla_attention.analyze.commands.words import words
 from vla_attention.analyze.core.about import about, notes
 from vla_attention.analyze.core.behaviour import behaviour, with_choices
+from vla_attention.analyze.core.exchanged import exchanged
 from vla_attention.analyze.core.result import Column, Finding, Result, Table
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.statistics.exact_tests import shuffled
@@ -42,6 +43,7 @@ def language(question: Question) -> Result:
         failures = f"vla-attention failures {_paths(question)}" if (~asked["outcome"]).any() else ""
         behaved = replace(behaved, next_step=failures)
     done = _behaviour_tables(asked)
+    followed, matrix, pictured = exchanged(asked)
     decide, effects = word_effects(question)
     # Attention to the words: one call.
     read = words(question, named_at=SHOWN_AT)
@@ -50,9 +52,9 @@ def language(question: Question) -> Result:
     return Result(
         "Does it listen? What was told, and what was done",
         about(question),
-        [behaved, *decide, *read.findings[:1]],
-        [*done[:1], *effects, *done[1:], *read.tables[:1]],
-        read.figures[:1],
+        [behaved, *followed, *decide, *read.findings[:1]],
+        [*matrix, *(() if matrix else done[:1]), *effects, *done[1:], *read.tables[:1]],
+        [*pictured, *read.figures[:1]],
         [*left, *notes(question)],
     )
 
@@ -126,7 +128,7 @@ def _behaviour_tables(asked: pl.DataFrame) -> list[Table]:
     matrix = matrix.sort("told", "episodes", "did", descending=[False, True, False])
     result = pl.col("outcome").replace_strict({True: "solved", False: "failed"}, default="not known")
     rows = asked.with_columns(outcome=result).drop(
-        "goals", "scene", "stratum", "state", "own_goal", "told_goal", "first"
+        "goals", "scene", "stratum", "state", "own_goal", "told_goal", "first", "scene_goal"
     )
     return [
         Table("told_and_did", matrix, _MATRIX, "Told and did", rows=20),

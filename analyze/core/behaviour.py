@@ -25,8 +25,10 @@ _TEXTS = (
 )  # fmt: skip
 SCHEMA: dict[str, Any] = {
     **dict.fromkeys(_TEXTS, pl.String),
-    **dict.fromkeys(("task_id", "episode_index", "num_steps", "touched_at", "did_at"), pl.Int64),
+    **dict.fromkeys(("scene_instruction", "scene_goal"), pl.String),
+    **dict.fromkeys(("task_id", "episode_index", "num_steps", "touched_at", "did_at", "scene_task_id"), pl.Int64),
     "outcome": pl.Boolean,
+    "followed": pl.Boolean,
     "goals": pl.List(pl.Struct({"goal": pl.String, "instruction": pl.String, "held": pl.Int64})),
 }
 OTHER_GOAL, OTHER_TOUCH, NO_TOUCH = "reached another goal", "touched something else first", "touched nothing"
@@ -56,6 +58,9 @@ def behaviour(episodes: Iterable[tuple[Store, StoredEpisode]]) -> pl.DataFrame:
         how                        what it did, if its task was not solved: a sentence without its subject
         before                     a goal like the told one that held before the told one was reached; null: none
         goals                      of the scene: goal, instruction, held (step at which it first held; null: never)
+        scene_task_id, scene_instruction, scene_goal
+                                   in an exchange, the task whose scene and initial state it began with; else null
+        followed                   in an exchange, see `_followed`; else null
     """
     pairs = [(store, episode) for store, episode in episodes if store.attributes.rerun_of is None]
     opened = read_one_by_one(episode for _, episode in pairs)
@@ -92,6 +97,7 @@ def row_of(
         (True, OTHER_TOUCH),
     )  # fmt: skip
     how = next(reason for holds, reason in reasons if holds)
+    scene = None if attributes.scene_task_id is None else steps.goal_of(attributes.scene_task_id)
     return {
         "suite": suite,
         "task_id": attributes.task_id,
@@ -111,11 +117,26 @@ def row_of(
         "did_at": None if done is None else done.first_held,
         "how": None if attributes.success else how,
         "before": None if before is None else visible(before.instruction),
+        "scene_task_id": attributes.scene_task_id,
+        "scene_instruction": None if scene is None else visible(scene.instruction),
+        "scene_goal": None if scene is None else key_of(scene),
+        "followed": None if scene is None else _followed(attributes, scene, touched, told_so),
         "goals": [
             {"goal": key_of(goal), "instruction": visible(goal.instruction), "held": goal.first_held}
             for goal in steps.goals
         ],
     }
+
+
+def _followed(attributes: EpisodeAttributes, scene: TaskGoal, touched: str | None, told_so: bool) -> bool | None:
+    """Whether it turned to what it was told about: reached the told goal, or first touched a thing of it alone.
+
+    None where that cannot be seen: told sentence and scene's own name the same things, or it touched one of both.
+    """
+    named = {thing.name for thing in attributes.objects if thing.of_interest}
+    if named == {*scene.things}:
+        return None
+    return True if told_so else None if touched in named & {*scene.things} else touched in named
 
 
 class Verdict(NamedTuple):

@@ -8,7 +8,7 @@ The options of a figure, by kind:
     lines         x, value; color: a column of series. uniform: a column, drawn dashed. log, xlabel, ylabel.
     stacked       x, value, color: a column of parts, which are stacked in their order. ylabel, xlabel.
     distribution  x, value: a box for each x, with a dot for each row. uniform, log, xlabel, ylabel.
-    heat_map      x, y, value: factors around 1. xlabel, ylabel, label.
+    heat_map      x, y, value: factors around 1, or shares with share=True. xlabel, ylabel, label.
     scatter       x, y, label: points with names, NAME_low and NAME_high as bars. log (both axes), xlabel, ylabel.
     pictures      see `render.pictures`.
 
@@ -312,9 +312,9 @@ _MOST_NUMBERS, _MOST_NUMBERED_COLUMNS = 64, 12
 def _heat_map(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
     """Factors as colours around 1, the first row at the bottom; infinite ones and 0 have the ends of the colours.
 
-    In a small map every cell also shows its number.
+    With `share` the values are shares: 0 to 1, from white on. In a small map every cell also shows its number.
     """
-    from matplotlib.colors import LinearSegmentedColormap, LogNorm
+    from matplotlib.colors import LinearSegmentedColormap, LogNorm, Normalize
 
     columns, lines = (rows[o[axis]].unique(maintain_order=True).to_list() for axis in ("x", "y"))
     factors = np.full((len(lines), len(columns)), np.nan)
@@ -322,24 +322,33 @@ def _heat_map(axes: Axes, rows: pl.DataFrame, o: Options) -> None:
         factors[lines.index(y), columns.index(x)] = value
     known = factors[np.isfinite(factors) & (factors > 0)]
     most = float(np.maximum(known, 1 / known).max(initial=_LEAST_FACTOR))
-    shown = np.clip(factors, 1 / most, most)
-    colors = LinearSegmentedColormap.from_list("less_more", _STOPS).with_extremes(bad=_NO_VALUE)
-    image = axes.imshow(shown, colors, LogNorm(1 / most, most), origin="lower", aspect="auto", interpolation="none")
+    shares = bool(o.get("share"))
+    low, high = (0.0, 1.0) if shares else (1 / most, most)
+    shown, scale = np.clip(factors, low, high), Normalize(low, high) if shares else LogNorm(low, high)
+    stops, written = (_STOPS[2:], _percent) if shares else (_STOPS, _factor)
+    colors = LinearSegmentedColormap.from_list("less_more", stops).with_extremes(bad=_NO_VALUE)
+    image = axes.imshow(shown, colors, scale, origin="lower", aspect="auto", interpolation="none")
     numbered = factors.size <= _MOST_NUMBERS and len(columns) <= _MOST_NUMBERED_COLUMNS
     for row, column in np.argwhere(np.isinf(factors) | (factors == 0) | (numbered & ~np.isnan(factors))):
-        ink = "white" if abs(np.log(shown[row, column])) > 0.6 * np.log(most) else "black"
-        axes.text(column, row, _factor(factors[row, column]), ha="center", va="center", color=ink, size=7)
+        place = float(scale(shown[row, column]))
+        ink = "white" if place > 0.8 or (place < 0.2 and not shares) else "black"
+        axes.text(column, row, written(factors[row, column]), ha="center", va="center", color=ink, size=7)
     canvas: Any = axes.figure
     bar = canvas.colorbar(image, axes.inset_axes((1.02, 0.05, 0.025, 0.9)))
-    ratio_axis(bar.ax.yaxis, [1 / most, most])
-    bar.ax.set_ylim(1 / most, most)
-    bar.ax.yaxis.set_major_formatter(lambda value, _: _factor(value))
+    if not shares:
+        ratio_axis(bar.ax.yaxis, [low, high])
+        bar.ax.set_ylim(low, high)
+    bar.ax.yaxis.set_major_formatter(lambda value, _: written(value))
     bar.set_label(wrapped(o.get("label", o["value"]), 20, 3))
     bar.outline.set_visible(False)
     label_positions(axes.xaxis, [str(one) for one in columns], _MOST_LABELS)
     label_positions(axes.yaxis, [str(one) for one in lines], _MOST_LABELS)
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
+
+
+def _percent(value: float) -> str:
+    return f"{100 * value:.0f} %"
 
 
 def _factor(value: float) -> str:

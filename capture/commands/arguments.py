@@ -31,6 +31,10 @@ _FURTHER_EXAMPLES = """\
   vla-attention capture verify runs/libero_10.zarr               check everything; --repair moves damaged episodes aside
   vla-attention capture doctor                                         what this machine can do, and what is missing
 """
+_EXCHANGE_EXAMPLES = """\
+  vla-attention capture exchange pi --checkpoint pi05_cubes --task-suite cubes --task 0 1 2 3 4 5
+  vla-attention capture exchange pi --checkpoint gs://openpi-assets/checkpoints/pi05_libero --task-suite libero_goal
+"""
 _DOCTOR_EXAMPLES = """\
   vla-attention capture doctor                                    this machine, for a run of the policy that comes along
   vla-attention capture doctor pi --checkpoint gs://openpi-assets/checkpoints/pi05_libero --task-suite libero_10
@@ -99,6 +103,35 @@ def build_evaluate_parser(family: PolicyFamily, script: PublishedScript) -> argp
     return parser
 
 
+@dataclass(frozen=True)
+class ExchangeSettings:
+    """What an exchange is asked beside a capture."""
+
+    most_rollouts: int = option(
+        "most rollouts; more of them are an error before the first (default: %(default)s)",
+        100,
+        group="evaluation",
+        name="rollouts",
+        dest="most_rollouts",
+        least=1,
+    )
+
+
+def _add_exchange_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -> None:
+    """Add all options. given: what will be parsed; the policy among it decides the model's options."""
+    family = _add_policy_argument(parser, given)
+    _add_capture_arguments(parser, family)
+    add_options(parser, ExchangeSettings)
+    parser.set_defaults(command=run_capture_of_family, family=family, num_episodes=1)
+
+
+def _add_policy_argument(parser: argparse.ArgumentParser, given: Sequence[str]) -> PolicyFamily:
+    families, default = {family.name: family for family in policy_families()}, default_family()
+    text = f"{', '.join(families)} (default: {default.name}), then the options of the run"
+    parser.add_argument("policy", nargs="?", choices=[*families], default=default.name, metavar="POLICY", help=text)
+    return next((families[word] for word in given if word in families), default)
+
+
 def _add_capture_arguments(
     parser: argparse.ArgumentParser, family: PolicyFamily, script: PublishedScript | None = None
 ) -> None:
@@ -134,10 +167,7 @@ def _add_capture_arguments(
 
 def _add_doctor_arguments(parser: argparse.ArgumentParser, given: Sequence[str]) -> None:
     """Add all options. given: what will be parsed; a policy among it decides the model's options."""
-    families, default = {family.name: family for family in policy_families()}, default_family()
-    text = f"{', '.join(families)} (default: {default.name}), then the options of the run"
-    parser.add_argument("policy", nargs="?", choices=[*families], default=default.name, metavar="POLICY", help=text)
-    family = next((families[word] for word in given if word in families), default)
+    family = _add_policy_argument(parser, given)
     _add_capture_arguments(parser, family)
     parser.set_defaults(command=_run_doctor, family=family)
 
@@ -194,6 +224,15 @@ def _run_tasks(arguments: argparse.Namespace, termination: Termination) -> int:
 #: Commands beside those of the policy families: what each is for, in a line and in sentences, examples, and what adds
 #: its arguments to a parser, which may go by the words that will be parsed.
 _COMMANDS: dict[str, tuple[str, str, str, Callable[[argparse.ArgumentParser, Sequence[str]], None]]] = {
+    "exchange": (
+        "tell every task in the scenes of the tasks that share it: does the policy do what it is told?",
+        "Where tasks share a scene, begin with the initial state of one and tell the policy the sentence of another. "
+        "Goals of all of them are watched; an episode ends when the told one is reached. Takes the options of a "
+        "capture; --num-episodes is the number of initial states of each pair (default: 1), --task chooses the tasks. "
+        "Any number of processes may fill one store with --resume. Then ask vla-attention language STORE.",
+        _EXCHANGE_EXAMPLES,
+        _add_exchange_arguments,
+    ),
     "replay": (
         "make policy calls on the frames of a data set of a robot",
         "Feed the pictures, states and tasks of a LeRobotDataset (2.0, 2.1 or 3.0) to a policy, without a simulator, "

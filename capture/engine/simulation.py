@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from vla_attention.capture.environments.base import (
@@ -125,20 +126,29 @@ class Simulation:
     cameras: Sequence[CameraPatches]
     check: StopCheck = lambda: None
 
-    def begin(self, episode_index: int, what: str) -> Begun:
-        """Reset to the stored initial state of that index; what: the episode's title in messages.
+    def begin(self, state: int, what: str, told: int | None = None) -> Begun:
+        """Reset to the stored initial state of that number; what: the episode's title in messages.
+
+        told: the task of the scene whose goal ends the episode; None: the environment's own.
 
         Raises:
             SimulationFailed: the simulator raised an error; `wait` and `advance` do the same.
         """
         self._what, self._step, self._replan = what, 0, 0
+        self._told: int | None = None
         with naming_the_simulator(what):
             environment = self.environment
-            environment.reset(episode_index, self.protocol.seed)
+            environment.reset(state, self.protocol.seed)
             begun = Begun(environment.initial_state_digest, tuple(environment.objects))
             if not isinstance(environment, TellsMoments):
                 return begun
-            return replace(begun, bodies=environment.bodies, goals=environment.goals)
+            goals = environment.goals
+            if told is not None:
+                self._told = [goal.task_id for goal in goals].index(told)
+                things = goals[self._told].things
+                named = (structs.replace(thing, of_interest=thing.name in things) for thing in begun.objects)
+                begun = replace(begun, objects=tuple(named))
+            return replace(begun, bodies=environment.bodies, goals=goals)
 
     def wait(self) -> Advanced:
         """Make the waiting steps, in which objects come to rest; only the last one is observed."""
@@ -166,7 +176,7 @@ class Simulation:
                 self._step += 1
                 observation = result.observation
                 moments += self._moment()
-                if result.success:
+                if result.success if self._told is None else moments[-1].held[self._told]:
                     return Advanced(i + 1, True, None, tuple(moments))
             self._replan += 1
             seen = None if observation is None else self._seen(observation)

@@ -88,13 +88,15 @@ class SimulatorSetup:
 class BeginEpisode:
     """Asks for the beginning of an episode, with its waiting steps.
 
-    title: its name in messages. resets: what another simulator's `KnownResets` told about the task.
+    task_id, state: in whose scene it begins, and the number of the initial state. title: its name in messages. resets:
+    what another simulator's `KnownResets` told about the task. told: the task whose goal ends it; None: the same.
     """
 
     task_id: int
-    episode_index: int
+    state: int
     title: str
     resets: Any = None
+    told: int | None = None
 
 
 @dataclass(frozen=True)
@@ -225,11 +227,11 @@ class SimulatorServer:
         shared = environment if isinstance(environment, SharesResets) else None
         if shared is not None and request.resets is not None:
             shared.learn_resets(seed, request.resets)
-        missing = environment.missing_resets(request.episode_index, seed)
+        missing = environment.missing_resets(request.state, seed)
         if missing:
-            self.send(ResetsFirst(missing, request.task_id, episode_name(request.task_id, request.episode_index)))
+            self.send(ResetsFirst(missing, request.task_id, episode_name(request.task_id, request.state)))
         self.simulation = Simulation(environment, self.setup.protocol, self.setup.cameras, self.check)
-        begun = self.simulation.begin(request.episode_index, request.title)
+        begun = self.simulation.begin(request.state, request.title, request.told)
         if shared is not None:
             self.send(KnownResets(shared.known_resets(seed)))
         self.send(begun)

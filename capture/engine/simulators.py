@@ -13,7 +13,7 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -170,27 +170,28 @@ class Simulators(Source):
         begun; until then a second one would make them all again.
         """
         task_id = self._idle[-1][1] if self._idle else None
-        taken = {episode.job.task.task_id for episode in self._episodes} | {number for _, number in self._idle}
+        taken = {episode.job.begins_as[0] for episode in self._episodes} | {number for _, number in self._idle}
 
         def preference(place: int) -> tuple[bool, bool, int]:
-            other = left[place].task.task_id
+            other = left[place].begins_as[0]
             return (other != task_id, other in taken, place)
 
         place = min(range(len(left)), key=preference)
-        wanted, index = left[place].task.task_id, left[place].episode_index
+        wanted, index = left[place].begins_as
         known = self._resets.get(wanted)
-        resetting = any(other.job.task.task_id == wanted and other.begun is None for other in self._episodes)
+        resetting = any(other.job.begins_as[0] == wanted and other.begun is None for other in self._episodes)
         return None if task_id == wanted and known and len(known) <= index and resetting else place
 
     def open(self, job: EpisodeJob) -> SimulatedEpisode:
         """Let a simulator begin an episode."""
-        task_id = job.task.task_id
+        task_id, state = job.begins_as
         place = max(range(len(self._idle)), key=lambda place: (self._idle[place][1] == task_id, place), default=None)
         simulator = self._started() if place is None else self._idle.pop(place)[0]
         episode = SimulatedEpisode(self, job, simulator)
         self._episodes.append(episode)
         try:
-            simulator.ask(BeginEpisode(task_id, job.episode_index, episode.title, self._resets.get(task_id)))
+            told = None if job.scene is None else job.task.task_id
+            simulator.ask(BeginEpisode(task_id, state, episode.title, self._resets.get(task_id), told))
         except Exception as error:
             episode.close(error)
             raise
@@ -227,7 +228,7 @@ class Simulators(Source):
         """Take the simulator of an episode that has ended."""
         self._episodes.remove(episode)
         if is_sound:
-            self._idle.append((simulator, episode.job.task.task_id))
+            self._idle.append((simulator, episode.job.begins_as[0]))
         else:
             simulator.close()
 
@@ -278,7 +279,7 @@ class SimulatedEpisode(Episode):
                 case ResetsFirst():
                     self.source.tell_resets(answer)
                 case KnownResets(resets):
-                    self.source.learn_resets(self.job.task.task_id, resets)
+                    self.source.learn_resets(self.job.begins_as[0], resets)
                 case Begun():
                     self.begun, machine = answer, self.source.machine
                     digest, objects = answer.initial_state_digest, answer.objects
@@ -350,7 +351,9 @@ class SimulatedEpisode(Episode):
         policy_input = policy.prepare(seen.observation, start.instruction)
         if caller.changes.interventions.changes_input:
             policy_input = caller.prepared(policy_input.given, context)
-        seed = caller.drawn_seed(source.protocol.seed, context)
+        # What begins alike has the same noise, whatever it is told.
+        scene, state = self.job.begins_as
+        seed = caller.drawn_seed(source.protocol.seed, replace(context, task_id=scene, episode_index=state))
         return PolicyCall(policy_input, seed, context, env_step, where, constant_cameras=constant)
 
     def _steps(self) -> RecordedSteps | None:

@@ -25,17 +25,29 @@ from vla_attention.schemas.stores.store_place import bytes_below
 
 @dataclass(frozen=True)
 class EpisodeJob:
-    """An episode that is to be recorded. size: most units of it, for the progress; title: its name there."""
+    """An episode that is to be recorded.
+
+    size: most units of it, for the progress; title: its name there. scene, state: in an exchange, the task that it
+    begins like, and the number of the initial state; else its own task and index.
+    """
 
     task: Task
     episode_index: int
     size: int
     title: str
+    scene: Task | None = None
+    state: int | None = None
 
     @property
     def name(self) -> str:
         """The episode's name in the store."""
         return episode_name(self.task.task_id, self.episode_index)
+
+    @property
+    def begins_as(self) -> tuple[int, int]:
+        """The task in whose scene it begins, and the number of the initial state."""
+        task = self.task if self.scene is None else self.scene
+        return task.task_id, self.episode_index if self.state is None else self.state
 
 
 def episode_start(
@@ -45,11 +57,12 @@ def episode_start(
     state_digest: str,
     objects: tuple[SceneObject, ...] = (),
     state_index: int | None = None,
+    scene_task_id: int | None = None,
 ) -> EpisodeStart:
     """Return what is known of an episode before its first replan.
 
-    machine: provenance of this process. state_digest, state_index: of the initial state, whose index is the episode's
-    where none is given.
+    machine: provenance of this process. state_digest, state_index: of the initial state, whose index is the job's
+    where none is given. scene_task_id: of an exchanged episode that is run again; else the job's.
     """
     task = job.task
     return EpisodeStart(
@@ -57,11 +70,12 @@ def episode_start(
         task_name=task.name,
         instruction=task.instruction,
         episode_index=job.episode_index,
-        initial_state_index=job.episode_index if state_index is None else state_index,
+        initial_state_index=job.begins_as[1] if state_index is None else state_index,
         initial_state_digest=state_digest,
         objects=objects,
         provenance=dict(machine),
         task_family=task.task_family,
+        scene_task_id=scene_task_id if job.scene is None else job.scene.task_id,
     )
 
 

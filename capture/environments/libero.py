@@ -66,6 +66,12 @@ def parent_of_region(name: str, known: Sequence[str]) -> str | None:
     return max(owners, key=len, default=None)
 
 
+def _subjects(of_interest: Iterable[str], names: Sequence[str]) -> list[str]:
+    """The objects and fixtures, of those names, that a task's file names as its objects of interest."""
+    subjects = dict.fromkeys(parent_of_region(name, names) for name in of_interest)
+    return [name for name in subjects if name is not None]
+
+
 @dataclass(frozen=True)
 class ResetStart:
     """With what a reset begins: the state of numpy's global generator, and the number of samplers of joints."""
@@ -181,7 +187,11 @@ class LiberoEnvironment(SimulatedEnvironment):
 
     def _scene_goals(self) -> Sequence[TaskGoal]:
         self._conditions_of = goals_of_scene(self.task, self._suite_tasks)
-        return [goal_of(task, map(" ".join, conditions)) for task, conditions in self._conditions_of.items()]
+        names, goals = [*self._simulator.objects_dict, *self._simulator.fixtures_dict], []
+        for task, conditions in self._conditions_of.items():
+            of_interest = read_task_file(task_file(task))["obj_of_interest"]
+            goals.append(goal_of(task, map(" ".join, conditions), _subjects(of_interest, names)))
+        return goals
 
     def _held(self) -> Sequence[bool]:
         simulator = self._simulator
@@ -197,7 +207,7 @@ class LiberoEnvironment(SimulatedEnvironment):
     def _describe_objects(self) -> tuple[Iterable[SceneObject], Mapping[str, Sequence[str]]]:
         movable, fixed = self._simulator.objects_dict, self._simulator.fixtures_dict
         names = [*movable, *fixed]
-        subjects = {parent_of_region(name, names) for name in self._simulator.obj_of_interest}
+        subjects = _subjects(self._simulator.obj_of_interest, names)
         described = [
             *(SceneObject(name, "object", name in subjects) for name in movable),
             *(SceneObject(name, "fixture", name in subjects) for name in fixed),
@@ -235,13 +245,18 @@ def goals_of_scene(task: Task, tasks: Sequence[Task]) -> dict[Task, tuple[tuple[
     A condition is a predicate with its objects. The initial states of such tasks are drawn from one distribution; which
     ones are stored with a task is the task's own. LIBERO must have been loaded.
     """
-    parsed = {one: read_task_file(task_file(one)) for one in tasks}
-    scenes = {one: [parsed[one][part] for part in _SCENE] for one in tasks}
+    scene = scene_of(task)
     return {
-        one: tuple(tuple(condition) for condition in parsed[one]["goal_state"])
+        one: tuple(tuple(condition) for condition in read_task_file(task_file(one))["goal_state"])
         for one in tasks
-        if scenes[one] == scenes[task]
+        if scene_of(one) == scene
     }
+
+
+def scene_of(task: Task) -> list[Any]:
+    """Return what tasks of one scene share, of a task's file; LIBERO must have been loaded."""
+    parsed = read_task_file(task_file(task))
+    return [parsed[part] for part in _SCENE]
 
 
 #: Bytes of a task file; LIBERO's have up to 3,300.

@@ -91,9 +91,9 @@ class CameraGate:
         return gated
 
 
-def goal_of(task: Task, conditions: Iterable[str]) -> TaskGoal:
-    """Return the goal of a task, before any step."""
-    return TaskGoal(task.task_id, task.name, task.instruction, tuple(conditions), None)
+def goal_of(task: Task, conditions: Iterable[str], things: Iterable[str] = ()) -> TaskGoal:
+    """Return the goal of a task, before any step; things: the objects that it names as its subject."""
+    return TaskGoal(task.task_id, task.name, task.instruction, tuple(conditions), None, tuple(things))
 
 
 class SimulatedEnvironment:

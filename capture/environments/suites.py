@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from vla_attention.capture.environments.base import Environment, EnvironmentSettings, Suite, Task, check_task_id
-from vla_attention.capture.environments.cubes.tasks import list_cube_tasks
+from vla_attention.capture.environments.cubes.tasks import CUBE_TASKS, list_cube_tasks
 from vla_attention.capture.environments.robosuite_installation import find_robosuite
 from vla_attention.schemas.errors import look_up
 
@@ -54,6 +54,27 @@ def list_tasks(suite: Suite) -> tuple[Task, ...]:
         Task(suite.name, number, name, instruction, suite.initial_states_per_task, family)
         for number, (name, instruction, family) in enumerate(texts)
     )
+
+
+def tasks_by_scene(suite: Suite, settings: EnvironmentSettings) -> list[tuple[Task, ...]]:
+    """Return the suite's tasks, those that share a scene together; runs no simulator.
+
+    Raises:
+        MissingDependency, LiberoAssetsMissing: LIBERO reads its task files itself, and is not there.
+    """
+    tasks = list_tasks(suite)
+    if suite.kind == "libero":
+        from vla_attention.capture.environments.libero import scene_of
+        from vla_attention.capture.environments.libero_installation import find_assets, load_libero
+
+        load_libero(find_assets(settings.libero_assets))
+        scenes: list[object] = [scene_of(task) for task in tasks]
+    elif suite.kind == "cubes":
+        scenes = [CUBE_TASKS[task.task_id].num_cubes for task in tasks]
+    else:
+        scenes = [task.name for task in tasks]
+    different = [scene for place, scene in enumerate(scenes) if scene not in scenes[:place]]
+    return [tuple(task for task, its in zip(tasks, scenes, strict=True) if its == scene) for scene in different]
 
 
 def check_installed(suite: Suite, libero_assets: Path | None) -> None:

@@ -81,6 +81,7 @@ class StoredEpisodes(Source):
             state_digest=attributes.initial_state_digest,
             objects=attributes.objects,
             state_index=attributes.initial_state_index,
+            scene_task_id=attributes.scene_task_id,
         )
         keep_actions = not self.store.attributes.interventions.is_none
         return EpisodeAgain(self.caller, calls, start, keep_actions=keep_actions)

@@ -16,7 +16,7 @@ from vla_attention.capture.engine.simulators import Simulators, check_protocol, 
 from vla_attention.capture.engine.source import Committed, EpisodeJob
 from vla_attention.capture.environments.base import EnvironmentSettings, Task, check_initial_state_index
 from vla_attention.capture.environments.episode_protocol import WAIT_STEPS, EvaluationProtocol
-from vla_attention.capture.environments.suites import list_tasks
+from vla_attention.capture.environments.suites import list_tasks, tasks_by_scene
 from vla_attention.capture.interventions.prompts import check_synonyms
 from vla_attention.capture.interventions.resolution import interventions_for
 from vla_attention.capture.interventions.run_changes import RunChanges
@@ -25,6 +25,7 @@ from vla_attention.capture.machine import POLICY_BATCH, describe_machine
 from vla_attention.capture.policies.families import family_of_kind
 from vla_attention.capture.policies.identity import downloads_of
 from vla_attention.capture.policies.policy import BatchPolicy, Policy, stored_picture_sizes
+from vla_attention.capture.run.exchange import describe_exchange, exchanged_jobs
 from vla_attention.capture.run.run_settings import RunSettings, default_num_envs
 from vla_attention.capture.store.disk_estimate import estimate_disk
 from vla_attention.capture.store.store_writer import open_run
@@ -52,6 +53,7 @@ def plan_protocol(settings: RunSettings, evaluation: EvaluationProtocol, policy:
         max_steps=published_steps if settings.max_steps is None else settings.max_steps,
         name=evaluation.name,
         image_size=evaluation.image_size,
+        exchanged=settings.most_rollouts is not None,
     )
 
 
@@ -78,22 +80,20 @@ def run_capture(
     )
     for task in wanted:
         check_initial_state_index(task, settings.num_episodes - 1)
+    environment = EnvironmentSettings(evaluation, settings.libero_assets)
+    jobs, source_lines = _jobs(settings, wanted, environment, protocol.max_steps)
     num_envs = settings.num_envs or default_num_envs()
     batch = _policy_batch(settings, policy, device, num_envs)
     store = open_run(settings.store, attributes, settings.output.mode)
     done = store.committed()
-    jobs = [
-        EpisodeJob(task, episode, protocol.max_steps, f"task {task.task_id} episode {episode}")
-        for task in wanted
-        for episode in range(settings.num_episodes)
-    ]
     todo = [job for job in jobs if (job.task.task_id, job.episode_index) not in done]
     damaged = find_damaged(store.path, {job.name for job in jobs}, settings.output.verify) if done else []
     pictures = stored_picture_sizes(policy, protocol.image_size)
     bound = estimate_disk(caller.recording, policy.sites, pictures, max_replans(protocol), len(todo))
-    announce(attributes, _lines_on_source(policy.identity(), protocol), bound, store.path, len(jobs), damaged)
-    expected = (*wanted, *(tasks[index] for index in settings.array_task_ids))
-    plan = plan_of((task, episode) for task in expected for episode in range(settings.num_episodes))
+    lines = [*_lines_on_source(policy.identity(), protocol), *source_lines]
+    announce(attributes, lines, bound, store.path, len(jobs), damaged)
+    others = [(tasks[i], episode) for i in settings.array_task_ids for episode in range(settings.num_episodes)]
+    plan = plan_of([*((job.task, job.episode_index) for job in jobs), *others])
     known = planned_episodes(read_logs(store.path))
     results, faults = [], Faults()
     if todo or not all(known.get(task.task_id, set()) >= {*task.indices} for task in plan):
@@ -104,7 +104,6 @@ def run_capture(
         if num_envs > 1:
             batches = f" Policy calls in batches of at most {batch}; --policy-batch N changes it." if batch > 1 else ""
             say(f"Simulators: {num_envs} processes; --num-envs N changes it.{batches}")
-        environment = EnvironmentSettings(evaluation, settings.libero_assets)
         source = Simulators(settings.suite, environment, store, caller, machine, termination.check, max(1, num_envs))
         loop = EpisodeLoop(store, plan, termination, "step", source, batch)
         results, faults = loop.record_all(todo), loop.faults
@@ -120,6 +119,23 @@ def run_capture(
     if lacking:
         raise (EpisodesMissing if faults.dropped else DamagedEpisodesLeft)(" ".join(lacking))
     return results
+
+
+def _jobs(
+    settings: RunSettings, wanted: Sequence[Task], environment: EnvironmentSettings, max_steps: int
+) -> tuple[list[EpisodeJob], list[str]]:
+    """Return the run's episodes, and what is printed of them."""
+    states = settings.num_episodes
+    if settings.most_rollouts is None:
+        return [
+            EpisodeJob(task, episode, max_steps, f"task {task.task_id} episode {episode}")
+            for task in wanted
+            for episode in range(states)
+        ], []
+    every = tasks_by_scene(settings.suite, environment)
+    scenes = [chosen for scene in every if (chosen := [task for task in scene if task in wanted])]
+    jobs = exchanged_jobs(settings.suite, scenes, states, max_steps, settings.most_rollouts)
+    return jobs, [describe_exchange(scenes, states, jobs)]
 
 
 def _plan_calls(settings: RunSettings, policy: Policy, protocol: Protocol, tasks: Sequence[Task]) -> Caller:

@@ -44,6 +44,8 @@ class RunSettings:
     the policy. seed, replan_steps, max_steps: None takes the protocol's number. array_task_ids: tasks that other
     processes of the same array job run; the store is expected to hold these too. interventions: what is changed, with
     layer numbers as typed. allow_empty: leave a replan unchanged where a group of an intervention has no key.
+    most_rollouts: of an exchange (`exchange.py`), which tells every task in the scenes of the others; None: every task
+    is told its own sentence.
     """
 
     suite: Suite = option("name of the suite", group="evaluation", name="task-suite", type=str, metavar="SUITE")
@@ -79,6 +81,7 @@ class RunSettings:
     interventions: Interventions
     allow_empty: bool = False
     array_task_ids: tuple[int, ...] = ()
+    most_rollouts: int | None = None
 
     def instructions(self) -> tuple[str, ...]:
         """What the policy is told in the episodes."""
@@ -102,6 +105,9 @@ def run_settings(given: argparse.Namespace) -> RunSettings:
     output = read_options(CaptureOutput, given)
     if output.verify and not output.resume:
         raise BadArgument("Cannot use --verify without --resume: a new store has no episodes that could be read.")
+    interventions, exchanged = read_interventions(given), hasattr(given, "most_rollouts")
+    if exchanged and interventions.prompt is not None:
+        raise BadArgument("Cannot use --prompt in an exchange: every task is told in the scenes of the others already.")
     suite = find_suite(given.task_suite)
     name = getattr(given, "protocol", None)  # a family with a single protocol has no such option
     return read_options(
@@ -110,10 +116,10 @@ def run_settings(given: argparse.Namespace) -> RunSettings:
         suite=suite,
         task_ids=None if given.task_id is None else _task_ids(suite, given.task_id),
         protocol=next((protocol for protocol in family.protocols if protocol.name == name), None),
-        store=output.place(f"{family.store_prefix}{suite.name}"),
+        store=output.place(f"{family.store_prefix}{suite.name}{'_exchange' * exchanged}"),
         output=output,
         recording=recording_settings(given),
-        interventions=read_interventions(given),
+        interventions=interventions,
     )
 
 

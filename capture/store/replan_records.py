@@ -148,3 +148,4 @@ class EpisodeStart:
     objects: tuple[SceneObject, ...]
     provenance: dict[str, str]
     task_family: str = ""
+    scene_task_id: int | None = None

@@ -187,6 +187,9 @@ class Protocol(Document, frozen=True):
 
     Runs without a simulator of ours have the name `recorded` (the caller's own loop) or `dataset` (a replayed data
     set); `suite` is the caller's name for the tasks, and a number that is not known is 0.
+
+    `exchanged`: every episode begins in the scene and initial state of one task and is told the sentence of another
+    (or of the same), whose goal decides on its success. It is an episode of the told task.
     """
 
     name: str
@@ -196,6 +199,7 @@ class Protocol(Document, frozen=True):
     replan_steps: int
     max_steps: int
     image_size: int
+    exchanged: bool = False
 
     def __post_init__(self) -> None:
         """Check the suite's name."""
@@ -340,7 +344,8 @@ class EpisodeAttributes(Document, frozen=True):
 
     `task_family`: what tasks of one sentence template share; empty where nobody knows it. `effects`: what the arrays of
     effects are of; None where none were measured. `steps`: the same of the arrays of steps; None where no simulator of
-    ours ran the episode.
+    ours ran the episode. `scene_task_id`: the task whose scene and initial state an exchanged episode began with; None
+    for an episode that began with its own.
 
     `NUMBERS` are of each replan, and the noise level or flow time of each recorded denoise step; `env_step` counts the
     waiting steps too, `prompt_index` is the number of a prompt, `dataset_action_count` how many of `dataset_actions`
@@ -369,6 +374,7 @@ class EpisodeAttributes(Document, frozen=True):
     task_family: str = ""
     effects: EpisodeEffects | None = None
     steps: EpisodeSteps | None = None
+    scene_task_id: int | None = None
 
     def __post_init__(self) -> None:
         """Check the task's name, and the names of arrays, which are paths."""

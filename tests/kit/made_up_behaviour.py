@@ -61,6 +61,7 @@ def did(
             task_family=family if isinstance(family, str) else family[task],
             initial_state=str(number) if state is None else state,
             success=task in seen,
+            scene_task_id=None,
             num_steps=last,
             objects=(SimpleNamespace(name=f"thing_{(named or {}).get(task, task)}", of_interest=True),),
         )

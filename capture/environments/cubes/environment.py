@@ -61,10 +61,8 @@ class CubesEnvironment(SimulatedEnvironment):
         self._reset_once()
 
     def _describe_objects(self) -> tuple[Iterable[SceneObject], Mapping[str, Sequence[str]]]:
-        task = self._cube_task
-        names = [f"{colour}_cube" for colour in COLOURS[: task.num_cubes]]
-        named = {f"{colour}_cube" for colour in (task.target, task.destination) if colour in COLOURS}
-        cubes = [SceneObject(name, "object", of_interest=name in named or not named) for name in names]
+        names, named = _cubes_of(self._cube_task), _named_cubes(self._cube_task)
+        cubes = [SceneObject(name, "object", of_interest=name in named) for name in names]
         if self._has_mark:
             cubes.append(SceneObject(MARK, "object", of_interest=True))  # no body: it exists in pictures only
         return cubes, {name: (f"{name}_main",) for name in names}
@@ -76,7 +74,7 @@ class CubesEnvironment(SimulatedEnvironment):
             if CUBE_TASKS[task.task_id].num_cubes == self._cube_task.num_cubes
         ]
         self._sharing = [cube_task for _, cube_task in sharing]
-        return [goal_of(task, (cube_task.name,)) for task, cube_task in sharing]
+        return [goal_of(task, (cube_task.name,), _named_cubes(cube_task)) for task, cube_task in sharing]
 
     def _held(self) -> Sequence[bool]:
         return [self._simulator.solves(task) for task in self._sharing]
@@ -118,3 +116,13 @@ class CubesEnvironment(SimulatedEnvironment):
             )
         self._cube_task = task
         self._simulator.task = task
+
+
+def _cubes_of(task: CubeTask) -> list[str]:
+    return [f"{colour}_cube" for colour in COLOURS[: task.num_cubes]]
+
+
+def _named_cubes(task: CubeTask) -> list[str]:
+    """The cubes that a task is about: those of its colours, or all where it names a place."""
+    named = [f"{colour}_cube" for colour in (task.target, task.destination) if colour in COLOURS]
+    return named or _cubes_of(task)

@@ -1,0 +1,135 @@
+"""An exchange: tasks told in the scenes of others. What was done, told by told and scene by scene.
+
+Two rates, which LIBERO-CF (Fang et al. 2026, arXiv 2602.17659) reports of instructions exchanged in LIBERO's scenes:
+language following, whether the policy turns to what it was told about, and success, whether it reaches the told goal.
+"""
+
+from __future__ import annotations
+
+import polars as pl
+
+from vla_attention.analyze.core.estimate import estimate
+from vla_attention.analyze.core.result import Column, Figure, Finding, Table
+from vla_attention.analyze.statistics.units import Estimand, Sampling
+from vla_attention.schemas.errors import plural
+from vla_attention.schemas.groupings.words import split_words, stop_words
+
+OWN, EXCHANGED = "its own", "another task's"
+_COLOURS = {"black", "white", "grey", "gray", "red", "green", "blue", "yellow", "orange", "pink", "purple", "brown"}
+_PLACES = {
+    "left", "right", "front", "back", "rear", "middle", "center", "centre", "top", "bottom", "leftmost", "rightmost",
+    "upper", "lower", "inside", "next", "between", "near", "under", "above", "behind", "side",
+}  # fmt: skip
+
+
+def exchanged(asked: pl.DataFrame) -> tuple[list[Finding], list[Table], list[Figure]]:
+    """What an exchange showed, of the rows of `with_choices`; nothing of episodes that began with their own scene.
+
+    Left out are episodes that cannot show it: the told goal held at the beginning, or is a part of another told goal.
+    """
+    rows = asked.drop_nulls("scene_task_id")
+    if rows.is_empty():
+        return [], [], []
+    rows = rows.with_columns(
+        sentence=pl.when(pl.col("told_goal") == pl.col("scene_goal")).then(pl.lit(OWN)).otherwise(pl.lit(EXCHANGED)),
+        did_told=pl.col("did") == pl.col("told"),
+        did_scene=(pl.col("did") == pl.col("scene_instruction")) & (pl.col("did") != pl.col("told")),
+        kind=pl.Series([kinds_of_words(*pair) for pair in rows.select("told", "scene_instruction").iter_rows()]),
+    ).with_columns(pl.col("did_told", "did_scene").fill_null(False))
+    shown = rows.filter(pl.col("left_out").is_null())
+    rates = _rates(shown, "sentence").sort("sentence", descending=True)
+    others = shown.filter(sentence=EXCHANGED)
+    kinds = _rates(others, "kind").sort("num_episodes", "kind", descending=[True, False])
+    cells = (
+        rows.group_by("task_id", "scene_task_id", "told", "scene_instruction", maintain_order=True)
+        .agg(
+            pl.len().alias("rollouts"),
+            pl.col("left_out").is_null().sum().alias("counted"),
+            pl.col("did_told", "did_scene").sum(),
+            pl.col("did").is_null().sum().alias("nothing"),
+        )
+        .sort("task_id", "scene_task_id")
+    )
+    tables = [
+        Table("exchange", rates, _RATES, "Told which sentence"),
+        Table("exchange_kinds", kinds, _KINDS, "Told another sentence, by the words that differ"),
+        Table("exchange_matrix", cells),
+    ]
+    return [_finding(rates, rows.height - shown.height)], tables, [_matrix(cells)]
+
+
+def kinds_of_words(one: str, other: str) -> str:
+    """The kinds of the words in which two sentences differ: verb, colour, place, object; joined by " + ".
+
+    The verb is the first word. Colours and places are of fixed lists; words without a meaning of their own do not
+    count, and all others are of objects.
+    """
+    first, second = (_words(text) for text in (one, other))
+    different = {*first, *second} - ({*first} & {*second})
+    kinds = {
+        "verb" if word in (first[:1] + second[:1])
+        else "colour" if word in _COLOURS
+        else "place" if word in _PLACES
+        else "object"
+        for word in different - (stop_words() - _PLACES)
+    }  # fmt: skip
+    return " + ".join(kind for kind in ("verb", "object", "colour", "place") if kind in kinds) or "order"
+
+
+def _words(text: str) -> list[str]:
+    return [text[start:stop].casefold() for start, stop in split_words(text)]
+
+
+def _rates(rows: pl.DataFrame, by: str) -> pl.DataFrame:
+    """Shares of the rollouts with each value of a column, with intervals about these tasks, and their numbers."""
+    shares = ("did_told", "followed", "did_scene")
+    numbers = rows.with_columns(pl.col(*shares).cast(pl.Float64))
+    found = estimate(numbers, [by], dict.fromkeys(shares, "share"), Sampling(Estimand.THESE_TASKS))
+    counts = rows.group_by(by).agg(right=pl.col("did_told").sum(), scenes=pl.col("did_scene").sum())
+    return found.join(counts, on=by, how="left", maintain_order="left")
+
+
+def _finding(rates: pl.DataFrame, left_out: int) -> Finding:
+    """How often another task's sentence was followed, beside the scene's own."""
+    known = {row["sentence"]: row for row in rates.iter_rows(named=True)}
+    other, own = known.get(EXCHANGED), known.get(OWN)
+    limit = f"{plural(left_out, 'rollout')} not counted: the told goal held at the beginning." if left_out else ""
+    if other is None:
+        return Finding("No rollout of the exchange shows anything: every told goal held at the beginning.", _ASKS)
+    right, n = other["right"], other["num_episodes"]
+    ends = (other["did_told_low"], other["did_told_high"])
+    interval = "" if None in ends else f" [{100 * ends[0]:.0f} to {100 * ends[1]:.0f} %]"
+    beside = f" (the scene's own sentence: {own['right']} of {own['num_episodes']})" if own else ""
+    instead = f"; in {other['scenes']} it did the scene's own task" if other["scenes"] else ""
+    sentence = f"It did what another task's sentence says in {right} of {n} rollouts{interval}{beside}{instead}."
+    if other["followed"] is not None:
+        sentence += f" Language following {100 * other['followed']:.0f} %, success {100 * other['did_told']:.0f} %."
+    numbers = {"right": right, "n": n, "low": ends[0], "high": ends[1], "following": other["followed"]}
+    return Finding(sentence, _ASKS, numbers, limit)
+
+
+def _matrix(cells: pl.DataFrame) -> Figure:
+    share = pl.when(pl.col("counted") > 0).then(pl.col("did_told") / pl.col("counted"))
+    frame = cells.with_columns(share=share, scene=pl.col("scene_task_id").cast(pl.String))
+    frame = frame.sort("task_id", "scene_task_id", descending=[True, False])
+    options = {"x": "scene", "y": "told", "value": "share", "share": True, "label": "did what it was told",
+               "xlabel": "in the scene and initial state of task"}  # fmt: skip
+    n = f"{plural(int(cells['rollouts'].sum()), 'rollout')}; grey: not counted, the told goal held at the beginning."
+    return Figure("exchange_matrix", "heat_map", frame, "Did it do what it was told? By the task in whose scene it began", n, options)
+
+
+_ASKS = "Told another task's sentence?"
+_SHARES = (
+    Column("num_episodes", "count", "rollouts"),
+    Column("did_told", "percent", "success", "reached the told goal"),
+    Column(
+        "followed",
+        "percent",
+        "language following",
+        "first touched a thing that the told sentence names and the scene's own does not, or reached the told goal; "
+        "of rollouts whose sentences name different things",
+    ),
+    Column("did_scene", "percent", "did the scene's own", "reached the goal of the scene's own sentence instead"),
+)
+_RATES = [Column("sentence", "text"), *_SHARES]
+_KINDS = [Column("kind", "text", "words that differ"), *_SHARES]
