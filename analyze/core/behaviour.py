@@ -37,7 +37,7 @@ UNFINISHED, TOLD_SO = "touched what the task names, did not finish", "did what i
 _NO_GOAL = "the told sentence names no goal of the scene"
 _AT_START = "the told goal held at the beginning of an episode"
 _PART = "the told goal is a part of another told goal"
-_ALONE = "nothing else was told in the scene"
+ALONE = "nothing else was told in the scene"
 #: Between the conditions of a goal, in its key; no condition has one.
 _AND = "\x1f"
 
@@ -243,4 +243,4 @@ def _of_stratum(part: pl.DataFrame) -> pl.DataFrame:
     )
     part = part.join(first, on=episode, how="left", maintain_order="left").with_columns(left_out=left_out)
     alone = part.filter(pl.col("left_out").is_null())["told_goal"].n_unique() == 1
-    return part.with_columns(pl.coalesce("left_out", pl.lit(_ALONE)).alias("left_out")) if alone else part
+    return part.with_columns(pl.coalesce("left_out", pl.lit(ALONE)).alias("left_out")) if alone else part

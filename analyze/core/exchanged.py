@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import polars as pl
 
+from vla_attention.analyze.core.behaviour import ALONE
 from vla_attention.analyze.core.estimate import estimate
 from vla_attention.analyze.core.result import Column, Figure, Finding, Table
 from vla_attention.analyze.statistics.units import Estimand, Sampling
@@ -35,8 +36,9 @@ def exchanged(asked: pl.DataFrame) -> tuple[list[Finding], list[Table], list[Fig
         did_told=pl.col("did") == pl.col("told"),
         did_scene=(pl.col("did") == pl.col("scene_instruction")) & (pl.col("did") != pl.col("told")),
         kind=pl.Series([kinds_of_words(*pair) for pair in rows.select("told", "scene_instruction").iter_rows()]),
+        counted=pl.col("left_out").is_null() | (pl.col("left_out") == ALONE),
     ).with_columns(pl.col("did_told", "did_scene").fill_null(False))
-    shown = rows.filter(pl.col("left_out").is_null())
+    shown = rows.filter("counted")
     rates = _rates(shown, "sentence").sort("sentence", descending=True)
     others = shown.filter(sentence=EXCHANGED)
     kinds = _rates(others, "kind").sort("num_episodes", "kind", descending=[True, False])
@@ -44,8 +46,7 @@ def exchanged(asked: pl.DataFrame) -> tuple[list[Finding], list[Table], list[Fig
         rows.group_by("task_id", "scene_task_id", "told", "scene_instruction", maintain_order=True)
         .agg(
             pl.len().alias("rollouts"),
-            pl.col("left_out").is_null().sum().alias("counted"),
-            pl.col("did_told", "did_scene").sum(),
+            pl.col("counted", "did_told", "did_scene").sum(),
             pl.col("did").is_null().sum().alias("nothing"),
         )
         .sort("task_id", "scene_task_id")
@@ -115,7 +116,14 @@ def _matrix(cells: pl.DataFrame) -> Figure:
     options = {"x": "scene", "y": "told", "value": "share", "share": True, "label": "did what it was told",
                "xlabel": "in the scene and initial state of task"}  # fmt: skip
     n = f"{plural(int(cells['rollouts'].sum()), 'rollout')}; grey: not counted, the told goal held at the beginning."
-    return Figure("exchange_matrix", "heat_map", frame, "Did it do what it was told? By the task in whose scene it began", n, options)
+    return Figure(
+        "exchange_matrix",
+        "heat_map",
+        frame,
+        "Did it do what it was told? By the task in whose scene it began",
+        n,
+        options,
+    )
 
 
 _ASKS = "Told another task's sentence?"
