@@ -21,6 +21,7 @@ from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.statistics.exact_tests import shuffled
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.schemas.errors import plural
+from vla_attention.schemas.safe_text import visible
 
 _LISTENS = "Does it listen?"
 #: p of what is done, and q of a word that is read: three kinds of things are named (docs/benchmarks.md has the rates).
@@ -29,6 +30,8 @@ SHOWN_AT = NAMED_AT / 3
 _MOSTLY = 0.8
 #: Of episodes or steps.
 _HALF = 0.5
+#: Of a probability, and of an action in its unit (as effects are refused from there on): smaller changes are rounding.
+_ROUNDING, _SAME_ACTION = 1e-6, 1e-4
 
 
 def language(question: Question) -> Result:
@@ -43,7 +46,8 @@ def language(question: Question) -> Result:
         failures = f"vla-attention failures {_paths(question)}" if (~asked["outcome"]).any() else ""
         behaved = replace(behaved, next_step=failures)
     done = _behaviour_tables(asked)
-    followed, matrix, pictured = exchanged(asked)
+    followed, matrix, pictured = exchanged(asked, question.sampling)
+    reached = words_get_through(question)
     decide, effects = word_effects(question)
     # Attention to the words: one call.
     read = words(question, named_at=SHOWN_AT)
@@ -52,11 +56,39 @@ def language(question: Question) -> Result:
     return Result(
         "Does it listen? What was told, and what was done",
         about(question),
-        [behaved, *followed, *decide, *read.findings[:1]],
+        [*reached, behaved, *followed, *decide, *read.findings[:1]],
         [*matrix, *(() if matrix else done[:1]), *effects, *done[1:], *read.tables[:1]],
         [*pictured, *read.figures[:1]],
         [*left, *notes(question)],
     )
+
+
+def words_get_through(question: Question) -> list[Finding]:
+    """Whether the instruction reaches the model, its attention and its action, as the first call of a process showed.
+
+    Of several processes, the one that shows the least; none where none was looked at.
+    """
+    looked = [plumbing for item in question.selected if (plumbing := item.episode.attributes.plumbing) is not None]
+    if not looked:
+        return []
+    worst = min(looked, key=lambda one: (not one.problem, one.action_changed or 0.0, one.rows_changed or 0.0))
+    other = f"'{visible(worst.other)}'"
+    limit = ""
+    if worst.problem:
+        sentence = f"No, this is plumbing, not the model: {worst.problem}"
+        limit = "Look at the tokenizer, the key of the data set, the prompt's template, how a batch is put together."
+    elif worst.input_changed is None:
+        sentence = "The prompt's tokens spell the instruction; whether they change the action was not tried"
+        sentence += f": {worst.why_not.removesuffix('.')}."
+    elif not (worst.rows_changed or 0.0) > _ROUNDING:
+        sentence = f"They reach the model's input and no further: told {other}, no attention that was recorded changed."
+    elif not (worst.action_changed or 0.0) > _SAME_ACTION:
+        sentence = f"They reach the model and its attention, and not the action: told {other}, it is the same."
+    else:
+        by = f"the action by {worst.action_changed:.2g} of its unit"
+        sentence = f"Yes: told {other}, the model's input, its attention and its action change ({by})."
+    numbers = {"rows": worst.rows_changed, "action": worst.action_changed, "calls": len(looked)}
+    return [Finding(sentence, "Do the words get through?", numbers, limit)]
 
 
 def listens(asked: pl.DataFrame) -> Finding:

@@ -11,7 +11,7 @@ import polars as pl
 from vla_attention.analyze.core.behaviour import ALONE
 from vla_attention.analyze.core.estimate import estimate
 from vla_attention.analyze.core.result import Column, Figure, Finding, Table
-from vla_attention.analyze.statistics.units import Estimand, Sampling
+from vla_attention.analyze.statistics.units import Sampling
 from vla_attention.schemas.errors import plural
 from vla_attention.schemas.groupings.words import split_words, stop_words
 
@@ -23,10 +23,11 @@ _PLACES = {
 }  # fmt: skip
 
 
-def exchanged(asked: pl.DataFrame) -> tuple[list[Finding], list[Table], list[Figure]]:
+def exchanged(asked: pl.DataFrame, sampling: Sampling) -> tuple[list[Finding], list[Table], list[Figure]]:
     """What an exchange showed, of the rows of `with_choices`; nothing of episodes that began with their own scene.
 
-    Left out are episodes that cannot show it: the told goal held at the beginning, or is a part of another told goal.
+    sampling: what intervals are about. Left out are episodes that cannot show it: the told goal held at the beginning,
+    or is a part of another told goal.
     """
     rows = asked.drop_nulls("scene_task_id")
     if rows.is_empty():
@@ -39,9 +40,9 @@ def exchanged(asked: pl.DataFrame) -> tuple[list[Finding], list[Table], list[Fig
         counted=pl.col("left_out").is_null() | (pl.col("left_out") == ALONE),
     ).with_columns(pl.col("did_told", "did_scene").fill_null(False))
     shown = rows.filter("counted")
-    rates = _rates(shown, "sentence").sort("sentence", descending=True)
+    rates = _rates(shown, "sentence", sampling).sort("sentence", descending=True)
     others = shown.filter(sentence=EXCHANGED)
-    kinds = _rates(others, "kind").sort("num_episodes", "kind", descending=[True, False])
+    kinds = _rates(others, "kind", sampling).sort("num_episodes", "kind", descending=[True, False])
     cells = (
         rows.group_by("task_id", "scene_task_id", "told", "scene_instruction", maintain_order=True)
         .agg(
@@ -81,11 +82,11 @@ def _words(text: str) -> list[str]:
     return [text[start:stop].casefold() for start, stop in split_words(text)]
 
 
-def _rates(rows: pl.DataFrame, by: str) -> pl.DataFrame:
-    """Shares of the rollouts with each value of a column, with intervals about these tasks, and their numbers."""
+def _rates(rows: pl.DataFrame, by: str, sampling: Sampling) -> pl.DataFrame:
+    """Shares of the rollouts with each value of a column, with intervals, and their numbers."""
     shares = ("did_told", "followed", "did_scene")
     numbers = rows.with_columns(pl.col(*shares).cast(pl.Float64))
-    found = estimate(numbers, [by], dict.fromkeys(shares, "share"), Sampling(Estimand.THESE_TASKS))
+    found = estimate(numbers, [by], dict.fromkeys(shares, "share"), sampling)
     counts = rows.group_by(by).agg(right=pl.col("did_told").sum(), scenes=pl.col("did_scene").sum())
     return found.join(counts, on=by, how="left", maintain_order="left")
 
@@ -100,9 +101,9 @@ def _finding(rates: pl.DataFrame, left_out: int) -> Finding:
     right, n = other["right"], other["num_episodes"]
     ends = (other["did_told_low"], other["did_told_high"])
     interval = "" if None in ends else f" [{100 * ends[0]:.0f} to {100 * ends[1]:.0f} %]"
-    beside = f" (the scene's own sentence: {own['right']} of {own['num_episodes']})" if own else ""
+    beside = f" (told the scene's own: {own['right']} of {own['num_episodes']})" if own else ""
     instead = f"; in {other['scenes']} it did the scene's own task" if other["scenes"] else ""
-    sentence = f"It did what another task's sentence says in {right} of {n} rollouts{interval}{beside}{instead}."
+    sentence = f"Told another task's sentence, it did that in {right} of {n} rollouts{interval}{beside}{instead}."
     if other["followed"] is not None:
         sentence += f" Language following {100 * other['followed']:.0f} %, success {100 * other['did_told']:.0f} %."
     numbers = {"right": right, "n": n, "low": ends[0], "high": ends[1], "following": other["followed"]}
@@ -126,7 +127,7 @@ def _matrix(cells: pl.DataFrame) -> Figure:
     )
 
 
-_ASKS = "Told another task's sentence?"
+_ASKS = "Does it follow other sentences?"
 _SHARES = (
     Column("num_episodes", "count", "rollouts"),
     Column("did_told", "percent", "success", "reached the told goal"),

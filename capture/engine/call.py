@@ -62,13 +62,15 @@ class Caller:
     """Makes the policy calls of a run.
 
     recording: what is recorded of them. changes: the run's interventions; without any, nothing. effects: what measures
-    the effects of calls; None where they are not recorded.
+    the effects of calls; None where they are not recorded. looks_at_words: whether the first calls are looked at for
+    whether the instruction gets through (`plumbing.py`); a rerun repeats calls that were.
     """
 
     policy: Policy
     recording: Recording
     changes: RunChanges = field(default_factory=lambda: RunChanges(Interventions(), {}))
     effects: EffectMeasurement | None = None
+    looks_at_words: bool = False
 
     def denoise_times(self) -> NDArray[np.float64]:
         """Return the noise levels of the denoise steps that are recorded, (denoise,)."""

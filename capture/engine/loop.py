@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
@@ -23,6 +23,7 @@ from multiprocessing.connection import Connection, wait
 from vla_attention.capture.effects.measurement import EpisodeEffectsMeasured
 from vla_attention.capture.engine.call import Caller, PolicyCall, RecordedCall, record_of
 from vla_attention.capture.engine.faults import EPISODE_FAULTS, Faults, SimulatorDied
+from vla_attention.capture.engine.plumbing import look_at_words
 from vla_attention.capture.engine.progress import EpisodeProgress, Progress, Unit
 from vla_attention.capture.engine.source import Committed, Episode, EpisodeJob, Outcome, Source, SourceLost
 from vla_attention.capture.engine.writing import EpisodeInBackground, WritingThread
@@ -32,6 +33,7 @@ from vla_attention.capture.store.episode_writer import EpisodeTaken
 from vla_attention.capture.store.store_writer import RunStore
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.errors import listing, plural
+from vla_attention.schemas.plumbing import Plumbing
 from vla_attention.schemas.stop_signals import Terminated, Termination
 from vla_attention.schemas.stores.locks import Held, Holder
 from vla_attention.schemas.stores.store_format import StoreExists
@@ -94,6 +96,8 @@ class EpisodeLoop:
     #: Those of them that have a policy call, in the order in which it came.
     _ready: deque[_Running] = field(default_factory=deque, init=False)
     _committing: list[_Running] = field(default_factory=list, init=False)
+    #: Whether it was looked at whether the instruction gets through.
+    _looked: bool = field(default=False, init=False)
 
     def __post_init__(self) -> None:
         """Begin the log of this worker."""
@@ -263,6 +267,7 @@ class EpisodeLoop:
         batch = [self._ready.popleft() for _ in range(min(self.policy_batch, len(self._ready)))]
         calls = [running.call for running in batch if running.call is not None]
         made = caller.make(calls)
+        plumbing = self._look_at_words(caller, calls, made)
         recorded: list[tuple[_Running, PolicyCall, RecordedCall]] = []
         for running, call, result in zip(batch, calls, made, strict=True):
             running.call = None
@@ -273,9 +278,25 @@ class EpisodeLoop:
                 running.episode.advance(result.actions)
                 recorded.append((running, call, result))
         for running, call, result in recorded:
-            self._keep(caller, running, call, result)
+            self._keep(caller, running, call, result, plumbing)
+            plumbing = None
 
-    def _keep(self, caller: Caller, running: _Running, call: PolicyCall, made: RecordedCall) -> None:
+    def _look_at_words(
+        self, caller: Caller, calls: Sequence[PolicyCall], made: Sequence[RecordedCall | NumbersNotFinite]
+    ) -> Plumbing | None:
+        """Return whether the instruction gets through, of the first calls of the process; None of later ones."""
+        results = [one for one in made if isinstance(one, RecordedCall)]
+        if not caller.looks_at_words or self._looked or len(results) < len(made):
+            return None
+        self._looked = True
+        found = look_at_words(caller, calls, results)
+        if said := found.problem:
+            self.progress.say(f"WARNING: {said}")
+        return found
+
+    def _keep(
+        self, caller: Caller, running: _Running, call: PolicyCall, made: RecordedCall, plumbing: Plumbing | None
+    ) -> None:
         """Store a policy call that has been made, with its effects. A simulator elsewhere goes on meanwhile."""
         assert running.episode is not None
         if running.writer is None:
@@ -283,7 +304,8 @@ class EpisodeLoop:
             running.effects = None if caller.effects is None else caller.effects.begin()
         running.num_replans += 1
         recording, effects = caller.recording, running.effects
-        running.writer.append(record_of(call, made.rows, made.actions, recording, effects, call.noise_seed))
+        record = record_of(call, made.rows, made.actions, recording, effects, call.noise_seed)
+        running.writer.append(replace(record, plumbing=plumbing))
 
     @contextmanager
     def _dropping_faults(self, running: _Running) -> Iterator[None]:

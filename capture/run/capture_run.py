@@ -156,7 +156,8 @@ def _plan_calls(settings: RunSettings, policy: Policy, protocol: Protocol, tasks
     pictures = pictures_of(settings.recording.effects, policy, settings.suite.name)
     if note:
         say(note)
-    return Caller(policy, recording, changes, measurement_of(recording.effects, policy, families, say, pictures))
+    effects = measurement_of(recording.effects, policy, families, say, pictures)
+    return Caller(policy, recording, changes, effects, looks_at_words=True)
 
 
 def _policy_batch(settings: RunSettings, policy: Policy, device: str, num_envs: int) -> int:

@@ -252,6 +252,7 @@ class EpisodeWriter:
                 tuple(number for _, of in measured for number in of.measured),
             ),
             steps=None if steps is None else steps.attributes,
+            plumbing=next((record.plumbing for record in records if record.plumbing is not None), None),
         )
 
     @contextmanager

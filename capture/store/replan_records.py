@@ -14,6 +14,7 @@ from vla_attention.schemas.episode_steps import EXECUTED, GRIPPER, POSES, Episod
 from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import Interventions
 from vla_attention.schemas.layout import Prompt
+from vla_attention.schemas.plumbing import Plumbing
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,8 @@ class ReplanRecord:
     camera (patch, object) float32. `dataset_actions` (steps, action_dim) are those that a data set has from this replan
     on, fewer at the end of its episode. `base_actions` (horizon, action_dim) are those that the base has for this call,
     in a rerun. What is None is not known; all replans of an episode know the same. `constant_cameras`: cameras of the
-    simulator whose picture is of one colour. `effects`: None where they are not measured at this replan.
+    simulator whose picture is of one colour. `effects`: None where they are not measured at this replan. `plumbing`: of
+    the first call of a process.
     """
 
     env_step: int
@@ -88,6 +90,7 @@ class ReplanRecord:
     base_actions: NDArray[np.float64] | None = None
     constant_cameras: frozenset[str] = frozenset()
     effects: ReplanEffects | None = None
+    plumbing: Plumbing | None = None
 
     @property
     def arrays(self) -> dict[str, tuple[NDArray[Any], tuple[str, ...]]]:

@@ -40,6 +40,7 @@ from vla_attention.schemas.groupings.vocabulary import SceneObject
 from vla_attention.schemas.interventions import Interventions, RerunSource
 from vla_attention.schemas.jsonable import Document, Number
 from vla_attention.schemas.layout import Prompt, SiteLayout
+from vla_attention.schemas.plumbing import Plumbing
 from vla_attention.schemas.safe_text import check_inner_path, check_name, check_text
 from vla_attention.schemas.segments import Segment
 
@@ -345,7 +346,8 @@ class EpisodeAttributes(Document, frozen=True):
     `task_family`: what tasks of one sentence template share; empty where nobody knows it. `effects`: what the arrays of
     effects are of; None where none were measured. `steps`: the same of the arrays of steps; None where no simulator of
     ours ran the episode. `scene_task_id`: the task whose scene and initial state an exchanged episode began with; None
-    for an episode that began with its own.
+    for an episode that began with its own. `plumbing`: where the first policy call of a process is this
+    episode's.
 
     `NUMBERS` are of each replan, and the noise level or flow time of each recorded denoise step; `env_step` counts the
     waiting steps too, `prompt_index` is the number of a prompt, `dataset_action_count` how many of `dataset_actions`
@@ -375,6 +377,7 @@ class EpisodeAttributes(Document, frozen=True):
     effects: EpisodeEffects | None = None
     steps: EpisodeSteps | None = None
     scene_task_id: int | None = None
+    plumbing: Plumbing | None = None
 
     def __post_init__(self) -> None:
         """Check the task's name, and the names of arrays, which are paths."""

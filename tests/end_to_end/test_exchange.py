@@ -63,8 +63,8 @@ def test_an_arm_that_always_touches_the_red_cube(monkeypatch, tmp_path):
     assert (rates["its own"]["did_told"], rates["its own"]["num_episodes"]) == (pytest.approx(1 / 3), 3)
     other = rates["another task's"]
     assert (other["right"], other["num_episodes"], other["scenes"]) == (2, 6, 2)
-    # A mean over told tasks: 0 touched its red cube, 1 never its green one, 3 its red one in the scene of green. Whether
-    # 'touch' or 'lift' was heard of one red cube, the cube that is touched does not show.
+    # A mean over told tasks: 0 touched its red cube, 1 never its green one, 3 its red one in the scene of green. The
+    # cube that is touched does not show whether 'touch' or 'lift' was heard of it.
     assert other["followed"] == pytest.approx(2 / 3)
     kinds = found["exchange_kinds"].select("kind", "num_episodes").rows()
     assert sorted(kinds) == [("colour", 2), ("verb", 2), ("verb + colour", 2)]
