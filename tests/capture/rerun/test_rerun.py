@@ -50,7 +50,8 @@ def test_a_store_is_made_again_to_the_bit(family, request, tmp_path, capsys):
     assert [episode.name for episode in again.episodes] == [episode.name for episode in base.episodes]
     for old, new in zip(base.episodes, again.episodes, strict=True):
         assert new.attributes.arrays == old.attributes.arrays  # shapes and digests of all values
-        assert structs.replace(new.attributes, provenance={}) == structs.replace(old.attributes, provenance={})
+        mine, its = (structs.replace(one.attributes, provenance={}, plumbing=None) for one in (new, old))
+        assert mine == its
         assert new.attributes.steps is not None
         assert new.attributes.steps.touched == ("cube",)
         np.testing.assert_array_equal(new.read("steps/actions")[:4], old.read("actions")[0, :4].astype(np.float32))
