@@ -17,7 +17,7 @@ from vla_attention.schemas.layout import Prompt
 from vla_attention.schemas.plumbing import Plumbing
 
 #: Short, so that it is not cut, and without a word of a task of the standard suites.
-WHOLLY_DIFFERENT = "wave hello"
+WHOLLY_DIFFERENT = "wave hello twice"
 
 
 def look_at_words(caller: Caller, calls: Sequence[PolicyCall], made: Sequence[RecordedCall]) -> Plumbing:
