@@ -18,10 +18,10 @@ class Plumbing(Document, frozen=True):
         unread: the words of the instruction that are in none of the prompt's tokens.
         row_of_another: whether a row of a batch was answered as if it had the first row's instruction; None: not looked
             at (no batch with two instructions, or both give the same actions).
-        input_changed: whether the model's text input was another one; None where no call was made.
-        rows_changed: the largest change of a recorded attention probability. None where none was made.
+        input_changed: whether the model's text input was another one; None where it was not seen.
+        rows_changed: the largest change of a recorded attention probability; None where it was not seen.
         action_changed: root mean square over the chunk of the change of the action, in the unit of each dimension of
-            the action that effects have. None where none was made.
+            the action that effects have; None where no call was made.
         why_not: why no call was made.
     """
 

@@ -73,20 +73,20 @@ def words_get_through(question: Question) -> list[Finding]:
         return []
     worst = min(looked, key=lambda one: (not one.problem, one.action_changed or 0.0, one.rows_changed or 0.0))
     other = f"'{visible(worst.other)}'"
-    limit = ""
+    limit, seen = "", "" if worst.rows_changed is None else ", its attention"
     if worst.problem:
         sentence = f"No, this is plumbing, not the model: {worst.problem}"
         limit = "Look at the tokenizer, the key of the data set, the prompt's template, how a batch is put together."
-    elif worst.input_changed is None:
+    elif not worst.other:
         sentence = "The prompt's tokens spell the instruction; whether they change the action was not tried"
         sentence += f": {worst.why_not.removesuffix('.')}."
-    elif not (worst.rows_changed or 0.0) > _ROUNDING:
+    elif worst.rows_changed is not None and not worst.rows_changed > _ROUNDING:
         sentence = f"They reach the model's input and no further: told {other}, no attention that was recorded changed."
     elif not (worst.action_changed or 0.0) > _SAME_ACTION:
-        sentence = f"They reach the model and its attention, and not the action: told {other}, it is the same."
+        sentence = f"They reach the model{seen}, and not the action: told {other}, it is the same."
     else:
         by = f"the action by {worst.action_changed:.2g} of its unit"
-        sentence = f"Yes: told {other}, the model's input, its attention and its action change ({by})."
+        sentence = f"Yes: told {other}, the model's input{seen} and its action change ({by})."
     numbers = {"rows": worst.rows_changed, "action": worst.action_changed, "calls": len(looked)}
     return [Finding(sentence, "Do the words get through?", numbers, limit)]
 

@@ -26,8 +26,10 @@ from vla_attention.capture.torch_policies.replan_inputs import ReplanInputs, rea
 from vla_attention.capture.torch_policies.replan_text import PromptIds, ReplanText
 from vla_attention.capture.torch_policies.site_recorder import ReplanRecorder, SiteRows, final_contribution
 from vla_attention.capture.torch_policies.watch import RandomNumbers, watch_attention
+from vla_attention.capture.torch_policies.words_heard import look_at_words_heard
 from vla_attention.schemas.errors import BadArgument, Note
 from vla_attention.schemas.layout import Prompt
+from vla_attention.schemas.plumbing import Plumbing
 
 if TYPE_CHECKING:
     from vla_attention.capture.torch_policies.recorded_episodes import Episode
@@ -83,6 +85,8 @@ class WatchedCall(ReplanRecorder):
         #: Of a row of the batch, what changes it: asked at its first call.
         self._bias_of = cache(self._row_bias)
         self._before = self._state_before(calls[0])
+        looks = not run._looked_at_words and calls[0].inputs.repeat is not None
+        self._before_first = self._before or (RandomNumbers() if looks else None)
 
     def _state_before(self, one: RowOfCall) -> RandomNumbers | None:
         """Return the random numbers before a policy call whose effects are measured; None where they are not."""
@@ -167,7 +171,22 @@ class WatchedCall(ReplanRecorder):
         if self._before is not None:
             call = self._to_be_repeated(call, one, actions, self._before)
         effects = one.episode._effects
-        return record_of(call, stored, actions, run.attributes.recording, effects, inputs.noise_seed)
+        plumbing = self._look_at_words(one, prompt, actions)
+        record = record_of(call, stored, actions, run.attributes.recording, effects, inputs.noise_seed)
+        return replace(record, plumbing=plumbing)
+
+    def _look_at_words(self, one: RowOfCall, prompt: Prompt, actions: NDArray[np.float64] | None) -> Plumbing | None:
+        """Return whether the instruction gets through, of the first call of the run; None of later ones."""
+        run, inputs = self._run, one.inputs
+        if run._looked_at_words:
+            return None
+        run._looked_at_words = True
+        found = look_at_words_heard(
+            prompt, inputs.instruction, actions, inputs.repeat, self._before_first, run._embeddings
+        )
+        if found is not None and found.problem:
+            warnings.warn(found.problem, Note)
+        return found
 
     def _to_be_repeated(
         self, call: PolicyCall, one: RowOfCall, actions: NDArray[np.float64] | None, before: RandomNumbers

@@ -74,7 +74,7 @@ def record(store: Path, num_envs: int, *words: str) -> int:
 
 
 def assert_same_episodes(one: Path, other: Path) -> None:
-    """Compare two stores array by array, with types, shapes and attributes; only each process's first has `plumbing`."""
+    """Compare two stores array by array, with types, shapes and attributes but that of a process's first call."""
     first, second = (zarr.open_group(store, mode="r")["episodes"] for store in (one, other))
     assert sorted(first.keys()) == sorted(second.keys())
     for name in first:
