@@ -8,10 +8,10 @@
     with va.record("run.zarr", policy, layout=va.layouts.smolvla(policy)) as run:    # docs/your-policy.md
         ...
 
-Public names: `open`, `example`, `workers` and `OpenStores` (stage two); `record`, `inspect`, `check_layout`, `layouts`,
-the parts of a `PolicyLayout`, `EffectSettings`, `Interventions` and `knockout` (stage one, from your own code; it needs
-torch); `UserError` (the base of every error that a user can cause) and `__version__`. `vla_attention.datasets` reads
-data sets of robots. This import loads neither torch nor zarr, polars or numpy.
+Public names: `open`, `example`, `workers`, `OpenStores` and `language_test` (stage two); `record`, `inspect`,
+`check_layout`, `layouts`, the parts of a `PolicyLayout`, `EffectSettings`, `Interventions` and `knockout` (stage one,
+from your own code; it needs torch); `UserError` (the base of every error that a user can cause) and `__version__`.
+`vla_attention.datasets` reads data sets of robots. This import loads neither torch nor zarr, polars or numpy.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     # What `__getattr__` gives, for type checkers and editors.
     from vla_attention import datasets as datasets
     from vla_attention.analyze.api import OpenStores as OpenStores
+    from vla_attention.analyze.language_test import language_test as language_test
     from vla_attention.capture.effects.arguments import EffectSettings as EffectSettings
     from vla_attention.capture.torch_policies import layouts as layouts
     from vla_attention.capture.torch_policies.inspect_calls import CallTable
@@ -61,7 +62,7 @@ _RECORDER = {
     "schemas.layout": ("PatchGrid", "SiteLayout", "Span"),
 }
 
-__all__ = ["OpenStores", "UserError", "__version__", "example", "inspect", "open", "workers"]
+__all__ = ["OpenStores", "UserError", "__version__", "example", "inspect", "language_test", "open", "workers"]
 
 
 def __dir__() -> list[str]:
@@ -145,6 +146,10 @@ if not TYPE_CHECKING:  # else every misspelt name would be of type Any
             from vla_attention.analyze.api import OpenStores
 
             return OpenStores
+        if name == "language_test":
+            from vla_attention.analyze.language_test import language_test
+
+            return language_test
         if name == "__version__":
             from importlib.metadata import version
 
