@@ -83,12 +83,11 @@ def row_of(
 ) -> dict[str, object]:
     """The row of `behaviour` of one episode that was told a sentence; `same`: with other words for its own goal."""
     own = steps.goal_of(attributes.task_id)
-    aim = own if same or same_words(told, attributes.instruction) else None
-    aim = aim or next((goal for goal in steps.goals if same_words(goal.instruction, told)), None)
+    aim = told_goal(attributes, steps, told, same)
     done, before = _done(steps.goals, aim, attributes.task_family)
     touched = steps.touched[0] if steps.touched else None
     touched_at = None if touched is None else steps.first_touch[steps.bodies.index(touched)]
-    named = touched in {thing.name for thing in attributes.objects if thing.of_interest}
+    named = touched in named_things(attributes, aim)
     # Who pushes what is named has touched it, and may have reached the goal of touching it.
     elsewhere = done is not None and not (named and done.first_held == touched_at)
     told_so = done is not None and aim is not None and key_of(done) == key_of(aim)
@@ -133,7 +132,7 @@ def _followed(attributes: EpisodeAttributes, scene: TaskGoal, touched: str | Non
 
     None where that cannot be seen: told sentence and scene's own name the same things, or it touched one of both.
     """
-    named = {thing.name for thing in attributes.objects if thing.of_interest}
+    named = named_things(attributes, None)
     if named == {*scene.things}:
         return None
     return True if told_so else None if touched in named & {*scene.things} else touched in named
@@ -169,6 +168,24 @@ def verdict(store: Store, attributes: EpisodeAttributes) -> Verdict:
         NO_TOUCH: NO_TOUCH,
     }
     return Verdict(f"{begin}, {came_to[str(row['how'])]}.", row["how"] in (OTHER_GOAL, OTHER_TOUCH))
+
+
+def told_goal(attributes: EpisodeAttributes, steps: EpisodeSteps, told: str, same: bool = False) -> TaskGoal | None:
+    """The goal of the scene that a sentence names; `same`: it is the task's own in other words. None: it names none."""
+    own = steps.goal_of(attributes.task_id)
+    if own is not None and (same or same_words(told, attributes.instruction)):
+        return own
+    return next((goal for goal in steps.goals if same_words(goal.instruction, told)), None)
+
+
+def named_things(attributes: EpisodeAttributes, aim: TaskGoal | None) -> set[str]:
+    """The objects that the policy was told about; none where it was told another sentence and nobody knows them.
+
+    aim: of `told_goal`; None: the sentence is the task's own, as far as anybody knows.
+    """
+    if aim is None or aim.task_id == attributes.task_id:
+        return {thing.name for thing in attributes.objects if thing.of_interest}
+    return {*aim.things}
 
 
 def key_of(goal: TaskGoal) -> str:

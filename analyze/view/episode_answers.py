@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import io
 import math
-import re
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 
 from vla_attention.analyze.ask import answer_to
 from vla_attention.analyze.core.action_changes import GRIPPER, ActionSpread
+from vla_attention.analyze.core.behaviour import named_things, told_goal
 from vla_attention.analyze.core.camera_maps import PictureMap, map_note, seen_cameras, stored_picture, upright, view_of
 from vla_attention.analyze.core.levels import levels_of
 from vla_attention.analyze.core.measure import means
@@ -39,7 +39,6 @@ from vla_attention.schemas.episode_steps import EXECUTED, HAND, POSES
 from vla_attention.schemas.episode_steps import GRIPPER as FINGERS
 from vla_attention.schemas.errors import BadArgument, unknown_name
 from vla_attention.schemas.groupings.resolve import check_names
-from vla_attention.schemas.groupings.words import has_phrase, split_words
 from vla_attention.schemas.safe_text import visible
 from vla_attention.schemas.stores.reader import Store, StoredEpisode
 
@@ -80,14 +79,12 @@ class ShownEpisode:
 
     @cached_property
     def named(self) -> set[str]:
-        """The objects that the policy was told of: the task's, or of another sentence those whose name stands in it."""
+        """The objects that the policy was told about, see `named_things`; none where no goal says them."""
         attributes = self.episode.attributes
-        told = told_instruction(self.store, attributes)
-        if same_words(told, attributes.instruction):
-            return {thing.name for thing in attributes.objects if thing.of_interest}
-        words = [told[start:stop].casefold() for start, stop in split_words(told)]
-        names = [thing.name for thing in attributes.objects if thing.kind == "object"]
-        return {name for name in names if has_phrase(words, re.sub(r"_\d+$", "", name))}
+        told, steps = told_instruction(self.store, attributes), attributes.steps
+        aim = None if steps is None else told_goal(attributes, steps, told)
+        known = aim is not None or same_words(told, attributes.instruction)
+        return named_things(attributes, aim) if known else set()
 
     def about(self) -> dict[str, Any]:
         """`about.json`: what happened, and what every key is."""

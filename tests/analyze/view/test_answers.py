@@ -7,25 +7,28 @@ import json
 import math
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 import polars as pl
 import pytest
+from msgspec import structs
 from PIL import Image
 
 import vla_attention as va
 from tests.end_to_end.test_cameras_of_several_spans import write_spans_store
 from tests.kit.bowl_scene import bowl_tokens
 from tests.kit.golden_stores import golden_store
-from tests.kit.stores import StoreSpec, write_store
+from tests.kit.stores import StoreSpec, small_steps, write_store
 from tests.kit.viewer import ask, served
 from vla_attention.analyze.core.camera_maps import camera_names, episode_maps, stored_picture, upright
 from vla_attention.analyze.measures.question import ask as question_of
 from vla_attention.analyze.measures.question_settings import AnalysisSettings
 from vla_attention.analyze.view.answers import Answers
 from vla_attention.analyze.view.episode_answers import MEAN, _closings
+from vla_attention.schemas.episode_steps import TaskGoal
 from vla_attention.schemas.stores.reader import open_store
 from vla_attention.schemas.stores.seal import SEAL_FILE
 
@@ -198,13 +201,20 @@ def test_a_copy_has_the_actions_of_all_that_is_taken_away_or_exchanged(server, p
     assert {f"actions/{number}.npy" for number in numbers} <= copied
 
 
-def test_another_sentence_names_the_objects_whose_names_stand_in_it(tmp_path):
+def with_another_goal(spec, task, episode, steps):
+    """The steps of a scene in which another task is about the plate."""
+    made = small_steps(spec, task, episode, steps)
+    other = TaskGoal(7, "push", "push the plate to the front", ("in front",), None, ("plate_1",))
+    return replace(made, attributes=structs.replace(made.attributes, goals=(*made.attributes.goals, other)))
+
+
+def test_another_sentence_names_the_objects_of_its_goal(tmp_path):
     for told, expected in (
-        ("put the bowl on the plate", {"akita_black_bowl_1", "plate_1"}),  # the task's own: as the simulator says
+        ("put the bowl on the plate", {"akita_black_bowl_1", "plate_1"}),  # the task's own
         ("push the plate to the front", {"plate_1"}),
-        ("push the black bowl", set()),
+        ("push the black bowl", set()),  # no goal of the scene
     ):
-        spec = StoreSpec(tasks=(0,), episodes=1, tokens=bowl_tokens(instruction=told))
+        spec = StoreSpec(tasks=(0,), episodes=1, tokens=bowl_tokens(instruction=told), plant_steps=with_another_goal)
         with served(write_store(tmp_path / f"{len(told)}.zarr", spec=spec)) as server:
             about = read_path(server, "runs/0/task000_episode000/about.json")
         assert {thing["name"] for thing in about["objects"] if thing["named"]} == expected
