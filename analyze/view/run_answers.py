@@ -80,6 +80,7 @@ def episode_line(store: Store, episode: StoredEpisode) -> dict[str, Any]:
             "outcome": attributes.success if store.attributes.rerun_of is None else None,
             "verdict": came_to.sentence,
             "did_other": came_to.other,
+            "scene": attributes.scene_task_id,
             "num_steps": attributes.num_steps,
             "num_replans": attributes.num_replans,
             "picture": [pictured[0], last] if pictured and last >= 0 else None,

@@ -16,6 +16,8 @@ export interface EpisodeLine {
   readonly verdict: string;
   /** Whether it did or touched something else than it was told. */
   readonly did_other: boolean;
+  /** In an exchange, the task in whose scene and initial state it began; null: its own. */
+  readonly scene: number | null;
   readonly num_steps: number;
   readonly num_replans: number;
   /** Camera and replan. */

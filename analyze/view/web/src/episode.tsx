@@ -76,6 +76,7 @@ function ChooseBeside() {
 function Banners({ scene }: { scene: Scene }) {
   const episode = scene.about.value.value!;
   if (episode.told_other) return <p class="banner" role="alert">The policy was told '{episode.told}'; the task is '{episode.instruction}'.</p>;
+  if (episode.scene != null && episode.scene !== episode.task) return <p class="soft">It began in the scene and initial state of task {episode.scene}.</p>;
   return <>{runs.value.value?.runs[scene.run.value]?.changed.map((line) => <p class="banner" key={line}>{line}</p>)}</>;
 }
 

@@ -53,6 +53,8 @@ export function kindOf(line: EpisodeLine): "solved" | "failed" | "unknown" {
   return line.outcome === true ? "solved" : line.outcome === false ? "failed" : "unknown";
 }
 
+const mark = (line: EpisodeLine) => (line.outcome === true ? "✓" : line.outcome === false ? "✗" : "·");
+
 function Card({ line }: { line: EpisodeLine }) {
   const numbers = runNumbers.value?.episodes.find(({ name }) => name === line.name);
   return (
@@ -63,11 +65,41 @@ function Card({ line }: { line: EpisodeLine }) {
         <span class="no-picture">{line.failed === undefined ? "no pictures" : "cannot be read"}</span>
       )}
       <span class="about">
-        <b>{line.outcome === true ? "✓" : line.outcome === false ? "✗" : "·"} {line.episode}</b>
+        <b>{mark(line)} {line.scene == null ? line.episode : `scene ${line.scene}`}</b>
         {line.num_steps ? <span>{line.num_steps} steps</span> : null}
         {numbers?.ratio != null ? <span class="soft" title={`ratio ${runNumbers.value?.ratio ?? ""}, and times what even attention gives`}>ratio {shown(numbers.ratio)} ({shown(numbers.lift)} × even)</span> : null}
       </span>
     </button>
+  );
+}
+
+/** An exchange: what was told, in whose scene. A cell opens its episode. */
+function Matrix() {
+  const lines = listed.value.filter(({ scene }) => scene != null);
+  if (!lines.length) return null;
+  const scenes = [...new Set(lines.map(({ scene }) => scene!))].sort((a, b) => a - b);
+  const told = new Map(lines.map(({ task, instruction }) => [task, instruction]));
+  return (
+    <section class="matrix" aria-label="Told and scene">
+      <p class="soft">Told (rows) in the scene and initial state of task (columns); ✓ did what it was told. A cell opens its episode.</p>
+      <table>
+        <thead><tr><th />{scenes.map((scene) => <th scope="col" key={scene} title={told.get(scene)}>{scene}</th>)}</tr></thead>
+        <tbody>
+          {[...told].map(([task, instruction]) => (
+            <tr key={task}>
+              <th scope="row">{instruction} <span class="soft">{task}</span></th>
+              {scenes.map((scene) => (
+                <td key={scene} class={scene === task ? "own" : ""}>
+                  {lines.filter((line) => line.task === task && line.scene === scene).map((line) => (
+                    <button key={line.name} class={kindOf(line)} title={line.verdict} aria-label={`task ${task} told in scene ${scene}: ${line.verdict}`} onClick={() => openEpisode(line.name)}>{mark(line)}</button>
+                  ))}
+                </td>
+              ))}
+            </tr>
+          ))}
+        </tbody>
+      </table>
+    </section>
   );
 }
 
@@ -129,6 +161,7 @@ export function Overview() {
         <input type="search" aria-label="Find episodes" placeholder="find: red, failed, not solved …" value={part("find")} onInput={(event) => setPart({ find: event.currentTarget.value })} />
         <span class="soft" role="status">{listed.value.length} of {shownRun.episodes.length} episodes</span>
       </div>
+      <Matrix />
       <div class={`tasks of-${Math.max(0, ...tasks.value.map(({ lines }) => lines.length))}`}>
         {tasks.value.map(({ task, instruction, lines }) => (
         <section class="task" key={`${task} ${instruction}`}>
