@@ -11,26 +11,52 @@ from typing import Literal
 from msgspec import field
 
 from vla_attention.schemas.errors import BadArgument
-from vla_attention.schemas.interventions import Interventions
+from vla_attention.schemas.interventions import Interventions, PromptChange, PromptKind
 from vla_attention.schemas.jsonable import Document, Number
+from vla_attention.schemas.safe_text import visible
 
 #: Changes of actions under the conditions of `EpisodeEffects`; below each site, the weights of the keys cut for them.
 CHANGE = "effects/change"
 CUT = "cut"
 #: What is taken away, one at a time. `text`: every word of the instruction, every part of the prompt, and all of it.
 #: `cameras`: every camera's picture, and all of them. `objects`: the patches of every object. `tokens`: every key of
-#: the prompt that is no piece of a word. `groups`: every group of a grouping, and everything but the group.
-EffectItems = Literal["text", "cameras", "objects", "tokens", "groups"]
+#: the prompt that is no piece of a word. `groups`: every group of a grouping, and everything but the group. `prompts`:
+#: the instruction, exchanged for every other sentence of a table.
+EffectItems = Literal["text", "cameras", "objects", "tokens", "groups", "prompts"]
 #: Whose queries no longer read it. `all`: nobody reads it. `action`: the action queries alone. `pictures`, `text`: the
 #: tokens of pictures, or of the prompt, before the denoise steps.
 EffectReaders = Literal["all", "action", "pictures", "text"]
+
+
+class OtherPrompt(Document, frozen=True):
+    """A row of a prompt table: what a task is told instead. Without a sentence it is `empty`, or `shuffled` by us."""
+
+    task_id: int
+    kind: PromptKind
+    sentence: str = ""
+
+    def __post_init__(self) -> None:
+        """Check that the sentence is there where the kind needs one."""
+        if (self.kind == "empty") if self.sentence else (self.kind not in ("empty", "shuffled")):
+            raise BadArgument(
+                f"A prompt of the kind '{self.kind}' has the sentence '{visible(self.sentence)}'; 'empty' has none, "
+                "'shuffled' may have one, every other kind needs one."
+            )
+
+    @property
+    def change(self) -> PromptChange:
+        """The row as a change of the prompt."""
+        if self.sentence:
+            return PromptChange("text", text=self.sentence, meaning=self.kind)
+        return PromptChange("empty" if self.kind == "empty" else "shuffled", meaning=self.kind)
 
 
 class EffectsRecorded(Document, frozen=True):
     """Which effects a run measures.
 
     `every`: at every so many replans, from the first on. `denoise_steps`: network evaluations of a changed call.
-    `seed`: of the random keys, and of the other noise. `groups`: the selector of each group, by name.
+    `seed`: of the random keys, and of the other noise. `groups`: the selector of each group, by name. `prompts`: the
+    prompt table.
     """
 
     items: tuple[EffectItems, ...]
@@ -39,6 +65,7 @@ class EffectsRecorded(Document, frozen=True):
     denoise_steps: int
     seed: int
     groups: dict[str, str] = field(default_factory=dict)
+    prompts: tuple[OtherPrompt, ...] = ()
 
     def __post_init__(self) -> None:
         """Check that something is measured, and the numbers."""

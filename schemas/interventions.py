@@ -17,6 +17,8 @@ from vla_attention.schemas.jsonable import Document
 from vla_attention.schemas.safe_text import check_name, check_text, visible
 
 Queries = Literal["action", "all", "prefix"]
+#: What another sentence is to the task's own. `exchanged`: a word of it for one that other tasks of its family have.
+PromptKind = Literal["paraphrased", "exchanged", "contradicted", "other task", "empty", "shuffled"]
 _READERS: dict[Queries, str] = {
     "action": "the action queries",
     "all": "all queries",
@@ -147,7 +149,8 @@ class PromptChange(Document, frozen=True):
     """Another instruction than the task's.
 
     `empty`: none. `shuffled`: its words in another order, drawn from `seed`. `task`: that of the suite's task
-    `task_id`. `text`: `text`. `synonyms`: words replaced by those that `synonyms` gives for them.
+    `task_id`. `text`: `text`. `synonyms`: words replaced by those that `synonyms` gives for them. `meaning`: what the
+    sentence is to the task's own, where somebody said it.
     """
 
     kind: Literal["empty", "shuffled", "task", "text", "synonyms"]
@@ -155,6 +158,7 @@ class PromptChange(Document, frozen=True):
     task_id: int | None = None
     synonyms: dict[str, str] = field(default_factory=dict)
     seed: int = 0
+    meaning: PromptKind | Literal[""] = ""
 
     def __post_init__(self) -> None:
         """Check that the kind has what it needs."""

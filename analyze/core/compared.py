@@ -190,7 +190,8 @@ def _effects(first: Run, other: Run) -> tuple[pl.DataFrame, pl.DataFrame] | None
         rows = one.episodes().filter(pl.col("kind").is_in(["without", "prompt", "image"]))
         rows = rows.with_columns(pl.col("reader").fill_null("total"))
         # An episode has few words to exchange: all together they say what none of them shows.
-        exchanged = rows.filter(kind="prompt", reader="total").group_by(EPISODE_ID).agg(pl.mean("effect"))
+        is_exchange = pl.col("item_kind").is_in(["exchange", "exchanged"])
+        exchanged = rows.filter(is_exchange, kind="prompt", reader="total").group_by(EPISODE_ID).agg(pl.mean("effect"))
         exchanged = exchanged.with_columns(
             item_kind=pl.lit("exchange"), item=pl.lit("any word exchanged"), reader=pl.lit("total")
         )

@@ -212,9 +212,11 @@ def described(given: Interventions, groups: Mapping[str, str]) -> dict[str, str 
         others = {"only": f"all but the {item.removeprefix('all ')}", "random": f"random keys, as many as {item}"}
         item, selector, reader = others.get(kind, item), visible(knockout.selector), _reader_of(knockout)
     elif given.prompt is not None:
-        kind, item_kind = "prompt", "exchange"
+        kind, item_kind = "prompt", given.prompt.meaning or "exchange"
         if given.prompt.kind == "synonyms":
             item = visible(", ".join(f"'{word}' as '{other}'" for word, other in given.prompt.synonyms.items()))
+        elif given.prompt.text:
+            item = visible(f"'{given.prompt.text}'")
     elif len(given.images) == 1:
         kind, item_kind, image = "image", "exchange", given.images[0]
         how = {"blank": "grey", "mean": "as the task's mean"}.get(image.kind, image.kind)

@@ -6,13 +6,15 @@ import argparse
 from dataclasses import dataclass, fields
 from typing import get_args
 
-from vla_attention.schemas.effects import EffectReaders
+from vla_attention.schemas.effects import EffectReaders, OtherPrompt
 from vla_attention.schemas.errors import BadArgument, did_you_mean, listing
 from vla_attention.schemas.options import add_options, option, read_options
 from vla_attention.schemas.stores.store_url import StorePlace, store_place
 
 #: Beginning of the item that names a grouping.
 GROUPING = "grouping:"
+#: Prompt tables: the one that is made of the tasks, and the beginning of one that names a file.
+STANDARD, TABLE = "standard", "table:"
 #: What effects can be of, as it is typed.
 ITEMS = ("text", "cameras", "objects", "tokens", f"{GROUPING}FILE")
 
@@ -23,6 +25,7 @@ class EffectSettings:
 
     items: of `EffectItems`, and `grouping:NAME` or `grouping:FILE.toml` for the groups of a grouping.
     pictures: the store of whose pictures cameras get the mean; None: in a rerun that of the base, else grey.
+    rows: of the prompt table, once it was read.
     """
 
     items: tuple[str, ...] = option(
@@ -56,8 +59,21 @@ class EffectSettings:
         metavar="STORE",
     )
 
+    prompts: str = option(
+        "the instruction exchanged for the sentences of a table, table:FILE.csv or .toml (task, sentence, kind), or "
+        "standard: empty, shuffled, of other tasks, a word exchanged, paraphrased and contradicted, and the cameras",
+        "",
+        name="prompts",
+        metavar="TABLE",
+    )
+    rows: tuple[OtherPrompt, ...] = ()
+
     def __post_init__(self) -> None:
         """Check the words, and bring them into their order."""
+        if self.prompts not in ("", STANDARD) and not (self.prompts.startswith(TABLE) and self.prompts != TABLE):
+            raise BadArgument(f"Cannot use --prompts '{self.prompts}'; expected {STANDARD}, {TABLE}FILE.csv or .toml.")
+        if self.prompts == STANDARD:
+            object.__setattr__(self, "items", (*self.items, "cameras"))
         groupings = tuple(dict.fromkeys(word for word in self.items if word.startswith(GROUPING)))
         if len(groupings) > 1:
             raise BadArgument(f"Effects take the groups of one grouping, not of {listing(groupings)}.")
@@ -85,7 +101,7 @@ def effect_settings(given: argparse.Namespace) -> EffectSettings | None:
     """Return what parsed arguments say; None for no effects."""
     words = getattr(given, "effects", "none")
     settings = read_options(EffectSettings, given, items=() if words == "none" else _items(words))
-    if settings.items:
+    if settings.items or settings.prompts:
         return settings
     for one in fields(EffectSettings):
         if one.name != "items" and getattr(settings, one.name) != one.default:

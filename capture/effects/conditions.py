@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from vla_attention.capture.effects.arguments import EffectSettings
 from vla_attention.capture.interventions.condition_name import condition_name, knockout_of_group, plain
+from vla_attention.capture.interventions.prompts import with_synonyms
 from vla_attention.capture.interventions.resolution import run_vocabularies
 from vla_attention.capture.policies.policy import Policy, PolicyInput, UnitsPolicy, VariantPolicy
 from vla_attention.schemas.effects import EffectItems, EffectReaders, EffectsRecorded
@@ -18,7 +19,7 @@ from vla_attention.schemas.groupings.builtin_groupings import TEXT_KEYS, find_gr
 from vla_attention.schemas.groupings.grouping import REST
 from vla_attention.schemas.groupings.selector_weights import selector_weights
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, SceneObject, Vocabulary
-from vla_attention.schemas.groupings.words import Word, split_words, words_of
+from vla_attention.schemas.groupings.words import Word, folded_words, words_of
 from vla_attention.schemas.interventions import (
     ImageChange,
     Interventions,
@@ -79,12 +80,19 @@ def effects_recorded(
     items: list[EffectItems] = [item for item in get_args(EffectItems) if item in settings.items]
     groups = {} if settings.grouping is None else _groups_of(settings.grouping, sites)
     items += ["groups"] if groups else []
-    return EffectsRecorded(tuple(items), settings.readers, settings.every, denoise_steps, seed, groups)
+    if settings.prompts and not settings.rows:
+        raise BadArgument(
+            f"Cannot use --prompts {settings.prompts} here: the tasks are not known before the first call; use "
+            "vla-attention capture rerun STORE --prompts on the store."
+        )
+    items += ["prompts"] if settings.rows else []
+    return EffectsRecorded(tuple(items), settings.readers, settings.every, denoise_steps, seed, groups, settings.rows)
 
 
 def describe_effects(planned: EffectsRecorded) -> str:
     """Return the line that is printed before a run."""
-    items = [item if item != "groups" else f"{plural(len(planned.groups), 'group')}" for item in planned.items]
+    named = {"groups": plural(len(planned.groups), "group"), "prompts": plural(len(planned.prompts), "other prompt")}
+    items = [named.get(item, item) for item in planned.items]
     readers = {"all": "for all queries", "action": "for the action queries", "pictures": "by the pictures"}
     by = listing((readers | {"text": "by the prompt"})[reader] for reader in planned.readers)
     often = "every replan" if planned.every == 1 else f"one replan in {planned.every}"
@@ -108,12 +116,14 @@ def conditions_of(
     vocabularies: Mapping[str, Vocabulary],
     objects: Sequence[SceneObject],
     siblings: Sequence[str],
+    task_id: int,
     with_mean: Collection[str] = (),
 ) -> tuple[Interventions, ...]:
     """Return the conditions of an episode, from its first call: the unchanged call, other noise, then every item.
 
     tokens, vocabularies: by site. objects: of the scene. siblings: the instructions of the other tasks of the task's
-    family. with_mean: the cameras of which a mean picture is known; the others become grey.
+    family. task_id: of the rows of a prompt table. with_mean: the cameras of which a mean picture is known; the others
+    become grey.
     """
     words = words_of(policy_input.prompt)
     groups: dict[str, _Group] = {}
@@ -135,8 +145,13 @@ def conditions_of(
         for selector in controlled:
             random = KeyKnockout(selector, queries=queries, query_selector=query_selector, random_seed=planned.seed)
             conditions.append(knockout_of_group("random", groups[selector].name, random))
+    instruction, rows = policy_input.prompt.instruction_text, [row for row in planned.prompts if row.task_id == task_id]
+    changes = [row.change for row in rows]
     if "text" in planned.items:
-        conditions += [_named(Interventions(prompt=change)) for change in exchanges(words, siblings)]
+        told = {folded_words(row.sentence) for row in rows}
+        exchanged = exchanges(instruction, siblings)
+        changes += [one for one in exchanged if folded_words(with_synonyms(instruction, one.synonyms)) not in told]
+    conditions += [_named(Interventions(prompt=change)) for change in changes]
     if "cameras" in planned.items:
         for camera in policy_input.frames:
             change = ImageChange(camera, "mean" if camera in with_mean else "blank")
@@ -232,15 +247,15 @@ def _controlled(planned: EffectsRecorded, words: Sequence[Word]) -> list[str]:
     return list(dict.fromkeys([*of_text, *planned.groups.values()]))
 
 
-def exchanges(words: Sequence[Word], siblings: Sequence[str]) -> list[PromptChange]:
+def exchanges(instruction: str, siblings: Sequence[str]) -> list[PromptChange]:
     """Return the exchange of each word for every other word that stands in its place in a sibling's instruction.
 
     Siblings with another number of words have no such places.
     """
-    mine = _texts(words)
+    mine = folded_words(instruction)
     changes: dict[tuple[str, str], PromptChange] = {}
     for sibling in siblings:
-        theirs = [sibling[start:stop].casefold() for start, stop in split_words(sibling)]
+        theirs = folded_words(sibling)
         if len(theirs) == len(mine):
             for word, other in zip(mine, theirs, strict=True):
                 if word != other:

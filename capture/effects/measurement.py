@@ -31,6 +31,7 @@ from vla_attention.schemas.effects import EffectsRecorded
 from vla_attention.schemas.errors import BadArgument, UserError, plural
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, Vocabulary
 from vla_attention.schemas.interventions import Interventions, KeyKnockout
+from vla_attention.schemas.layout import Prompt
 from vla_attention.schemas.stores.store_format import episode_name
 
 #: Calls that are made at a time, at most; a family takes fewer where its model is large. With 32, effects take 8 %
@@ -97,10 +98,10 @@ class EffectMeasurement:
         """Whether the model computes in float32."""
         return str(self.policy.identity().config.get("dtype", "float32")) == "float32"
 
-    def say_once(self, line: str) -> None:
-        """Say a line, unless it was said before."""
-        if line not in self._said:
-            self._said.add(line)
+    def say_once(self, line: str, about: str = "") -> None:
+        """Say a line, unless it or another line about the same was said before."""
+        if (about or line) not in self._said:
+            self._said.add(about or line)
             self.say(line)
 
     def actions_of(self, variants: Mapping[int, CallVariant]) -> dict[int, NDArray[np.float64]]:
@@ -225,6 +226,7 @@ class EpisodeEffectsMeasured:
                 vocabularies,
                 context.objects,
                 siblings,
+                context.task_id,
                 context.mean_pictures,
             )
             if "text" in planned.items and not any(condition.prompt for condition in self.conditions):
@@ -287,6 +289,9 @@ class EpisodeEffectsMeasured:
     ) -> CallVariant | None:
         """Return the call under a condition; None where there is nothing to change."""
         policy, editors = self.run.policy, dict[str, SiteEditor]()
+        told = policy_input.prompt.instruction_text
+        if condition.prompt and condition.prompt.kind == "text" and told != self.instruction:
+            return None  # of a table's row: it is another sentence for the task of the first call
         if condition.keys:
             place = ReplanPlace(context.task_id, context.episode_index, context.replan)
             try:
@@ -300,11 +305,16 @@ class EpisodeEffectsMeasured:
                 changed = changed_inputs(policy_input.given, condition, policy.sites, context)
                 exchanged = policy.prepare_again(changed)
             except UserError as error:  # a prompt that the policy has no encoding of
-                self.run.say_once(f"'{condition.name}' is left out of the effects: {error}")
-                return None
-            if any((exchanged.key_role[site] != roles).any() for site, roles in policy_input.key_role.items()):
                 self.run.say_once(
-                    f"'{condition.name}' is not measured where the prompt would have another number of tokens."
+                    f"'{condition.name}' is left out of the effects, and so are others like it: {error}",
+                    about=type(error).__name__,
+                )
+                return None
+            if _end_is_cut(exchanged.prompt) and not _end_is_cut(policy_input.prompt):
+                self.run.say_once(
+                    f"'{condition.name}' is left out of the effects, and so are other long ones: the policy has room "
+                    f"for {plural(len(exchanged.prompt.pieces), 'token')}, and would not read the end of the prompt.",
+                    about="cut",
                 )
                 return None
             policy_input = exchanged
@@ -337,6 +347,10 @@ class EpisodeEffectsMeasured:
             )
         self.run.refused += 1
         return [unchanged]
+
+
+def _end_is_cut(prompt: Prompt) -> bool:
+    return bool(prompt.pieces and prompt.text[prompt.pieces[-1].stop :].strip())
 
 
 def _cut(variant: CallVariant, site: str, num_keys: int) -> NDArray[np.float32]:

@@ -80,7 +80,7 @@ def _of_prompt(change: PromptChange) -> str:
         "shuffled": _of_seed(change.seed),
         "synonyms": "".join(f"_{word}_{synonym}" for word, synonym in change.synonyms.items()),
     }.get(change.kind, "")
-    return f"prompt_{change.kind}{detail}"
+    return f"prompt_{change.meaning or change.kind}{detail}"
 
 
 def _of_image(change: ImageChange) -> str:

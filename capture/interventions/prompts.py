@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from vla_attention.schemas.errors import BadArgument, listing
-from vla_attention.schemas.groupings.words import split_words
+from vla_attention.schemas.groupings.words import folded_words, split_words
 from vla_attention.schemas.interventions import PromptChange
 from vla_attention.schemas.jsonable import decode_json
 
@@ -70,7 +70,7 @@ def with_synonyms(instruction: str, synonyms: Mapping[str, str]) -> str:
 
 def check_synonyms(change: PromptChange, instructions: Iterable[str]) -> None:
     """Raise `BadArgument` for a word with a synonym that no instruction has."""
-    words = {text[start:stop].casefold() for text in instructions for start, stop in split_words(text)}
+    words = {word for text in instructions for word in folded_words(text)}
     for word in change.synonyms:
         if word.casefold() not in words:
             raise BadArgument(

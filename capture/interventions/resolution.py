@@ -16,7 +16,7 @@ from vla_attention.schemas.errors import BadArgument, unknown_name
 from vla_attention.schemas.groupings.resolve import EmptyGroup
 from vla_attention.schemas.groupings.selector_weights import check_selector, selector_weights
 from vla_attention.schemas.groupings.vocabulary import EpisodeTokens, SceneObject, Vocabulary, collect_vocabulary
-from vla_attention.schemas.groupings.words import split_words
+from vla_attention.schemas.groupings.words import folded_words
 from vla_attention.schemas.interventions import AttentionScale, AttentionUniform, Interventions, KeyKnockout
 from vla_attention.schemas.layers import select_layers
 from vla_attention.schemas.layout import Prompt, Role, SiteLayout
@@ -127,7 +127,7 @@ def run_vocabularies(
     sites: Sequence[SiteLayout], instructions: Sequence[str], objects: Sequence[SceneObject]
 ) -> dict[str, Vocabulary]:
     """Return the names that selectors may use in a run of these instructions in a scene, by site."""
-    sentences = tuple(dict.fromkeys(tuple(text[a:b].casefold() for a, b in split_words(text)) for text in instructions))
+    sentences = tuple(dict.fromkeys(folded_words(text) for text in instructions))
     vocabularies: dict[str, Vocabulary] = {}
     for layout in sites:
         reads = any(span.kind == "text" for span in layout.spans)

@@ -27,6 +27,7 @@ RERUN_EXAMPLES = """\
   vla-attention capture rerun runs/libero_10.zarr --keep role:instruction        with the words of the instruction alone
   vla-attention capture rerun runs/libero_10.zarr --prompt empty --image left_wrist_0_rgb=blank
   vla-attention capture rerun runs/libero_10.zarr --effects text,grouping:default    every word and group, with controls
+  vla-attention capture rerun runs/libero_10.zarr --prompts standard                 other sentences, by what they say
   vla-attention capture rerun runs/libero_10.zarr --output more.zarr --layers 0 1 2 --queries all
 """
 

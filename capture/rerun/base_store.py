@@ -98,6 +98,16 @@ def families_of(store: Store) -> list[tuple[int, str, str]]:
     return [known[number] for number in sorted(known)]
 
 
+def scenes_of(store: Store) -> dict[int, dict[int, str]]:
+    """Return the instructions of the tasks that share a task's scene, where the store's steps say it; by task."""
+    scenes = {}
+    for episode in open_store(store.path).episodes:
+        with suppress(CorruptEpisode):
+            if (steps := episode.attributes.steps) is not None:
+                scenes[episode.attributes.task_id] = {goal.task_id: goal.instruction for goal in steps.goals}
+    return scenes
+
+
 def check_may_change(store: Store, interventions: Interventions) -> None:
     """Raise `StoreError` for interventions on a store whose own run had some already."""
     stored = store.attributes.interventions

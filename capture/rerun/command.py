@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from vla_attention.capture.effects.conditions import refuse_both
 from vla_attention.capture.effects.mean_pictures import pictures_of
+from vla_attention.capture.effects.prompt_tables import with_rows
 from vla_attention.capture.engine.plan import plan_recording
 from vla_attention.capture.engine.progress import say
 from vla_attention.capture.engine.settings import RecordingSettings, recording_settings
@@ -15,7 +17,13 @@ from vla_attention.capture.machine import describe_machine, load_torch
 from vla_attention.capture.policies.family import PolicyFamily
 from vla_attention.capture.policies.identity import downloads_of
 from vla_attention.capture.rerun.arguments import RerunOutput, RerunSettings
-from vla_attention.capture.rerun.base_store import check_may_change, check_same_policy, open_base
+from vla_attention.capture.rerun.base_store import (
+    check_may_change,
+    check_same_policy,
+    families_of,
+    open_base,
+    scenes_of,
+)
 from vla_attention.capture.rerun.interventions_of_rerun import check_on_store, rerun_interventions, told
 from vla_attention.capture.rerun.rerun_store import Rerun
 from vla_attention.capture.rerun.stored_calls import check_has_inputs
@@ -36,6 +44,8 @@ def run_rerun(arguments: argparse.Namespace, threads: Threads, termination: Term
     settings, output = read_options(RerunSettings, arguments), read_options(RerunOutput, arguments)
     recording = recording_settings(arguments)
     base = open_base(arguments.base, settings.tasks, settings.num_episodes)
+    effects = with_rows(recording.effects, base.suite, families_of(base), scenes_of(base))
+    recording = replace(recording, effects=effects)
     interventions = rerun_interventions(arguments)
     check_may_change(base, interventions)
     # All mistakes that need no model are errors now, before the minutes for loading one. Those of the changes come

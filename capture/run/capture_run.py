@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from vla_attention.capture.effects.conditions import refuse_both
 from vla_attention.capture.effects.mean_pictures import pictures_of
 from vla_attention.capture.effects.measurement import measurement_of
+from vla_attention.capture.effects.prompt_tables import with_rows
 from vla_attention.capture.engine.call import Caller
 from vla_attention.capture.engine.faults import EpisodesMissing, Faults, describe_missing
 from vla_attention.capture.engine.loop import EpisodeLoop
@@ -145,14 +147,15 @@ def _plan_calls(settings: RunSettings, policy: Policy, protocol: Protocol, tasks
     suite.
     """
     asked, instructions = settings.interventions, {task.task_id: task.instruction for task in tasks}
-    recording, note = plan_recording(settings.recording, policy, asked.noise.seed if asked.noise else protocol.seed)
+    families = [(task.task_id, task.instruction, task.task_family) for task in tasks]
+    planned = replace(settings.recording, effects=with_rows(settings.recording.effects, settings.suite.name, families))
+    recording, note = plan_recording(planned, policy, asked.noise.seed if asked.noise else protocol.seed)
     changes = RunChanges(interventions_for(asked, policy), instructions, settings.allow_empty)
     if changes.interventions.prompt is not None:
         check_synonyms(changes.interventions.prompt, instructions.values())
     changes.check_names(policy.sites)
     if recording.effects is not None:
         refuse_both(changes.interventions)
-    families = [(task.task_id, task.instruction, task.task_family) for task in tasks]
     pictures = pictures_of(settings.recording.effects, policy, settings.suite.name)
     if note:
         say(note)

@@ -32,6 +32,11 @@ def split_words(text: str) -> list[tuple[int, int]]:
     return [match.span() for match in _WORD.finditer(text.replace("_", " "))]
 
 
+def folded_words(text: str) -> tuple[str, ...]:
+    """The words of a text in lower case: sentences with the same ones say the same."""
+    return tuple(text[start:stop].casefold() for start, stop in split_words(text))
+
+
 def words_of(prompt: Prompt) -> tuple[Word, ...]:
     """The words of the prompt's instruction, in order. A piece that touches a word's characters belongs to it."""
     first, last = prompt.instruction
@@ -52,7 +57,7 @@ def _words_in(text: str, first: int, pieces: tuple[Piece, ...]) -> tuple[Word, .
 
 def find_phrase(words: Sequence[Word], phrase: str) -> tuple[Word, ...]:
     """Every word that takes part in an occurrence of the phrase (case-insensitive, whole words, in sequence)."""
-    wanted = [phrase[start:stop].casefold() for start, stop in split_words(phrase)]
+    wanted = folded_words(phrase)
     given = [word.text.casefold() for word in words]
     taken = {i for first in _occurrences(given, wanted) for i in range(first, first + len(wanted))}
     return tuple(words[i] for i in sorted(taken))
@@ -76,7 +81,7 @@ def word_class(word: str) -> WordClass:
 
 def has_phrase(sentence: Sequence[str], phrase: str) -> bool:
     """Whether the words of a phrase follow each other in a sentence, both case-folded."""
-    wanted = [phrase[start:stop].casefold() for start, stop in split_words(phrase)]
+    wanted = folded_words(phrase)
     return any(True for _ in _occurrences(sentence, wanted))
 
 

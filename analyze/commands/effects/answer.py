@@ -21,6 +21,7 @@ from vla_attention.analyze.commands.effects.items import (
     figures_of_items,
     with_untested,
 )
+from vla_attention.analyze.commands.effects.prompts import other_sentences
 from vla_attention.analyze.core.about import about, enough, notes, with_interval
 from vla_attention.analyze.core.action_changes import GRIPPER, ActionSpread
 from vla_attention.analyze.core.axes import check_axes, columns_of
@@ -72,14 +73,15 @@ def word_effects(question: Question) -> tuple[list[Finding], list[Table]]:
     except BadArgument as error:
         return [Finding(f"Not shown: {error}", _DECIDE)], []
     if found is None:
-        rerun = f"vla-attention capture rerun {shlex.quote(str(question.stores[0].path))} --effects text,cameras"
+        rerun = f"vla-attention capture rerun {shlex.quote(str(question.stores[0].path))} --effects text --prompts standard"
         return [Finding("Not recorded: how the action changes without a word.", _DECIDE, next_step=rerun)], []
     episodes = found.episodes()
     items = with_untested(question, by_item(summary_of(episodes, question.sampling)))
     table = items.filter(item_kind="word")
     columns = [column for column in columns_of_items(table) if column.name != "lift"]
-    findings = [*exchanged(question, episodes), deciding(table, found.spread)]
-    return findings, [Table("word_effects", table, columns, "What the action does without a word")]
+    otherwise, tables = other_sentences(question, episodes)
+    findings = [*exchanged(question, episodes), *otherwise, deciding(table, found.spread)]
+    return findings, [*tables, Table("word_effects", table, columns, "What the action does without a word")]
 
 
 def _recorded(found: RecordedEffects, by: Collection[str]) -> tuple[list[Finding], list[Table], list[Figure]]:
@@ -94,18 +96,23 @@ def _recorded(found: RecordedEffects, by: Collection[str]) -> tuple[list[Finding
         Table("effects", found.rows()),
     ]
     shown = [*looks, *columns_of_items(items)]
+    otherwise, of_prompts = other_sentences(question, episodes, looks)
     if by:
         said = f"Below, a row for each item and {' and '.join(by)}."
-        return [Finding(said, "What does the action depend on?")], [Table("effects_items", items, shown), *files], []
+        return (
+            [Finding(said, "What does the action depend on?")],
+            [Table("effects_items", items, shown), *of_prompts, *files],
+            [],
+        )
     items = with_untested(question, items)
     is_word, of_prompt = pl.col("item_kind") == "word", pl.col("item").str.starts_with("'")
     words, others = items.filter(is_word), items.filter(~of_prompt)
-    findings = [*exchanged(question, episodes), deciding(words, found.spread)]
+    findings = [*exchanged(question, episodes), *otherwise, deciding(words, found.spread)]
     findings += [*_sides(question, episodes, items), *_others(others), *_ways(words)]
     findings += _unlike_attention(words)
     course = _over_time(found, items)
     tables = [Table("effects_items", items, shown, "Without it, the action changes by", rows=16), *files]
-    return findings, [*tables, Table("effects_time", course)], figures_of_items(items, course, summary)
+    return findings, [*of_prompts, *tables, Table("effects_time", course)], figures_of_items(items, course, summary)
 
 
 def deciding(words: pl.DataFrame, spread: ActionSpread) -> Finding:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import get_args
 
 import polars as pl
 
@@ -13,6 +14,7 @@ from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.schemas.errors import listing
+from vla_attention.schemas.interventions import PromptKind
 
 #: Whether an item is shown to change the action by more than another noise seed does.
 MORE, OPEN, LESS, FEW, UNTESTED, NO_NOISE = (
@@ -35,21 +37,15 @@ def by_item(summary: pl.DataFrame, looks: Sequence[str] = ()) -> pl.DataFrame:
         than_noise; and the effect of every reader. Effects have intervals.
     """
     names = [*looks, "item", "item_kind"]
-    rows = summary.filter(pl.col("kind").is_in(_SHOWN_KINDS)).with_columns(pl.col("reader").fill_null("total"))
+    # Other sentences are no items: `prompts` has them, by what they are.
+    is_item = pl.col("kind").is_in(_SHOWN_KINDS) & ~pl.col("item_kind").is_in(get_args(PromptKind))
+    rows = summary.filter(is_item).with_columns(pl.col("reader").fill_null("total"))
     of_total = rows.filter(reader="total")
     direct = rows.filter(reader="direct").join(of_total, on=names, how="anti", nulls_equal=True)
-    # On the scale of the effects themselves, which differ by factors: a difference would be of the largest episodes.
-    q, above = pl.col("times_noise_q"), pl.col("times_noise")
-    shown = (
-        pl.when(above.is_null()).then(pl.lit(NO_NOISE))
-        .when(above <= 0).then(pl.lit(LESS))
-        .when(q.is_null()).then(pl.lit(FEW))
-        .when(q <= NAMED_AT).then(pl.lit(MORE))
-        .otherwise(pl.lit(OPEN))
-    )  # fmt: skip
     found = pl.concat([of_total, direct]).select(
         *names, "condition", "reader", *_with_ends("effect"), turn="angle", grip="gripper_flips",
-        grip_part="gripper_part", lift="lift", noise="noise", than_noise=shown, q=q, num_episodes="num_episodes",
+        grip_part="gripper_part", lift="lift", noise="noise", than_noise=against_noise(), q="times_noise_q",
+        num_episodes="num_episodes",
     )  # fmt: skip
     for reader in _READERS:
         part = rows.filter(reader=reader).select(*names, *_with_ends("effect", reader))
@@ -57,6 +53,19 @@ def by_item(summary: pl.DataFrame, looks: Sequence[str] = ()) -> pl.DataFrame:
     order = pl.col("item_kind").replace_strict({kind: i for i, kind in enumerate(_KINDS)}, default=len(_KINDS))
     down = [*(False for _ in looks), False, True]
     return found.sort(*looks, order, "effect", descending=down, nulls_last=True, maintain_order=True)
+
+
+def against_noise() -> pl.Expr:
+    """Whether the effect of a row is shown to be more than that of another noise seed, from times_noise and its q."""
+    # On the scale of the effects themselves, which differ by factors: a difference would be of the largest episodes.
+    q, above = pl.col("times_noise_q"), pl.col("times_noise")
+    return (
+        pl.when(above.is_null()).then(pl.lit(NO_NOISE))
+        .when(above <= 0).then(pl.lit(LESS))
+        .when(q.is_null()).then(pl.lit(FEW))
+        .when(q <= NAMED_AT).then(pl.lit(MORE))
+        .otherwise(pl.lit(OPEN))
+    )  # fmt: skip
 
 
 def _with_ends(name: str, to: str = "") -> list[pl.Expr]:
@@ -77,7 +86,8 @@ _TEXTS = dict.fromkeys(("item", "item_kind", "than_noise"), pl.String)
 
 def exchanged(question: Question, episodes: pl.DataFrame) -> list[Finding]:
     """Whether it tells words apart: how far the action moves with one exchanged for another, which tasks also have."""
-    rows = episodes.filter(kind="prompt", item_kind="exchange").group_by(*EPISODE_ID, maintain_order=True)
+    is_exchange = pl.col("item_kind").is_in(["exchange", "exchanged"])
+    rows = episodes.filter(is_exchange, kind="prompt").group_by(*EPISODE_ID, maintain_order=True)
     of_episodes = rows.agg(pl.mean("effect", "noise"), words=pl.col("item"))
     if of_episodes.is_empty():
         return []

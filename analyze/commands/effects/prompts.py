@@ -1,0 +1,99 @@
+"""Other sentences by what they are to the task's own: how far they move the action, and towards what."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import polars as pl
+
+from vla_attention.analyze.commands.effects.items import MORE, UNIT, against_noise
+from vla_attention.analyze.core.about import with_interval
+from vla_attention.analyze.core.directions import directions, things_of_sentences
+from vla_attention.analyze.core.estimate import Scale, estimate
+from vla_attention.analyze.core.result import Column, Finding, Table
+from vla_attention.analyze.measures.frames import EPISODE_ID
+from vla_attention.analyze.measures.question import Question
+from vla_attention.analyze.statistics.many_looks import NAMED_AT
+from vla_attention.schemas.errors import listing, plural
+
+_CENTIMETRES = 100
+
+
+def other_sentences(
+    question: Question, episodes: pl.DataFrame, looks: Sequence[Column] = ()
+) -> tuple[list[Finding], list[Table]]:
+    """How far each kind of sentence moves the action beside another noise seed, and whether towards what it names.
+
+    episodes: as `RecordedEffects.episodes` gives them. looks: columns that tell cells apart; then there is no finding.
+    """
+    cells = [column.name for column in looks]
+    rows = episodes.filter(kind="prompt").with_columns(sentence=pl.col("item_kind").replace("exchange", "exchanged"))
+    if not {*rows["sentence"]} - {"exchanged"}:  # single words are items like others
+        return [], []
+    rows = rows.group_by(*EPISODE_ID, *cells, "sentence", maintain_order=True).agg(pl.mean("effect", "noise"))
+    rows = rows.with_columns(times_noise=(pl.col("effect") / pl.col("noise")).log())
+    sizes: dict[str, Scale] = {"effect": "positive", "noise": "positive", "times_noise": "plain"}
+    found = estimate(
+        rows, [*cells, "sentence"], sizes, question.sampling, {"times_noise": 0.0}, cells,
+        {"over_noise": ("effect", "noise")},
+    )  # fmt: skip
+    found = found.with_columns(than_noise=against_noise()).sort(
+        *cells, "effect", descending=[*(False for _ in cells), True]
+    )
+    table = Table("effects_prompts", found, [*looks, *_SENTENCES], "Told something else, the action changes by")
+    if looks:
+        return [], [table]
+    towards, where = _towards(question)
+    return [_moves(found), *towards], [table, *where]
+
+
+def _moves(found: pl.DataFrame) -> Finding:
+    sure, has_noise = found.filter(than_noise=MORE), found["over_noise"].count() > 0
+    size, unit = ("over_noise", "times as much as another noise seed") if has_noise else ("effect", UNIT)
+    sizes = dict(found.drop_nulls(size).select("sentence", size).iter_rows())
+    said = "Other words move the action" if sure.height else "No other words are shown to move the action"
+    said += f": {listing([f'{kind} {value:.2g}' for kind, value in sizes.items()], 6)} {unit}."
+    limit = f"Shown to be more than noise: {listing(sure['sentence'], 6)}." if sure.height else ""
+    return Finding(said, "Do other words move it?", sizes | {"n": found["num_episodes"].max()}, limit)
+
+
+def _towards(question: Question) -> tuple[list[Finding], list[Table]]:
+    rows, known, unknown = directions(question.selected, things_of_sentences(question.stores))
+    if rows.is_empty():
+        return [], []
+    left = f"Left out: {plural(unknown, 'sentence')} of which no task says that they name a single other thing."
+    names = ("changed", "unchanged", "closer")
+    rows = rows.with_columns(pl.col(*names) * _CENTIMETRES)
+    scales: dict[str, Scale] = dict.fromkeys(names, "plain")
+    kinds, whole = (
+        estimate(part.group_by(*EPISODE_ID, "sentence", maintain_order=True).agg(pl.mean(*names)), ["sentence"], scales,
+                 question.sampling, {"closer": 0.0})
+        for part in (rows.rename({"kind": "sentence"}), rows.with_columns(sentence=pl.lit("any")))
+    )  # fmt: skip
+    row = whole.row(0, named=True)
+    sure = row["closer_q"] is not None and row["closer_q"] <= NAMED_AT and row["closer"] > 0
+    said = f"told of another thing, the next steps go {with_interval(row, 'changed')} cm closer to it (unchanged: "
+    said += f"{row['unchanged']:.2g} cm)"
+    said = f"{said[0].upper()}{said[1:]}." if sure else f"Not shown to go where the words say: {said}."
+    numbers = {"estimate": row["closer"], "low": row["closer_low"], "high": row["closer_high"], "q": row["closer_q"],
+               "n": row["num_episodes"], "sentences": known, "left_out": unknown}  # fmt: skip
+    table = Table("effects_directions", kinds, _DIRECTIONS, "Told of another thing, the next steps go")
+    return [Finding(said, "Towards what the words name?", numbers, left if unknown else "")], [table]
+
+
+_SENTENCES = [
+    Column("sentence", "text", "told", "what the sentence is to the task's own"),
+    Column("effect", "number", "change", f"how far the action moves then, in {UNIT}"),
+    Column("over_noise", "factor", "times noise", "that, over how far another noise seed moves it"),
+    Column("than_noise", "text", "than noise", "whether that is shown to be more than another noise seed does"),
+    Column("noise", "number", "another noise", screen=False),
+    Column("num_episodes", "count", "episodes"),
+]
+_DIRECTIONS = [
+    Column("sentence", "text", "told"),
+    Column("changed", "signed", "cm closer", "to the thing that the words name, summed over the executed steps"),
+    Column("unchanged", "signed", "unchanged", "the same of the call with the task's own sentence"),
+    Column("closer", "signed", "difference"),
+    Column("closer_q", "p", "q", "p of no difference, adjusted for the number of rows"),
+    Column("num_episodes", "count", "episodes"),
+]

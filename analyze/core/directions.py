@@ -1,0 +1,107 @@
+"""Where the next steps go when the policy is told of another thing of the scene: towards it, or as they went without.
+
+Only what the simulator says of its tasks decides which things a sentence names: those that it calls of interest in the
+task whose instruction the sentence is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from vla_attention.analyze.core.action_changes import TRANSLATION, BaseEpisode, counted
+from vla_attention.analyze.measures.frames import EPISODE_ID, episode_columns
+from vla_attention.analyze.measures.selected import SelectedEpisode
+from vla_attention.schemas.effects import CHANGE
+from vla_attention.schemas.episode_steps import EXECUTED, HAND, POSES
+from vla_attention.schemas.groupings.words import folded_words
+from vla_attention.schemas.stores.reader import Store
+from vla_attention.schemas.stores.store_format import EpisodeAttributes, parse_episode_name
+
+Array = NDArray[np.float64]
+Names = Mapping[tuple[str, ...], frozenset[str]]
+
+#: The kinds of sentences that may name another thing.
+KINDS = ("exchanged", "other task", "contradicted")
+
+
+def things_of_sentences(stores: Sequence[Store]) -> Names:
+    """The things that the simulator says a task names, by the words of its instruction; of its first episode."""
+    found: dict[tuple[str, ...], frozenset[str]] = {}
+    for store in stores:
+        first = {parse_episode_name(episode.name)[0]: episode for episode in reversed(store.episodes)}
+        for episode in first.values():
+            found.setdefault(folded_words(episode.attributes.instruction), _of_interest(episode.attributes))
+    return found
+
+
+def _of_interest(attributes: EpisodeAttributes) -> frozenset[str]:
+    return frozenset(thing.name for thing in attributes.objects if thing.of_interest)
+
+
+def directions(items: Sequence[SelectedEpisode], names: Names) -> tuple[pl.DataFrame, int, int]:
+    """How much closer to the newly named thing the executed steps of a chunk go, as the policy was told and otherwise.
+
+    The steps' translations are summed, projected on the line from the hand to the thing at the chunk's beginning, and
+    brought to metres by how far the hand moved for all executed chunks: sum(moved . told) / sum(told . told).
+
+    Returns:
+        One row per episode, kind of sentence and thing: suite, task_id, episode_index, kind, thing, and in metres
+        changed, unchanged, closer (their difference), means over replans; how many different sentences of `KINDS` name
+        a single other thing, and of how many others that is not known.
+    """
+    rows, moved, counted_in, left_out = [], np.zeros(2), set(), set()
+    for item in items:
+        attributes, base = item.episode.attributes, BaseEpisode.of(item)
+        steps, effects = attributes.steps, attributes.effects
+        if steps is None or effects is None or not item.episode.has(CHANGE):
+            continue
+        poses = item.episode.read(POSES).astype(np.float64)[..., :3]
+        hand = poses[:, steps.bodies.index(HAND)]
+        moved += _moved(hand, item.episode.read(EXECUTED).astype(np.float64), base)
+        change = item.episode.read(CHANGE).astype(np.float64) * np.array(effects.units)
+        for number, condition in enumerate(effects.conditions):
+            if condition.prompt is None or condition.prompt.meaning not in KINDS:
+                continue
+            named = names.get(folded_words(condition.prompt.text))
+            others = (named or frozenset()) & {*steps.bodies} - _of_interest(attributes)
+            if named is None or len(others) > 1:
+                left_out.add(condition.prompt.text)
+            entries = np.flatnonzero(np.array(effects.condition) == number)
+            if len(others) != 1 or not entries.size:
+                continue
+            (thing,) = others
+            counted_in.add(condition.prompt.text)
+            at = base.at(np.array(effects.replan)[entries])
+            line = poses[at.starts, steps.bodies.index(thing)] - hand[at.starts]
+            unchanged, changed = (
+                along(line, actions, at.executed) for actions in (at.actions, at.actions + change[entries])
+            )
+            values = {"changed": changed.mean(), "unchanged": unchanged.mean(), "closer": (changed - unchanged).mean()}
+            keys = episode_columns(item, EPISODE_ID, 1)
+            rows.append(pl.DataFrame({**keys, "kind": condition.prompt.meaning, "thing": thing, **values}))
+    if not rows or not moved.all():
+        return pl.DataFrame(), 0, len(left_out)
+    metres = pl.col("changed", "unchanged", "closer").mean() * (moved[0] / moved[1])
+    by = (*EPISODE_ID, "kind", "thing")
+    return pl.concat(rows).group_by(by, maintain_order=True).agg(metres), len(counted_in), len(left_out - counted_in)
+
+
+def along(line: Array, actions: Array, steps: NDArray[np.int64]) -> Array:
+    """How far the first `steps` (replan,) of each chunk go along a line (replan, 3), in the actions' own unit.
+
+    actions: (replan, horizon, dimension); the first three move the hand along the axes of the world.
+    """
+    told = (actions[..., TRANSLATION] * counted(steps, actions.shape[1])[..., None]).sum(axis=1)
+    result: Array = (told * line).sum(axis=1) / np.linalg.norm(line, axis=1)
+    return result
+
+
+def _moved(hand: Array, executed: Array, base: BaseEpisode) -> Array:
+    """Of an episode sum(moved . told) and sum(told . told) over its replans; hand: (moment, 3), executed: by step."""
+    edges = np.append(base.starts, base.num_steps)
+    told = np.add.reduceat(executed[:, TRANSLATION], base.starts, axis=0)
+    return np.array([(np.diff(hand[edges], axis=0) * told).sum(), (told**2).sum()])
