@@ -6,6 +6,7 @@ another word, picture or noise; the robot executes the unchanged call. `docs/eff
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import Literal
 
 from msgspec import field
@@ -76,6 +77,11 @@ class EffectsRecorded(Document, frozen=True):
                 f"Effects at every {self.every} replans, of {self.denoise_steps} denoise steps, with the seed "
                 f"{self.seed}; expected at least 1, 1 and 0."
             )
+
+    @property
+    def most_prompts(self) -> int:
+        """The most rows that the prompt table has of a task."""
+        return max(Counter(row.task_id for row in self.prompts).values(), default=0)
 
 
 class EpisodeEffects(Document, frozen=True):

@@ -7,6 +7,7 @@ task whose instruction the sentence is.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 
 import numpy as np
 import polars as pl
@@ -19,7 +20,7 @@ from vla_attention.schemas.effects import CHANGE
 from vla_attention.schemas.episode_steps import EXECUTED, HAND, POSES
 from vla_attention.schemas.groupings.words import folded_words
 from vla_attention.schemas.stores.reader import Store
-from vla_attention.schemas.stores.store_format import EpisodeAttributes, parse_episode_name
+from vla_attention.schemas.stores.store_format import CorruptEpisode, EpisodeAttributes, parse_episode_name
 
 Array = NDArray[np.float64]
 Names = Mapping[tuple[str, ...], frozenset[str]]
@@ -34,7 +35,8 @@ def things_of_sentences(stores: Sequence[Store]) -> Names:
     for store in stores:
         first = {parse_episode_name(episode.name)[0]: episode for episode in reversed(store.episodes)}
         for episode in first.values():
-            found.setdefault(folded_words(episode.attributes.instruction), _of_interest(episode.attributes))
+            with suppress(CorruptEpisode):  # `--skip-corrupt`
+                found.setdefault(folded_words(episode.attributes.instruction), _of_interest(episode.attributes))
     return found
 
 
@@ -54,7 +56,7 @@ def directions(items: Sequence[SelectedEpisode], names: Names) -> tuple[pl.DataF
         a single other thing, and of how many others that is not known.
     """
     rows, moved, counted_in, left_out = [], np.zeros(2), set(), set()
-    for item in items:
+    for item in (one.fresh() for one in items):
         attributes, base = item.episode.attributes, BaseEpisode.of(item)
         steps, effects = attributes.steps, attributes.effects
         if steps is None or effects is None or not item.episode.has(CHANGE):
@@ -83,7 +85,7 @@ def directions(items: Sequence[SelectedEpisode], names: Names) -> tuple[pl.DataF
             values = {"changed": changed.mean(), "unchanged": unchanged.mean(), "closer": (changed - unchanged).mean()}
             keys = episode_columns(item, EPISODE_ID, 1)
             rows.append(pl.DataFrame({**keys, "kind": condition.prompt.meaning, "thing": thing, **values}))
-    if not rows or not moved.all():
+    if not rows or moved.min() <= 0:
         return pl.DataFrame(), 0, len(left_out)
     metres = pl.col("changed", "unchanged", "closer").mean() * (moved[0] / moved[1])
     by = (*EPISODE_ID, "kind", "thing")

@@ -91,7 +91,7 @@ def effects_recorded(
 
 def describe_effects(planned: EffectsRecorded) -> str:
     """Return the line that is printed before a run."""
-    named = {"groups": plural(len(planned.groups), "group"), "prompts": plural(len(planned.prompts), "other prompt")}
+    named = {"groups": plural(len(planned.groups), "group"), "prompts": plural(planned.most_prompts, "other prompt")}
     items = [named.get(item, item) for item in planned.items]
     readers = {"all": "for all queries", "action": "for the action queries", "pictures": "by the pictures"}
     by = listing((readers | {"text": "by the prompt"})[reader] for reader in planned.readers)

@@ -15,6 +15,7 @@ from vla_attention.capture.effects.arguments import STANDARD, TABLE, EffectSetti
 from vla_attention.capture.effects.conditions import exchanges
 from vla_attention.capture.effects.measurement import siblings_of
 from vla_attention.capture.environments.suites import find_suite, list_tasks
+from vla_attention.capture.interventions.condition_name import plain
 from vla_attention.capture.interventions.prompts import with_synonyms
 from vla_attention.schemas.command_line import format_bytes
 from vla_attention.schemas.effects import OtherPrompt
@@ -63,13 +64,13 @@ def with_rows(
     else:
         rows = read_prompt_table(Path(effects.prompts.removeprefix(TABLE)), instructions)
     own = {number for number, _, _ in tasks}
-    chosen = {(row.task_id, row.kind, folded_words(row.sentence)): row for row in rows if row.task_id in own}
+    chosen = tuple(row for row in rows if row.task_id in own)
     if not chosen:
         raise BadArgument(
             f"The table of --prompts {effects.prompts} has no row for the tasks of the run, {listing(sorted(own))}; it "
             f"has rows for {listing(sorted({row.task_id for row in rows}))}."
         )
-    return replace(effects, rows=tuple(chosen.values()))
+    return replace(effects, rows=chosen)
 
 
 def _made_of(tasks: Sequence[tuple[int, str, str]], scenes: Mapping[int, Mapping[int, str]]) -> Iterator[OtherPrompt]:
@@ -103,7 +104,8 @@ def read_prompt_table(path: Path, instructions: Mapping[int, str]) -> list[Other
     Raises:
         BadArgument: something is wrong with the file or with a row; names the line, what was expected and what exists.
     """
-    found: dict[tuple[int, tuple[str, ...], bool], str] = {}
+    # Conditions are told apart by their names, in which commas and hyphens are alike.
+    found = {(number, folded_words(plain(text)), False): "its own instruction" for number, text in instructions.items()}
     rows = []
     for where, row in _rows_of(path):
         kinds, sentence = get_args(PromptKind), row["sentence"]
@@ -121,7 +123,7 @@ def read_prompt_table(path: Path, instructions: Mapping[int, str]) -> list[Other
             check_text("sentence", sentence)
             made = [OtherPrompt(number, row["kind"], sentence) for number in numbers]
             for one in made:
-                key = one.task_id, folded_words(sentence), one.kind == "empty"
+                key = one.task_id, folded_words(plain(sentence)), one.kind == "empty"
                 if key in found:
                     raise BadArgument(f"Task {one.task_id} has the same words in {found[key]}; expected each once.")
                 found[key] = where
@@ -141,18 +143,14 @@ def _rows_of(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """Where each row of a table stands, and its columns, with white space around them taken off."""
     try:
         size = path.stat().st_size
-        if size > _MOST_BYTES:
-            raise BadArgument(
-                f"The prompt table {path} has {format_bytes(size)}; expected at most {format_bytes(_MOST_BYTES)}. Take "
-                "some of its sentences."
-            )
-        text = path.read_text(encoding="utf-8-sig")
-        rows = list(_toml_rows(text) if path.suffix == ".toml" else _csv_rows(text))
-    except (OSError, ValueError, csv.Error) as error:
-        if isinstance(error, UserError):
-            raise
+        text = path.read_text(encoding="utf-8-sig") if size <= _MOST_BYTES else ""
+        rows = list(_toml_rows(text) if path.suffix == ".toml" and text else _csv_rows(text))
+    except (OSError, ValueError, csv.Error, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise BadArgument(f"Cannot read the prompt table {path} ({reason}); expected CSV or TOML in UTF-8.") from None
+    if size > _MOST_BYTES:
+        most = format_bytes(_MOST_BYTES)
+        raise BadArgument(f"The prompt table {path} has {format_bytes(size)}; take at most {most} of its sentences.")
     if not rows:
         raise BadArgument(f"The prompt table {path} has no row; expected {listing(COLUMNS)} in each.")
     for where, row in rows:

@@ -119,6 +119,7 @@ def _bytes_of_effects(effects: EffectsRecorded, horizon: int, sites: Sequence[Si
     tokens = sum(span.num_keys for site in sites for span in site.spans if span.kind == "text")
     # Each group is cut off, kept alone, and has a control.
     counts = {"cameras": 2 + 2 * cameras, "tokens": tokens, "groups": 3 * len(effects.groups)}
+    counts["prompts"] = effects.most_prompts
     entries = len(effects.readers) * sum(counts.get(item, _MOST_ITEMS) for item in effects.items) + _MOST_ITEMS
     of_entry = 4 * horizon * _ACTION_DIMENSIONS * _INCOMPRESSIBLE + sum(site.num_keys for site in sites) / 8
     return entries * of_entry / effects.every

@@ -73,7 +73,9 @@ def word_effects(question: Question) -> tuple[list[Finding], list[Table]]:
     except BadArgument as error:
         return [Finding(f"Not shown: {error}", _DECIDE)], []
     if found is None:
-        rerun = f"vla-attention capture rerun {shlex.quote(str(question.stores[0].path))} --effects text --prompts standard"
+        rerun = (
+            f"vla-attention capture rerun {shlex.quote(str(question.stores[0].path))} --effects text --prompts standard"
+        )
         return [Finding("Not recorded: how the action changes without a word.", _DECIDE, next_step=rerun)], []
     episodes = found.episodes()
     items = with_untested(question, by_item(summary_of(episodes, question.sampling)))

@@ -30,7 +30,8 @@ def other_sentences(
     rows = episodes.filter(kind="prompt").with_columns(sentence=pl.col("item_kind").replace("exchange", "exchanged"))
     if not {*rows["sentence"]} - {"exchanged"}:  # single words are items like others
         return [], []
-    rows = rows.group_by(*EPISODE_ID, *cells, "sentence", maintain_order=True).agg(pl.mean("effect", "noise"))
+    names = dict.fromkeys([*EPISODE_ID, *cells, "sentence"])
+    rows = rows.group_by(*names, maintain_order=True).agg(pl.mean("effect", "noise"))
     rows = rows.with_columns(times_noise=(pl.col("effect") / pl.col("noise")).log())
     sizes: dict[str, Scale] = {"effect": "positive", "noise": "positive", "times_noise": "plain"}
     found = estimate(
