@@ -14,7 +14,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from vla_attention.analyze.core.action_changes import TRANSLATION, BaseEpisode, counted
-from vla_attention.analyze.measures.frames import EPISODE_ID, episode_columns
+from vla_attention.analyze.measures.frames import EPISODE_ID
 from vla_attention.analyze.measures.selected import SelectedEpisode
 from vla_attention.schemas.effects import CHANGE
 from vla_attention.schemas.episode_steps import EXECUTED, HAND, POSES
@@ -44,52 +44,49 @@ def _of_interest(attributes: EpisodeAttributes) -> frozenset[str]:
     return frozenset(thing.name for thing in attributes.objects if thing.of_interest)
 
 
-def directions(items: Sequence[SelectedEpisode], names: Names) -> tuple[pl.DataFrame, int, int]:
+def directions(items: Sequence[SelectedEpisode], names: Names) -> tuple[pl.DataFrame, int]:
     """How much closer to the newly named thing the executed steps of a chunk go, as the policy was told and otherwise.
 
     The steps' translations are summed, projected on the line from the hand to the thing at the chunk's beginning, and
     brought to metres by how far the hand moved for all executed chunks: sum(moved . told) / sum(told . told).
 
     Returns:
-        One row per episode, kind of sentence and thing: suite, task_id, episode_index, kind, thing, and in metres
-        changed, unchanged, closer (their difference), means over replans; how many different sentences of `KINDS` name
-        a single other thing, and of how many others that is not known.
+        One row per episode and sentence that names a single other thing: suite, task_id, episode_index, sentence (its
+        kind), and in metres changed, unchanged, closer (their difference), means over replans; and of how many
+        sentences of `KINDS` that is not known.
     """
-    rows, moved, counted_in, left_out = [], np.zeros(2), set(), set()
-    for item in (one.fresh() for one in items):
+    rows, moved, left_out = [], np.zeros(2), set()
+    for item in (one.fresh() for one in items if one.episode.has(CHANGE) and one.episode.has(POSES)):
         attributes, base = item.episode.attributes, BaseEpisode.of(item)
         steps, effects = attributes.steps, attributes.effects
-        if steps is None or effects is None or not item.episode.has(CHANGE):
-            continue
+        assert steps is not None
+        assert effects is not None
         poses = item.episode.read(POSES).astype(np.float64)[..., :3]
         hand = poses[:, steps.bodies.index(HAND)]
         moved += _moved(hand, item.episode.read(EXECUTED).astype(np.float64), base)
         change = item.episode.read(CHANGE).astype(np.float64) * np.array(effects.units)
-        for number, condition in enumerate(effects.conditions):
-            if condition.prompt is None or condition.prompt.meaning not in KINDS:
+        for number, prompt in enumerate(condition.prompt for condition in effects.conditions):
+            entries = np.flatnonzero(np.array(effects.condition) == number)
+            if prompt is None or prompt.meaning not in KINDS or not entries.size:
                 continue
-            named = names.get(folded_words(condition.prompt.text))
+            named = names.get(folded_words(prompt.text))
             others = (named or frozenset()) & {*steps.bodies} - _of_interest(attributes)
             if named is None or len(others) > 1:
-                left_out.add(condition.prompt.text)
-            entries = np.flatnonzero(np.array(effects.condition) == number)
-            if len(others) != 1 or not entries.size:
+                left_out.add(prompt.text)
+            if len(others) != 1:
                 continue
-            (thing,) = others
-            counted_in.add(condition.prompt.text)
             at = base.at(np.array(effects.replan)[entries])
-            line = poses[at.starts, steps.bodies.index(thing)] - hand[at.starts]
-            unchanged, changed = (
-                along(line, actions, at.executed) for actions in (at.actions, at.actions + change[entries])
+            line = poses[at.starts, steps.bodies.index(next(iter(others)))] - hand[at.starts]
+            changed = along(line, at.actions + change[entries], at.executed).mean()
+            unchanged = along(line, at.actions, at.executed).mean()
+            rows.append(
+                (item.store.suite, attributes.task_id, attributes.episode_index, prompt.meaning, changed, unchanged)
             )
-            values = {"changed": changed.mean(), "unchanged": unchanged.mean(), "closer": (changed - unchanged).mean()}
-            keys = episode_columns(item, EPISODE_ID, 1)
-            rows.append(pl.DataFrame({**keys, "kind": condition.prompt.meaning, "thing": thing, **values}))
-    if not rows or moved.min() <= 0:
-        return pl.DataFrame(), 0, len(left_out)
-    metres = pl.col("changed", "unchanged", "closer").mean() * (moved[0] / moved[1])
-    by = (*EPISODE_ID, "kind", "thing")
-    return pl.concat(rows).group_by(by, maintain_order=True).agg(metres), len(counted_in), len(left_out - counted_in)
+    if moved.min() <= 0:
+        return pl.DataFrame(), len(left_out)
+    table = pl.DataFrame(rows, schema=[*EPISODE_ID, "sentence", "changed", "unchanged"], orient="row")
+    table = table.with_columns(pl.col("changed", "unchanged") * (moved[0] / moved[1]))
+    return table.with_columns(closer=pl.col("changed") - pl.col("unchanged")), len(left_out)
 
 
 def along(line: Array, actions: Array, steps: NDArray[np.int64]) -> Array:

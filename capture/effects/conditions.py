@@ -81,10 +81,7 @@ def effects_recorded(
     groups = {} if settings.grouping is None else _groups_of(settings.grouping, sites)
     items += ["groups"] if groups else []
     if settings.prompts and not settings.rows:
-        raise BadArgument(
-            f"Cannot use --prompts {settings.prompts} here: the tasks are not known before the first call; use "
-            "vla-attention capture rerun STORE --prompts on the store."
-        )
+        raise BadArgument(f"Cannot use --prompts {settings.prompts} here, where no task is known yet; use a rerun.")
     items += ["prompts"] if settings.rows else []
     return EffectsRecorded(tuple(items), settings.readers, settings.every, denoise_steps, seed, groups, settings.rows)
 

@@ -305,15 +305,12 @@ class EpisodeEffectsMeasured:
                 changed = changed_inputs(policy_input.given, condition, policy.sites, context)
                 exchanged = policy.prepare_again(changed)
             except UserError as error:  # a prompt that the policy has no encoding of
-                self.run.say_once(
-                    f"'{condition.name}' is left out of the effects, and so are others like it: {error}",
-                    about=type(error).__name__,
-                )
+                self.run.say_once(f"'{condition.name}' and its like are left out: {error}", about=type(error).__name__)
                 return None
             if _end_is_cut(exchanged.prompt) and not _end_is_cut(policy_input.prompt):
                 self.run.say_once(
-                    f"'{condition.name}' is left out of the effects, and so are other long ones: the policy has room "
-                    f"for {plural(len(exchanged.prompt.pieces), 'token')}, and would not read the end of the prompt.",
+                    f"'{condition.name}' and other long ones are left out: the policy has no room for the end of the "
+                    "prompt, and would not read it.",
                     about="cut",
                 )
                 return None

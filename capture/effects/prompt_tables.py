@@ -22,7 +22,7 @@ from vla_attention.schemas.effects import OtherPrompt
 from vla_attention.schemas.errors import BadArgument, UserError, listing, unknown_name
 from vla_attention.schemas.groupings.words import folded_words, word_class
 from vla_attention.schemas.interventions import PromptKind
-from vla_attention.schemas.safe_text import check_text, visible
+from vla_attention.schemas.safe_text import check_text
 
 #: Our own tables, SUITE.csv: two paraphrases and a contradiction of each task.
 SHIPPED = Path(__file__).parent / "prompts"
@@ -115,21 +115,17 @@ def read_prompt_table(path: Path, instructions: Mapping[int, str]) -> list[Other
                 raise unknown_name("task", row["task"], [f"{n} ({text})" for n, text in instructions.items()])
             if row["kind"] not in kinds:
                 raise unknown_name("kind of prompt", row["kind"], kinds)
-            if sentence.startswith(_FORMULA):
-                raise BadArgument(
-                    f"'{visible(sentence)}' begins as a formula of a spreadsheet; expected a sentence that begins with "
-                    "a letter."
-                )
             check_text("sentence", sentence)
-            made = [OtherPrompt(number, row["kind"], sentence) for number in numbers]
-            for one in made:
-                key = one.task_id, folded_words(plain(sentence)), one.kind == "empty"
+            if sentence.startswith(_FORMULA):
+                raise BadArgument(f"'{sentence}' begins as a formula of a spreadsheet; expected words.")
+            for number in numbers:
+                key = number, folded_words(plain(sentence)), row["kind"] == "empty"
                 if key in found:
-                    raise BadArgument(f"Task {one.task_id} has the same words in {found[key]}; expected each once.")
+                    raise BadArgument(f"Task {number} has the same words in {found[key]}; expected each once.")
                 found[key] = where
+                rows.append(OtherPrompt(number, row["kind"], sentence))
         except UserError as error:
             raise BadArgument(f"{path}, {where}: {error}") from None
-        rows += made
     return rows
 
 

@@ -16,7 +16,8 @@ from vla_attention.analyze.measures.question import Question
 from vla_attention.analyze.statistics.many_looks import NAMED_AT
 from vla_attention.schemas.errors import listing, plural
 
-_CENTIMETRES = 100
+#: All kinds of sentences that name another thing.
+_ANY = "any of these"
 
 
 def other_sentences(
@@ -38,9 +39,8 @@ def other_sentences(
         rows, [*cells, "sentence"], sizes, question.sampling, {"times_noise": 0.0}, cells,
         {"over_noise": ("effect", "noise")},
     )  # fmt: skip
-    found = found.with_columns(than_noise=against_noise()).sort(
-        *cells, "effect", descending=[*(False for _ in cells), True]
-    )
+    down = [*(False for _ in cells), True]
+    found = found.with_columns(than_noise=against_noise()).sort(*cells, "effect", descending=down)
     table = Table("effects_prompts", found, [*looks, *_SENTENCES], "Told something else, the action changes by")
     if looks:
         return [], [table]
@@ -53,32 +53,27 @@ def _moves(found: pl.DataFrame) -> Finding:
     size, unit = ("over_noise", "times as much as another noise seed") if has_noise else ("effect", UNIT)
     sizes = dict(found.drop_nulls(size).select("sentence", size).iter_rows())
     said = "Other words move the action" if sure.height else "No other words are shown to move the action"
-    said += f": {listing([f'{kind} {value:.2g}' for kind, value in sizes.items()], 6)} {unit}."
+    said += f": {listing([f'{kind} {value:.3g}' for kind, value in sizes.items()], 6)} {unit}."
     limit = f"Shown to be more than noise: {listing(sure['sentence'], 6)}." if sure.height else ""
     return Finding(said, "Do other words move it?", sizes | {"n": found["num_episodes"].max()}, limit)
 
 
 def _towards(question: Question) -> tuple[list[Finding], list[Table]]:
-    rows, known, unknown = directions(question.selected, things_of_sentences(question.stores))
+    rows, unknown = directions(question.selected, things_of_sentences(question.stores))
     if rows.is_empty():
         return [], []
-    left = f"Left out: {plural(unknown, 'sentence')} of which no task says that they name a single other thing."
     names = ("changed", "unchanged", "closer")
-    rows = rows.with_columns(pl.col(*names) * _CENTIMETRES)
-    scales: dict[str, Scale] = dict.fromkeys(names, "plain")
-    kinds, whole = (
-        estimate(part.group_by(*EPISODE_ID, "sentence", maintain_order=True).agg(pl.mean(*names)), ["sentence"], scales,
-                 question.sampling, {"closer": 0.0})
-        for part in (rows.rename({"kind": "sentence"}), rows.with_columns(sentence=pl.lit("any")))
-    )  # fmt: skip
-    row = whole.row(0, named=True)
+    rows = pl.concat([rows, rows.with_columns(sentence=pl.lit(_ANY))]).with_columns(pl.col(*names) * 100)  # in cm
+    rows = rows.group_by(*EPISODE_ID, "sentence", maintain_order=True).agg(pl.mean(*names))
+    found = estimate(rows, ["sentence"], dict.fromkeys(names, "plain"), question.sampling, {"closer": 0.0})
+    row = found.row(by_predicate=pl.col("sentence") == _ANY, named=True)
     sure = row["closer_q"] is not None and row["closer_q"] <= NAMED_AT and row["closer"] > 0
-    said = f"told of another thing, the next steps go {with_interval(row, 'changed')} cm closer to it (unchanged: "
-    said += f"{row['unchanged']:.2g} cm)"
-    said = f"{said[0].upper()}{said[1:]}." if sure else f"Not shown to go where the words say: {said}."
+    said = f"{'Told' if sure else 'Not shown to go where the words say: told'} of another thing, the next steps go "
+    said += f"{with_interval(row, 'changed')} cm closer to it (unchanged: {row['unchanged']:.2g} cm)."
     numbers = {"estimate": row["closer"], "low": row["closer_low"], "high": row["closer_high"], "q": row["closer_q"],
-               "n": row["num_episodes"], "sentences": known, "left_out": unknown}  # fmt: skip
-    table = Table("effects_directions", kinds, _DIRECTIONS, "Told of another thing, the next steps go")
+               "n": row["num_episodes"], "left_out": unknown}  # fmt: skip
+    left = f"Left out: {plural(unknown, 'sentence')} of which no task says that they name a single other thing."
+    table = Table("effects_directions", found, _DIRECTIONS, "Told of another thing, the next steps go")
     return [Finding(said, "Towards what the words name?", numbers, left if unknown else "")], [table]
 
 

@@ -85,9 +85,9 @@ def test_the_steps_go_towards_the_named_thing_by_the_planted_metres(store):
     question = question_about(store)
     names = things_of_sentences(question.stores)
     assert names[tuple(INSTRUCTIONS[1].split())] == {"akita_black_bowl_1", "plate_1"}
-    rows, known, unknown = directions(question.selected, names | CABINETS)
-    assert (known, unknown) == (1, 1)
-    assert {*rows["kind"]} == {"other task"}
+    rows, unknown = directions(question.selected, names | CABINETS)
+    assert (rows.height, unknown) == (12, 1)
+    assert {*rows["sentence"]} == {"other task"}
     for row in rows.iter_rows(named=True):
         task, episode = row["task_id"], row["episode_index"]
         steps, actions = num_steps(SPEC, episode), actions_of(task, episode, SPEC.num_replans)
