@@ -30,13 +30,17 @@ KINDS = ("exchanged", "other task", "contradicted")
 
 
 def things_of_sentences(stores: Sequence[Store]) -> Names:
-    """The things that the simulator says a task names, by the words of its instruction; of its first episode."""
+    """The things that the simulator says a task names, by the words of its instruction; of tasks' first episodes."""
     found: dict[tuple[str, ...], frozenset[str]] = {}
     for store in stores:
         first = {parse_episode_name(episode.name)[0]: episode for episode in reversed(store.episodes)}
         for episode in first.values():
             with suppress(CorruptEpisode):  # `--skip-corrupt`
-                found.setdefault(folded_words(episode.attributes.instruction), _of_interest(episode.attributes))
+                attributes = episode.attributes
+                found.setdefault(folded_words(attributes.instruction), _of_interest(attributes))
+                for goal in attributes.steps.goals if attributes.steps is not None else ():
+                    if goal.things:  # a task that shares the scene, whether the store has an episode of it or not
+                        found.setdefault(folded_words(goal.instruction), frozenset(goal.things))
     return found
 
 
